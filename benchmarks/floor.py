@@ -1,0 +1,115 @@
+"""The floor: the least time that any program needs for the same output, by bytes and by instructions."""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.config import Config
+from benchmarks.timing import in_turn
+
+LANES = {"avx512": 16, "avx2": 8, "vector128": 4, "scalar": 1}
+
+# Vector instructions for one registration of each lane, counted from native/registration.h, random.h and
+# exact_kernel.cpp for one Gaussian return and a dead time that is not a whole number of periods; loads of
+# constants left out.
+PLAIN = {
+    "Threefry-2x32-13: add and exclusive or of 13 rounds, key schedule": 13 * 2 + 14,
+    "two exponentials: 13 to split the integer, 22 for the logarithm": 2 * (13 + 22),
+    "whole periods and fractions of the two waits, check for long waits": 2 * 6 + 8,
+    "background arrival: add the wait, carry into the next period": 5,
+    "place in the pulse's table, interpolation of the energy": 10,
+    "energy of the arrival, number of periods": 8,
+    "its quantile: sign, octave cell, line": 8,
+    "the earlier of the two arrivals": 8,
+    "end of the dead time": 5,
+    "laser period and bin, end of exposure": 13,
+}
+ROTATIONS = 13  # one instruction with AVX-512 and in scalar code, else three
+SELECTIONS = 9  # one instruction from AVX2 on, with SSE2 three; the minimum of integers among them
+PAIR_LOOKUPS = 2  # of two floats, forward and inverse table of the pulse: per lane an address and a load each
+INCREMENTS = 1  # of the histogram: per lane an address and a read-modify-write
+VECTOR_PER_CYCLE, ALL_PER_CYCLE = 2.0, 4.0  # issued by large x86-64 cores since about 2015
+
+
+@dataclass(frozen=True)
+class Operations:
+    """Least number of instructions per registration at a vector level."""
+
+    vector: float
+    scalar: float
+
+    @property
+    def total(self) -> float:
+        """Vector and scalar."""
+        return self.vector + self.scalar
+
+    def seconds(self, hertz: float) -> float:
+        """Least time per registration at this clock."""
+        return max(self.vector / VECTOR_PER_CYCLE, self.total / ALL_PER_CYCLE) / hertz
+
+
+def operations(level: str) -> Operations:
+    """Of the exact engine, per registration; moves and address arithmetic of a compiler are not counted."""
+    rotation = 1 if level in ("avx512", "scalar") else 3
+    selection = 3 if level == "vector128" else 1
+    group = sum(PLAIN.values()) + ROTATIONS * rotation + SELECTIONS * selection
+    per_lane = 2.0 * (PAIR_LOOKUPS + INCREMENTS)
+    if level == "scalar":
+        return Operations(0.0, group + per_lane)
+    return Operations(group / LANES[level], per_lane)
+
+
+@lru_cache(maxsize=1)
+def nominal_clock() -> float | None:
+    """Hertz, from the processor's description; None where that is not told."""
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return None
+    found = re.search(r"@ ([\d.]+)GHz", text) or re.search(r"cpu MHz\s*: ([\d.]+)", text)
+    if found is None:
+        return None
+    return float(found[1]) * (1e9 if "GHz" in found[0] else 1e6)
+
+
+@dataclass(frozen=True)
+class Bandwidth:
+    """Bytes per second of `numpy.ndarray.fill`, into memory written before and into fresh memory."""
+
+    warm_one: float
+    warm_all: float
+    fresh_one: float
+    fresh_all: float
+
+    def seconds(self, size: int, *, threads: int, fresh: bool) -> float:
+        """Least time to write `size` bytes."""
+        one, every = (self.fresh_one, self.fresh_all) if fresh else (self.warm_one, self.warm_all)
+        return size / (one if threads == 1 else every)
+
+
+def measure_bandwidth(config: Config) -> Bandwidth:
+    """On an array as large as the canonical cube, by one thread and by all."""
+    size = config.pixels * config.bins * 2
+    warm = np.ones(size // 8, np.uint64)
+    with ThreadPoolExecutor(config.threads) as pool:
+
+        def fill(array: NDArray[np.uint64], threads: int) -> None:
+            list(pool.map(lambda part: part.fill(0), np.array_split(array, threads)))
+
+        times = in_turn(
+            {
+                "warm_one": lambda: warm.fill(0),
+                "warm_all": lambda: fill(warm, config.threads),
+                "fresh_one": lambda: np.empty_like(warm).fill(0),
+                "fresh_all": lambda: fill(np.empty_like(warm), config.threads),
+            },
+            config,
+        )
+    return Bandwidth(**{name: size / timing.median for name, timing in times.items()})

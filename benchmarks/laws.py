@@ -1,0 +1,125 @@
+"""The analytic half: count laws, shapes and the stationary distribution, beside the dense eigen-solution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.config import Config
+from benchmarks.floor import Bandwidth
+from benchmarks.report import Goal, Row, Section
+from benchmarks.timing import Timing, in_turn
+from benchmarks.workload import PERIOD_NS, system
+from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics.exposure import exposure_moments
+from mars_lidar.statistics.grid import photons_per_bin
+from mars_lidar.statistics.law import count_law
+
+GOAL_MOMENTS_MS, GOAL_PMF_MS, GOAL_STATIONARY_MS, GOAL_TABLE_S = 3.0, 20.0, 50.0, 30.0
+TABLE = (256, 100)  # of the paper: S x B, log-spaced on [0.01, 10]
+_SIGNAL, _BACKGROUND = 1.0, 0.5
+
+
+def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
+    """Exact moments, mean histogram and pmf of a finite exposure; the paper's table."""
+    del bandwidth
+    instrument, every = system(config), config.threads
+    random = np.random.default_rng(3)
+    signal, background = 10.0 ** random.uniform(-2.0, 1.0, (2, 32))
+    grid = _table_entries(config.table_entries)
+
+    def pmf() -> object:
+        return count_law(signal, background, instrument, method="exact", threads=1).pmf
+
+    cases: dict[str, tuple[int, int, Callable[[], object]]] = {
+        "moments and mean histogram": (
+            signal.size, 1, lambda: exposure_moments(signal, background, instrument, threads=1)
+        ),
+        "count pmf": (signal.size, 1, pmf),
+        "table entries, moments and shapes": (
+            grid.shape[1], every, lambda: exposure_moments(*grid, instrument, threads=every)
+        ),
+    }
+    times = in_turn({name: case for name, (_, _, case) in cases.items()}, config)
+    section = Section("Laws of a finite exposure", notes=[_EXPOSURE_NOTE])
+    section.rows = [
+        _row(name, config.bins, threads, cells, times[name]) for name, (cells, threads, _) in cases.items()
+    ]
+    cell_ms = {row["case"]: row["ms per (S, B)"] for row in section.rows}
+    whole = 1e-3 * cell_ms["table entries, moments and shapes"] * TABLE[0] * TABLE[1]
+    scaled = "" if grid.shape[1] == TABLE[0] * TABLE[1] else f", scaled from {grid.shape[1]}"
+    section.goals = [
+        Goal("exact moments and mean histogram, per (S, B), 1 thread", cell_ms["moments and mean histogram"],
+             GOAL_MOMENTS_MS, "ms"),
+        Goal("exact count pmf, per (S, B), 1 thread", cell_ms["count pmf"], GOAL_PMF_MS, "ms"),
+        Goal(f"25,600 table entries, {every} threads{scaled}", whole, GOAL_TABLE_S, "s"),
+    ]
+    return section
+
+
+def stationary_distribution(config: Config, bandwidth: Bandwidth) -> Section:
+    """Ours by O(n) products; the paper's way by a dense matrix and its eigenvectors."""
+    del bandwidth
+    dense, fine = config.dense_bins, config.chain_bins
+    cases: dict[str, Callable[[], object]] = {
+        f"feedback equation, {dense} bins": lambda: _chain(config, dense).stationary(),
+        f"dense matrix and eigenvectors, {dense} bins": lambda: dense_stationary(_chain(config, dense)),
+        f"feedback equation, {fine} bins": lambda: _chain(config, fine).stationary(),
+    }
+    times = in_turn(cases, config)
+    ours, paper, _ = times.values()
+    section = Section("Stationary distribution")
+    section.notes.append(
+        f"S = {_SIGNAL:g}, B = {_BACKGROUND:g}, one (S, B). At {dense} bins the eigenvectors of the dense "
+        f"matrix, the paper's way, take {paper.ratio(ours):.0f} times as long."
+    )
+    for name in cases:
+        bins = fine if str(fine) in name else dense
+        section.rows.append(_row(name, bins, 1, 1, times[name]))
+    found = 1e3 * times[f"feedback equation, {fine} bins"].median
+    section.goals.append(Goal(f"stationary distribution, {fine} bins", found, GOAL_STATIONARY_MS, "ms"))
+    return section
+
+
+def dense_stationary(chain: PhaseChain) -> NDArray[np.float64]:
+    """Stationary distribution as the left eigenvector of the dense transition matrix for the eigenvalue 1."""
+    values, vectors = np.linalg.eig(chain.dense("rapp").T)
+    vector = np.abs(vectors[:, np.argmin(np.abs(values - 1.0))])
+    return np.asarray(vector / vector.sum())
+
+
+def _chain(config: Config, bins: int) -> PhaseChain:
+    instrument = system(config)
+    photons = photons_per_bin(_SIGNAL, _BACKGROUND, instrument, delay_ns=0.5 * PERIOD_NS, bins=bins)
+    return PhaseChain(photons, instrument.dead_time_periods)
+
+
+def _table_entries(number: int) -> NDArray[np.float64]:
+    """(2, number) entries (S, B) of the paper's table, spread evenly over it."""
+    axes = np.meshgrid(*(np.geomspace(0.01, 10.0, points) for points in TABLE), indexing="ij")
+    every = np.stack([axis.reshape(-1) for axis in axes])
+    order = np.random.default_rng(4).permutation(every.shape[1])
+    return every[:, np.sort(order[:number])]
+
+
+def _row(case: str, bins: int, threads: int, cells: int, timing: Timing) -> Row:
+    return {
+        "case": case,
+        "bins": bins,
+        "threads": threads,
+        "(S, B)": cells,
+        "ms": 1e3 * timing.median,
+        "ms least": 1e3 * timing.least,
+        "CPU ms": 1e3 * timing.cpu_median,
+        "ms per (S, B)": 1e3 * timing.median / cells,
+        "turns": len(timing.wall),
+    }
+
+
+_EXPOSURE_NOTE = (
+    "N_r and bins as in the canonical configuration; S and B log-uniform on [0.01, 10]. The statistics grid "
+    "is refined until the result settles, so these times hold more than one grid; the pmf includes the "
+    "moments."
+)

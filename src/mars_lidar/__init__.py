@@ -1,0 +1,28 @@
+"""mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
+
+from mars_lidar._version import __version__
+from mars_lidar.flux import Flux
+from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
+from mars_lidar.scene import Scene
+from mars_lidar.simulate import simulate, simulate_timestamps
+from mars_lidar.statistics import CountLaw, count_law, holding_time_covariance, registration_pdf
+from mars_lidar.system import Detector, System
+from mars_lidar.timestamps import Timestamps
+
+__all__ = [
+    "CountLaw",
+    "Detector",
+    "Flux",
+    "GaussianPulse",
+    "Pulse",
+    "SampledPulse",
+    "Scene",
+    "System",
+    "Timestamps",
+    "__version__",
+    "count_law",
+    "holding_time_covariance",
+    "registration_pdf",
+    "simulate",
+    "simulate_timestamps",
+]

@@ -1,0 +1,46 @@
+"""Argument checks: every message names the argument, the value given and what is allowed."""
+
+from __future__ import annotations
+
+import math
+from numbers import Integral, Real
+from typing import Any
+
+
+def real(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False) -> float:
+    """A finite real number in [low, high] (or (low, high] with `strict_low`), as float."""
+    allowed = f"a finite number in {'(' if strict_low else '['}{low:g}, {high:g}]"
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name} must be {allowed}, got {value!r} ({type(value).__name__})")
+    number = float(value)
+    if not math.isfinite(number) or number > high or number < low or (strict_low and number == low):
+        raise ValueError(f"{name} must be {allowed}, got {value!r}")
+    return number
+
+
+def integer(name: str, value: Any, *, low: int, high: int) -> int:
+    """An integer in [low, high]; floats are refused, even whole ones, so that 1e3 is a visible decision."""
+    allowed = f"an integer in [{low}, {high}]"
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise TypeError(f"{name} must be {allowed}, got {value!r} ({type(value).__name__})")
+    number = int(value)
+    if not low <= number <= high:
+        raise ValueError(f"{name} must be {allowed}, got {value!r}")
+    return number
+
+
+def choice(name: str, value: Any, allowed: tuple[str, ...]) -> str:
+    """One of a few strings."""
+    if not isinstance(value, str) or value not in allowed:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+    return value
+
+
+def known_keys(name: str, mapping: Any, allowed: tuple[str, ...]) -> dict[str, Any]:
+    """A mapping whose keys are all known; a misspelt key is an error, never ignored."""
+    if not isinstance(mapping, dict):
+        raise TypeError(f"{name} must be a mapping with keys {', '.join(allowed)}, got {mapping!r}")
+    unknown = [key for key in mapping if key not in allowed]
+    if unknown:
+        raise ValueError(f"{name} has unknown key {unknown[0]!r}; allowed: {', '.join(allowed)}")
+    return mapping

@@ -1,0 +1,3 @@
+"""Package version, the same as in pyproject.toml (a test compares them)."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,61 @@
+"""The command `mars-lidar`.
+
+Exit codes: 0 done, 1 failed (disk full, a bug), 2 bad input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from mars_lidar.cli.init import init
+from mars_lidar.cli.inspect import info, view
+from mars_lidar.cli.simulate import EPILOG, simulate
+
+app = typer.Typer(
+    name="mars-lidar",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,  # a traceback means a bug, and is wanted whole in a report
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command(no_args_is_help=True, epilog=EPILOG)(simulate)
+app.command(no_args_is_help=True)(info)
+app.command(no_args_is_help=True)(view)
+app.command()(init)
+
+
+_EPILOG = "\n\n".join(
+    (
+        "[bold]A first run[/bold]",
+        "mars-lidar simulate --scene room -o room.zarr",
+        "mars-lidar info room.zarr",
+        "mars-lidar view room.zarr --pixel 40,64 -o pixel.png",
+        "Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted. "
+        "[bold]mars-lidar COMMAND --help[/bold] says more.",
+    )
+)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from mars_lidar import __version__
+
+        print(f"mars-lidar {__version__}")
+        raise typer.Exit
+
+
+@app.callback(epilog=_EPILOG)
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and stop.", is_eager=True, callback=_version)
+    ] = False,
+) -> None:
+    """Exact, fast simulation of single-photon LiDAR histograms under SPAD dead time."""
+
+
+def main() -> None:
+    """Entry point of the command `mars-lidar`."""
+    app()

@@ -1,0 +1,125 @@
+"""Messages, exit codes and the progress bar: standard output carries results, standard error the rest."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import typer
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+_PATIENCE_S = 0.5  # a bar that would vanish at once is not drawn
+
+
+def say(message: str) -> None:
+    """One line on standard error."""
+    print(f"mars-lidar: {message}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def reported() -> Iterator[None]:
+    """Turn what goes wrong into one line and an exit code; anything unforeseen keeps its traceback."""
+    from mars_lidar.io import Interrupted, WriteError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = _show_warning
+            yield
+    except Interrupted as stop:
+        say(str(stop))
+        raise typer.Exit(INTERRUPTED) from None
+    except KeyboardInterrupt:
+        say("interrupted")
+        raise typer.Exit(INTERRUPTED) from None
+    except WriteError as error:
+        say(f"failed: {error.strerror}")
+        raise typer.Exit(FAILED) from None
+    except (FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
+        say(_of_file(error))
+        raise typer.Exit(BAD_INPUT) from None
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        say(f"failed: {_of_file(error)}")
+        raise typer.Exit(FAILED) from None
+    except (ValueError, TypeError, OverflowError, MemoryError) as error:
+        say(" ".join(str(error).split()) or type(error).__name__)
+        raise typer.Exit(BAD_INPUT) from None
+
+
+@contextlib.contextmanager
+def progress_bar(label: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A callback (done, total) that draws a bar with the time left, or None where nobody is watching."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    bar: Any = None
+    task: Any = None
+    began = time.monotonic()
+
+    def update(done: int, total: int) -> None:
+        nonlocal bar, task
+        if bar is None:
+            if time.monotonic() - began < _PATIENCE_S:
+                return
+            bar = _new_bar()
+            bar.start()
+            task = bar.add_task(label, total=total)
+        bar.update(task, completed=done, total=total)
+
+    try:
+        yield update
+    finally:
+        if bar is not None:
+            bar.stop()
+
+
+def _new_bar() -> Any:
+    from rich import progress as columns
+    from rich.console import Console
+
+    return columns.Progress(
+        columns.TextColumn("{task.description}"),
+        columns.BarColumn(),
+        columns.TaskProgressColumn(),
+        columns.TextColumn("elapsed"),
+        columns.TimeElapsedColumn(),
+        columns.TextColumn("left"),
+        columns.TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )
+
+
+def table(rows: list[tuple[str, str]]) -> None:
+    """Two columns on standard output: a label, and text that is never cut; plain where it is piped."""
+    if not sys.stdout.isatty():
+        for label, text in rows:
+            print(f"{label:<14} {text}")
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(style="bold", no_wrap=True)
+    grid.add_column(overflow="fold")
+    for label, text in rows:
+        grid.add_row(label, Text(text))
+    Console(highlight=False).print(grid)
+
+
+def _of_file(error: OSError) -> str:
+    if error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if issubclass(category, UserWarning):
+        say(f"warning: {message}")

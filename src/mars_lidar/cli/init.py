@@ -1,0 +1,62 @@
+"""`mars-lidar init`: a commented system file to start from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mars_lidar.cli.console import reported
+
+# The values are those of `system_options.DEFAULT_SYSTEM`; a test reads the file back and compares.
+TEMPLATE = """\
+# A system for mars-lidar: laser, detector and histogram.
+# Use it:  mars-lidar simulate --scene room --system {name} -o room.zarr
+# In Python:  system = mars_lidar.System.load("{name}")
+
+# Laser period in ns: 1000 / repetition rate in MHz; this is 7.5 MHz. Depth is unambiguous up to
+# c * period / 2, here 20 m: what lies beyond looks nearer.
+period_ns: 133.33333333333334
+
+# Laser periods per exposure (one histogram); 1000 last 133 microseconds.
+cycles: 1000
+
+# Histogram bins over one period; here 130 ps each, 2 cm of depth.
+bins: 1024
+
+# Shape of the returned pulse, detector response (jitter) included.
+pulse:
+  kind: gaussian
+  sigma_ns: 0.5  # standard deviation; or  fwhm_ns: 1.1774 (FWHM = 2.355 sigma)
+# A measured impulse response instead; its samples must span no more than a period:
+# pulse:
+#   kind: sampled
+#   values: [0, 2, 30, 100, 61, 24, 10, 4, 1, 0]
+#   bin_ns: 0.05
+#   origin: peak  # what the delay of a return refers to: peak, centroid or first (start of sample 0)
+
+detector:
+  dead_time_ns: 75.0  # blind after each registration, across periods; 0, a fraction of a period, or many
+  mode: nonparalyzable  # free running: photons that arrive while blind have no effect
+
+# State of the pixel at the start of an exposure: armed (ready), or stationary (warmed up).
+start: armed
+"""
+
+
+def init(
+    file: Annotated[Path, typer.Argument(help="Where to write it: .yaml or .yml.")] = Path("system.yaml"),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+) -> None:
+    """Write a commented YAML file that describes a system: laser, detector, histogram.
+
+    Edit it and pass it on:  mars-lidar simulate --scene room --system system.yaml -o room.zarr
+    """
+    with reported():
+        if file.suffix not in (".yaml", ".yml"):
+            raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
+        if file.exists() and not overwrite:
+            raise FileExistsError(f"{file} exists already; choose another name or give --overwrite")
+        file.write_text(TEMPLATE.format(name=file))
+        print(f"wrote {file}")

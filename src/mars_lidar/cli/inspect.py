@@ -1,0 +1,168 @@
+"""`mars-lidar info` and `mars-lidar view`: what is in a file, in words and as a picture."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mars_lidar.cli.console import reported, table
+
+if TYPE_CHECKING:
+    from mars_lidar.io import Cube
+
+
+def info(
+    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5 or .npz.", show_default=False)],
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="Simulate again and compare every count; exit code 1 if they differ."),
+    ] = False,
+) -> None:
+    """Say what is in a cube: system, flux, engine, size, whether it is complete, and how to open it."""
+    from mars_lidar.io import IncompleteFileError, load
+    from mars_lidar.io import verify as same_again
+
+    with reported():
+        try:
+            cube = load(file, allow_incomplete=True)
+        except IncompleteFileError as error:  # nothing in it can be read
+            table([("file", str(file)), ("complete", f"NO: {error}")])
+            return
+        with cube:
+            table(_rows(cube))
+            if not verify:
+                return
+            from mars_lidar.cli.console import FAILED, progress_bar
+
+            if not cube.complete:
+                raise ValueError(f"{file} is incomplete: there is nothing to verify")
+            with progress_bar("verifying") as progress:
+                same = same_again(cube, progress=progress)
+            table([("verified", "simulated again, every count is the same" if same else "NO: counts differ")])
+            if not same:
+                raise typer.Exit(FAILED)
+
+
+def view(
+    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5 or .npz.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="The picture: .png, .pdf or .svg.", show_default=False)
+    ],
+    pixel: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--pixel",
+            metavar="Y,X",
+            help="Pixel whose histogram is drawn; up to 6 times. "
+            "[dim]Default: a bright, a dim and an edge pixel.[/dim]",
+        ),
+    ] = None,
+    realization: Annotated[
+        int, typer.Option("--realization", help="Which exposure, counted from 0 in this file.")
+    ] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
+) -> None:
+    """Draw depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
+
+    Each histogram stands beside the incident rate, scaled to the same total: the difference is pile-up.
+    """
+    with reported():
+        if out.suffix not in (".png", ".pdf", ".svg"):
+            raise ValueError(f"--out must end in .png, .pdf or .svg, got {str(out)!r}")
+        if out.exists() and not overwrite:
+            raise FileExistsError(f"{out} exists already; choose another name or give --overwrite")
+        pixels = None if not pixel else [_pixel(text) for text in pixel]
+        from mars_lidar.io import load
+
+        with load(file) as cube:
+            from mars_lidar.plot import overview
+
+            figure = overview(cube, realization=realization, pixels=pixels)
+        unfinished = out.with_name(out.name + ".incomplete")
+        try:
+            figure.savefig(unfinished, format=out.suffix[1:])
+            os.replace(unfinished, out)
+        finally:
+            unfinished.unlink(missing_ok=True)
+        print(f"wrote {out}")
+
+
+def _pixel(text: str) -> tuple[int, int]:
+    try:
+        y, x = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--pixel must be two integers Y,X (row, column), got {text!r}") from None
+    return y, x
+
+
+def _rows(cube: Cube) -> list[tuple[str, str]]:
+    system, flux, recipe = cube.system, cube.flux, cube.recipe
+    count, height, width, bins = cube.shape
+    photons = f"mean S {flux.signal.mean():.4g}, B {flux.background.mean():.4g} photons per laser period"
+    if flux.waveform is not None:
+        photons += f"; waveform of {flux.waveform.shape[-1]} parts"
+    elif len(flux.returns_signal) > 1:
+        photons += f"; {len(flux.returns_signal)} returns"
+    complete = "yes" if cube.complete else "NO: the simulation did not finish"
+    if cube.progress:
+        complete += f"; {cube.progress}"
+    rows = [
+        ("file", f"{cube.path} (mars-lidar {cube.version})"),
+        ("complete", complete),
+        (
+            "counts",
+            f"{count} × {height} × {width} × {bins} (realization, y, x, time) {recipe.dtype}, "
+            f"{recipe.nbytes / 1e6:,.4g} MB in memory, {_on_disk(cube) / 1e6:,.4g} MB on disk",
+        ),
+    ]
+    if cube.registrations is not None:
+        pixels = count * height * width
+        each = cube.registrations / pixels
+        rows.append(("registrations", f"{cube.registrations:,}, {each:,.4g} per pixel and exposure"))
+    first = recipe.first_realization
+    numbers = f"{first}" if count == 1 else f"{first} to {first + count - 1}"
+    dead = system.detector.dead_time_ns
+    rows += [
+        ("engine", f"{cube.engine}, seed {cube.seed}, realization {numbers}"),
+        (
+            "laser",
+            f"period {system.period_ns:.6g} ns ({1e3 / system.period_ns:.4g} MHz, unambiguous to "
+            f"{system.unambiguous_range_m:.4g} m), {system.cycles:,} cycles",
+        ),
+        ("pulse", repr(system.pulse)),
+        (
+            "detector",
+            f"dead time {dead:.6g} ns ({system.dead_time_periods:.4g} periods), {system.detector.mode}, "
+            f"start {system.start}",
+        ),
+        ("bins", f"{1e3 * system.bin_ns:.5g} ps, {system.depth_m(system.bin_ns):.3g} m of depth each"),
+        ("flux", photons),
+    ]
+    made_of = [f"{k} {_short(v)}" for k, v in flux.info.items() if not k.endswith("_definition")]
+    if made_of:
+        rows.append(("flux made of", ", ".join(made_of)))
+    if recipe.source:
+        rows.append(("scene", recipe.source))
+    opener = f"xarray.open_zarr({str(cube.path)!r})" if str(cube.path).endswith(".zarr") else ""
+    mine = f"mars_lidar.io.load({str(cube.path)!r})"
+    if not cube.complete:
+        rows.append(("open with", f"{mine[:-1]}, allow_incomplete=True)"))
+    else:
+        rows.append(("open with", f"{mine}  or  {opener}" if opener else mine))
+    return rows
+
+
+def _on_disk(cube: Cube) -> int:
+    path = cube.path
+    if path is None:
+        return 0
+    if path.is_file():
+        return path.stat().st_size
+    return sum(part.stat().st_size for part in path.rglob("*") if part.is_file())
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

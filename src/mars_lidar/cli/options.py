@@ -1,0 +1,174 @@
+"""The options of `mars-lidar simulate`, each with its unit and default in its help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+_SCENE, _SYSTEM = "Scene (one of --scene and --depth)", "System"
+_LIGHT, _RUN, _OUTPUT = "Light", "Simulation", "Output"
+
+
+def _option(*names: str, panel: str, help: str, default: str | None = None, **more: Any) -> Any:
+    told = help if default is None else f"{help} [dim]Default: {default}.[/dim]"
+    return typer.Option(*names, rich_help_panel=panel, help=told, show_default=False, **more)
+
+
+Out = Annotated[
+    Path,
+    _option(
+        "-o", "--out", panel=_OUTPUT,
+        help="The cube: .zarr (any size, written as it is simulated), .h5, .hdf5 or .npz.",
+    ),
+]
+Scene = Annotated[str | None, _option("--scene", panel=_SCENE, help="A built-in scene: room.")]
+Size = Annotated[
+    int | None,
+    _option(
+        "--size", panel=_SCENE, min=1,
+        help="Image size in pixels: square for --scene; the longer side, resampled, for --depth.",
+        default="128 for --scene, the file's own for --depth",
+    ),
+]
+SceneSeed = Annotated[
+    int,
+    _option("--scene-seed", panel=_SCENE, help="Arrangement of the built-in scene.", default="0"),
+]
+Depth = Annotated[
+    Path | None,
+    _option(
+        "--depth", panel=_SCENE,
+        help="Depth: 16-bit PNG or TIFF in mm, .npy or .npz in m, or a Middlebury folder with its image.",
+    ),
+]
+Image = Annotated[
+    Path | None,
+    _option("--image", panel=_SCENE, help="Image to --depth: its luminance is the reflectivity."),
+]
+DepthUnitM = Annotated[
+    float | None,
+    _option(
+        "--depth-unit-m", panel=_SCENE, help="Metres per stored unit of --depth.",
+        default="0.001 for images, 1 for arrays",
+    ),
+]
+FocalPx = Annotated[
+    float | None,
+    _option(
+        "--focal-px", panel=_SCENE,
+        help="Focal length, pixels: turns depth along the axis into range along the ray.",
+        default="depth as it is",
+    ),
+]
+System = Annotated[
+    Path | None,
+    _option(
+        "--system", panel=_SYSTEM,
+        help="YAML or JSON file (see mars-lidar init); single options replace its values.",
+    ),
+]
+PeriodNs = Annotated[
+    float | None,
+    _option("--period-ns", panel=_SYSTEM, help="Laser period, ns.", default="133.33, 7.5 MHz"),
+]
+DeadTimeNs = Annotated[
+    float | None,
+    _option("--dead-time-ns", panel=_SYSTEM, help="Dead time after a registration, ns.", default="75"),
+]
+Cycles = Annotated[
+    int | None,
+    _option("--cycles", panel=_SYSTEM, help="Laser periods per exposure.", default="1000"),
+]
+Bins = Annotated[
+    int | None,
+    _option("--bins", panel=_SYSTEM, help="Histogram bins per period.", default="1024"),
+]
+PulseSigmaNs = Annotated[
+    float | None,
+    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse: standard deviation, ns.", default="0.5"),
+]
+PulseFwhmNs = Annotated[
+    float | None,
+    _option("--pulse-fwhm-ns", panel=_SYSTEM, help="Gaussian pulse: full width at half maximum, ns."),
+]
+PulseFile = Annotated[
+    Path | None,
+    _option("--pulse-file", panel=_SYSTEM, help="Measured impulse response: 1-D .npy array."),
+]
+PulseBinNs = Annotated[
+    float | None,
+    _option("--pulse-bin-ns", panel=_SYSTEM, help="Sample width of --pulse-file, ns."),
+]
+PulseOrigin = Annotated[
+    str | None,
+    _option(
+        "--pulse-origin", panel=_SYSTEM,
+        help="What a delay refers to in --pulse-file: peak, centroid or first.", default="peak",
+    ),
+]
+Start = Annotated[
+    str | None,
+    _option(
+        "--start", panel=_SYSTEM,
+        help="Pixel at the start of an exposure: armed (ready) or stationary (warmed up).", default="armed",
+    ),
+]
+Signal = Annotated[
+    float,
+    _option(
+        "--signal", panel=_LIGHT, default="1",
+        help="Mean signal S over the pixels with a return, detectable photons per laser period.",
+    ),
+]
+Sbr = Annotated[
+    float,
+    _option("--sbr", panel=_LIGHT, help="Mean signal / mean ambient photons per period.", default="1"),
+]
+Attenuation = Annotated[
+    str,
+    _option(
+        "--attenuation", panel=_LIGHT, default="none",
+        help="Signal against depth z: none or inverse_square (1 / z^2).",
+    ),
+]
+Ambient = Annotated[
+    str | None,
+    _option(
+        "--ambient", panel=_LIGHT,
+        help="Ambient light over the image: uniform, reflectivity, or map (of the scene).",
+        default="map where there is one, else uniform",
+    ),
+]
+DarkCounts = Annotated[
+    float,
+    _option("--dark-counts", panel=_LIGHT, help="Dark counts of a pixel, counts/s, on top.", default="0"),
+]
+Engine = Annotated[
+    str,
+    _option(
+        "--engine", panel=_RUN, default="exact",
+        help="exact; sequential (slow, independent gold standard); poisson (no dead time).",
+    ),
+]
+Realizations = Annotated[
+    int,
+    _option("--realizations", panel=_RUN, help="Independent exposures of the image.", default="1"),
+]
+Seed = Annotated[
+    int,
+    _option("--seed", panel=_RUN, help="Seed: the same command gives the same counts.", default="0"),
+]
+Threads = Annotated[
+    int | None,
+    _option("--threads", panel=_RUN, help="Threads; the counts do not depend on it.", default="all cores"),
+]
+Overwrite = Annotated[
+    bool,
+    _option("--overwrite", panel=_OUTPUT, help="Replace an existing cube and picture."),
+]
+Picture = Annotated[
+    bool,
+    _option("--picture/--no-picture", panel=_OUTPUT, help="A PNG overview beside the cube.", default="yes"),
+]

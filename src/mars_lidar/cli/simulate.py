@@ -1,0 +1,182 @@
+"""`mars-lidar simulate`: from a scene to a cube on disk and a picture of it, in one command."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mars_lidar.cli import options
+from mars_lidar.cli.console import progress_bar, reported, say, table
+from mars_lidar.cli.system_options import build_system
+
+if TYPE_CHECKING:
+    from mars_lidar.io import Written
+    from mars_lidar.scene import Scene
+
+EPILOG = "\n\n".join(
+    (
+        "[bold]Examples[/bold]",
+        "mars-lidar simulate --scene room -o room.zarr",
+        "mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr",
+        "mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr",
+        "mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5",
+        "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
+        "S and B are expected detectable photons per laser period, after detection efficiency. Dead time "
+        "bends histograms where S + B is not small.",
+    )
+)
+
+
+def simulate(
+    *,
+    scene: options.Scene = None,
+    size: options.Size = None,
+    scene_seed: options.SceneSeed = 0,
+    depth: options.Depth = None,
+    image: options.Image = None,
+    depth_unit_m: options.DepthUnitM = None,
+    focal_px: options.FocalPx = None,
+    system: options.System = None,
+    period_ns: options.PeriodNs = None,
+    dead_time_ns: options.DeadTimeNs = None,
+    cycles: options.Cycles = None,
+    bins: options.Bins = None,
+    pulse_sigma_ns: options.PulseSigmaNs = None,
+    pulse_fwhm_ns: options.PulseFwhmNs = None,
+    pulse_file: options.PulseFile = None,
+    pulse_bin_ns: options.PulseBinNs = None,
+    pulse_origin: options.PulseOrigin = None,
+    start: options.Start = None,
+    signal: options.Signal = 1.0,
+    sbr: options.Sbr = 1.0,
+    attenuation: options.Attenuation = "none",
+    ambient: options.Ambient = None,
+    dark_counts: options.DarkCounts = 0.0,
+    engine: options.Engine = "exact",
+    realizations: options.Realizations = 1,
+    seed: options.Seed = 0,
+    threads: options.Threads = None,
+    out: options.Out,
+    overwrite: options.Overwrite = False,
+    picture: options.Picture = True,
+) -> None:
+    """Simulate histograms of a scene under dead time, and write the cube with a picture of it.
+
+    The file holds all that is needed to make the cube again. xarray.open_zarr(OUT) opens a .zarr with named
+    dimensions and units; mars_lidar.io.load(OUT) opens any of the formats.
+    """
+    with reported():
+        began = time.perf_counter()
+        png = out.with_suffix(".png")
+        if picture and png.exists() and not overwrite:
+            raise FileExistsError(f"{png} exists already; give --overwrite, --no-picture or another --out")
+        if out.exists() and not overwrite:
+            raise FileExistsError(f"{out} exists already; give --overwrite or another --out")
+        instrument = build_system(
+            system,
+            period_ns=period_ns,
+            cycles=cycles,
+            bins=bins,
+            dead_time_ns=dead_time_ns,
+            start=start,
+            pulse_sigma_ns=pulse_sigma_ns,
+            pulse_fwhm_ns=pulse_fwhm_ns,
+            pulse_file=pulse_file,
+            pulse_bin_ns=pulse_bin_ns,
+            pulse_origin=pulse_origin,
+        )
+        view, source = _scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px)
+        flux = view.flux(
+            instrument,
+            signal=signal,
+            sbr=sbr,
+            attenuation=attenuation,  # type: ignore[arg-type]  # checked there
+            ambient=ambient,  # type: ignore[arg-type]
+            dark_counts_per_s=dark_counts,
+        )
+        from mars_lidar.io import simulate_to
+
+        with progress_bar("simulating") as progress:
+            written = simulate_to(
+                out,
+                flux,
+                instrument,
+                engine=engine,
+                realizations=realizations,
+                seed=seed,
+                threads=threads,
+                depth_m=view.depth_m,
+                reflectivity=view.reflectivity,
+                source=source,
+                overwrite=overwrite,
+                progress=progress,
+            )
+        if picture:
+            _draw(out, png)
+        _summary(written, png if picture else None, began)
+
+
+def _scene(
+    name: str | None,
+    size: int | None,
+    seed: int,
+    depth: Path | None,
+    image: Path | None,
+    unit: float | None,
+    focal: float | None,
+) -> tuple[Scene, str]:
+    from mars_lidar.scene import Scene
+
+    if (name is None) == (depth is None):
+        told = "neither" if name is None else "both"
+        raise ValueError(f"the scene is one of --scene and --depth, got {told}")
+    if depth is None:
+        for option, value in (("--image", image), ("--depth-unit-m", unit), ("--focal-px", focal)):
+            if value is not None:
+                raise ValueError(f"{option} belongs to --depth, which is not given")
+        size = 128 if size is None else size
+        return Scene.example(name or "", size=size, seed=seed), f"example {name}, size {size}, seed {seed}"
+    source = f"depth {depth}" + ("" if image is None else f", image {image}")
+    return Scene.from_rgbd(depth, image, size=size, depth_unit_m=unit, focal_px=focal), source
+
+
+def _draw(cube: Path, png: Path) -> None:
+    """The overview of a finished cube; the cube is good whatever happens here."""
+    from mars_lidar.io import load
+    from mars_lidar.plot import overview
+
+    unfinished = png.with_name(png.name + ".incomplete")
+    try:
+        with load(cube) as stored:
+            overview(stored).savefig(unfinished, format="png", pil_kwargs={"compress_level": 4})
+        os.replace(unfinished, png)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        say(f"{cube} is complete; its picture was not made (mars-lidar view {cube} -o {png} does it)")
+        raise
+
+
+def _summary(written: Written, png: Path | None, began: float) -> None:
+    from mars_lidar.io import load
+
+    with load(written.path) as cube:
+        count, height, width, bins = cube.shape
+        each = f", {written.ns_per_registration:.3g} ns per registration" if written.registrations else ""
+        rows = [
+            (
+                "simulated",
+                f"{count} × {height} × {width} × {bins} (realization, y, x, time) {cube.recipe.dtype}, "
+                f"{written.registrations:,} registrations, engine {cube.engine}, seed {cube.seed}",
+            ),
+            (
+                "time",
+                f"{written.simulate_s:.3g} s simulating{each}; {written.write_s:.3g} s writing; "
+                f"{time.perf_counter() - began:.3g} s in all",
+            ),
+            ("cube", str(written.path)),
+        ]
+    if png is not None:
+        rows.append(("picture", str(png)))
+    table(rows)

@@ -1,0 +1,88 @@
+"""The system of a command line: a file, single options, or a file with some values replaced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
+from mars_lidar.system import Detector, System
+
+DEFAULT_SYSTEM = System(
+    period_ns=1e3 / 7.5,
+    cycles=1000,
+    bins=1024,
+    pulse=GaussianPulse(sigma_ns=0.5),
+    detector=Detector(dead_time_ns=75.0),
+    start="armed",
+)
+
+
+def build_system(
+    file: Path | None,
+    *,
+    period_ns: float | None,
+    cycles: int | None,
+    bins: int | None,
+    dead_time_ns: float | None,
+    start: str | None,
+    pulse_sigma_ns: float | None,
+    pulse_fwhm_ns: float | None,
+    pulse_file: Path | None,
+    pulse_bin_ns: float | None,
+    pulse_origin: str | None,
+) -> System:
+    """The system of `file` (or the default one) with the options that are not None in place of its values."""
+    base = DEFAULT_SYSTEM if file is None else System.load(file)
+    changes: dict[str, Any] = {
+        "period_ns": period_ns,
+        "cycles": cycles,
+        "bins": bins,
+        "start": start,
+        "pulse": _pulse(pulse_sigma_ns, pulse_fwhm_ns, pulse_file, pulse_bin_ns, pulse_origin),
+    }
+    if dead_time_ns is not None:
+        changes["detector"] = Detector(dead_time_ns=dead_time_ns, mode=base.detector.mode)
+    return base.replace(**{name: value for name, value in changes.items() if value is not None})
+
+
+def _pulse(
+    sigma_ns: float | None, fwhm_ns: float | None, file: Path | None, bin_ns: float | None, origin: str | None
+) -> Pulse | None:
+    given = [
+        name
+        for name, value in (
+            ("--pulse-sigma-ns", sigma_ns),
+            ("--pulse-fwhm-ns", fwhm_ns),
+            ("--pulse-file", file),
+        )
+        if value is not None
+    ]
+    if len(given) > 1:
+        raise ValueError(f"the pulse is given once: choose one of {' and '.join(given)}")
+    if file is None and (bin_ns is not None or origin is not None):
+        raise ValueError("--pulse-bin-ns and --pulse-origin belong to --pulse-file, which is not given")
+    if sigma_ns is not None:
+        return GaussianPulse(sigma_ns=sigma_ns)
+    if fwhm_ns is not None:
+        return GaussianPulse.from_fwhm(fwhm_ns=fwhm_ns)
+    if file is None:
+        return None
+    if bin_ns is None:
+        raise ValueError(f"--pulse-file {file} needs --pulse-bin-ns, the width of its samples in ns")
+    return _measured(file, bin_ns, origin or "peak")
+
+
+def _measured(file: Path, bin_ns: float, origin: str) -> SampledPulse:
+    import numpy as np
+
+    if file.suffix != ".npy":
+        raise ValueError(f"--pulse-file must be a 1-D .npy array, got {str(file)!r}")
+    try:
+        values = np.load(file, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{file}: {error}") from error
+    try:
+        return SampledPulse(values, bin_ns, origin)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{file}: {error}") from error

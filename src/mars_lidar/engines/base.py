@@ -1,0 +1,122 @@
+"""What an engine is: the contract, written once; the leaves stay silent."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar import _core
+    from mars_lidar.pulse import Pulse
+
+Progress = Callable[[int, int], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One checked request: which pixels of which realizations of which flux, seen by which system.
+
+    `pixel_index` (H * W,) uint32 names the random stream of each pixel, so that any part of an image can be
+    made alone with the bits that it has in the whole.
+    """
+
+    flux: Flux
+    system: System
+    realizations: int
+    first_realization: int
+    pixel_index: NDArray[np.uint32]
+    seed: int
+    threads: int
+    progress: Progress | None
+
+    @property
+    def items(self) -> int:
+        """Exposures to simulate: realizations x pixels."""
+        return self.realizations * self.pixel_index.size
+
+    @cached_property
+    def pulse(self) -> _core.PulseTable:
+        """The native pulse."""
+        return _pulse_table(self.system.pulse, self.system.period_ns)
+
+    @cached_property
+    def job(self) -> _core.Job:
+        """The native form of this task; times in laser periods."""
+        from mars_lidar import _core
+
+        flux, pixels = self.flux, self.pixel_index.size
+        signal = np.ascontiguousarray(flux.returns_signal.reshape(-1, pixels))
+        delay = np.ascontiguousarray(flux.returns_delay_ns.reshape(-1, pixels)) / self.system.period_ns
+        delay = np.nan_to_num(delay - np.floor(delay), nan=0.0)
+        wave = flux.waveform
+        return _core.Job(
+            signal=signal,
+            delay=delay,
+            background=np.ascontiguousarray(flux.background.reshape(-1)),
+            waveform=None if wave is None else np.ascontiguousarray(wave.reshape(pixels, -1)),
+            pixel_index=self.pixel_index,
+            realizations=self.realizations,
+            first_realization=self.first_realization,
+            seed=self.seed,
+            cycles=self.system.cycles,
+            bins=self.system.bins,
+            dead_time=self.system.dead_time_periods,
+            stationary=self.system.start == "stationary",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """Packed registrations of a task: item i owns ``[offsets[i], offsets[i + 1])``; times in periods."""
+
+    offsets: NDArray[np.int64]
+    times: NDArray[np.float64]
+    cycle: NDArray[np.int32]
+    bin: NDArray[np.int32]
+
+    @classmethod
+    def allocate(cls, counts: NDArray[np.int64]) -> Records:
+        """Room for `counts` (items,) registrations each."""
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        n = int(offsets[-1])
+        return cls(offsets, np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32))
+
+
+class Engine(ABC):
+    """A way to draw histograms. Engines never see files or scenes.
+
+    Sampling is reproducible: it depends on the flux, the system, the seed, and on the pixel index and number
+    of the realization, never on threads, chunks, or what else is simulated in the same call.
+    """
+
+    name: ClassVar[str]
+    description: ClassVar[str]
+
+    def check(self, flux: Flux, system: System) -> None:  # noqa: B027  (most engines take everything)
+        """Raise ValueError, naming the field, for what this engine cannot do."""
+
+    @abstractmethod
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        """Fill `out` (items, bins), C-contiguous, of the system's histogram dtype."""
+
+    def counts(self, task: Task) -> NDArray[np.int64]:
+        """Registrations of each exposure (items,), with the draws of `histogram`."""
+        raise ValueError(f"engine {self.name!r} draws histograms only, not single registrations; use 'exact'")
+
+    def timestamps(self, task: Task, records: Records) -> None:
+        """Fill `records`, allocated from `counts`, with the draws of `histogram`."""
+        raise ValueError(f"engine {self.name!r} draws histograms only, not timestamps; use 'exact'")
+
+
+@lru_cache(maxsize=16)
+def _pulse_table(pulse: Pulse, period_ns: float) -> _core.PulseTable:
+    return pulse._native(period_ns)

@@ -1,0 +1,245 @@
+"""Photon flux at the pixels: what arrives at the detector, per laser period."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Flux:
+    """Expected *detectable* photons per laser period at each pixel (photon detection efficiency included).
+
+    The arrival rate at a pixel is periodic: ``lambda(t) = S s(t - tau) + B / t_r`` with the pulse s of the
+    `System`, or any non-negative waveform.
+
+    Parameters
+    ----------
+    signal
+        Signal photons per period S: scalar or (H, W).
+    background
+        Background photons per period B, uniform in time: scalar or (H, W).
+    delay_ns
+        Delay tau of the return, ns: scalar or (H, W). Any finite value: it wraps into the laser period.
+        NaN, for "no return", is allowed where the signal is 0.
+    waveform
+        Instead of `signal` and `delay_ns`: photons per period in each of T equal parts of the period
+        (..., T), as they reach the detector (the pulse of the system is *not* applied), constant inside
+        each part. T is free: it need not be the number of histogram bins.
+
+    Attributes
+    ----------
+    signal, background, delay_ns
+        (H, W), read-only. With several returns `signal` is their sum and `delay_ns` that of the strongest;
+        with a waveform `signal` is its sum and `delay_ns` is NaN.
+    returns_signal, returns_delay_ns
+        (K, H, W), one row per return (K = 0 with a waveform).
+    waveform
+        (H, W, T) or None.
+    info
+        What made this flux, for the record (scene radiometry puts its achieved means here).
+    """
+
+    signal: FloatArray
+    background: FloatArray
+    delay_ns: FloatArray
+    returns_signal: FloatArray
+    returns_delay_ns: FloatArray
+    waveform: FloatArray | None
+    info: dict[str, Any]
+
+    def __init__(
+        self,
+        signal: ArrayLike | None = None,
+        background: ArrayLike = 0.0,
+        delay_ns: ArrayLike | None = None,
+        *,
+        waveform: ArrayLike | None = None,
+        info: dict[str, Any] | None = None,
+    ) -> None:
+        if waveform is not None:
+            if signal is not None or delay_ns is not None:
+                raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
+            wave, back = _waveform_maps(waveform, background)
+            _fill(self, np.empty((0, *back.shape)), np.empty((0, *back.shape)), back, wave, info)
+            return
+        if signal is None:
+            raise ValueError("signal must be given (photons per period), or a waveform instead of it")
+        maps = [_map("signal", signal), _map("background", background)]
+        maps.append(_map("delay_ns", 0.0 if delay_ns is None else delay_ns, photons=False))
+        s, b, tau = _broadcast(("signal", "background", "delay_ns"), maps)
+        if delay_ns is None and (s > 0).any():
+            raise ValueError("delay_ns must be given where signal > 0")
+        _fill(self, s[None], tau[None], b, None, info)
+
+    @classmethod
+    def multi(cls, *fluxes: Flux, info: dict[str, Any] | None = None) -> Flux:
+        """The sum of several fluxes: their returns side by side, their backgrounds added.
+
+        For a pane of glass in front of a wall, say. Waveforms of equal length add up; a waveform cannot be
+        mixed with returns, because the pulse that shapes those belongs to the `System`.
+        """
+        if not fluxes or not all(isinstance(f, Flux) for f in fluxes):
+            raise TypeError(f"multi takes one or more Flux objects, got {fluxes!r}")
+        waves = [f.waveform for f in fluxes if f.waveform is not None]
+        if waves and len(waves) != len(fluxes):
+            raise ValueError("multi cannot mix waveforms with returns; write the returns into the waveform")
+        shape = _common_shape(tuple(f"fluxes[{k}]" for k in range(len(fluxes))), [f.shape for f in fluxes])
+        back = np.sum([np.broadcast_to(f.background, shape) for f in fluxes], axis=0)
+        self = cls.__new__(cls)
+        if waves:
+            lengths = {w.shape[-1] for w in waves}
+            if len(lengths) > 1:
+                raise ValueError(f"waveforms must have equal lengths to add up, got {sorted(lengths)}")
+            wave = np.sum([np.broadcast_to(w, (*shape, w.shape[-1])) for w in waves], axis=0)
+            _fill(self, np.empty((0, *shape)), np.empty((0, *shape)), back, wave, info)
+            return self
+        s = np.concatenate([np.broadcast_to(f.returns_signal, (len(f.returns_signal), *shape)) for f in fluxes])
+        tau = np.concatenate([np.broadcast_to(f.returns_delay_ns, (len(f.returns_delay_ns), *shape)) for f in fluxes])
+        _fill(self, s, tau, back, None, info)
+        return self
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        h, w = self.background.shape
+        return h, w
+
+    @property
+    def total(self) -> FloatArray:
+        """Photons per period Lambda = S + B (H, W)."""
+        return self.signal + self.background
+
+    def __getitem__(self, key: Any) -> Flux:
+        """Part of the image: ``flux[rows]``, ``flux[rows, columns]``; integers keep their axis, so the part
+        is an image again.
+        """
+        keys = key if isinstance(key, tuple) else (key,)
+        if len(keys) > 2:
+            raise IndexError(f"flux has two axes (rows, columns), got {len(keys)} indices")
+        window = tuple(slice(k, k + 1 or None) if isinstance(k, (int, np.integer)) else k for k in keys)
+        for k, n in zip(keys, self.shape, strict=False):
+            if isinstance(k, (int, np.integer)) and not -n <= k < n:
+                raise IndexError(f"index {k} is out of range for an axis of {n} pixels")
+            if not isinstance(k, (int, np.integer, slice)):
+                raise IndexError(f"flux takes integers and slices, got {k!r}")
+        part = Flux.__new__(Flux)
+        _fill(
+            part,
+            self.returns_signal[(slice(None), *window)],
+            self.returns_delay_ns[(slice(None), *window)],
+            self.background[window],
+            None if self.waveform is None else self.waveform[window],
+            self.info,
+        )
+        if 0 in part.shape:
+            raise IndexError(f"flux{list(keys)} selects no pixel of {self.shape}")
+        return part
+
+    def __repr__(self) -> str:
+        h, w = self.shape
+        what = f"waveform of {self.waveform.shape[-1]}" if self.waveform is not None else ""
+        what = what or (f"{len(self.returns_signal)} returns" if len(self.returns_signal) > 1 else "1 return")
+        return (
+            f"Flux({h} x {w} pixels, {what}, mean signal {self.signal.mean():.4g}, "
+            f"mean background {self.background.mean():.4g} photons per period)"
+        )
+
+
+def _map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
+    array = array.astype(np.float64)
+    if array.ndim > 2:
+        raise ValueError(f"{name} must be a scalar or (H, W), got shape {array.shape}")
+    if array.size == 0:
+        raise ValueError(f"{name} must have at least one pixel, got shape {array.shape}")
+    if photons:
+        _check_photons(name, array)
+    elif np.isinf(array).any():
+        raise ValueError(f"{name} must be finite (or NaN where there is no return), got inf")
+    return np.atleast_2d(array)
+
+
+def _check_photons(name: str, array: FloatArray) -> None:
+    bad = ~((array >= 0) & (array <= MAX_PHOTONS))
+    if bad.any():
+        where = tuple(int(k) for k in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]} at index {where}"
+        )
+
+
+def _common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    try:
+        return np.broadcast_shapes(*shapes)
+    except ValueError:
+        told = ", ".join(f"{n} {s}" for n, s in zip(names, shapes, strict=True))
+        raise ValueError(f"shapes must broadcast to one (H, W), got {told}") from None
+
+
+def _broadcast(names: Sequence[str], maps: Sequence[FloatArray]) -> list[FloatArray]:
+    shape = _common_shape(names, [m.shape for m in maps])
+    return [np.broadcast_to(m, shape) for m in maps]
+
+
+def _waveform_maps(waveform: ArrayLike, background: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    wave = np.asarray(waveform)
+    if wave.dtype.kind not in "fiub":
+        raise TypeError(f"waveform must be real numbers, got dtype {wave.dtype}")
+    if wave.ndim not in (1, 2, 3) or wave.size == 0:
+        raise ValueError(f"waveform must be (T,), (W, T) or (H, W, T), got shape {wave.shape}")
+    wave = wave.astype(np.float64)
+    _check_photons("waveform", wave)
+    wave = wave.reshape((1,) * (3 - wave.ndim) + wave.shape)
+    _check_photons("waveform summed over a period", wave.sum(-1))
+    back = _map("background", background)
+    shape = _common_shape(("waveform", "background"), [wave.shape[:2], back.shape])
+    return np.broadcast_to(wave, (*shape, wave.shape[-1])), np.broadcast_to(back, shape)
+
+
+def _frozen(array: FloatArray) -> FloatArray:
+    copy = np.ascontiguousarray(array, dtype=np.float64)
+    if copy is array or copy.base is not None:
+        copy = copy.copy()
+    copy.flags.writeable = False
+    return copy
+
+
+def _fill(
+    flux: Flux,
+    signal: FloatArray,
+    delay: FloatArray,
+    background: FloatArray,
+    waveform: FloatArray | None,
+    info: dict[str, Any] | None,
+) -> None:
+    lost = np.isnan(delay) & (signal > 0)
+    if lost.any():
+        where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
+        raise ValueError(f"delay_ns must be finite where signal > 0, got NaN at pixel {where}")
+    if waveform is not None:
+        total, nearest = waveform.sum(-1), np.full(background.shape, np.nan)
+    elif len(signal) == 1:
+        total, nearest = signal[0], delay[0]
+    else:
+        total = signal.sum(0)
+        nearest = np.take_along_axis(delay, signal.argmax(0)[None], axis=0)[0]
+    for name, array in {
+        "signal": total,
+        "background": background,
+        "delay_ns": nearest,
+        "returns_signal": signal,
+        "returns_delay_ns": delay,
+    }.items():
+        object.__setattr__(flux, name, _frozen(array))
+    object.__setattr__(flux, "waveform", None if waveform is None else _frozen(waveform))
+    object.__setattr__(flux, "info", dict(info or {}))

@@ -1,0 +1,213 @@
+"""A histogram cube with all that explains it, and the two functions that put it on disk and get it back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._memory import check_memory
+from mars_lidar.flux import Flux
+from mars_lidar.io import layout
+from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.store import INCOMPLETE_SUFFIX, CountArray, IncompleteFileError, Writer, check_target
+from mars_lidar.system import System
+
+SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cube:
+    """A histogram cube and the recipe that makes it again.
+
+    Attributes
+    ----------
+    histogram
+        (realizations, H, W, bins) uint16 or uint32. From a ``.zarr`` or ``.h5`` it is read from disk when
+        indexed: ``cube.histogram[0, y, x]`` reads one chunk. ``np.asarray(cube.histogram)`` reads it all.
+    recipe
+        Arguments of the simulation.
+    complete
+        False for what an unfinished run left (see `load`).
+    registrations
+        Total counts; None where they were never added up.
+    version
+        Version of mars-lidar that wrote the file.
+    path
+        The file, or None for a cube in memory.
+    """
+
+    histogram: CountArray
+    recipe: Recipe
+    complete: bool = True
+    registrations: int | None = None
+    version: str = ""
+    path: Path | None = None
+    progress: str = ""
+    _close: Callable[[], None] = field(default=lambda: None, repr=False)
+
+    def __post_init__(self) -> None:
+        if tuple(self.histogram.shape) != self.recipe.shape:
+            raise ValueError(
+                f"histogram must have the shape {self.recipe.shape} of its recipe "
+                f"(realizations, H, W, bins), got {tuple(self.histogram.shape)}"
+            )
+
+    @property
+    def system(self) -> System:
+        """Laser, detector and histogram."""
+        return self.recipe.system
+
+    @property
+    def flux(self) -> Flux:
+        """Photons per period at each pixel."""
+        return self.recipe.flux
+
+    @property
+    def engine(self) -> str:
+        """Name of the engine."""
+        return self.recipe.engine
+
+    @property
+    def seed(self) -> int:
+        """Seed of the random streams."""
+        return self.recipe.seed
+
+    @property
+    def depth_m(self) -> NDArray[np.float64]:
+        """Depth (H, W), m; NaN where there is no return."""
+        return self.recipe.depth_m
+
+    @property
+    def reflectivity(self) -> NDArray[np.float64] | None:
+        """Reflectivity (H, W), or None where no scene is behind the flux."""
+        return self.recipe.reflectivity
+
+    @property
+    def time_ns(self) -> NDArray[np.float64]:
+        """Bin centres (bins,), ns."""
+        return self.system.time_ns
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """(realizations, H, W, bins)."""
+        return self.recipe.shape
+
+    def close(self) -> None:
+        """Close the file; the histogram cannot be read from it afterwards."""
+        self._close()
+
+    def __enter__(self) -> Cube:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
+    """Write a cube to a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz``.
+
+    Raises
+    ------
+    ValueError
+        Another suffix.
+    OSError
+        `path` exists and `overwrite` is false, or cannot be written.
+    """
+    writer = create(path, cube.recipe, overwrite=overwrite)
+    try:
+        registrations = 0
+        for realizations, rows in cube.recipe.blocks(writer.chunks):
+            block = np.asarray(cube.histogram[realizations, rows])
+            if block.dtype != cube.recipe.dtype:
+                raise TypeError(f"histogram must be {cube.recipe.dtype} for this system, got {block.dtype}")
+            writer.write(realizations, rows, block)
+            registrations += int(block.sum(dtype=np.uint64))
+        writer.finish(registrations)
+    except BaseException:
+        writer.abandon()
+        raise
+
+
+def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
+    """Open a cube; its counts stay on disk until they are indexed.
+
+    Parameters
+    ----------
+    path
+        ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` written by mars-lidar.
+    allow_incomplete
+        Open what an unfinished run left; parts that were not written read as zeros.
+
+    Raises
+    ------
+    FileNotFoundError
+        No such file.
+    IncompleteFileError
+        The file was left by an unfinished run (a ValueError).
+    ValueError
+        Not a cube of mars-lidar.
+    """
+    source = Path(path)
+    form = _format(source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX)), "path")
+    if not source.exists():
+        leftover = source.with_name(source.name + INCOMPLETE_SUFFIX)
+        if leftover.exists():
+            raise IncompleteFileError(f"{source} was never finished: a stopped run left {leftover}")
+        raise FileNotFoundError(f"{source} does not exist")
+    store = form.open_store(source)
+    try:
+        complete = store.complete and not source.name.endswith(INCOMPLETE_SUFFIX)
+        if not (complete or allow_incomplete):
+            told = f" ({store.progress})" if store.progress else ""
+            raise IncompleteFileError(f"{source} is incomplete: its simulation did not finish{told}")
+        recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]))
+        total = store.attrs.get("registrations")
+        return Cube(
+            histogram=store.histogram,
+            recipe=recipe,
+            complete=complete,
+            registrations=None if total is None else int(total),
+            version=str(store.attrs["version"]),
+            path=source,
+            progress=store.progress,
+            _close=store.close,
+        )
+    except BaseException:
+        store.close()
+        raise
+
+
+def check_output(path: str | Path, recipe: Recipe, *, overwrite: bool = False) -> None:
+    """Raise what `create` would raise, without touching anything."""
+    target = Path(path)
+    form = _format(target, "out")
+    check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
+    if form.__name__.endswith(".npz"):  # it could be written, but never read back here
+        what = f"the counts of {target}, which NumPy reads whole,"
+        check_memory(recipe.nbytes, what, "a .zarr or .h5 is read in parts")
+
+
+def create(path: str | Path, recipe: Recipe, *, overwrite: bool = False) -> Writer:
+    """A writer for the format that the suffix names."""
+    check_output(path, recipe, overwrite=overwrite)
+    writer: Writer = _format(Path(path), "out").open_writer(Path(path), recipe)
+    return writer
+
+
+def _format(path: Path, argument: str) -> Any:
+    module: ModuleType
+    if path.suffix == ".zarr":
+        from mars_lidar.io import zarr_store as module
+    elif path.suffix in (".h5", ".hdf5"):
+        from mars_lidar.io import hdf5 as module
+    elif path.suffix == ".npz":
+        from mars_lidar.io import npz as module
+    else:
+        raise ValueError(f"{argument} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
+    return module

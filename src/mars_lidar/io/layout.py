@@ -1,0 +1,165 @@
+"""The layout that every format shares: variables with dimensions and units, and the attributes.
+
+Version 1 of the layout:
+
+==================  ===========================  =====================================================
+variable            dimensions                   holds
+==================  ===========================  =====================================================
+histogram           realization, y, x, time      registrations, uint16 or uint32
+time                time                         bin centres, ns
+realization, y, x   themselves                   realization number of the random streams; pixel
+depth               y, x                         m
+reflectivity        y, x                         where a scene is behind the flux
+signal, background  y, x                         detectable photons per laser period
+delay               y, x                         ns; the strongest return
+returns_signal,     return, y, x                 where there are several returns
+returns_delay
+waveform            y, x, waveform_time          photons per period and part, where the flux is one
+pixel_index         y, x                         where the cube is a part of a larger image
+==================  ===========================  =====================================================
+
+Attributes: ``format``, ``format_version``, ``complete``, ``system`` (JSON), ``engine``, ``seed``,
+``first_realization``, ``flux`` (JSON: what made the flux), ``source``, ``version`` (of this package) and,
+once complete, ``registrations``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.flux import Flux
+from mars_lidar.io.recipe import Recipe
+from mars_lidar.system import System
+
+FORMAT = "mars-lidar cube"
+FORMAT_VERSION = 1
+DIMS = ("realization", "y", "x", "time")
+HISTOGRAM_LABELS = {"long_name": "registrations per bin", "units": "count"}
+_IMAGE = ("y", "x")
+_PHOTONS = "photons per laser period"
+
+
+@dataclass(frozen=True, eq=False)
+class Variable:
+    """A named array with named dimensions, a unit and a long name."""
+
+    name: str
+    dims: tuple[str, ...]
+    data: NDArray[Any]
+    units: str
+    long_name: str
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """Attributes of the variable."""
+        return {"long_name": self.long_name, "units": self.units}
+
+
+def variables(recipe: Recipe) -> list[Variable]:
+    """All variables but the histogram; coordinates first."""
+    flux, system = recipe.flux, recipe.system
+    height, width = flux.shape
+    numbers = recipe.first_realization + np.arange(recipe.realizations, dtype=np.int64)
+    out = [
+        Variable("realization", ("realization",), numbers, "1", "realization number"),
+        Variable("y", ("y",), np.arange(height), "pixel", "image row"),
+        Variable("x", ("x",), np.arange(width), "pixel", "image column"),
+        Variable("time", ("time",), system.time_ns, "ns", "time in the period, bin centre"),
+        Variable("depth", _IMAGE, recipe.depth_m, "m", "depth"),
+    ]
+    if recipe.reflectivity is not None:
+        out.append(Variable("reflectivity", _IMAGE, recipe.reflectivity, "1", "reflectivity"))
+    out += [
+        Variable("signal", _IMAGE, flux.signal, _PHOTONS, "signal"),
+        Variable("background", _IMAGE, flux.background, _PHOTONS, "background"),
+        Variable("delay", _IMAGE, flux.delay_ns, "ns", "delay of the strongest return"),
+    ]
+    if len(flux.returns_signal) > 1:
+        dims = ("return", *_IMAGE)
+        out += [
+            Variable("returns_signal", dims, flux.returns_signal, _PHOTONS, "signal of each return"),
+            Variable("returns_delay", dims, flux.returns_delay_ns, "ns", "delay of each return"),
+        ]
+    if flux.waveform is not None:
+        parts = flux.waveform.shape[-1]
+        centres = (np.arange(parts) + 0.5) * (system.period_ns / parts)
+        wave_dims = (*_IMAGE, "waveform_time")
+        out += [
+            Variable("waveform_time", ("waveform_time",), centres, "ns", "time in the period, part centre"),
+            Variable("waveform", wave_dims, flux.waveform, _PHOTONS + " and part", "incident waveform"),
+        ]
+    if recipe.pixel_index is not None:
+        index = recipe.pixel_index.reshape(height, width)
+        out.append(Variable("pixel_index", _IMAGE, index, "1", "pixel number of the random streams"))
+    return out
+
+
+def attributes(recipe: Recipe) -> dict[str, str | int]:
+    """Attributes of the file as plain strings and integers; ``complete`` is the writer's own."""
+    from mars_lidar import __version__
+
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "system": recipe.system.to_json(),
+        "engine": recipe.engine,
+        "seed": recipe.seed,
+        "first_realization": recipe.first_realization,
+        "flux": json.dumps(recipe.flux.info, default=_plain),
+        "source": recipe.source,
+        "version": __version__,
+    }
+
+
+def recipe_from(
+    attrs: Mapping[str, Any],
+    names: frozenset[str],
+    read: Callable[[str], NDArray[Any]],
+    realizations: int,
+) -> Recipe:
+    """The recipe that `variables` and `attributes` wrote; `read` returns a variable by name."""
+    background, info = read("background"), json.loads(attrs["flux"])
+    if "waveform" in names:
+        flux = Flux(waveform=read("waveform"), background=background, info=info)
+    elif "returns_signal" in names:
+        returns = zip(read("returns_signal"), read("returns_delay"), strict=True)
+        zero = np.zeros_like(background)
+        flux = Flux.multi(
+            *[Flux(s, zero if k else background, tau) for k, (s, tau) in enumerate(returns)], info=info
+        )
+    else:
+        flux = Flux(read("signal"), background, read("delay"), info=info)
+    return Recipe(
+        system=System.from_json(attrs["system"]),
+        flux=flux,
+        engine=str(attrs["engine"]),
+        seed=int(attrs["seed"]),
+        realizations=realizations,
+        first_realization=int(attrs["first_realization"]),
+        pixel_index=read("pixel_index").ravel() if "pixel_index" in names else None,
+        depth_m=read("depth"),
+        reflectivity=read("reflectivity") if "reflectivity" in names else None,
+        source=str(attrs["source"]),
+    )
+
+
+def check_format(path: object, attrs: Mapping[str, Any]) -> None:
+    """Raise ValueError unless these are the attributes of a cube that this version can read."""
+    if attrs.get("format") != FORMAT:
+        raise ValueError(f"{path} is not a cube written by mars-lidar (no attribute format = {FORMAT!r})")
+    version = int(attrs.get("format_version", 0))
+    if version != FORMAT_VERSION:
+        raise ValueError(f"{path} has layout version {version}; version {FORMAT_VERSION} can be read")
+
+
+def _plain(value: Any) -> Any:
+    """NumPy scalars and arrays inside `Flux.info`, as JSON knows them."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    return str(value)

@@ -1,0 +1,149 @@
+"""What a cube is made of: everything that is needed to make it again, bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
+
+BLOCK_BYTES = 64 * 2**20  # one call of the simulator: enough work for every core, little beside the output
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recipe:
+    """All arguments of one `mars_lidar.simulate`, and the maps that explain its cube.
+
+    Parameters
+    ----------
+    system, flux, engine, seed, realizations, first_realization, pixel_index
+        As `mars_lidar.simulate` takes them; `pixel_index` is (H * W,) or None for the row-major numbering
+        of the flux.
+    depth_m
+        (H, W), m. By default the depth c tau / 2 of the flux's strongest return.
+    reflectivity
+        (H, W) or None where no scene is behind the flux.
+    source
+        Free text: where the scene came from.
+    """
+
+    system: System
+    flux: Flux
+    engine: str = "exact"
+    seed: int = 0
+    realizations: int = 1
+    first_realization: int = 0
+    pixel_index: NDArray[np.int64] | None = None
+    depth_m: NDArray[np.float64] = None  # type: ignore[assignment]  # filled below, never None afterwards
+    reflectivity: NDArray[np.float64] | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.system, System):
+            raise TypeError(f"system must be a System, got {self.system!r}")
+        if not isinstance(self.flux, Flux):
+            raise TypeError(f"flux must be a Flux, got {self.flux!r}")
+        for name, low, high in (
+            ("seed", 0, 2**64 - 1),
+            ("realizations", 1, 2**32),
+            ("first_realization", 0, 2**32 - 1),
+        ):
+            number = _validate.integer(name, getattr(self, name), low=low, high=high)
+            object.__setattr__(self, name, number)
+        if not isinstance(self.engine, str):
+            raise TypeError(f"engine must be the name of an engine, got {self.engine!r}")
+        depth = self.system.depth_m(self.flux.delay_ns) if self.depth_m is None else self.depth_m
+        object.__setattr__(self, "depth_m", self._map("depth_m", depth))
+        if self.reflectivity is not None:
+            object.__setattr__(self, "reflectivity", self._map("reflectivity", self.reflectivity))
+        if self.pixel_index is not None:
+            index = np.ascontiguousarray(self.pixel_index)
+            pixels = math.prod(self.flux.shape)
+            if index.dtype.kind not in "iu" or index.size != pixels:
+                raise ValueError(
+                    f"pixel_index must be {pixels} integers, one per pixel of the flux, "
+                    f"got {index.size} of dtype {index.dtype}"
+                )
+            object.__setattr__(self, "pixel_index", index.astype(np.int64).ravel())
+
+    def _map(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
+        array = np.asarray(value, dtype=np.float64)
+        if array.shape != self.flux.shape:
+            raise ValueError(f"{name} must have the flux's shape {self.flux.shape}, got {array.shape}")
+        return array
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """(realizations, H, W, bins) of the cube."""
+        return (self.realizations, *self.flux.shape, self.system.bins)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the counts, a function of the system."""
+        return self.system.histogram_dtype
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the whole cube in memory."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    def chunks(self, target_bytes: int) -> tuple[int, int, int, int]:
+        """Shape of a storage chunk of at most about `target_bytes`: image rows x all columns x all bins.
+
+        Realizations share a chunk only where whole images are small, and columns are split only where a
+        single row is larger than the target.
+        """
+        realizations, height, width, bins = self.shape
+        pixel = bins * self.dtype.itemsize
+        columns = min(width, max(1, target_bytes // pixel))
+        rows = min(height, max(1, target_bytes // (columns * pixel)))
+        together = min(realizations, max(1, target_bytes // (height * width * pixel)))
+        return together, rows, columns, bins
+
+    def blocks(self, chunks: tuple[int, int, int, int]) -> Iterator[tuple[slice, slice]]:
+        """Parts (realizations, rows) that cover the cube in C order, each one made of whole chunks.
+
+        A part is several whole images or a band of rows of one image, of at most about `BLOCK_BYTES`.
+        """
+        realizations, height, width, bins = self.shape
+        row_bytes = width * bins * self.dtype.itemsize
+        images = BLOCK_BYTES // (height * row_bytes)
+        if images >= 1:
+            step = max(chunks[0], images // chunks[0] * chunks[0])
+            for first in range(0, realizations, step):
+                yield slice(first, min(first + step, realizations)), slice(0, height)
+            return
+        band = max(chunks[1], BLOCK_BYTES // row_bytes // chunks[1] * chunks[1])
+        for k in range(realizations):
+            for row in range(0, height, band):
+                yield slice(k, k + 1), slice(row, min(row + band, height))
+
+    def part(self, realizations: slice, rows: slice) -> dict[str, Any]:
+        """Arguments with which `mars_lidar.simulate` makes this part alone, the same bits as in the whole.
+
+        Both slices count from the start of this cube and have explicit ends.
+        """
+        width = self.flux.shape[1]
+        index = self.pixel_index
+        first, last = rows.start * width, rows.stop * width
+        return {
+            "flux": self.flux[rows],
+            "system": self.system,
+            "engine": self.engine,
+            "realizations": realizations.stop - realizations.start,
+            "first_realization": self.first_realization + realizations.start,
+            "pixel_index": np.arange(first, last) if index is None else index[first:last],
+            "seed": self.seed,
+        }
+
+    def replace(self, **changes: Any) -> Recipe:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)

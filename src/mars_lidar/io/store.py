@@ -1,0 +1,108 @@
+"""What the three formats have in common: a writer, an opened file, and the rules for the place to write to.
+
+A format is one module with a `Writer` and a function `open_store`. The rule for all of them: what is half
+written never looks complete, whatever stops the process.
+"""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is written to
+
+
+class IncompleteFileError(ValueError):
+    """The file was left by a simulation that did not finish."""
+
+
+class CountArray(Protocol):
+    """Counts in memory or on disk: `shape`, `dtype`, and indexing that reads only what is asked for."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(realizations, H, W, bins)."""
+
+    @property
+    def dtype(self) -> Any:
+        """uint16 or uint32."""
+
+    def __getitem__(self, key: Any) -> Any:
+        """The selected counts, in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedStore:
+    """A file as its format module reads it."""
+
+    attrs: Mapping[str, Any]
+    names: frozenset[str]
+    read: Callable[[str], NDArray[Any]]
+    histogram: CountArray
+    complete: bool
+    progress: str  # how far an incomplete file got, for people; empty where that is not known
+    close: Callable[[], None]
+
+
+class Writer(ABC):
+    """Writes one cube, block by block, in the order of `Recipe.blocks`.
+
+    The file exists from the constructor on and is complete only after `finish`.
+    """
+
+    chunks: tuple[int, int, int, int]
+
+    @abstractmethod
+    def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
+        """Store the counts (realizations, rows, W, bins) of one block."""
+
+    @abstractmethod
+    def finish(self, registrations: int) -> None:
+        """Close the file and mark it complete."""
+
+    @abstractmethod
+    def abandon(self) -> str:
+        """Stop early; returns a sentence that says what is left on disk."""
+
+
+class TemporarySibling:
+    """The file beside the target that is renamed to it when all is written: the rename is atomic."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+        self.path = target.with_name(target.name + INCOMPLETE_SUFFIX)
+
+    def publish(self) -> None:
+        """Put the finished file in its place."""
+        os.replace(self.path, self.target)
+
+    def discard(self) -> str:
+        """Remove the unfinished file; says so."""
+        self.path.unlink(missing_ok=True)
+        if self.target.exists():
+            return f"{self.target} is what it was before"
+        return f"nothing was left at {self.target}"
+
+
+def check_target(path: Path, *, folder: bool, overwrite: bool) -> None:
+    """Raise OSError unless `path` can be written to; `folder` says whether the format is a directory."""
+    parent = path.parent
+    if not parent.is_dir():
+        raise FileNotFoundError(f"out must lie in an existing folder, got {str(path)!r}")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"out must lie in a folder that can be written to, got {str(path)!r}")
+    if not (path.exists() or path.is_symlink()):
+        return
+    if not overwrite:
+        raise FileExistsError(f"{path} exists already; choose another name or allow overwriting")
+    # never delete what a slip of the keyboard named: only a store is replaced by a store, a file by a file
+    if folder and not ((path / "zarr.json").is_file() or (path.is_dir() and not any(path.iterdir()))):
+        raise FileExistsError(f"{path} exists and is not a Zarr store; it will not be overwritten")
+    if not folder and not path.is_file():
+        raise FileExistsError(f"{path} exists and is not a file; it will not be overwritten")

@@ -1,0 +1,222 @@
+"""Simulate straight into a file, and make a cube again: where the verb `simulate` and the files meet."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar.flux import Flux
+from mars_lidar.io.cube import Cube, check_output, create
+from mars_lidar.io.recipe import Recipe
+from mars_lidar.system import System
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Written:
+    """What `simulate_to` did.
+
+    Attributes
+    ----------
+    path
+        The file.
+    registrations
+        Total counts of the cube.
+    simulate_s, write_s
+        Seconds spent in the engine and on the file.
+    """
+
+    path: Path
+    registrations: int
+    simulate_s: float
+    write_s: float
+
+    @property
+    def ns_per_registration(self) -> float:
+        """Engine time per registration, all threads together; NaN without registrations."""
+        return 1e9 * self.simulate_s / self.registrations if self.registrations else math.nan
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during `simulate_to`; its text says what is left on disk."""
+
+
+class WriteError(OSError):
+    """The file could not be written (a full disk, say); its text says what is left on disk."""
+
+
+def simulate_to(
+    path: str | Path,
+    flux: Flux,
+    system: System,
+    *,
+    engine: str = "exact",
+    realizations: int = 1,
+    first_realization: int = 0,
+    pixel_index: ArrayLike | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    depth_m: ArrayLike | None = None,
+    reflectivity: ArrayLike | None = None,
+    source: str = "",
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Written:
+    """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
+
+    Blocks of at most about 64 MiB are simulated and written one after the other, so the cube never needs
+    to fit in memory; its counts are those of one `mars_lidar.simulate`, bit for bit.
+
+    Parameters
+    ----------
+    path
+        The file; its suffix chooses the format.
+    flux, system, engine, realizations, first_realization, pixel_index, seed, threads
+        As for `mars_lidar.simulate`.
+    depth_m, reflectivity
+        Maps (H, W) of the scene to store beside the counts; depth is c tau / 2 by default.
+    source
+        Free text: where the scene came from.
+    overwrite
+        Replace an existing file.
+    progress
+        Called with (pixel exposures done, in all).
+
+    Raises
+    ------
+    ValueError, TypeError
+        A bad argument; nothing was written.
+    FileExistsError
+        `path` exists and `overwrite` is false.
+    MemoryError
+        An ``.npz`` that could not be read back in this machine's memory.
+    WriteError, Interrupted
+        Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
+    """
+    recipe = Recipe(
+        system=system,
+        flux=flux,
+        engine=engine,
+        seed=seed,
+        realizations=realizations,
+        first_realization=first_realization,
+        pixel_index=None if pixel_index is None else np.asarray(pixel_index),
+        depth_m=system.depth_m(flux.delay_ns) if depth_m is None else np.asarray(depth_m),
+        reflectivity=None if reflectivity is None else np.asarray(reflectivity),
+        source=source,
+    )
+    target = Path(path)
+    check_output(target, recipe, overwrite=overwrite)
+    _try_brightest_pixel(recipe, threads)
+    try:
+        writer = create(target, recipe, overwrite=overwrite)
+    except OSError as error:
+        raise WriteError(error.errno, f"{error.strerror or error}; nothing was left at {target}") from error
+    registrations = 0
+    simulate_s = write_s = 0.0
+    try:
+        for images, rows in recipe.blocks(writer.chunks):
+            began = time.perf_counter()
+            block = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))
+            ended = time.perf_counter()
+            writer.write(images, rows, block)
+            registrations += int(block.sum(dtype=np.uint64))
+            simulate_s += ended - began
+            write_s += time.perf_counter() - ended
+        writer.finish(registrations)
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {writer.abandon()}") from None
+    except OSError as error:
+        raise WriteError(error.errno, f"{error.strerror or error}; {writer.abandon()}") from error
+    except BaseException:
+        writer.abandon()
+        raise
+    return Written(target, registrations, simulate_s, write_s)
+
+
+def regenerate(
+    cube: Cube | Recipe,
+    *,
+    realizations: slice = slice(None),
+    rows: slice = slice(None),
+    threads: int | None = None,
+) -> NDArray[Any]:
+    """Simulate a cube, or a part of it, again from its recipe.
+
+    Parameters
+    ----------
+    cube
+        What `load` returned, or its recipe.
+    realizations, rows
+        Part to make: slices of step 1 that count from the start of the cube.
+    threads
+        As for `mars_lidar.simulate`.
+
+    Returns
+    -------
+    NDArray
+        (realizations, rows, W, bins): the bits of the cube, with the same engine on the same version.
+    """
+    recipe = cube.recipe if isinstance(cube, Cube) else cube
+    parts = []
+    count, height = recipe.shape[:2]
+    for name, part, size in (("realizations", realizations, count), ("rows", rows, height)):
+        first, last, step = part.indices(size)
+        if step != 1 or first >= last:
+            raise ValueError(f"{name} must select a run of at least one of {size}, got {part!r}")
+        parts.append(slice(first, last))
+    return _simulate(recipe, parts[0], parts[1], threads, None)
+
+
+def verify(cube: Cube, *, threads: int | None = None, progress: Progress | None = None) -> bool:
+    """Whether simulating again gives the stored counts, bit for bit; one block in memory at a time."""
+    recipe = cube.recipe
+    for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
+        again = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))
+        if not np.array_equal(again, np.asarray(cube.histogram[images, rows])):
+            return False
+    return True
+
+
+def _simulate(
+    recipe: Recipe, images: slice, rows: slice, threads: int | None, progress: Progress | None
+) -> NDArray[Any]:
+    from mars_lidar import simulate
+
+    counts: NDArray[Any] = simulate(**recipe.part(images, rows), threads=threads, progress=progress)
+    return counts
+
+
+def _try_brightest_pixel(recipe: Recipe, threads: int | None) -> None:
+    """Let the simulator check its arguments before anything on disk is touched."""
+    y, x = (int(k) for k in np.unravel_index(np.argmax(recipe.flux.total), recipe.flux.shape))
+    one = recipe.replace(
+        flux=recipe.flux[y, x],
+        realizations=1,
+        pixel_index=np.array([0 if recipe.pixel_index is None else recipe.pixel_index.max()]),
+        depth_m=recipe.depth_m[:1, :1],
+        reflectivity=None,
+    )
+    _simulate(one, slice(0, 1), slice(0, 1), threads, None)
+
+
+def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
+    """A callback for one block that tells `progress` how far the whole cube is, in pixel exposures."""
+    if progress is None:
+        return None
+    count, height, width, _ = recipe.shape
+    before = images.start * height * width + rows.start * width
+    size = (images.stop - images.start) * (rows.stop - rows.start) * width
+
+    def shifted(done: int, total: int) -> None:
+        progress(before + size * done // max(total, 1), count * height * width)
+
+    return shifted

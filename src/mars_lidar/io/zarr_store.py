@@ -1,0 +1,129 @@
+"""Zarr v3: the format for cubes of any size; chunks are written as they are simulated.
+
+``xarray.open_zarr(path)`` opens a store with its dimensions, coordinates and units.
+"""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.io import layout
+from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.store import OpenedStore, Writer
+
+_CHUNK_BYTES = 4 * 2**20
+
+
+class ZarrWriter(Writer):
+    """A store whose attribute ``complete`` is false from its first byte on and true after its last."""
+
+    def __init__(self, path: Path, recipe: Recipe) -> None:
+        self._path = path
+        if path.exists():
+            # without its root document the old store is no store: a removal cut short cannot pass for a cube
+            (path / "zarr.json").unlink(missing_ok=True)
+            shutil.rmtree(path)
+        try:
+            self._group = self._create(recipe)
+        except BaseException:
+            shutil.rmtree(path, ignore_errors=True)  # no counts are lost
+            raise
+        self._histogram: Any = self._group["histogram"]
+
+    def _create(self, recipe: Recipe) -> Any:
+        import zarr
+
+        attrs = {"complete": False, **layout.attributes(recipe)}
+        group = zarr.create_group(self._path, zarr_format=3, attributes=attrs)
+        for v in layout.variables(recipe):
+            array = group.create_array(
+                v.name,
+                shape=v.data.shape,
+                dtype=v.data.dtype,
+                chunks=_map_chunks(v.data),
+                compressors=_compressor(v.data.dtype, "shuffle"),
+                dimension_names=v.dims,
+                attributes={**v.labels},
+            )
+            array[...] = v.data
+        self.chunks = recipe.chunks(_CHUNK_BYTES)
+        group.create_array(
+            "histogram",
+            shape=recipe.shape,
+            dtype=recipe.dtype,
+            chunks=self.chunks,
+            compressors=_compressor(recipe.dtype, "bitshuffle"),
+            dimension_names=layout.DIMS,
+            attributes={**layout.HISTOGRAM_LABELS},
+        )
+        with warnings.catch_warnings():  # that other Zarr libraries may ignore the consolidated copy
+            warnings.filterwarnings("ignore", "Consolidated metadata", category=UserWarning)
+            return zarr.consolidate_metadata(group.store)
+
+    def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
+        """Store whole chunks."""
+        self._histogram[realizations, rows] = block
+
+    def finish(self, registrations: int) -> None:
+        """Mark the store complete: one atomic replacement of its root document."""
+        self._group.update_attributes({"registrations": registrations, "complete": True})
+
+    def abandon(self) -> str:
+        """Leave what is there, marked incomplete."""
+        return f"{self._path} is left behind, marked incomplete"
+
+
+def open_writer(path: Path, recipe: Recipe) -> Writer:
+    """Begin a file; an existing one is replaced."""
+    return ZarrWriter(path, recipe)
+
+
+def open_store(path: Path) -> OpenedStore:
+    """Open a store for reading; chunks are read when the histogram is indexed."""
+    import zarr
+
+    if not (path / "zarr.json").is_file():
+        raise ValueError(f"{path} is not a Zarr v3 store (it has no zarr.json)")
+    group = zarr.open_group(path, mode="r")
+    attrs = dict(group.attrs)
+    layout.check_format(path, attrs)
+    complete = attrs.get("complete") is True
+    names = frozenset(group.array_keys())
+    if "histogram" not in names:
+        raise ValueError(f"{path} has no variable 'histogram': its writing stopped at the very start")
+    histogram: Any = group["histogram"]
+    progress = ""
+    if not complete:
+        progress = f"at least {histogram.nchunks_initialized} of {histogram.nchunks} chunks are written"
+
+    def read(name: str) -> NDArray[Any]:
+        array: Any = group[name]
+        return np.asarray(array[...])
+
+    return OpenedStore(attrs, names, read, histogram, complete, progress, lambda: None)
+
+
+def _compressor(dtype: np.dtype[Any], shuffle: Any) -> Any:
+    """Blosc zstd at level 1, with bitshuffle for counts.
+
+    Measured on a room of 128 x 128 x 1024 uint16 counts (61 % zeros, 34 MB, 2 cores; write, read, size):
+    zstd-1 bitshuffle 0.11 s, 0.03 s, 3.6 MB; lz4 bitshuffle 0.15 s, 0.04 s, 4.6 MB; zstd-1 byte shuffle
+    0.15 s, 0.06 s, 4.5 MB; zstd alone 0.20 s, 0.08 s, 5.8 MB; none 0.12 s, 0.07 s, 34 MB.
+    """
+    from zarr.codecs import BloscCodec
+
+    return BloscCodec(cname="zstd", clevel=1, shuffle=shuffle, typesize=dtype.itemsize)
+
+
+def _map_chunks(data: NDArray[Any]) -> tuple[int, ...]:
+    """Whole maps; a large waveform in bands of rows."""
+    if data.nbytes <= 8 * _CHUNK_BYTES or data.ndim < 3:
+        return data.shape
+    rows = max(1, _CHUNK_BYTES * data.shape[0] // data.nbytes)
+    return (rows, *data.shape[1:])

@@ -1,0 +1,31 @@
+// What the Python bindings of the engines share.
+#pragma once
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include "job.h"
+#include "pulse.h"
+
+namespace mars {
+
+namespace nb = nanobind;
+
+template <class T>
+using Vector = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Matrix = nb::ndarray<T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+// A job together with the arrays that it points into.
+struct BoundJob : Job {
+    nb::object arrays;
+};
+
+void bind_pulse(nb::module_& module);
+void bind_exact(nb::module_& module);
+void bind_waveform(nb::module_& module);
+void bind_sequential(nb::module_& module);
+void bind_poisson(nb::module_& module);
+void bind_chain(nb::module_& module);
+void bind_exposure(nb::module_& module);
+
+}  // namespace mars

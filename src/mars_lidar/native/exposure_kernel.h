@@ -1,0 +1,97 @@
+// The exposure recursion, one set of functions per vector level (exposure_kernel.cpp is compiled once for each).
+// Equation numbers everywhere in exposure*.{h,cpp} are those of docs/theory_exposure.md.
+#pragma once
+#include <atomic>
+#include <cstdint>
+
+namespace mars {
+
+constexpr int kExposureParts = 4;   // photon energies are given per quarter of a grid bin
+constexpr int kExposureOrders = 4;  // cumulants
+
+// One laser period on n bins of width D = 1/n; dead time K + (d + f)/n periods.
+struct ExposureGrid {
+    int64_t cycles = 1;
+    int64_t max_periods = 0;  // give up (settled = kUnsettled) after so many periods without settling
+    int64_t whole = 0;        // K
+    int32_t bins = 1;         // n
+    int32_t out_bins = 1;     // histogram bins, a divisor of n
+    int32_t shift = 0;        // d
+    double fraction = 0.0;    // f in [0, 1)
+    bool stationary = false;
+    double tolerance = 0.0;   // relative change per period below which a state counts as repeated
+
+    int64_t delay() const { return whole * bins + shift; }  // whole bins of dead time
+    // Bins whose registrations must be remembered: no more than the exposure has.
+    int64_t memory() const { return delay() < cycles * bins ? delay() + 2 : cycles * bins + 2; }
+    int64_t window() const { return 3 * (whole + 1); }  // periods over which a state must repeat
+};
+
+// Photons per period and part of a bin: signal * shapes[shape] + background / parts.
+struct ExposureFlux {
+    int64_t entries = 0;
+    const double* signal = nullptr;      // (entries)
+    const double* background = nullptr;  // (entries)
+    const int32_t* shape = nullptr;      // (entries) row of `shapes`
+    const double* shapes = nullptr;      // (rows, n * kExposureParts)
+    int32_t bins = 1;                    // n
+
+    double photons(int64_t entry, int64_t part) const {
+        const int64_t parts = static_cast<int64_t>(bins) * kExposureParts;
+        return signal[entry] * shapes[shape[entry] * parts + part] + background[entry] / static_cast<double>(parts);
+    }
+};
+
+// What `settled` holds besides the number of periods that were needed.
+constexpr int64_t kRanToEnd = -1;   // the exposure ended first: no extrapolation, nothing lost
+constexpr int64_t kUnsettled = -2;  // max_periods was reached: no result
+
+// Cumulants and mean histogram of entries [first, first + count), count at most the level's lanes.
+struct MomentsBlock {
+    const ExposureGrid* grid;
+    const ExposureFlux* flux;
+    int64_t first, count;
+    double* cumulants;       // (entries, 4)
+    double* cumulant_rates;  // (entries, 4) per period once settled, else NaN
+    double* histogram;       // (entries, out_bins)
+    double* histogram_rate;  // (entries, out_bins) per period once settled, else NaN
+    int64_t* settled;        // (entries)
+    const std::atomic<bool>* stop;
+};
+
+// Stationary registrations per period and bin of entries [first, first + count).
+struct StationaryBlock {
+    const ExposureGrid* grid;
+    const ExposureFlux* flux;
+    int64_t first, count;
+    double* histogram;  // (entries, out_bins)
+    int64_t* settled;   // (entries)
+    const std::atomic<bool>* stop;
+};
+
+// E[z^N] of one entry at `count` points z, count at most the level's lanes. Complex points on the unit circle
+// give the value itself; real points (`tilted`) give its logarithm in `re`.
+struct CharacteristicBlock {
+    const ExposureGrid* grid;
+    const ExposureFlux* flux;
+    int64_t entry, count;
+    bool tilted;
+    const double* z_re;
+    const double* z_im;
+    double* re;
+    double* im;
+    int64_t* settled;
+    const std::atomic<bool>* stop;
+};
+
+#define MARS_DECLARE_EXPOSURE(level)                                 \
+    void exposure_moments_##level(const MomentsBlock& block);        \
+    void exposure_stationary_##level(const StationaryBlock& block);  \
+    void exposure_characteristic_##level(const CharacteristicBlock& block);
+
+MARS_DECLARE_EXPOSURE(scalar)
+MARS_DECLARE_EXPOSURE(vector128)
+MARS_DECLARE_EXPOSURE(avx2)
+MARS_DECLARE_EXPOSURE(avx512)
+
+}  // namespace mars

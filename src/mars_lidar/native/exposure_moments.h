@@ -1,0 +1,162 @@
+// Cumulants of the count and mean histogram of a finite exposure.
+#pragma once
+#include <limits>
+
+#include "exposure_start.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+namespace {
+
+constexpr int kOrders = kExposureOrders + 1;  // Taylor coefficients 0..4
+using Moments = Series<kOrders>;
+
+// Cumulants by the normalised recursion of section 5.
+class MomentsRun {
+ public:
+    MomentsRun(const MomentsBlock& block)
+        : block_(block), grid_(*block.grid), response_(responses(*block.flux, block.first, block.count)) {}
+
+    void run() {
+        Stationary start{};
+        if (grid_.stationary) start = stationary_state(grid_, response_, block_.count, *block_.stop);
+        Recursion<Moments, Real> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr);
+        recursion.armed.c[0] = grid_.stationary ? start.armed : splat(1.0);
+        if (grid_.stationary) recursion.set_last({one(start.bins.back().mass), one(start.bins.back().moment)});
+        std::vector<Real> histogram(grid_.bins), before(grid_.bins);
+        std::vector<Moments> repeated = recursion.repeated;
+        const int64_t kept = std::min(grid_.whole + 1, grid_.cycles);
+        increments_.assign(kept, Moments{});
+        totals_.assign(kept, Moments{});
+        tails_.assign(kept, Moments{});
+        if (grid_.stationary) start_history(start);
+        bool done[kReals]{};
+        int64_t streak[kReals]{}, left = block_.count;
+        for (int k = 0; k < block_.count; ++k)
+            if (grid_.stationary && !start.settled[k]) {
+                block_.settled[block_.first + k] = kUnsettled;
+                done[k] = true;
+                --left;
+            }
+        for (int64_t q = 0; q < grid_.cycles && left > 0; ++q) {
+            if (block_.stop->load(std::memory_order_relaxed)) return;
+            bool near = false;
+            for (int k = 0; k < block_.count; ++k) near = near || (!done[k] && streak[k] + 1 >= grid_.window());
+            if (near) before = histogram;
+            recursion.period(q, factor(q, grid_.whole + 1), factor(q, grid_.whole), histogram.data());
+            const Moments step = growth(recursion.total);
+            cumulative_ = cumulative_ + step;
+            recursion.armed = weighted(exp_series(-1.0 * step), recursion.armed);
+            increments_[slot(q)] = step;
+            totals_[slot(q)] = recursion.total;
+            tails_[slot(q)] = recursion.tail;
+            if (q % (1 + grid_.whole / 16) == 0) {  // armed + blind = 1 at every order (eq. 17)
+                recursion.armed = -1.0 * blind(q + 1);
+                recursion.armed.c[0] += 1.0;
+            }
+            const Real moved = change(recursion.repeated, repeated);
+            repeated = recursion.repeated;
+            const int64_t periods = q + 1;
+            for (int k = 0; k < block_.count; ++k) {
+                if (done[k]) continue;
+                streak[k] = lane(moved, k) <= grid_.tolerance ? streak[k] + 1 : 0;
+                const bool settled = streak[k] >= grid_.window(), over = periods == grid_.cycles;
+                if (!settled && !over && periods < grid_.max_periods) continue;
+                done[k] = true;
+                --left;
+                if (settled || over)
+                    put(k, step, periods, settled, histogram.data(), before.data());
+                else
+                    block_.settled[block_.first + k] = kUnsettled;
+            }
+        }
+    }
+
+ private:
+    static Moments one(const Real& x) {
+        Moments out{};
+        out.c[0] = x;
+        return out;
+    }
+
+    // log(1 + (e^s - 1) R(s)): what one period adds to the cumulant generating function (eq. 16).
+    static Moments growth(const Moments& total) {
+        Moments out{};
+        out.c[0] = splat(1.0);
+        constexpr double inverse_factorial[] = {1.0, 1.0, 1.0 / 2, 1.0 / 6, 1.0 / 24};
+        for (int k = 1; k < kOrders; ++k)
+            for (int i = 1; i <= k; ++i) out.c[k] += inverse_factorial[i] * total.c[k - i];
+        return log_series(out);
+    }
+
+    // Weight of a registration made `ago` periods before period q, in the units of that period (eq. 15): e^s times
+    // the change of unit; without e^s where it lies before the exposure.
+    Moments factor(int64_t q, int64_t ago) const {
+        Moments exponent{};
+        if (ago <= q) exponent.c[1] += splat(1.0);
+        for (int64_t i = std::max<int64_t>(q - ago, 0); i < q; ++i) exponent = exponent - increments_[slot(i)];
+        return exp_series(exponent);
+    }
+
+    int64_t slot(int64_t period) const { return period % static_cast<int64_t>(increments_.size()); }
+
+    // Weighted probability of being blind at the start of period q, in the units of that period.
+    Moments blind(int64_t q) const {
+        Moments out{}, exponent{};
+        exponent.c[1] += splat(1.0);
+        for (int64_t p = q - 1; p >= q - 1 - grid_.whole; --p) {
+            if (p >= 0) {
+                exponent = exponent - increments_[slot(p)];
+            } else {
+                if (!grid_.stationary) break;
+                if (p == -1) exponent.c[1] -= 1.0;
+            }
+            const Moments weight = exp_series(exponent);
+            const bool whole = p > q - 1 - grid_.whole;
+            if (p >= 0)
+                out = out + weighted(weight, whole ? totals_[slot(p)] : tails_[slot(p)]);
+            else
+                out = out + (whole ? history_total_ : history_tail_) * weight;
+        }
+        return out;
+    }
+
+    void start_history(const Stationary& start) {
+        for (const Registrations<Real>& r : start.bins) history_total_ += r.mass;
+        history_tail_ = start.tail;
+    }
+
+    void put(int k, const Moments& step, int64_t periods, bool settled, const Real* histogram, const Real* before) {
+        const int64_t entry = block_.first + k;
+        const double rest = static_cast<double>(grid_.cycles - periods);
+        constexpr double factorial[] = {1.0, 1.0, 2.0, 6.0, 24.0};
+        constexpr double unknown = std::numeric_limits<double>::quiet_NaN();
+        double* cumulants = block_.cumulants + entry * kExposureOrders;
+        double* rates = block_.cumulant_rates + entry * kExposureOrders;
+        for (int order = 1; order < kOrders; ++order) {
+            const double rate = factorial[order] * lane(step.c[order], k);
+            cumulants[order - 1] = factorial[order] * lane(cumulative_.c[order], k) + (settled ? rest * rate : 0.0);
+            rates[order - 1] = settled ? rate : unknown;
+        }
+        double* mean = block_.histogram + entry * grid_.out_bins;
+        double* mean_rate = block_.histogram_rate + entry * grid_.out_bins;
+        put_histogram(grid_, histogram, k, 1.0, mean);
+        if (settled) put_histogram(grid_, before, k, 1.0, mean_rate);
+        for (int32_t b = 0; b < grid_.out_bins; ++b) {
+            mean_rate[b] = settled ? mean[b] - mean_rate[b] : unknown;
+            if (settled) mean[b] += rest * mean_rate[b];
+        }
+        block_.settled[entry] = settled ? periods : kRanToEnd;
+    }
+
+    const MomentsBlock& block_;
+    const ExposureGrid grid_;
+    const std::vector<Response<Real>> response_;
+    Moments cumulative_{};
+    std::vector<Moments> increments_, totals_, tails_;  // of the last K + 1 periods, by `slot`
+    Real history_total_{}, history_tail_{};             // of a period before the exposure
+};
+
+}  // namespace
+}  // namespace MARS_LEVEL
+}  // namespace mars

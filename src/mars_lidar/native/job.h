@@ -1,0 +1,29 @@
+// What every engine is asked to do. Times are in laser periods, fluxes in photons per period.
+#pragma once
+#include <cstdint>
+
+namespace mars {
+
+struct Job {
+    int64_t pixels = 0;
+    int64_t returns = 0;       // 0 with a waveform
+    int64_t realizations = 1;
+    uint32_t first_realization = 0;
+    uint64_t seed = 0;
+    int32_t cycles = 1;
+    int32_t bins = 1;
+    double dead_time = 0.0;
+    bool stationary = false;   // warmed up at t = 0, else armed
+    const double* signal = nullptr;       // (returns, pixels)
+    const double* delay = nullptr;        // (returns, pixels), finite, any number of periods
+    const double* background = nullptr;   // (pixels)
+    const double* waveform = nullptr;     // (pixels, samples): photons per sample, or null
+    int64_t samples = 0;
+    const uint32_t* pixel_index = nullptr;  // (pixels): names the random streams
+
+    int64_t items() const { return pixels * realizations; }  // item = realization * pixels + pixel
+    uint32_t realization(int64_t item) const { return first_realization + static_cast<uint32_t>(item / pixels); }
+    int64_t pixel(int64_t item) const { return item % pixels; }
+};
+
+}  // namespace mars

@@ -1,0 +1,257 @@
+// Pairs of hardware vectors by the vector extensions of GCC and Clang. Included by lanes.h only.
+#pragma once
+#if defined(__x86_64__) || defined(__i386__)
+#include <immintrin.h>
+#define MARS_X86
+#endif
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+constexpr int kHardwareLanes = MARS_LANES;
+constexpr int kLanes = 2 * kHardwareLanes;
+
+typedef float HardFloat __attribute__((vector_size(4 * kHardwareLanes)));
+typedef int32_t HardInt __attribute__((vector_size(4 * kHardwareLanes)));
+typedef uint32_t HardUInt __attribute__((vector_size(4 * kHardwareLanes)));
+#if defined(MARS_LEVEL_avx512)
+typedef __mmask16 HardMask;
+#else
+typedef HardInt HardMask;  // 0 or -1 per lane
+#endif
+
+struct Float {
+    HardFloat low, high;
+};
+struct Int {
+    HardInt low, high;
+};
+struct UInt {
+    HardUInt low, high;
+};
+struct Mask {
+    HardMask low, high;
+};
+
+MARS_INLINE Float splat(float x) { return {HardFloat{} + x, HardFloat{} + x}; }
+MARS_INLINE Int splat(int32_t x) { return {HardInt{} + x, HardInt{} + x}; }
+MARS_INLINE UInt splat(uint32_t x) { return {HardUInt{} + x, HardUInt{} + x}; }
+
+#define MARS_BINARY(T, S, op)                                                                       \
+    MARS_INLINE T operator op(T a, T b) { return {a.low op b.low, a.high op b.high}; }              \
+    MARS_INLINE T operator op(T a, S b) { return a op splat(b); }                                   \
+    MARS_INLINE T operator op(S a, T b) { return splat(a) op b; }
+MARS_BINARY(Float, float, +)
+MARS_BINARY(Float, float, -)
+MARS_BINARY(Float, float, *)
+MARS_BINARY(Int, int32_t, +)
+MARS_BINARY(Int, int32_t, -)
+MARS_BINARY(UInt, uint32_t, +)
+MARS_BINARY(UInt, uint32_t, -)
+MARS_BINARY(UInt, uint32_t, &)
+MARS_BINARY(UInt, uint32_t, |)
+MARS_BINARY(UInt, uint32_t, ^)
+#undef MARS_BINARY
+MARS_INLINE UInt& operator+=(UInt& a, UInt b) { return a = a + b; }
+MARS_INLINE UInt& operator^=(UInt& a, UInt b) { return a = a ^ b; }
+MARS_INLINE UInt operator<<(UInt a, int n) { return {a.low << n, a.high << n}; }
+MARS_INLINE UInt operator>>(UInt a, int n) { return {a.low >> n, a.high >> n}; }
+MARS_INLINE Int operator>>(Int a, int n) { return {a.low >> n, a.high >> n}; }
+
+#if defined(MARS_LEVEL_avx512)
+#define MARS_COMPARE_HARD(name, op, f, i)                                                                           \
+    MARS_INLINE HardMask name(HardFloat a, HardFloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, f); }      \
+    MARS_INLINE HardMask name(HardInt a, HardInt b) { return _mm512_cmp_epi32_mask((__m512i)a, (__m512i)b, i); }     \
+    MARS_INLINE HardMask name(HardUInt a, HardUInt b) { return _mm512_cmp_epu32_mask((__m512i)a, (__m512i)b, i); }
+#else
+#define MARS_COMPARE_HARD(name, op, f, i)                                         \
+    MARS_INLINE HardMask name(HardFloat a, HardFloat b) { return (HardMask)(a op b); } \
+    MARS_INLINE HardMask name(HardInt a, HardInt b) { return (HardMask)(a op b); }     \
+    MARS_INLINE HardMask name(HardUInt a, HardUInt b) { return (HardMask)(a op b); }
+#endif
+MARS_COMPARE_HARD(compare_less, <, _CMP_LT_OQ, _MM_CMPINT_LT)
+MARS_COMPARE_HARD(compare_at_least, >=, _CMP_GE_OQ, _MM_CMPINT_NLT)
+MARS_COMPARE_HARD(compare_equal, ==, _CMP_EQ_OQ, _MM_CMPINT_EQ)
+#undef MARS_COMPARE_HARD
+
+#define MARS_COMPARE(T, S)                                                                                          \
+    MARS_INLINE Mask operator<(T a, T b) { return {compare_less(a.low, b.low), compare_less(a.high, b.high)}; }      \
+    MARS_INLINE Mask operator>(T a, T b) { return b < a; }                                                          \
+    MARS_INLINE Mask operator>=(T a, T b) {                                                                         \
+        return {compare_at_least(a.low, b.low), compare_at_least(a.high, b.high)};                                  \
+    }                                                                                                               \
+    MARS_INLINE Mask operator==(T a, T b) { return {compare_equal(a.low, b.low), compare_equal(a.high, b.high)}; }   \
+    MARS_INLINE Mask operator<(T a, S b) { return a < splat(b); }                                                   \
+    MARS_INLINE Mask operator>(T a, S b) { return a > splat(b); }                                                   \
+    MARS_INLINE Mask operator>=(T a, S b) { return a >= splat(b); }                                                 \
+    MARS_INLINE Mask operator==(T a, S b) { return a == splat(b); }
+MARS_COMPARE(Float, float)
+MARS_COMPARE(Int, int32_t)
+MARS_COMPARE(UInt, uint32_t)
+#undef MARS_COMPARE
+MARS_INLINE Mask operator&(Mask a, Mask b) { return {(HardMask)(a.low & b.low), (HardMask)(a.high & b.high)}; }
+MARS_INLINE Mask operator|(Mask a, Mask b) { return {(HardMask)(a.low | b.low), (HardMask)(a.high | b.high)}; }
+
+MARS_INLINE Float to_float(Int x) {
+    return {__builtin_convertvector(x.low, HardFloat), __builtin_convertvector(x.high, HardFloat)};
+}
+MARS_INLINE Int truncate(Float x) {
+    return {__builtin_convertvector(x.low, HardInt), __builtin_convertvector(x.high, HardInt)};
+}
+MARS_INLINE Int as_int(UInt x) { return {(HardInt)x.low, (HardInt)x.high}; }
+MARS_INLINE UInt as_uint(Int x) { return {(HardUInt)x.low, (HardUInt)x.high}; }
+MARS_INLINE UInt bits(Float x) { return {(HardUInt)x.low, (HardUInt)x.high}; }
+MARS_INLINE Float from_bits(UInt x) { return {(HardFloat)x.low, (HardFloat)x.high}; }
+
+#if defined(MARS_LEVEL_avx512)
+MARS_INLINE bool any(Mask m) { return (m.low | m.high) != 0; }
+MARS_INLINE HardInt choose(HardMask m, HardInt yes, HardInt no) {
+    return (HardInt)_mm512_mask_blend_epi32(m, (__m512i)no, (__m512i)yes);
+}
+MARS_INLINE HardFloat choose(HardMask m, HardFloat yes, HardFloat no) {
+    return (HardFloat)_mm512_mask_blend_ps(m, (__m512)no, (__m512)yes);
+}
+#else
+MARS_INLINE bool any(Mask m) {
+    const HardInt both = m.low | m.high;
+#if defined(MARS_LEVEL_avx2)
+    return _mm256_movemask_ps((__m256)both) != 0;
+#elif defined(MARS_X86)
+    return _mm_movemask_ps((__m128)both) != 0;
+#else
+    return (both[0] | both[1] | both[2] | both[3]) != 0;
+#endif
+}
+MARS_INLINE HardInt choose(HardMask m, HardInt yes, HardInt no) { return m ? yes : no; }
+MARS_INLINE HardFloat choose(HardMask m, HardFloat yes, HardFloat no) { return m ? yes : no; }
+#endif
+MARS_INLINE Int select(Mask m, Int yes, Int no) {
+    return {choose(m.low, yes.low, no.low), choose(m.high, yes.high, no.high)};
+}
+MARS_INLINE Float select(Mask m, Float yes, Float no) {
+    return {choose(m.low, yes.low, no.low), choose(m.high, yes.high, no.high)};
+}
+
+#if defined(MARS_LEVEL_avx512)
+#define MARS_IF(name, intrinsic_i, intrinsic_f)                                                                   \
+    MARS_INLINE Int name(Int x, Mask m) {                                                                         \
+        const __m512i one = _mm512_set1_epi32(1), low = (__m512i)x.low, high = (__m512i)x.high;                   \
+        return {(HardInt)intrinsic_i(low, m.low, low, one), (HardInt)intrinsic_i(high, m.high, high, one)};       \
+    }                                                                                                             \
+    MARS_INLINE Float name(Float x, Mask m) {                                                                     \
+        const __m512 one = _mm512_set1_ps(1.0f), low = (__m512)x.low, high = (__m512)x.high;                      \
+        return {(HardFloat)intrinsic_f(low, m.low, low, one), (HardFloat)intrinsic_f(high, m.high, high, one)};   \
+    }
+MARS_IF(plus_if, _mm512_mask_add_epi32, _mm512_mask_add_ps)
+MARS_IF(minus_if, _mm512_mask_sub_epi32, _mm512_mask_sub_ps)
+#undef MARS_IF
+#else
+MARS_INLINE Int plus_if(Int x, Mask m) { return {x.low - m.low, x.high - m.high}; }
+MARS_INLINE Int minus_if(Int x, Mask m) { return {x.low + m.low, x.high + m.high}; }
+MARS_INLINE Float plus_if(Float x, Mask m) { return select(m, x + 1.0f, x); }
+MARS_INLINE Float minus_if(Float x, Mask m) { return select(m, x - 1.0f, x); }
+#endif
+
+// a < b ? a : b and a > b ? a : b, as the x86 instructions define them
+#if defined(MARS_LEVEL_avx512)
+MARS_INLINE HardFloat least(HardFloat a, HardFloat b) { return (HardFloat)_mm512_min_ps((__m512)a, (__m512)b); }
+MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return (HardFloat)_mm512_max_ps((__m512)a, (__m512)b); }
+#elif defined(MARS_LEVEL_avx2)
+MARS_INLINE HardFloat least(HardFloat a, HardFloat b) { return (HardFloat)_mm256_min_ps((__m256)a, (__m256)b); }
+MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return (HardFloat)_mm256_max_ps((__m256)a, (__m256)b); }
+#else
+MARS_INLINE HardFloat least(HardFloat a, HardFloat b) { return a < b ? a : b; }
+MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return a > b ? a : b; }
+#endif
+MARS_INLINE Float minimum(Float a, Float b) { return {least(a.low, b.low), least(a.high, b.high)}; }
+MARS_INLINE Float maximum(Float a, Float b) { return {most(a.low, b.low), most(a.high, b.high)}; }
+MARS_INLINE Int minimum(Int a, Int b) { return select(a < b, a, b); }
+
+// Lanes to and from memory.
+template <class Vector, class Scalar>
+MARS_INLINE Vector load(const Scalar* from) {
+    Vector x;
+    memcpy(&x, from, sizeof x);
+    return x;
+}
+template <class Vector, class Scalar>
+MARS_INLINE void store(Scalar* to, const Vector& x) {
+    memcpy(to, &x, sizeof x);
+}
+
+// Lanes into memory, to be read one by one. The empty statement keeps compilers from "improving" this into
+// extractions from the register, which cost more than loads; and loads of single lanes are served from 256-bit
+// stores at once, while they wait for 512-bit ones to reach the cache.
+template <class Vector, class Scalar>
+MARS_INLINE void spill(Scalar (&to)[kLanes], const Vector& x) {
+#if defined(MARS_LEVEL_avx512)
+    __m256i* place = (__m256i*)to;
+    _mm256_store_si256(place, _mm512_castsi512_si256((__m512i)x.low));
+    _mm256_store_si256(place + 1, _mm512_extracti64x4_epi64((__m512i)x.low, 1));
+    _mm256_store_si256(place + 2, _mm512_castsi512_si256((__m512i)x.high));
+    _mm256_store_si256(place + 3, _mm512_extracti64x4_epi64((__m512i)x.high, 1));
+#else
+    memcpy(to, &x, sizeof x);
+#endif
+    asm("" : "+m"(to));
+}
+
+template <class Vector, class Scalar>
+MARS_INLINE Vector gather_lanes(const Scalar* table, Int index) {
+    alignas(64) int32_t k[kLanes];
+    alignas(64) Scalar found[kLanes];
+    spill(k, index);
+    for (int lane = 0; lane < kLanes; ++lane) found[lane] = table[k[lane]];
+    return load<Vector>(found);
+}
+MARS_INLINE Float gather(const float* table, Int index) { return gather_lanes<Float>(table, index); }
+MARS_INLINE Int gather(const int32_t* table, Int index) { return gather_lanes<Int>(table, index); }
+
+// Entries (2 i, 2 i + 1) of a table of pairs: loads of 64 bits, put together by shuffles. A third of the time of
+// the gather instructions, which are slow where processors guard against data sampling.
+#if defined(MARS_X86)
+MARS_INLINE __m128d two_pairs(const float* table, const int32_t* index) {
+    const double* pairs = (const double*)table;
+    return _mm_loadh_pd(_mm_load_sd(pairs + index[0]), pairs + index[1]);
+}
+#if defined(MARS_LEVEL_avx512) || defined(MARS_LEVEL_avx2)
+MARS_INLINE __m256d four_pairs(const float* table, const int32_t* index) {
+    return _mm256_insertf128_pd(_mm256_castpd128_pd256(two_pairs(table, index)), two_pairs(table, index + 2), 1);
+}
+#endif
+#endif
+MARS_INLINE void gather_pair(const float* table, const int32_t* k, HardFloat& first, HardFloat& second) {
+#if defined(MARS_LEVEL_avx512)
+    const __m512d low = _mm512_insertf64x4(_mm512_castpd256_pd512(four_pairs(table, k)), four_pairs(table, k + 4), 1);
+    const __m512d high =
+        _mm512_insertf64x4(_mm512_castpd256_pd512(four_pairs(table, k + 8)), four_pairs(table, k + 12), 1);
+    const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    const __m512i odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+    first = (HardFloat)_mm512_permutex2var_epi32((__m512i)low, even, (__m512i)high);
+    second = (HardFloat)_mm512_permutex2var_epi32((__m512i)low, odd, (__m512i)high);
+#elif defined(MARS_LEVEL_avx2)
+    const __m256 low = (__m256)four_pairs(table, k), high = (__m256)four_pairs(table, k + 4);
+    // lanes 0 1 4 5 | 2 3 6 7 after the shuffles within halves: back into order
+    const __m256i order = _mm256_setr_epi32(0, 1, 4, 5, 2, 3, 6, 7);
+    first = (HardFloat)_mm256_permutevar8x32_ps(_mm256_shuffle_ps(low, high, 0x88), order);
+    second = (HardFloat)_mm256_permutevar8x32_ps(_mm256_shuffle_ps(low, high, 0xdd), order);
+#elif defined(MARS_X86)
+    const __m128 low = (__m128)two_pairs(table, k), high = (__m128)two_pairs(table, k + 2);
+    first = (HardFloat)_mm_shuffle_ps(low, high, 0x88);
+    second = (HardFloat)_mm_shuffle_ps(low, high, 0xdd);
+#else
+    for (int lane = 0; lane < kHardwareLanes; ++lane) {
+        first[lane] = table[2 * k[lane]];
+        second[lane] = table[2 * k[lane] + 1];
+    }
+#endif
+}
+MARS_INLINE void gather_pair(const float* table, Int index, Float& first, Float& second) {
+    alignas(64) int32_t k[kLanes];
+    spill(k, index);
+    gather_pair(table, k, first.low, second.low);
+    gather_pair(table, k + kHardwareLanes, first.high, second.high);
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

@@ -1,0 +1,59 @@
+// The native core `mars_lidar._core`: thin bindings, no checks beyond shapes; Python validates.
+#include "bindings.h"
+
+#include <nanobind/stl/optional.h>
+
+namespace mars {
+namespace {
+
+void bind_job(nb::module_& module) {
+    nb::class_<BoundJob>(module, "Job", "Flux and system of one call, in laser periods.")
+        .def(
+            "__init__",
+            [](BoundJob* self, Matrix<const double> signal, Matrix<const double> delay,
+               Vector<const double> background, std::optional<Matrix<const double>> waveform,
+               Vector<const uint32_t> pixel_index, int64_t realizations, uint32_t first_realization,
+               uint64_t seed, int32_t cycles, int32_t bins, double dead_time, bool stationary) {
+                const size_t pixels = background.shape(0);
+                if (signal.shape(1) != pixels || delay.shape(0) != signal.shape(0) || delay.shape(1) != pixels ||
+                    pixel_index.shape(0) != pixels || (waveform && waveform->shape(0) != pixels))
+                    throw nb::value_error("arrays of a job disagree on the number of pixels");
+                new (self) BoundJob();
+                self->pixels = static_cast<int64_t>(pixels);
+                self->returns = static_cast<int64_t>(signal.shape(0));
+                self->realizations = realizations;
+                self->first_realization = first_realization;
+                self->seed = seed;
+                self->cycles = cycles;
+                self->bins = bins;
+                self->dead_time = dead_time;
+                self->stationary = stationary;
+                self->signal = signal.data();
+                self->delay = delay.data();
+                self->background = background.data();
+                self->waveform = waveform ? waveform->data() : nullptr;
+                self->samples = waveform ? static_cast<int64_t>(waveform->shape(1)) : 0;
+                self->pixel_index = pixel_index.data();
+                self->arrays = nb::make_tuple(signal, delay, background, waveform, pixel_index);
+            },
+            nb::kw_only(), nb::arg("signal"), nb::arg("delay"), nb::arg("background"),
+            nb::arg("waveform").none(), nb::arg("pixel_index"), nb::arg("realizations"),
+            nb::arg("first_realization"), nb::arg("seed"), nb::arg("cycles"), nb::arg("bins"),
+            nb::arg("dead_time"), nb::arg("stationary"))
+        .def_prop_ro("items", [](const BoundJob& self) { return self.items(); });
+}
+
+}  // namespace
+}  // namespace mars
+
+NB_MODULE(_core, module) {
+    module.doc() = "Native core of mars_lidar.";
+    mars::bind_job(module);
+    mars::bind_pulse(module);
+    mars::bind_exact(module);
+    mars::bind_waveform(module);
+    mars::bind_sequential(module);
+    mars::bind_poisson(module);
+    mars::bind_chain(module);
+    mars::bind_exposure(module);
+}

@@ -1,0 +1,258 @@
+// Exact pulse shapes and the sampler's tables. IEEE arithmetic only (no libm), so that the tables, and with
+// them every cube, are the same to the last bit on every machine.
+#include "pulse_table.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "bindings.h"
+
+namespace mars {
+namespace {
+
+constexpr double kGaussianReach = 8.5;    // half support in sigma: 1e-17 of the energy lies outside
+constexpr int kForwardCellsPerSigma = 256;
+
+// e^x for x <= 0: x = k log 2 + r, Taylor series to r^13 for |r| <= log(2)/2 (error below 1e-16).
+double exponential_function(double x) {
+    if (x < -745.0) return 0.0;
+    constexpr double kLog2High = 0x1.62e42fefa39efp-1, kLog2Low = 0x1.abc9e3b39803fp-56;
+    const double k = std::floor(x / kLog2High + 0.5);
+    const double r = (x - k * kLog2High) - k * kLog2Low;
+    double sum = 1.0;
+    for (int n = 13; n >= 1; --n) sum = 1.0 + sum * r / n;
+    return std::ldexp(sum, static_cast<int>(k));
+}
+
+}  // namespace
+
+// Phi(x). |x| < 3: Phi(-a) = 1/2 - phi(a) sum a^(2n+1)/(2n+1)!!, Abramowitz and Stegun 26.2.11; beyond: the
+// continued fraction 26.2.14, evaluated backwards from a depth that suffices for 1e-15.
+double normal_cumulative(double x) {
+    const double a = x < 0 ? -x : x;
+    if (a > 40.0) return x < 0 ? 0.0 : 1.0;
+    const double density = 0.3989422804014326779 * exponential_function(-0.5 * a * a);
+    double tail;
+    if (a < 3.0) {
+        double term = a, sum = a;
+        for (int n = 1; term > 1e-18 * sum; ++n) {
+            term *= a * a / (2 * n + 1);
+            sum += term;
+        }
+        tail = 0.5 - density * sum;
+    } else {
+        double fraction = a;
+        for (int n = 10 + static_cast<int>(1000.0 / (a * a)); n >= 1; --n) fraction = a + n / fraction;
+        tail = density / fraction;
+    }
+    return x < 0 ? tail : 1.0 - tail;
+}
+
+double PulseShape::low() const { return gaussian() ? -kGaussianReach * sigma : start; }
+
+double PulseShape::high() const {
+    return gaussian() ? kGaussianReach * sigma : start + width * static_cast<double>(knots.size() - 1);
+}
+
+double PulseShape::cumulative(double t) const {
+    if (gaussian()) return normal_cumulative(t / sigma);
+    const double x = (t - start) / width;
+    const double last = static_cast<double>(knots.size() - 1);
+    if (!(x > 0.0)) return 0.0;
+    if (x >= last) return 1.0;
+    const size_t k = static_cast<size_t>(x);
+    return knots[k] + (knots[k + 1] - knots[k]) * (x - static_cast<double>(k));
+}
+
+double PulseShape::periodic(double t) const {
+    const double whole = std::floor(t - high());
+    const double rest = t - whole;  // in [high, high + 1): later pulses may have begun
+    const int pulses = static_cast<int>(std::ceil(high() - low())) + 1;
+    double total = whole;
+    for (int k = 0; k < pulses; ++k) total += cumulative(rest - k);
+    return total;
+}
+
+double PulseShape::equivalent_width() const {
+    if (gaussian()) return 3.5449077018110318 * sigma;  // 2 sqrt(pi) sigma
+    double square = 0.0;
+    for (size_t k = 0; k + 1 < knots.size(); ++k) square += (knots[k + 1] - knots[k]) * (knots[k + 1] - knots[k]);
+    return width / square;
+}
+
+namespace {
+
+int32_t octave_cell(float p) {
+    uint32_t word;
+    std::memcpy(&word, &p, sizeof word);
+    return static_cast<int32_t>(word >> kOctaveShift) - kOctaveBase;
+}
+
+// Lower edge of a cell of the octave table, the inverse of octave_cell.
+float octave_edge(int32_t cell) {
+    const uint32_t word = static_cast<uint32_t>(cell + kOctaveBase) << kOctaveShift;
+    float p;
+    std::memcpy(&p, &word, sizeof p);
+    return p;
+}
+
+// Frame and forward table from the energy at the edges of equal cells, `late` counted from the end.
+void build_forward(PulseTable& table, const std::vector<double>& early, const std::vector<double>& late, int split) {
+    const int cells = static_cast<int>(early.size()) - 1;
+    table.cells = cells;
+    table.split = static_cast<float>(early[split]);
+    table.forward.assign(2 * (cells + 2), 0.0f);  // one guard cell without energy at either end
+    for (int k = 0; k < cells; ++k) {
+        const double begin = k < split ? early[k] : late[k];
+        const double end = k < split ? early[k + 1] : late[k + 1];
+        table.forward[2 * (k + 1)] = static_cast<float>(begin);
+        table.forward[2 * (k + 1) + 1] = static_cast<float>(end - begin);
+    }
+}
+
+void build_gaussian(PulseTable& table) {
+    const PulseShape& shape = table.shape;
+    const double half = std::min(0.5, shape.high());
+    const int half_cells = std::max(256, static_cast<int>(std::ceil(half / shape.sigma * kForwardCellsPerSigma)));
+    const double width = half / half_cells;
+    // Energy of the frame [-1/2, 1/2) below v, for v <= 0: the pulse's own tail and its neighbours' overlaps.
+    const int reach = half < 0.5 ? 0 : static_cast<int>(std::ceil(shape.high())) + 1;
+    double outside = 0.0;
+    for (int k = -reach; reach > 0 && k <= reach; ++k) outside += normal_cumulative((-0.5 + k) / shape.sigma);
+    auto below = [&](double v) {
+        double sum = -outside;
+        for (int k = -reach; k <= reach; ++k) sum += normal_cumulative((v + k) / shape.sigma);
+        return sum;
+    };
+    std::vector<double> early(2 * half_cells + 1), late(2 * half_cells + 1);
+    for (int k = 0; k <= half_cells; ++k) {
+        const double energy = k == half_cells ? 0.5 : below((k - half_cells) * width);
+        early[k] = energy;
+        late[k] = energy - 1.0;
+        early[2 * half_cells - k] = 1.0 - energy;
+        late[2 * half_cells - k] = -energy;
+    }
+    table.centre = 0.0;
+    table.low = static_cast<float>(-half);
+    table.cells_per_period = static_cast<float>(1.0 / width);
+    table.median = 0.0f;
+    build_forward(table, early, late, half_cells);
+
+    auto density = [&](double v) {
+        double sum = 0.0;
+        for (int k = -reach; k <= reach; ++k) {
+            const double x = (v + k) / shape.sigma;
+            sum += exponential_function(-0.5 * x * x);
+        }
+        return 0.3989422804014326779 / shape.sigma * sum;
+    };
+
+    // Quantile of the early half on cells of equal relative width, linear inside a cell. Each edge is found by
+    // Newton's method between the one before and the median, kept inside the bracket by bisection.
+    auto quantile = [&](double p, double from) {
+        if (p >= 0.5) return 0.0;
+        double a = from, b = 0.0, v = from;
+        for (int step = 0; step < 60; ++step) {
+            const double error = below(v) - p;
+            if (std::fabs(error) <= 1e-14 * p) break;
+            (error < 0 ? a : b) = v;
+            const double newton = v - error / density(v);
+            v = newton > a && newton < b ? newton : 0.5 * (a + b);
+        }
+        return v;
+    };
+    const int32_t last = octave_cell(0.5f);
+    table.inverse.assign(2 * (last + 2), 0.0f);  // p = 1/2 and what rounds to a little more: the centre
+    double edge = octave_edge(0), position = quantile(edge, std::max(-0.5, -kGaussianReach * shape.sigma));
+    for (int32_t cell = 0; cell < last; ++cell) {
+        const double next_edge = octave_edge(cell + 1), next_position = quantile(next_edge, position);
+        const double slope = (next_position - position) / (next_edge - edge);
+        table.inverse[2 * cell] = static_cast<float>(position - slope * edge);
+        table.inverse[2 * cell + 1] = static_cast<float>(slope);
+        edge = next_edge;
+        position = next_position;
+    }
+}
+
+void build_sampled(PulseTable& table) {
+    const PulseShape& shape = table.shape;
+    const std::vector<double>& knots = shape.knots;
+    const int cells = static_cast<int>(knots.size()) - 1;
+    int split = 0;  // the sample edge nearest the median
+    for (int k = 0; k <= cells; ++k)
+        if (std::fabs(knots[k] - 0.5) < std::fabs(knots[split] - 0.5)) split = k;
+    const double half = 0.5 * shape.width * cells;
+    table.centre = shape.start + half;
+    table.low = static_cast<float>(-half);
+    table.cells_per_period = static_cast<float>(1.0 / shape.width);
+    table.median = static_cast<float>(split * shape.width - half);
+    std::vector<double> late(knots.size());
+    for (size_t k = 0; k < knots.size(); ++k) late[k] = knots[k] - 1.0;
+    build_forward(table, knots, late, split);
+
+    // Samples that carry energy, in order of time; `upper` is the energy at the end of each, early samples
+    // counted from the start, late ones from the end.
+    int32_t early_samples = 0;
+    for (int k = 0; k < cells; ++k) {
+        const float begin = static_cast<float>(k < split ? knots[k] : late[k]);
+        const float end = static_cast<float>(k < split ? knots[k + 1] : late[k + 1]);
+        if (!(end > begin)) continue;
+        table.upper.push_back(end);
+        table.end.push_back(static_cast<float>((k + 1) * shape.width - half));
+        table.periods_per_energy.push_back(static_cast<float>(shape.width / (knots[k + 1] - knots[k])));
+        if (k < split) early_samples = static_cast<int32_t>(table.upper.size());
+    }
+    table.last_early = std::max(early_samples - 1, 0);
+    table.last_late = static_cast<int32_t>(table.upper.size()) - 1;
+    // Guide: the first sample whose end lies above the smallest p of a cell of |p|.
+    const int32_t guides = octave_cell(1.0f) + 2;  // |p| up to 1 and what rounds to a little more
+    table.guide.resize(2 * guides);
+    table.guides = guides;
+    for (int32_t cell = 0; cell < guides; ++cell) {
+        const float least_early = cell == 0 ? 0.0f : octave_edge(cell), least_late = -octave_edge(cell + 1);
+        int32_t k = 0;
+        while (k < table.last_early && !(table.upper[k] > least_early)) ++k;
+        table.guide[cell] = k;
+        k = std::min(early_samples, table.last_late);
+        while (k < table.last_late && !(table.upper[k] > least_late)) ++k;
+        table.guide[guides + cell] = k;
+    }
+}
+
+}  // namespace
+
+PulseTable PulseTable::gaussian(double sigma) {
+    PulseTable table;
+    table.shape.sigma = sigma;
+    build_gaussian(table);
+    return table;
+}
+
+PulseTable PulseTable::sampled(std::vector<double> knots, double width, double start) {
+    PulseTable table;
+    table.shape.knots = std::move(knots);
+    table.shape.width = width;
+    table.shape.start = start;
+    build_sampled(table);
+    return table;
+}
+
+const PulseShape& shape_of(const PulseTable& table) { return table.shape; }
+
+void bind_pulse(nb::module_& module) {
+    nb::class_<PulseTable>(module, "PulseTable", "Pulse shape and sampling tables; times in laser periods.")
+        .def_static("gaussian", &PulseTable::gaussian, nb::arg("sigma"))
+        .def_static(
+            "sampled",
+            [](Vector<const double> knots, double width, double start) {
+                return PulseTable::sampled({knots.data(), knots.data() + knots.shape(0)}, width, start);
+            },
+            nb::arg("knots"), nb::arg("width"), nb::arg("start"))
+        .def("periodic", [](const PulseTable& self, double t) { return self.shape.periodic(t); },
+             "Energy of the pulse train up to t.")
+        .def("cumulative", [](const PulseTable& self, double t) { return self.shape.cumulative(t); },
+             "Energy of one pulse up to t.");
+}
+
+}  // namespace mars

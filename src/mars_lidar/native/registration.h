@@ -1,0 +1,222 @@
+// The physics of one registration: from re-arming to the next registered photon.
+//
+// Only registered photons are drawn. With C(t) the integrated flux, the next registration after re-arming at u
+// is C^-1(C(u) + E), E ~ Exp(1). The flux is a superposition, so each part (the background, each return) has an
+// exponential of its own and the earliest arrival wins; by memorylessness all are redrawn each time. Cost:
+// O(registrations), however bright the scene.
+//
+// Time is counted in frames: a frame is one period around a return of the first echo, [-1/2, 1/2) periods before
+// and after it. One pixel per lane (lanes.h); this header also compiles for CUDA with one lane.
+#pragma once
+#include "random.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+// Streams of draws of one pixel: the second counter word; the first is the number of the registration.
+constexpr uint32_t kStageArrival = 0;     // background and first return
+constexpr uint32_t kStageArrivalFine = 1;  // fresh fractions for long waits of those two
+constexpr uint32_t kStageStart = 2;       // state at the start of a stationary exposure
+constexpr uint32_t kStageReturns = 16;    // + 2 k: returns 2 k + 1 and 2 k + 2; + 2 k + 1: their fractions
+
+constexpr float kLongWait = 128.0f;        // periods; a float32 wait is coarser than 2^-16 period beyond
+constexpr float kForever = 134217728.0f;   // 2^27 periods: beyond every exposure
+
+// Tables of the pulse, see pulse_table.h.
+struct PulseView {
+    const float* forward;
+    const float* inverse;
+    const int32_t* guide;
+    const float* upper;
+    const float* end;
+    const float* periods_per_energy;
+    float low, cells_per_period, last_cell, median, split;
+    int32_t guides, last_early, last_late, octave_shift, octave_base;
+};
+
+struct SystemView {
+    PulseView pulse;
+    int32_t cycles, bins, returns;
+    int32_t dead_whole;   // dead time: whole periods ...
+    float dead_fraction;  // ... and the rest
+};
+
+// Flux of one component at the lane's pixel. A component without photons has rate = inverse = 0 and never = 2^27.
+struct Rate {
+    Float rate, inverse, never;
+};
+
+struct Return {
+    Rate flux;
+    Float offset;  // of this return from the first one, in [-1/2, 1/2) periods
+};
+
+struct Time {
+    Int frame;
+    Float phase;  // in [-1/2, 1/2)
+};
+
+struct Wait {
+    Int whole;
+    Float fraction;  // in [0, 1)
+};
+
+// Position in the frame of the energy p, signed as in pulse_table.h.
+template <bool gaussian>
+MARS_INLINE Float quantile(const PulseView& pulse, Float p) {
+    const UInt sign = bits(p) & 0x80000000u;  // late
+    const Float size = maximum(from_bits(bits(p) ^ sign), splat(0x1p-34f));
+    const Int cell = as_int(bits(size) >> pulse.octave_shift) - pulse.octave_base;
+    if constexpr (gaussian) {  // the early half, mirrored
+        Float intercept, slope;
+        gather_pair(pulse.inverse, cell, intercept, slope);
+        return from_bits(bits(intercept + slope * size) ^ sign);
+    } else {
+        const Mask late = p < 0.0f;
+        Int k = gather(pulse.guide, cell + select(late, splat(pulse.guides), splat(0)));
+        const Int last = select(late, splat(pulse.last_late), splat(pulse.last_early));
+        Float upper = gather(pulse.upper, k);
+        Mask step = (p >= upper) & (k < last);
+        while (any(step)) {
+            k = plus_if(k, step);
+            upper = gather(pulse.upper, k);
+            step = (p >= upper) & (k < last);
+        }
+        return gather(pulse.end, k) + minimum(p - upper, splat(0.0f)) * gather(pulse.periods_per_energy, k);
+    }
+}
+
+// A long wait in float32 has a coarse fraction: replace it by a fresh one. Exact, since whole periods and
+// fraction of an exponential wait are independent; the fraction has the density ~ e^(-rate r) on [0, 1).
+MARS_INLINE void refresh(Wait& wait, Mask lanes, UInt word, Float rate) {
+    const Float v = uniform(word);
+    const Float bend = 0.5f * rate * v * (1.0f - v) * (1.0f - rate * (1.0f - 2.0f * v) * 0.33333334f);
+    wait.fraction = select(lanes, v - bend, wait.fraction);
+}
+
+// Waits of two components, in periods (background) or pulse energies (returns).
+MARS_INLINE void draw_waits(UInt key0, UInt key1, UInt event, uint32_t stage, const Rate& a, const Rate& b,
+                            Wait& wait_a, Wait& wait_b) {
+    const Pair<UInt> words = threefry<13>(event, splat(stage), key0, key1);
+    const Float wa = minimum(exponential(words.first) * a.inverse + a.never, splat(kForever));
+    const Float wb = minimum(exponential(words.second) * b.inverse + b.never, splat(kForever));
+    wait_a.whole = truncate(wa);
+    wait_b.whole = truncate(wb);
+    wait_a.fraction = wa - to_float(wait_a.whole);
+    wait_b.fraction = wb - to_float(wait_b.whole);
+    const Mask long_a = wa >= kLongWait, long_b = wb >= kLongWait;
+    if (any(long_a | long_b)) {
+        const Pair<UInt> fine = threefry<13>(event, splat(stage + 1), key0, key1);
+        refresh(wait_a, long_a, fine.first, a.rate);
+        refresh(wait_b, long_b, fine.second, b.rate);
+    }
+}
+
+// Next arrival of a return after `from`, both in frames of that return, its wait given in pulse energies. With
+// `whole` (a dead time of whole periods) `energy` holds the signed energy of the lanes in `known` at `from` on
+// entry: a registration of this return that re-arms at the same phase takes no detour over the tables. On return
+// it holds the arrival's.
+template <bool gaussian, bool whole>
+MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask known, Float& energy) {
+    const Float x = minimum(maximum((from.phase - pulse.low) * pulse.cells_per_period + 1.0f, splat(0.0f)),
+                            splat(pulse.last_cell));
+    const Int cell = truncate(x);
+    Float here, slope;
+    gather_pair(pulse.forward, cell, here, slope);
+    here = here + slope * (x - to_float(cell));
+    Mask late = from.phase >= pulse.median;
+    if constexpr (whole) {
+        here = select(known, energy, here);
+        late = select(known, energy, select(late, splat(-1.0f), splat(0.0f))) < 0.0f;
+    }
+    const Float sum = here + wait.fraction;
+    const Mask over = sum >= pulse.split;
+    const Float p = minus_if(sum, over);
+    energy = p;
+    // from the late half of a frame to an early half: one frame further
+    const Int frames = minus_if(plus_if(plus_if(wait.whole, over), late), p < 0.0f);
+    const Float arrival = quantile<gaussian>(pulse, p);
+    // the tables' rounding must not turn time back
+    return {from.frame + frames, select(frames == 0, maximum(arrival, from.phase), arrival)};
+}
+
+MARS_INLINE Mask before(Time a, Time b) { return (a.frame < b.frame) | ((a.frame == b.frame) & (a.phase < b.phase)); }
+
+MARS_INLINE Time earlier(Mask first, Time a, Time b) {
+    return {select(first, a.frame, b.frame), select(first, a.phase, b.phase)};
+}
+
+// `time` later by a number of frames and less than one frame.
+MARS_INLINE Time later(Time time, Int frames, Float fraction) {
+    const Float phase = time.phase + fraction;
+    const Mask carry = phase >= 0.5f;
+    return {plus_if(time.frame + frames, carry), minus_if(phase, carry)};
+}
+
+// The same instant in the frames of a return `offset` later.
+MARS_INLINE Time shifted(Time time, Float offset) {
+    const Float phase = time.phase - offset;
+    const Int wrap = minus_if(one_if(phase >= 0.5f), phase < -0.5f);
+    return {time.frame + wrap, phase - to_float(wrap)};
+}
+
+// What the last registration was, for dead times of whole periods: the pixel then re-arms at the same phase of
+// the pulse, whose energy is known without rounding.
+struct Memory {
+    Mask known;    // the last registration came from return `source`
+    Int source;
+    Float energy;  // its signed energy
+};
+
+// Waits for the background and the first return, drawn ahead: they depend on the number of the registration only.
+struct Draw {
+    Wait background, signal;
+};
+
+MARS_INLINE Draw draw(const Rate& background, const Rate& signal, UInt key0, UInt key1, UInt event) {
+    Draw next;
+    draw_waits(key0, key1, event, kStageArrival, background, signal, next.background, next.signal);
+    return next;
+}
+
+// The next registration of a pixel that re-armed at `from`.
+template <bool gaussian, bool whole>
+MARS_INLINE Time next_registration(const SystemView& system, const Return* returns, Time from, const Draw& drawn,
+                                   UInt key0, UInt key1, UInt event, Memory& memory) {
+    Time first = later(from, drawn.background.whole, drawn.background.fraction);
+    Float energy = memory.energy;
+    const Time echo =
+        next_return<gaussian, whole>(system.pulse, from, drawn.signal, memory.known & (memory.source == 0), energy);
+    const Mask wins = before(echo, first);
+    first = earlier(wins, echo, first);
+    Memory next = {wins, splat(0), energy};
+
+    for (int32_t k = 1; k < system.returns; k += 2) {
+        const int32_t partner = k + 1 < system.returns ? k + 1 : k;
+        Wait waits[2];
+        draw_waits(key0, key1, event, kStageReturns + static_cast<uint32_t>(k - 1), returns[k].flux,
+                   returns[partner].flux, waits[0], waits[1]);
+        for (int32_t i = k; i <= partner; ++i) {
+            energy = memory.energy;
+            const Time other = shifted(next_return<gaussian, whole>(system.pulse, shifted(from, returns[i].offset),
+                                                                    waits[i - k],
+                                                                    memory.known & (memory.source == i), energy),
+                                       negative(returns[i].offset));
+            const Mask sooner = before(other, first);
+            first = earlier(sooner, other, first);
+            next.known = next.known | sooner;
+            next.source = select(sooner, splat(i), next.source);
+            next.energy = select(sooner, energy, next.energy);
+        }
+    }
+    if constexpr (whole) memory = next;
+    return first;
+}
+
+// End of the dead time after a registration.
+MARS_INLINE Time rearm(const SystemView& system, Time registration) {
+    return later(registration, splat(system.dead_whole), splat(system.dead_fraction));
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

@@ -1,0 +1,201 @@
+// The exact engine for arbitrary waveforms: a rate that is constant in each of T equal parts of the period.
+//
+// As in registration.h, the next registration after re-arming at u is C^-1(C(u) + E). C is piecewise linear here,
+// kept in double precision per pixel, and inverted by a guide table. Scalar IEEE arithmetic, compiled once: the
+// same bits on every machine.
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <vector>
+
+#include "bindings.h"
+#include "parallel.h"
+#include "random.h"
+#include "registration.h"
+#include "stationary.h"
+
+namespace mars {
+namespace {
+
+class Waveform {
+public:
+    Waveform(const Job& job, int64_t pixel) : samples_(job.samples), below_(job.samples + 1), guide_(job.samples + 1) {
+        const double* photons = job.waveform + pixel * samples_;
+        const double background = job.background[pixel] / static_cast<double>(samples_);
+        for (int64_t j = 0; j < samples_; ++j) below_[j + 1] = below_[j] + (photons[j] + background);
+        int64_t j = 0;
+        for (int64_t g = 0; g <= samples_; ++g) {
+            const double energy = total() * static_cast<double>(g) / static_cast<double>(samples_);
+            while (j + 1 < samples_ && below_[j + 1] <= energy) ++j;
+            guide_[g] = j;
+        }
+    }
+
+    double total() const { return below_[samples_]; }
+
+    // Photons before a phase in [0, 1).
+    double energy(double phase) const {
+        const double x = phase * static_cast<double>(samples_);
+        const int64_t j = std::min(static_cast<int64_t>(x), samples_ - 1);
+        return below_[j] + (below_[j + 1] - below_[j]) * (x - static_cast<double>(j));
+    }
+
+    // Phase in [0, 1) before which there are `energy` photons, 0 <= energy < total.
+    double phase(double energy) const {
+        const double scaled = energy / total() * static_cast<double>(samples_);
+        int64_t j = guide_[std::min(static_cast<int64_t>(scaled), samples_)];
+        while (j > 0 && below_[j] > energy) --j;  // the guide's own rounding
+        while (j + 1 < samples_ && below_[j + 1] <= energy) ++j;
+        const double step = below_[j + 1] - below_[j];
+        const double inside = step > 0.0 ? std::min((energy - below_[j]) / step, 1.0) : 0.0;
+        const double x = (static_cast<double>(j) + inside) / static_cast<double>(samples_);
+        return x < 1.0 ? x : std::nextafter(1.0, 0.0);
+    }
+
+    std::vector<double> photons() const {
+        // at least 1024 parts, a whole number of them in each sample
+        const int64_t split = std::max<int64_t>(1, 1024 / samples_);
+        std::vector<double> parts;
+        parts.reserve(samples_ * split);
+        for (int64_t j = 0; j < samples_; ++j)
+            parts.insert(parts.end(), split, (below_[j + 1] - below_[j]) / static_cast<double>(split));
+        return parts;
+    }
+
+private:
+    int64_t samples_;
+    std::vector<double> below_;
+    std::vector<int64_t> guide_;
+};
+
+// Walks through the registrations of one item; write(cycle, phase) for those inside the exposure.
+template <class Write>
+void walk(const Job& job, const Waveform& wave, const StationaryState* state, uint32_t realization, uint32_t pixel,
+          const std::atomic<bool>& stop, Write write) {
+    const double total = wave.total();
+    if (!(total >= 1e-30)) return;
+    const Pair<uint32_t> key = stream_key(job.seed, realization, pixel);
+    auto draw = [&](uint32_t event, uint32_t stage) {
+        return threefry<13, uint32_t>(event, stage, key.first, key.second);
+    };
+    const int64_t dead_whole = static_cast<int64_t>(job.dead_time);
+    const double dead_fraction = job.dead_time - static_cast<double>(dead_whole);
+    int64_t cycle = 0;
+    double phase = 0.0;
+    if (state) {
+        const Pair<uint32_t> words = draw(0, kStageStart);
+        const double residual = state->residual((words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32);
+        cycle = static_cast<int64_t>(residual) - dead_whole - 2;
+        phase = residual - std::floor(residual);
+    }
+    for (uint32_t event = 0;; ++event) {
+        if ((event & 0xffff) == 0xffff && stop.load(std::memory_order_relaxed)) return;
+        const Pair<uint32_t> words = draw(event, kStageArrival);
+        // both words: an exponential number from the first, a fresh fraction for long waits from the second
+        const double wait = static_cast<double>(exponential(words.first)) / total;
+        const double whole = std::floor(std::min(wait, static_cast<double>(kForever)));
+        double fraction = wait - whole;
+        if (whole >= kLongWait) {
+            const double v = (words.second + 0.5) * 0x1p-32;
+            fraction = v - 0.5 * total * v * (1.0 - v) * (1.0 - total * (1.0 - 2.0 * v) / 3.0);
+        }
+        cycle += static_cast<int64_t>(whole);
+        double energy = wave.energy(phase) + fraction * total;
+        const bool carry = energy >= total;
+        if (carry) energy -= total;
+        const double arrival = wave.phase(std::max(0.0, std::min(energy, total)));
+        phase = carry ? arrival : std::max(arrival, phase);  // rounding must not turn time back
+        cycle += carry ? 1 : 0;
+        if (cycle >= job.cycles) return;
+        if (cycle >= 0) write(static_cast<int32_t>(cycle), phase);
+        phase += dead_fraction;
+        cycle += dead_whole;
+        if (phase >= 1.0) {
+            phase -= 1.0;
+            ++cycle;
+        }
+    }
+}
+
+// Runs over the pixels of a job; make(item) gives the writer of an item.
+template <class Make>
+void run_waveform(const BoundJob& job, int threads, const nb::object& progress, const Make& make) {
+    const int64_t pixels = std::max<int64_t>(1, std::min<int64_t>(64, job.pixels / (4 * std::max(threads, 1))));
+    const int64_t across = (job.pixels + pixels - 1) / pixels;
+    const int64_t realizations = std::max<int64_t>(1, 256 / pixels);
+    const int64_t along = (job.realizations + realizations - 1) / realizations;
+    run_chunks(across * along, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+        const int64_t first = (chunk % across) * pixels, last = std::min(job.pixels, first + pixels);
+        const int64_t begin = (chunk / across) * realizations, end = std::min(job.realizations, begin + realizations);
+        for (int64_t pixel = first; pixel < last; ++pixel) {
+            const Waveform wave(job, pixel);
+            std::vector<StationaryState> state;
+            if (job.stationary && job.dead_time > 0.0) {
+                state.emplace_back(wave.photons(), job.dead_time);
+                state.front().check(job.pixel_index[pixel]);
+            }
+            for (int64_t r = begin; r < end; ++r) {
+                if (stop.load(std::memory_order_relaxed)) return;
+                walk(job, wave, state.empty() ? nullptr : state.data(), job.first_realization + static_cast<uint32_t>(r),
+                     job.pixel_index[pixel], stop, make(r * job.pixels + pixel));
+            }
+        }
+    });
+}
+
+int32_t bin_of(const Job& job, double phase) {
+    return std::min(static_cast<int32_t>(phase * job.bins), job.bins - 1);
+}
+
+template <class Count>
+void histogram(const BoundJob& job, Matrix<Count> out, int threads, const nb::object& progress) {
+    if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
+        throw nb::value_error("out must be (items, bins)");
+    Count* const data = out.data();
+    run_waveform(job, threads, progress, [&job, data](int64_t item) {
+        Count* const row = data + item * job.bins;
+        std::fill(row, row + job.bins, Count{0});
+        return [&job, row](int32_t, double phase) { ++row[bin_of(job, phase)]; };
+    });
+}
+
+}  // namespace
+
+void bind_waveform(nb::module_& module) {
+    module.def("waveform_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("out").noconvert(),
+               nb::arg("threads"), nb::arg("progress").none() = nb::none());
+    module.def("waveform_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("out").noconvert(),
+               nb::arg("threads"), nb::arg("progress").none() = nb::none());
+    module.def(
+        "waveform_counts",
+        [](const BoundJob& job, Vector<int64_t> out, int threads, const nb::object& progress) {
+            if (static_cast<int64_t>(out.shape(0)) != job.items()) throw nb::value_error("out must be (items,)");
+            int64_t* const counts = out.data();
+            run_waveform(job, threads, progress, [counts](int64_t item) {
+                counts[item] = 0;
+                return [count = counts + item](int32_t, double) { ++*count; };
+            });
+        },
+        nb::arg("job"), nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("progress").none() = nb::none());
+    module.def(
+        "waveform_timestamps",
+        [](const BoundJob& job, Vector<const int64_t> offsets, Vector<double> times, Vector<int32_t> cycle,
+           Vector<int32_t> bin, int threads, const nb::object& progress) {
+            if (static_cast<int64_t>(offsets.shape(0)) != job.items() + 1)
+                throw nb::value_error("offsets must be (items + 1,)");
+            const int64_t* const first = offsets.data();
+            double* const t = times.data();
+            int32_t *const c = cycle.data(), *const b = bin.data();
+            run_waveform(job, threads, progress, [&job, first, t, c, b](int64_t item) {
+                return [&job, t, c, b, k = first[item]](int32_t at, double phase) mutable {
+                    t[k] = static_cast<double>(at) + phase;
+                    c[k] = at;
+                    b[k++] = bin_of(job, phase);
+                };
+            });
+        },
+        nb::arg("job"), nb::arg("offsets"), nb::arg("times").noconvert(), nb::arg("cycle").noconvert(),
+        nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("progress").none() = nb::none());
+}
+
+}  // namespace mars

@@ -1,0 +1,98 @@
+"""What the pictures show: maps and rates computed from a cube, without matplotlib."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar.io import Cube
+
+_READ_BYTES = 64 * 2**20
+
+
+def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Total counts (H, W), and the depth (H, W) in m at the largest bin: NaN where nothing was counted.
+
+    The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
+    off; modulo the unambiguous range. The first of several equal bins is taken.
+    """
+    _, height, width, bins = cube.shape
+    totals = np.empty((height, width), np.int64)
+    peaks = np.empty((height, width), np.int64)
+    band = max(1, _READ_BYTES // (width * bins * np.dtype(cube.histogram.dtype).itemsize))
+    for row in range(0, height, band):
+        rows = slice(row, min(row + band, height))
+        counts = np.asarray(cube.histogram[realization, rows])
+        totals[rows] = counts.sum(-1, dtype=np.int64)
+        peaks[rows] = counts.argmax(-1)
+    system = cube.system
+    delay = (system.time_ns[peaks] - _peak_offset_ns(system)) % system.period_ns
+    return totals, np.where(totals > 0, system.depth_m(delay), np.nan)
+
+
+def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[int, int]]:
+    """A bright, a dim and an edge pixel: ``{"bright": (y, x), ...}``, as many as there are.
+
+    Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
+    the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
+    """
+    inside = np.zeros(flux.shape, bool)
+    rim = [n // 16 for n in flux.shape]
+    inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
+    lit = np.flatnonzero((flux.signal > 0) & inside)
+    if lit.size == 0:
+        return {"first": (0, 0)}
+    order = lit[np.argsort(flux.signal.ravel()[lit], kind="stable")]
+    flat = {"bright": order[int(0.98 * (order.size - 1))]}
+    dim = order[int(0.05 * (order.size - 1))]
+    if flux.signal.flat[dim] < flux.signal.flat[flat["bright"]]:
+        flat["dim"] = dim
+    if min(flux.shape) > 1:
+        slope = np.hypot(*np.gradient(depth_m))
+        slope[~np.isfinite(slope) | (flux.signal <= 0) | ~inside] = -1.0
+        if slope.max() > 0:
+            flat["edge"] = np.argmax(slope)
+    named: dict[str, tuple[int, int]] = {}
+    for name, k in flat.items():
+        pixel = (int(k) // flux.shape[1], int(k) % flux.shape[1])
+        if pixel not in named.values():
+            named[name] = pixel
+    return named
+
+
+def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
+    """Photons per period in each bin (bins,) that reach pixel (y, x), before dead time."""
+    background = np.full(system.bins, flux.background[y, x] / system.bins)
+    if flux.waveform is not None:
+        wave = flux.waveform[y, x]
+        cumulative = np.concatenate([[0.0], np.cumsum(wave)])
+        edges = np.linspace(0.0, wave.size, system.bins + 1)
+        background += np.diff(np.interp(edges, np.arange(wave.size + 1), cumulative))
+        return background
+    rate = background
+    for s, tau in zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True):
+        if s > 0:
+            rate = rate + s * system.pulse.bin_energy(tau, system.period_ns, system.bins)
+    return rate
+
+
+def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing."""
+    span = cube.system.unambiguous_range_m
+    wrapped = (estimate_m - cube.depth_m + 0.5 * span) % span - 0.5 * span
+    return np.asarray(wrapped, dtype=np.float64)
+
+
+def _peak_offset_ns(system: System) -> float:
+    """Time from the origin of a delay to the largest value of the pulse, at the width of a bin or finer."""
+    low, high = system.pulse.support_ns()
+    fine = max(64, min(2**16, int(np.ceil(4 * (high - low) / system.bin_ns))))
+    edges = np.linspace(low, high, fine + 1)
+    peak = int(np.argmax(np.diff(system.pulse.cumulative(edges))))
+    return float(0.5 * (edges[peak] + edges[peak + 1]))

@@ -1,0 +1,220 @@
+"""The figures: an overview of a cube, one pixel, one map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.plot.data import count_maps, depth_error_m, example_pixels, incident_rate
+from mars_lidar.plot.pixel import draw_pixel, quiet_corner
+from mars_lidar.plot.style import COLOURS, DPI, MISSING, style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from mars_lidar.io import Cube
+
+_Pixels = dict[str, tuple[int, int]]
+_GAP_INCHES = 0.3
+
+
+def overview(
+    cube: Cube,
+    *,
+    realization: int = 0,
+    pixels: Sequence[tuple[int, int]] | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
+
+    Parameters
+    ----------
+    cube
+        A cube in memory or on disk; only one realization is read, in bands of rows.
+    realization
+        Which one, counted from the start of the cube.
+    pixels
+        (y, x) of the pixels whose histograms are drawn, 1 to 6; default `example_pixels`.
+    title
+        Headline; by default a line on the system.
+
+    Raises
+    ------
+    ValueError
+        `realization` or a pixel outside of the cube.
+    """
+    chosen = _checked(cube, realization, pixels)
+    totals, peaks_m = count_maps(cube, realization)
+    with style():
+        from matplotlib.figure import Figure
+
+        width, height = 13.0, max(6.0, 1.75 * len(chosen) + 0.75)
+        figure = Figure(figsize=(width, height), dpi=DPI)
+        below, above = 0.46 / height, 1.0 - 0.62 / height
+        left, right = 0.012, 0.446
+        # two rows of images right below each other, whatever their aspect
+        image = (right - left) * width / 2.3 * cube.shape[1] / cube.shape[2]
+        bottom = max(0.02, above - (2.0 * image + _GAP_INCHES) / height)
+        box = {"left": left, "right": right, "bottom": bottom, "top": above}
+        maps = figure.add_gridspec(2, 2, **box, wspace=0.3, hspace=_hspace(height * (above - bottom)))
+        _draw_maps(maps.subplots(), cube, totals, peaks_m, chosen)
+        _draw_pixels(figure, (0.535, 0.99, below, above), cube, realization, chosen)
+        headline = _headline(cube, realization) if title is None else title
+        figure.text(0.012, 1.0 - 0.2 / height, headline, fontsize=9.0, va="center")
+    return figure
+
+
+def pixel_histogram(cube: Cube, y: int, x: int, *, realization: int = 0) -> Figure:
+    """Histogram of one pixel over the period and around its return, beside the incident rate's shape."""
+    chosen = _checked(cube, realization, [(y, x)])
+    with style():
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(7.0, 2.5), dpi=DPI)
+        _draw_pixels(figure, (0.085, 0.985, 0.17, 0.9), cube, realization, chosen)
+    return figure
+
+
+def map_image(values: NDArray[Any], label: str, *, cmap: str = "viridis") -> Figure:
+    """A map (H, W) with a colour bar; `label` names the quantity and its unit, NaN is grey."""
+    values = np.asarray(values)
+    if values.ndim != 2:
+        raise ValueError(f"values must be a map (H, W), got shape {values.shape}")
+    with style():
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(4.4, 3.6), dpi=DPI)
+        ax = figure.add_axes((0.02, 0.04, 0.78, 0.92))
+        _draw_map(ax, values, label, cmap, _limits(values))
+    return figure
+
+
+def _hspace(inches: float) -> float:
+    """The gap between two rows of images of `inches` in all, in heights of a row."""
+    return _GAP_INCHES / max(0.5 * (inches - _GAP_INCHES), 0.1)
+
+
+def _draw_maps(
+    axes: Any, cube: Cube, totals: NDArray[np.int64], peaks_m: NDArray[np.float64], pixels: _Pixels
+) -> None:
+    depth = cube.depth_m
+    known = bool(np.isfinite(depth).any())
+    limits = _limits(depth if known else peaks_m)
+    if known:
+        _draw_map(axes[0, 0], depth, "depth (m)", "viridis", limits, "Depth")
+    else:  # a waveform has no depth: its background stands here
+        _draw_map(axes[0, 0], cube.flux.background, "photons per period", "viridis", None, "Background")
+    if cube.reflectivity is not None:
+        _draw_map(axes[0, 1], cube.reflectivity, "reflectivity", "gray", None, "Reflectivity")
+    else:
+        _draw_map(axes[0, 1], cube.flux.signal, "photons per period", "gray", None, "Signal")
+    _draw_map(axes[1, 0], totals, "registrations", "magma", _limits(totals), "Total counts")
+    note = "Peak-bin depth"
+    error = np.abs(depth_error_m(cube, peaks_m))
+    if np.isfinite(error).any():
+        note += f" (median error {_metres(float(np.nanmedian(error)))})"
+    _draw_map(axes[1, 1], peaks_m, "depth (m)", "viridis", limits, note)
+    for ax in axes.flat:
+        for (y, x), colour in zip(pixels.values(), COLOURS, strict=False):
+            ax.plot(x, y, "o", ms=6, mfc="none", mec="white", mew=2.2)
+            ax.plot(x, y, "o", ms=6, mfc="none", mec=colour, mew=1.1)
+
+
+def _draw_map(
+    ax: Axes,
+    values: NDArray[Any],
+    label: str,
+    cmap: str,
+    limits: tuple[float, float] | None,
+    title: str = "",
+) -> None:
+    import matplotlib as mpl
+
+    low, high = limits or (None, None)
+    colours = mpl.colormaps[cmap].with_extremes(bad=MISSING)
+    image = ax.imshow(values, cmap=colours, vmin=low, vmax=high, aspect="equal")
+    finite = values[np.isfinite(values)]
+    above = bool(limits and finite.size and finite.max() > limits[1] * (1 + 1e-9))
+    below = bool(limits and finite.size and finite.min() < limits[0] * (1 - 1e-9))
+    extend = "both" if above and below else "max" if above else "min" if below else "neither"
+    strip = ax.inset_axes((1.025, 0.0, 0.035, 1.0))  # as high as the image, whatever its aspect
+    bar = ax.figure.colorbar(image, cax=strip, extend=extend, extendfrac=0.025)
+    bar.set_label(label, labelpad=2.0)
+    bar.outline.set_linewidth(0.5)
+    ax.set_title(title, loc="left")
+    ax.set_xticks([])
+    ax.set_yticks([])
+
+
+def _draw_pixels(
+    figure: Figure,
+    box: tuple[float, float, float, float],
+    cube: Cube,
+    realization: int,
+    pixels: _Pixels,
+) -> None:
+    left, right, bottom, top = box
+    grid = figure.add_gridspec(
+        len(pixels), 2, left=left, right=right, bottom=bottom, top=top, wspace=0.14, hspace=0.42,
+        width_ratios=(2.4, 1.0),
+    )
+    axes = grid.subplots(squeeze=False)
+    for row, ((name, pixel), colour) in enumerate(zip(pixels.items(), COLOURS, strict=False)):
+        draw_pixel(axes[row, 0], axes[row, 1], cube, realization, pixel, colour, name)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("counts per bin")
+        ax.yaxis.set_label_coords(-0.075, 0.5)
+    axes[-1, 0].set_xlabel("time in the laser period (ns)")
+    axes[-1, 1].set_xlabel("around the return (ns)")
+    spacing = {"handlelength": 1.6, "borderaxespad": 0.1, "labelspacing": 0.25}
+    y, x = next(iter(pixels.values()))
+    place = quiet_corner(incident_rate(cube.flux, cube.system, y, x))
+    axes[0, 0].legend(loc=place, frameon=False, **spacing)
+
+
+def _headline(cube: Cube, realization: int) -> str:
+    system, flux = cube.system, cube.flux
+    _, height, width, bins = cube.shape
+    which = f", realization {cube.recipe.first_realization + realization}" if cube.shape[0] > 1 else ""
+    return (
+        f"{width} × {height} pixels, {bins} bins of {1e3 * system.bin_ns:.4g} ps; "
+        f"{system.cycles:,} laser periods of {system.period_ns:.4g} ns; "
+        f"dead time {system.detector.dead_time_ns:.4g} ns; mean S = {flux.signal.mean():.3g}, "
+        f"B = {flux.background.mean():.3g} photons per period; {cube.engine} engine{which}"
+    )
+
+
+def _checked(cube: Cube, realization: int, pixels: Sequence[tuple[int, int]] | None) -> _Pixels:
+    """The pixels to draw by name, all arguments checked."""
+    count, height, width, _ = cube.shape
+    if not 0 <= realization < count:
+        raise ValueError(f"realization must be an integer in [0, {count - 1}], got {realization}")
+    if pixels is None:
+        return example_pixels(cube.flux, cube.depth_m)
+    if not 1 <= len(pixels) <= len(COLOURS):
+        raise ValueError(f"pixels must be 1 to {len(COLOURS)} pairs (y, x), got {len(pixels)}")
+    for y, x in pixels:
+        if not (0 <= y < height and 0 <= x < width):
+            raise ValueError(f"pixel must lie in y 0 to {height - 1}, x 0 to {width - 1}, got ({y}, {x})")
+    if len(pixels) == 1:
+        return {"": (int(pixels[0][0]), int(pixels[0][1]))}
+    return {f"{k}.": (int(y), int(x)) for k, (y, x) in enumerate(pixels, start=1)}
+
+
+def _limits(values: NDArray[Any]) -> tuple[float, float] | None:
+    """The range that all but 1 % of the pixels share, so that a few outliers do not flatten the picture."""
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return None
+    low, high = np.percentile(finite, (0.5, 99.5))
+    return (float(low), float(high)) if high > low else None
+
+
+def _metres(value: float) -> str:
+    if value < 0.01:
+        return f"{1e3 * value:.2g} mm"
+    return f"{1e2 * value:.2g} cm" if value < 1.0 else f"{value:.3g} m"

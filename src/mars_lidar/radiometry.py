@@ -1,0 +1,146 @@
+"""From a scene to photons: signal level, attenuation, ambient light, dark counts. Formulas: `Scene.flux`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import _validate
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar.scene import Scene
+
+FloatArray = NDArray[np.float64]
+
+_ATTENUATIONS = ("none", "inverse_square")
+_AMBIENTS = ("uniform", "reflectivity", "map")
+
+
+def scene_flux(
+    scene: Scene,
+    system: System,
+    signal: float,
+    sbr: float,
+    attenuation: str,
+    ambient: str | None,
+    dark_counts_per_s: float,
+) -> Flux:
+    """The body of `Scene.flux`, which documents arguments, formulas and warnings."""
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {system!r}")
+    level = _validate.real("signal", signal, low=0.0, strict_low=True)
+    ratio = _ratio(sbr)
+    _validate.choice("attenuation", attenuation, _ATTENUATIONS)
+    light_name = ("uniform" if scene.background is None else "map") if ambient is None else ambient
+    _validate.choice("ambient", light_name, _AMBIENTS)
+    rate = _validate.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
+    light = _ambient_light(scene, light_name)
+    valid = scene.valid
+    if not valid.any():
+        raise ValueError("depth_m is NaN at every pixel: there is no return to set a signal level with")
+    reach = system.unambiguous_range_m
+
+    s = _scaled(_returned(scene, valid, attenuation), level, valid, "reflectivity", f"signal={level:g}")
+    b = np.zeros(scene.shape)
+    if ratio < math.inf:
+        b = _scaled(light, level / ratio, valid, "ambient light", f"sbr={ratio:g}")
+    dark = rate * system.period_ns * 1e-9
+    wrapped = int(np.count_nonzero(scene.depth_m[valid] >= reach))
+    info = {
+        "source": "Scene.flux",
+        "signal": level,
+        "signal_definition": "mean signal photons per laser period over the pixels with a return",
+        "sbr": _plain(ratio),
+        "sbr_definition": "mean signal / mean ambient photons over the pixels with a return; no dark counts",
+        "attenuation": attenuation,
+        "ambient": light_name,
+        "dark_counts_per_s": rate,
+        "n_pixels": int(valid.size),
+        "n_valid": int(np.count_nonzero(valid)),
+        "n_wrapped": wrapped,
+        "unambiguous_range_m": reach,
+        **_means(s[valid], b[valid], dark),
+    }
+    flux = Flux(signal=s, background=b + dark, delay_ns=system.delay_ns(scene.depth_m), info=info)
+    _warn(int(np.count_nonzero(~valid)), wrapped, valid.size, reach)
+    return flux
+
+
+def _ambient_light(scene: Scene, name: str) -> FloatArray:
+    """Relative ambient light (H, W)."""
+    if name == "uniform":
+        return np.ones(scene.shape)
+    if name == "reflectivity":
+        return scene.reflectivity
+    if scene.background is None:
+        raise ValueError("ambient='map' needs a scene with a background map, got one without")
+    return scene.background
+
+
+def _returned(scene: Scene, valid: NDArray[np.bool_], attenuation: str) -> FloatArray:
+    """Relative returned laser light (H, W), 0 where nothing returns."""
+    share = np.where(valid, scene.reflectivity, 0.0)
+    if attenuation == "inverse_square":
+        # Relative to the nearest depth: the same after normalisation, and nothing overflows.
+        nearest = scene.depth_m[valid].min()
+        share *= (nearest / np.where(valid, scene.depth_m, np.inf)) ** 2
+    return share
+
+
+def _scaled(light: FloatArray, mean: float, valid: NDArray[np.bool_], what: str, asked: str) -> FloatArray:
+    """A relative map scaled to a mean over the valid pixels."""
+    top = float(light[valid].max())
+    if top == 0.0:
+        raise ValueError(f"{what} is zero at every pixel with a return: {asked} cannot be reached")
+    relative = light / top  # to order one first: a map of 1e-300 scales as well as one of 1e300
+    scaled: FloatArray = relative * (mean / float(relative[valid].mean()))
+    return scaled
+
+
+def _means(s: FloatArray, ambient: FloatArray, dark: float) -> dict[str, float | None]:
+    """What was achieved over the valid pixels, photons per laser period."""
+    mean_s, mean_a = float(s.mean()), float(ambient.mean())
+    mean_b = float((ambient + dark).mean())
+    return {
+        "mean_signal": mean_s,
+        "mean_ambient": mean_a,
+        "mean_dark": dark,
+        "mean_background": mean_b,
+        "achieved_sbr": _plain(mean_s / mean_a if mean_a > 0.0 else math.inf),
+        "achieved_sbr_with_dark": _plain(mean_s / mean_b if mean_b > 0.0 else math.inf),
+    }
+
+
+def _ratio(sbr: Any) -> float:
+    allowed = "a number in (0, inf], inf for no ambient light"
+    if isinstance(sbr, bool) or not isinstance(sbr, Real):
+        raise TypeError(f"sbr must be {allowed}, got {sbr!r} ({type(sbr).__name__})")
+    if not float(sbr) > 0.0:
+        raise ValueError(f"sbr must be {allowed}, got {sbr!r}")
+    return float(sbr)
+
+
+def _plain(ratio: float) -> float | None:
+    """JSON knows no infinity."""
+    return None if math.isinf(ratio) else ratio
+
+
+def _warn(lost: int, wrapped: int, pixels: int, reach: float) -> None:
+    level = 4  # the caller of Scene.flux
+    if lost:
+        text = f"{lost} of {pixels} pixels have no return (depth NaN): their signal is 0"
+        warnings.warn(text, UserWarning, stacklevel=level)
+    if wrapped:
+        warnings.warn(
+            f"{wrapped} of {pixels} pixels lie beyond the unambiguous range of {reach:.6g} m (c t_r / 2): "
+            f"their returns wrap into a later laser period and will look nearer by multiples of that range",
+            UserWarning,
+            stacklevel=level,
+        )

@@ -1,0 +1,193 @@
+"""The verb: check, estimate, dispatch."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar._memory import check_memory
+from mars_lidar.engines import ENGINES, Engine
+from mars_lidar.engines.base import Progress, Records, Task
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
+from mars_lidar.timestamps import Timestamps
+
+_MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
+
+
+def simulate(
+    flux: Flux,
+    system: System,
+    *,
+    engine: str = "exact",
+    realizations: int = 1,
+    first_realization: int = 0,
+    pixel_index: ArrayLike | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    out: NDArray[Any] | None = None,
+    progress: Progress | None = None,
+) -> NDArray[Any]:
+    """Histogram cubes of an image.
+
+    Parameters
+    ----------
+    flux
+        Photons at each pixel (H, W).
+    system
+        Laser, detector and histogram.
+    engine
+        ``"exact"`` (default), ``"sequential"`` (slow, independent gold standard) or ``"poisson"`` (no dead
+        time).
+    realizations
+        Independent exposures of the whole image.
+    first_realization
+        Number of the first one: ``realizations=2, first_realization=4`` are numbers 4 and 5 of a larger run.
+    pixel_index
+        (H * W,) or (H, W) integers in [0, 2**32): the place of each pixel in a larger image, row-major. Any
+        part of a cube can so be made alone, with the same bits. Default: 0 .. H * W - 1.
+    seed
+        Integer in [0, 2**64).
+    threads
+        Threads to run on; default: all processors this process may use. The result does not depend on it.
+    out
+        C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill.
+    progress
+        Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
+
+    Returns
+    -------
+    NDArray
+        (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given).
+    """
+    task, drawn_by = _task(
+        flux, system, engine, realizations, first_realization, pixel_index, seed, threads, progress
+    )
+    shape = (task.realizations, *flux.shape, system.bins)
+    if out is None:
+        _check_memory(shape, system.histogram_dtype.itemsize, "histograms")
+        out = np.empty(shape, system.histogram_dtype)
+    else:
+        _check_out(out, shape, system.histogram_dtype)
+    drawn_by.histogram(task, out.reshape(task.items, system.bins))
+    return out
+
+
+def simulate_timestamps(
+    flux: Flux,
+    system: System,
+    *,
+    engine: str = "exact",
+    realization: int = 0,
+    pixel_index: ArrayLike | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Timestamps:
+    """Registration times of an image in one realization.
+
+    Parameters are those of `simulate`. The histogram of the result equals
+    ``simulate(..., first_realization=realization)[0]`` of the same seed exactly.
+
+    Returns
+    -------
+    Timestamps
+        Packed times (ns), cycles and bins of all pixels.
+    """
+    task, drawn_by = _task(
+        flux, system, engine, 1, realization, pixel_index, seed, threads, progress, first_name="realization"
+    )
+    counts = drawn_by.counts(task)
+    _check_memory((int(counts.sum()),), 16, "timestamps")
+    records = Records.allocate(counts)
+    drawn_by.timestamps(task, records)
+    times_ns = records.times
+    times_ns *= system.period_ns
+    return Timestamps(
+        times_ns, records.cycle, records.bin, records.offsets, flux.shape, system.bins, system.histogram_dtype
+    )
+
+
+def _task(
+    flux: Flux,
+    system: System,
+    engine: str,
+    realizations: int,
+    first_realization: int,
+    pixel_index: ArrayLike | None,
+    seed: int,
+    threads: int | None,
+    progress: Progress | None,
+    first_name: str = "first_realization",
+) -> tuple[Task, Engine]:
+    if not isinstance(flux, Flux):
+        raise TypeError(f"flux must be a Flux, got {type(flux).__name__}")
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    drawn_by = ENGINES[_validate.choice("engine", engine, tuple(ENGINES))]
+    first = _validate.integer(first_name, first_realization, low=0, high=2**32 - 1)
+    number = _validate.integer("realizations", realizations, low=1, high=2**32 - first)
+    _validate.integer("seed", seed, low=0, high=2**64 - 1)
+    team = _default_threads() if threads is None else _validate.integer("threads", threads, low=1, high=1024)
+    if progress is not None and not callable(progress):
+        raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
+    if len(flux.returns_signal) > 16:
+        raise ValueError(f"flux must have at most 16 returns, got {len(flux.returns_signal)}; use a waveform")
+    _check_registrations(flux, system)
+    drawn_by.check(flux, system)
+    index = _pixel_index(pixel_index, flux.shape)
+    return Task(flux, system, number, first, index, seed, team, progress), drawn_by
+
+
+def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np.uint32]:
+    pixels = shape[0] * shape[1]
+    if pixel_index is None:
+        return np.arange(pixels, dtype=np.uint32)
+    index = np.asarray(pixel_index)
+    if index.dtype.kind not in "iu":
+        raise TypeError(f"pixel_index must be integers, got dtype {index.dtype}")
+    if index.shape not in ((pixels,), shape):
+        raise ValueError(f"pixel_index must have shape ({pixels},) or {shape}, got {index.shape}")
+    if index.min() < 0 or index.max() >= 2**32:
+        raise ValueError(f"pixel_index must lie in [0, 2**32), got {index.min()} to {index.max()}")
+    return np.ascontiguousarray(index.reshape(-1).astype(np.uint32))
+
+
+def _check_registrations(flux: Flux, system: System) -> None:
+    photons = float(flux.total.max())
+    most = photons * system.cycles / (1.0 + photons * system.dead_time_periods)
+    if most > 0.5 * _MAX_REGISTRATIONS:
+        raise ValueError(
+            f"a pixel must have at most {0.5 * _MAX_REGISTRATIONS:.3g} expected registrations, "
+            f"got {most:.3g} ({photons:g} photons per period, {system.cycles} cycles)"
+        )
+
+
+def _check_out(out: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    if not isinstance(out, np.ndarray):
+        raise TypeError(f"out must be a NumPy array or memory map, got {type(out).__name__}")
+    if out.shape != shape or out.dtype != dtype:
+        raise ValueError(f"out must have shape {shape} and dtype {dtype}, got {out.shape} and {out.dtype}")
+    if not out.flags.c_contiguous or not out.flags.writeable:
+        raise ValueError("out must be C-contiguous and writeable")
+
+
+def _check_memory(shape: tuple[int, ...], itemsize: int, what: str) -> None:
+    check_memory(
+        math.prod(shape) * itemsize,
+        f"{what} of shape {shape}",
+        "simulate rows (flux[rows] with pixel_index) or realizations (first_realization) one after another, "
+        "or give out= a memory map",
+    )
+
+
+def _default_threads() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1

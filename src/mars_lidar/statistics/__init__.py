@@ -1,0 +1,39 @@
+"""Analytic count laws and histogram shapes of one pixel: no scene, no sampling."""
+
+from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewal_moments, renewal_pmf
+from mars_lidar.statistics.chain import PhaseChain, Stationary
+from mars_lidar.statistics.exposure import Exposure, exposure_moments
+from mars_lidar.statistics.grid import photons_per_bin
+from mars_lidar.statistics.law import CountLaw, count_law, registration_pdf
+from mars_lidar.statistics.renewal import (
+    HoldingTimes,
+    MomentMatrices,
+    holding_times,
+    mars_moments,
+    moment_matrices,
+)
+from mars_lidar.statistics.spectral import HoldingTimeCovariance, holding_time_covariance
+
+__all__ = [
+    "ConvergenceError",
+    "CountLaw",
+    "Exposure",
+    "HoldingTimeCovariance",
+    "HoldingTimes",
+    "MomentMatrices",
+    "PhaseChain",
+    "Stationary",
+    "count_law",
+    "exposure_moments",
+    "holding_time_covariance",
+    "holding_times",
+    "mars_moments",
+    "moment_matrices",
+    "photons_per_bin",
+    "poisson_moments",
+    "poisson_pmf",
+    "registration_pdf",
+    "renewal_moments",
+    "renewal_pmf",
+]

@@ -1,0 +1,186 @@
+"""Exact count pmf of a finite exposure: generating function on the unit circle, turned by an FFT.
+
+The support comes first, from rigorous tail bounds; then only as many points of the circle as it has counts.
+Equation numbers: docs/theory_exposure.md, section 8.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics._feedback import ConvergenceError
+
+_TAIL = 1e-12  # probability that may lie outside the support, at either end
+_TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # standard deviations of reach
+_MAX_TILT = 25.0
+_MAX_LOG_GROWTH = 600.0  # of one period, below the largest double
+_CONSISTENT = 1e-5  # agreement demanded of the pmf with the cumulants, in standard deviations
+_CONSISTENT_PER_CYCLE = 1e-13  # and what extrapolation over so many cycles may add by rounding
+_UNSETTLED = -2
+_MAX_COUNTS = 2**24
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Probabilities `pmf` of the counts `first`, `first` + 1, ...; at most `outside` lies elsewhere."""
+
+    first: int
+    pmf: FloatArray
+    outside: float
+
+
+def poisson_window(mean: float) -> Window:
+    """Poisson law: exact without dead time. The support comes from Bernstein's bounds of the two tails."""
+    from scipy.special import gammaln, xlogy
+
+    reach = -math.log(_TAIL)
+    low = max(0, math.ceil(mean - math.sqrt(2.0 * reach * mean)))
+    high = math.floor(mean + reach / 3.0 + math.sqrt(reach**2 / 9.0 + 2.0 * reach * mean))
+    counts = np.arange(low, high + 1)
+    return Window(low, np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), _TAIL * (1 + (low > 0)))
+
+
+def gaussian_window(mean: float, variance: float) -> Window:
+    """Normal law on the integers: P(n) = Phi((n + 1/2 - mean) / sd) - Phi((n - 1/2 - mean) / sd).
+
+    What lies below 0 is in P(0).
+    """
+    from scipy.special import ndtr
+
+    spread = math.sqrt(variance)
+    low = max(0, math.floor(mean - 8.5 * spread))
+    high = max(low, math.ceil(mean + 8.5 * spread))
+    counts = np.arange(low, high + 1)
+    if spread == 0.0:
+        return Window(low, (counts == round(mean)).astype(np.float64), 0.0)
+    edges = np.arange(low, high + 2) - 0.5 - mean
+    if low == 0:
+        edges[0] = -np.inf
+    # differences of the smaller of the two tails keep their digits at both ends
+    below, above = ndtr(edges / spread), ndtr(-edges / spread)
+    pmf = np.where(edges[:-1] > 0, above[:-1] - above[1:], below[1:] - below[:-1])
+    return Window(low, np.maximum(pmf, 0.0), float(below[0] + above[-1]))
+
+
+def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Window]:
+    """Exact pmf of each cell, on the grid of `bins` (cells,) that its `cumulants` (cells, 4) needed."""
+    if cells.system.dead_time_periods == 0.0:
+        return [poisson_window(float(mean)) for mean in cumulants[:, 0]]
+    windows: list[Window | None] = [None] * cells.size
+    for n in np.unique(bins):
+        index = np.flatnonzero(bins == n)
+        cells.check_history(int(n))
+        for block in np.array_split(index, math.ceil(index.size / 64)):
+            lows, highs, outside = _supports(cells.part(block), cumulants[block], int(n), threads)
+            for k, cell in enumerate(block):
+                one = cells.part(block[k : k + 1])
+                window = _window(one, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads)
+                _check(cells, int(cell), window, cumulants[cell])
+                windows[cell] = window
+    return [window for window in windows if window is not None]
+
+
+def _supports(
+    cells: Cells, cumulants: FloatArray, bins: int, threads: int
+) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """First and last count of the support of each cell, and a bound on the probability outside (24)."""
+    mean, spread = cumulants[:, 0], np.sqrt(cumulants[:, 1])
+    # a period multiplies E e^(theta N) at most by e^(theta (1 + t_r/t_d)) and by exp(Lambda (e^theta - 1))
+    dead = cells.system.dead_time_periods
+    growth = np.maximum(
+        _MAX_LOG_GROWTH / (1.0 + 1.0 / dead),
+        np.log1p(_MAX_LOG_GROWTH / np.maximum(cells.signal + cells.background, 1e-300)),
+    )
+    tilt = _TILTS / np.maximum(spread, 1e-300)[:, None]
+    tilt = np.minimum(tilt, np.minimum(growth, _MAX_TILT)[:, None])
+    tilt = np.concatenate([tilt, -tilt], axis=1)
+    log_value = _characteristic(cells, np.exp(tilt), None, bins, threads)[0]
+    with np.errstate(invalid="ignore"):
+        # P(N >= edge) <= tail for a positive tilt, P(N <= edge) <= tail for a negative one
+        edge = (log_value - math.log(_TAIL)) / tilt
+    up, down = np.split(np.where(np.isfinite(edge), edge, np.nan), 2, axis=1)
+    exposure = float(cells.system.cycles)
+    most = min(math.floor(exposure / dead) + 1.0, 9e15)
+    high = np.fmin.reduce(up, axis=1, initial=most + 1.0)
+    low = np.fmax.reduce(down, axis=1, initial=-1.0)
+    last = np.minimum(np.ceil(high) - 1.0, most)
+    first = np.clip(np.floor(low) + 1.0, 0.0, np.floor(mean))
+    last = np.maximum(last, np.ceil(mean))
+    if (last - first >= _MAX_COUNTS).any():
+        k = int(np.argmax(last - first))
+        raise ConvergenceError(
+            f"count law of {cells.name(k)}: its support of {last[k] - first[k]:.3g} counts exceeds "
+            f"{_MAX_COUNTS}"
+        )
+    # where the support ends at the least or the largest possible count nothing lies beyond
+    outside = _TAIL * ((first > 0).astype(np.float64) + (last < most))
+    return first.astype(np.int64), last.astype(np.int64), outside
+
+
+def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int) -> Window:
+    counts = last - first + 1
+    size = counts + counts % 2
+    angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
+    re, im = _characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads)
+    # numpy's transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
+    folded = np.fft.irfft(re[0] - 1j * im[0], size)
+    pmf = folded[np.arange(first, first + counts) % size]
+    return Window(first, pmf, outside)
+
+
+def _characteristic(
+    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int
+) -> tuple[FloatArray, FloatArray]:
+    """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
+    from mars_lidar import _core
+
+    energy, row = cells.energies(bins)
+    re, im = np.empty(z_re.shape), np.empty(z_re.shape)
+    settled = np.empty(z_re.shape, np.int64)
+    _core.exposure_characteristic(
+        grid=cells.grid(bins, 1),
+        signal=cells.signal,
+        background=cells.background,
+        shape=row,
+        shapes=energy,
+        tilted=z_im is None,
+        z_re=np.ascontiguousarray(z_re),
+        z_im=np.zeros(z_re.shape) if z_im is None else np.ascontiguousarray(z_im),
+        re=re,
+        im=im,
+        settled=settled,
+        threads=threads,
+        level="",
+        progress=None,
+    )
+    lost = (settled == _UNSETTLED).any(-1)
+    if lost.any():
+        raise ConvergenceError(
+            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat from "
+            "period to period for so long that the exposure cannot be run to its end"
+        )
+    return re, im
+
+
+def _check(cells: Cells, cell: int, window: Window, cumulants: FloatArray) -> None:
+    """The pmf must be one, and have the mean and variance that came another way; then rounding is removed."""
+    pmf: NDArray[np.float64] = window.pmf
+    offset = window.first + np.arange(pmf.size) - cumulants[0]
+    spread = max(math.sqrt(cumulants[1]), 1e-3)
+    total, mean = float(pmf.sum()), float((pmf * offset).sum())
+    variance, least = float((pmf * offset**2).sum()), float(pmf.min())
+    error = max(abs(total - 1.0), abs(mean) / spread, abs(variance - cumulants[1]) / spread**2, -least)
+    allowed = _CONSISTENT + _CONSISTENT_PER_CYCLE * cells.system.cycles
+    if not error <= allowed:
+        raise ConvergenceError(
+            f"count law of {cells.name(cell)}: its pmf on {window.first} .. {window.first + pmf.size - 1} "
+            f"disagrees with the cumulants by {error:.2g} (allowed {allowed:.2g}): sum - 1 = "
+            f"{total - 1.0:.2g}, mean off by {mean:.2g}, variance {variance:.6g} for {cumulants[1]:.6g}, "
+            f"least {least:.2g}"
+        )
+    np.maximum(pmf, 0.0, out=pmf)

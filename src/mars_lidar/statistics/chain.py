@@ -1,0 +1,287 @@
+"""The Markov chain of registration phases: transition matrix, O(n) products, stationary distribution.
+
+Equation numbers refer to docs/theory.md. Times are in laser periods, fluxes in photons per bin and period.
+
+The state is the bin (of n) in which the last photon was registered. P is never needed as a matrix: its
+products are first-order recursions round the circle (2.4, 2.5), and its stationary distribution solves the
+*feedback* equation (2.8), in which the chain's own slow modes do not appear.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar.statistics._feedback import ConvergenceError, Feedback, Solution, cyclic_recursion
+from mars_lidar.statistics.grid import cell_name, photons_per_bin
+from mars_lidar.system import System
+
+FloatArray = NDArray[np.float64]
+Rearm = Literal["centre", "edge"]
+
+_REARMS = ("centre", "edge")
+_MAX_PHOTONS = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Stationary:
+    """Stationary distribution of a `PhaseChain`, with the evidence that it is one.
+
+    Attributes
+    ----------
+    pdf
+        (n,) probability of each phase bin, sums to 1.
+    rate
+        Registrations per period (2.9); 1 / rate is the mean holding time in periods.
+    residual
+        sum |pdf P - pdf|, by an O(n) product. In a slow-mixing chain it says little, which is why
+    error
+        the componentwise backward error of the feedback equation (2.8), is given beside it.
+    sweeps
+        Gauss-Seidel sweeps and Krylov steps spent; 0 where no iteration was needed.
+    method
+        ``"sweeps"``, ``"gmres"`` or ``"lu"``: what converged.
+    """
+
+    pdf: FloatArray
+    rate: float
+    residual: float
+    error: float
+    sweeps: int
+    method: str
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseChain:
+    """Chain of registration phases of a free-running, non-paralyzable detector.
+
+    After a registration in bin i the detector re-arms at x_i + t_d, with x_i the centre of bin i
+    (``rearm="centre"``) or its lower edge (``"edge"``, Rapp's code, which shortens every wait by half a bin).
+    That point lies in bin i + `shift` (cyclic), at the fraction `fraction` of it, so any dead time is
+    represented without rounding or interpolation (2.2).
+
+    Parameters
+    ----------
+    photons
+        (n,) photons per bin and period, finite, not all 0.
+    dead_time
+        Dead time t_d in laser periods, >= 0.
+    rearm
+        ``"centre"`` or ``"edge"``.
+    cell
+        Words that name this cell in warnings and errors.
+
+    Attributes
+    ----------
+    whole_periods, shift, fraction
+        K, s and r of (2.2): the detector re-arms K periods and s bins later, at the fraction r of that bin.
+    total
+        Photons per period Lambda; `loss` is 1 - exp(-Lambda).
+    keep, fire
+        (n,) probability q of passing a bin armed at its start, and p = 1 - q of firing in it.
+    rekeep, refire
+        (n,) the same, q' and p', for the part of the bin that is left at re-arming.
+    """
+
+    photons: FloatArray
+    dead_time: float
+    rearm: Rearm = "centre"
+    cell: str = ""
+
+    whole_periods: int = field(init=False)
+    shift: int = field(init=False)
+    fraction: float = field(init=False)
+    total: float = field(init=False)
+    loss: float = field(init=False, repr=False)
+    keep: FloatArray = field(init=False, repr=False)
+    rekeep: FloatArray = field(init=False, repr=False)
+    fire: FloatArray = field(init=False, repr=False)
+    refire: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        photons = np.array(self.photons, dtype=np.float64)
+        if photons.ndim != 1 or photons.size == 0:
+            raise ValueError(f"photons must be (n,) with n >= 1, got shape {photons.shape}")
+        bad = ~((photons >= 0) & (photons <= _MAX_PHOTONS))
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise ValueError(
+                f"photons must lie in [0, {_MAX_PHOTONS:g}] per bin, got photons[{k}] = {photons[k]}"
+            )
+        total = float(photons.sum())
+        if not total > 0:
+            raise ValueError("photons must not all be 0: without flux there is no registration and no chain")
+        dead = _validate.real("dead_time", self.dead_time, low=0.0)
+        _validate.choice("rearm", self.rearm, _REARMS)
+        photons.flags.writeable = False
+        n = photons.size
+        # whole periods apart first: t_d of 200.9 periods must not cost digits of its fraction (2.2)
+        whole = math.floor(dead)
+        position = (dead - whole) * n + (0.5 if self.rearm == "centre" else 0.0)
+        shift = math.floor(position)
+        fraction = position - shift
+        if shift >= n:  # re-arming half a bin past the period's end: the next period's first bins
+            whole, shift = whole + 1, shift - n
+        rest = (1.0 - fraction) * photons
+        for name, value in {
+            "photons": photons,
+            "dead_time": dead,
+            "whole_periods": whole,
+            "shift": shift,
+            "fraction": fraction,
+            "total": total,
+            "loss": -math.expm1(-total),
+            "keep": np.exp(-photons),
+            "rekeep": np.exp(-rest),
+            "fire": -np.expm1(-photons),
+            "refire": -np.expm1(-rest),
+        }.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_flux(
+        cls,
+        signal: float | None,
+        background: float,
+        system: System,
+        *,
+        rearm: Rearm = "centre",
+        bins: int | None = None,
+        delay_ns: float | None = None,
+        waveform: ArrayLike | None = None,
+    ) -> PhaseChain:
+        """The chain of one pixel; arguments as `photons_per_bin`."""
+        photons = photons_per_bin(signal, background, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
+        return cls(photons, system.dead_time_periods, rearm, cell_name(signal, background, system))
+
+    @property
+    def bins(self) -> int:
+        """Number of phase bins n."""
+        return self.photons.size
+
+    @property
+    def blind_bins(self) -> int:
+        """Bins from that of a registration to that of re-arming, whole periods included."""
+        return self.whole_periods * self.bins + self.shift
+
+    def rearmed(self, mass: FloatArray) -> FloatArray:
+        """Mass (n,) that re-arms in each bin when `mass` (n,) was registered: the cyclic row shift."""
+        return np.roll(mass, self.shift)
+
+    def armed(self, mass: FloatArray) -> FloatArray:
+        """Mass armed at the *start* of each bin (n,), when `mass` (n,) is registered in each bin (2.4)."""
+        return cyclic_recursion(self.keep, self.rekeep * self.rearmed(mass), self.loss)
+
+    def left(self, x: ArrayLike) -> FloatArray:
+        """The product x P of a distribution (n,) with the transition matrix, in O(n) (2.4)."""
+        mass = _vector("x", x, self.bins)
+        return self.armed(mass) * self.fire + self.refire * self.rearmed(mass)
+
+    def right(self, y: ArrayLike) -> FloatArray:
+        """The product P y: expectation of y (n,) one registration later, in O(n) (2.5)."""
+        values = _vector("y", y, self.bins)
+        ahead = cyclic_recursion(self.keep, self.fire * values, self.loss, backward=True)
+        return self.at_rearming(self.refire * values + self.rekeep * np.roll(ahead, -1))
+
+    def at_rearming(self, values: FloatArray) -> FloatArray:
+        """`values` (n,) of the re-arming bins, read by the bin of the registration before."""
+        return np.roll(values, -self.shift)
+
+    def dense(self, form: Literal["shift", "rapp"] = "shift") -> FloatArray:
+        """The transition matrix P (n, n), rows sum to 1; both forms agree to rounding.
+
+        ``"shift"``: rows of the first-arrival matrix, shifted cyclically by the dead time (2.3).
+        ``"rapp"``: element by element from the integrated flux between re-arming and arrival (2.1).
+        """
+        _validate.choice("form", form, ("shift", "rapp"))
+        return self._dense_shift() if form == "shift" else self._dense_rapp()
+
+    def _dense_shift(self) -> FloatArray:
+        n = self.bins
+        order = (np.arange(n)[:, None] + np.arange(n)) % n  # bins in the order met after arming in bin a
+        met = self.photons[order]
+        met[:, 0] *= 1.0 - self.fraction
+        before = np.zeros((n, n))
+        np.cumsum(met[:, :-1], axis=1, out=before[:, 1:])
+        first = np.exp(-before) * -np.expm1(-self.photons[order]) / self.loss
+        first[:, 0] = self.refire + self._again()
+        base = np.empty((n, n))
+        np.put_along_axis(base, order, first, axis=1)
+        return np.roll(base, -self.shift, axis=0)
+
+    def _dense_rapp(self) -> FloatArray:
+        n = self.bins
+        flux = np.concatenate([[0.0], np.cumsum(self.photons)])
+        j = np.arange(n)
+        arm = (j + self.shift) % n
+        start = flux[arm] + self.fraction * self.photons[arm]
+        exposure = flux[:-1][None, :] - start[:, None] + flux[-1] * (j[None, :] < arm[:, None])
+        exposure[j, arm] = 0.0
+        matrix = np.exp(-exposure) * -np.expm1(-self.photons) / self.loss
+        matrix[j, arm] = (self.refire + self._again())[arm]
+        return np.asarray(matrix, dtype=np.float64)
+
+    def _again(self) -> FloatArray:
+        """Probability of passing the re-arming bin and firing in it one or more periods later (2.1)."""
+        lead = np.exp(self.fraction * self.photons - self.total)
+        return np.asarray(lead * self.fire / self.loss, dtype=np.float64)
+
+    def feedback(self) -> Feedback:
+        """The feedback operator A (2.8), solvable in both directions."""
+        return Feedback(self.fire, self.refire, self.rekeep, self.shift)
+
+    def stationary(self) -> Stationary:
+        """Stationary distribution, from the feedback equation (2.8).
+
+        Raises
+        ------
+        ConvergenceError
+            Where no method reached a residual of 1e-9; the message names the cell.
+        """
+        return stationary_from(self, self.solve(adjoint=False))
+
+    def solve(self, *, adjoint: bool) -> Solution:
+        """w of A w = p (2.8), or o of A^T o = 1 (3.8); a failure names the cell."""
+        try:
+            return self.feedback().solve(adjoint=adjoint)
+        except ConvergenceError as error:
+            raise ConvergenceError(f"{self.describe()}: {error}") from None
+
+    def describe(self) -> str:
+        """The cell in words, for warnings and errors."""
+        told = f"{self.total:g} photons per period in {self.bins} bins, t_d = {self.dead_time:g} periods"
+        return self.cell or told
+
+
+def stationary_from(chain: PhaseChain, solution: Solution) -> Stationary:
+    """Stationary distribution from the solution w of the feedback equation (2.9)."""
+    weight = np.maximum(solution.x, 0.0)
+    pdf = weight / weight.sum()
+    # Round-off of the solve is absolute. One step of the chain, which only adds, makes it relative.
+    pdf = chain.left(pdf)
+    pdf /= pdf.sum()
+    residual = float(np.abs(chain.left(pdf) - pdf).sum())
+    if not residual < 1e-9:
+        raise ConvergenceError(f"{chain.describe()}: stationary distribution with residual {residual:.2e}")
+    mean = float(solution.x.sum())
+    pdf.flags.writeable = False
+    return Stationary(
+        pdf=pdf,
+        rate=mean / (1.0 + chain.whole_periods * mean),
+        residual=residual,
+        error=solution.residual,
+        sweeps=solution.steps,
+        method=solution.method,
+    )
+
+
+def _vector(name: str, value: Any, n: int) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (n,):
+        raise ValueError(f"{name} must be ({n},), got shape {array.shape}")
+    return array

@@ -1,0 +1,314 @@
+"""Exact statistics of a finite exposure: cumulants of the count and mean histogram, by the delay recursion.
+
+No stationarity, no Gaussian, no truncation: start-up, end and mixing of the exposure are in the result.
+Derivation and equation numbers: docs/theory_exposure.md.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.system import System
+
+Progress = Callable[[int, int], object]
+
+_ORDERS = 4
+_MAX_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
+_UNSETTLED = -2  # the native core's code: gave up
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Statistics of the count N and of the histogram of one exposure, for cells of shape (...).
+
+    Attributes
+    ----------
+    cumulants
+        (..., 4) mean, variance, third and fourth cumulant of N.
+    histogram
+        (..., bins) mean registrations per bin; sums to the mean of N.
+    cumulant_rates, histogram_rate
+        (..., 4) and (..., bins): what one more cycle adds, once the state repeats from period to period, so
+        that an exposure of n cycles has ``cumulants + (n - cycles) * cumulant_rates``. NaN where the exposure
+        ended before that.
+    settled
+        (...) periods after which the state repeated and the rest was extrapolated; -1 where the exposure was
+        run to its end.
+    bins
+        (...) bins per period of the statistics grid that was needed, which is not the histogram's.
+    movement
+        (...) how far the result moved when that grid was last halved: the largest of the changes of the mean
+        in standard deviations (or relative, if that is larger), of the other cumulants relative to
+        themselves or to the power of the standard deviation, and of the shape in total variation. The error
+        of the result is smaller: the method is of fourth order for smooth pulses.
+    """
+
+    cumulants: FloatArray
+    histogram: FloatArray
+    cumulant_rates: FloatArray
+    histogram_rate: FloatArray
+    settled: IndexArray
+    bins: IndexArray
+    movement: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of N (...)."""
+        return self.cumulants[..., 0]
+
+    @property
+    def variance(self) -> FloatArray:
+        """Variance of N (...), never negative."""
+        return self.cumulants[..., 1]
+
+
+def exposure_moments(
+    signal: ArrayLike | None,
+    background: ArrayLike,
+    system: System,
+    *,
+    delay_ns: ArrayLike | None = None,
+    waveform: ArrayLike | None = None,
+    tolerance: float = 1e-4,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Exposure:
+    """Exact cumulants of the count and mean histogram of an exposure of `System.cycles` periods.
+
+    Parameters
+    ----------
+    signal, background
+        S and B, photons per period in [0, 1e6]: scalars or arrays that broadcast to (...).
+    delay_ns
+        Delay of the return, ns, scalar or array that broadcasts with them; None: half the period. It matters:
+        an exposure that starts armed has a count law that depends on the delay.
+    waveform
+        (..., T) photons per period in T equal parts of the period, instead of `signal` and `delay_ns`.
+    tolerance
+        The statistics grid is refined until `Exposure.movement` is below this, in [1e-9, 0.1].
+    threads
+        Threads to run on; default: all processors that this process may use.
+    progress
+        Called as ``progress(done, total)`` for each pass over the cells; an exception from it stops the run.
+
+    Returns
+    -------
+    Exposure
+        For cells of shape (...).
+
+    Raises
+    ------
+    ConvergenceError
+        Naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
+        repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
+    """
+    cells = Cells.of(signal, background, system, delay_ns=delay_ns, waveform=waveform)
+    return refined_moments(cells, system.bins, tolerance=tolerance, threads=threads, progress=progress)
+
+
+def refined_moments(
+    cells: Cells, out_bins: int, *, tolerance: float, threads: int | None, progress: Progress | None = None
+) -> Exposure:
+    """`exposure_moments` of checked cells, histogram in `out_bins` bins; refines each cell as it needs."""
+    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    team = thread_count(threads)
+    if cells.system.dead_time_periods == 0.0:
+        return _poisson(cells, out_bins)
+    result = _blank(cells, out_bins)
+    pending = np.arange(cells.size)
+    bins = cells.first_bins(out_bins)
+    shared = math.gcd(bins // 2, out_bins)
+    coarse = _run(cells, bins // 2, shared, team, progress)
+    while True:
+        fine = _run(cells.part(pending), bins, out_bins, team, progress)
+        moved = _movement(coarse, fine)
+        good = moved <= tolerance
+        _put(result, pending[good], fine, good, bins, moved)
+        if good.all():
+            break
+        pending, coarse = pending[~good], _take(fine, ~good)
+        bins *= 2
+        if bins > max(_MAX_BINS, 4 * out_bins):
+            worst = int(np.argmax(moved[~good]))
+            raise ConvergenceError(
+                f"exposure statistics of {cells.name(int(pending[worst]))}: with {bins // 2} bins per period "
+                f"they still move by {moved[~good][worst]:.2g} (tolerance {tolerance:g})"
+            )
+    negative = result.cumulants[:, 1] < -1e-9 * result.cumulants[:, 0]
+    if negative.any():
+        k = int(np.argmax(negative))
+        raise ConvergenceError(
+            f"exposure statistics of {cells.name(k)}: variance {result.cumulants[k, 1]:.3g} < 0"
+        )
+    np.maximum(result.cumulants[:, 1], 0.0, out=result.cumulants[:, 1])  # rounding of a locked pixel
+    return _shaped(result, cells.shape)
+
+
+def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
+    """Registrations per period and bin (cells, out_bins) of a pixel that has been running for long (18)."""
+    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    team = thread_count(threads)
+    result = np.empty((cells.size, out_bins))
+    pending = np.arange(cells.size)
+    bins = cells.first_bins(out_bins)
+    shared = math.gcd(bins // 2, out_bins)
+    coarse = _stationary(cells, bins // 2, shared, team)
+    while pending.size:
+        fine = _stationary(cells.part(pending), bins, out_bins, team)
+        joined = fine.reshape(*coarse.shape, -1).sum(-1)
+        total = np.maximum(fine.sum(-1), np.finfo(float).tiny)
+        moved = np.abs(joined - coarse).sum(-1) / total
+        good = (moved <= tolerance) & (fine.min(-1) >= -1e-12 * total)
+        result[pending[good]] = np.maximum(fine[good], 0.0)
+        pending, coarse = pending[~good], fine[~good]
+        bins *= 2
+        if pending.size and bins > max(_MAX_BINS, 4 * out_bins):
+            raise ConvergenceError(
+                f"stationary histogram of {cells.name(int(pending[0]))}: with {bins // 2} bins per period it "
+                f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g})"
+            )
+    return result
+
+
+def thread_count(threads: int | None) -> int:
+    """Threads asked for, or all processors that this process may use."""
+    if threads is not None:
+        return _validate.integer("threads", threads, low=1, high=1024)
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on this system
+        return os.cpu_count() or 1
+
+
+def _blank(cells: Cells, out_bins: int) -> Exposure:
+    n = cells.size
+    return Exposure(
+        cumulants=np.empty((n, _ORDERS)),
+        histogram=np.empty((n, out_bins)),
+        cumulant_rates=np.empty((n, _ORDERS)),
+        histogram_rate=np.empty((n, out_bins)),
+        settled=np.empty(n, np.int64),
+        bins=np.empty(n, np.int64),
+        movement=np.zeros(n),
+    )
+
+
+def _run(cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None) -> Exposure:
+    """One pass of the recursion over all cells on one grid."""
+    from mars_lidar import _core
+
+    cells.check_history(bins)
+    result = _blank(cells, out_bins)
+    for part in cells.chunks(bins, out_bins):
+        some = cells.part(part)
+        energy, row = some.energies(bins)
+        _core.exposure_moments(
+            grid=some.grid(bins, out_bins),
+            signal=some.signal,
+            background=some.background,
+            shape=row,
+            shapes=energy,
+            cumulants=result.cumulants[part],
+            cumulant_rates=result.cumulant_rates[part],
+            histogram=result.histogram[part],
+            histogram_rate=result.histogram_rate[part],
+            settled=result.settled[part],
+            threads=threads,
+            level="",
+            progress=progress,
+        )
+    lost = result.settled == _UNSETTLED
+    if lost.any():
+        raise ConvergenceError(
+            f"exposure statistics of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not "
+            "repeat from period to period for so long that the exposure cannot be run to its end"
+        )
+    result.bins[:] = bins
+    return result
+
+
+def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:
+    from mars_lidar import _core
+
+    result = np.empty((cells.size, out_bins))
+    settled = np.empty(cells.size, np.int64)
+    for part in cells.chunks(bins, out_bins):
+        some = cells.part(part)
+        energy, row = some.energies(bins)
+        _core.exposure_stationary(
+            grid=some.grid(bins, out_bins),
+            signal=some.signal,
+            background=some.background,
+            shape=row,
+            shapes=energy,
+            histogram=result[part],
+            settled=settled[part],
+            threads=threads,
+            level="",
+            progress=None,
+        )
+    if (settled == _UNSETTLED).any():
+        k = int(np.argmax(settled == _UNSETTLED))
+        raise ConvergenceError(f"stationary state of {cells.name(k)}: not reached")
+    return result
+
+
+def _movement(coarse: Exposure, fine: Exposure) -> FloatArray:
+    """`Exposure.movement` (21); infinite where the fine grid is still so coarse that a bin is negative."""
+    mean, spread = np.abs(fine.cumulants[:, 0]), np.sqrt(np.maximum(fine.cumulants[:, 1], 0.0))
+    floor = 1e-10 * mean + np.finfo(float).tiny  # rounding: the variance of a locked pixel may be 0
+    change = np.abs(fine.cumulants - coarse.cumulants)
+    worst = change[:, 0] / np.maximum(np.minimum(mean, spread), floor)
+    for k in range(1, _ORDERS):
+        scale = np.maximum(np.abs(fine.cumulants[:, k]), spread ** (k + 1))
+        worst = np.maximum(worst, change[:, k] / np.maximum(scale, floor))
+    joined = fine.histogram.reshape(*coarse.histogram.shape, -1).sum(-1)
+    shape = 0.5 * np.abs(joined - coarse.histogram).sum(-1) / np.maximum(mean, np.finfo(float).tiny)
+    below = fine.histogram.min(-1) < -1e-12 * mean
+    return np.asarray(np.where(below, np.inf, np.maximum(worst, shape)), dtype=np.float64)
+
+
+def _take(some: Exposure, which: NDArray[np.bool_]) -> Exposure:
+    return Exposure(**{name: array[which] for name, array in vars(some).items()})
+
+
+def _put(
+    result: Exposure, at: IndexArray, fine: Exposure, good: NDArray[np.bool_], bins: int, moved: FloatArray
+) -> None:
+    for name, array in vars(fine).items():
+        vars(result)[name][at] = array[good]
+    result.histogram[at] = np.maximum(result.histogram[at], 0.0)
+    result.bins[at] = bins
+    result.movement[at] = moved[good]
+
+
+def _shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
+    return Exposure(**{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(flat).items()})
+
+
+def _poisson(cells: Cells, out_bins: int) -> Exposure:
+    """No dead time: Poisson exactly, in every bin and in all."""
+    from mars_lidar import _core
+
+    result = _blank(cells, out_bins)
+    parts = int(_core.EXPOSURE_PARTS)
+    step = out_bins * math.ceil(512 / out_bins)
+    for part in cells.chunks(step, out_bins):
+        some = cells.part(part)
+        energy, row = some.energies(step)
+        energy = energy.reshape(energy.shape[0], out_bins, step // out_bins * parts).sum(-1)
+        result.histogram_rate[part] = some.signal[:, None] * energy[row] + some.background[:, None] / out_bins
+    result.cumulant_rates[:] = (cells.signal + cells.background)[:, None]
+    result.cumulants[:] = cells.system.cycles * result.cumulant_rates
+    result.histogram[:] = cells.system.cycles * result.histogram_rate
+    result.settled[:], result.bins[:] = 0, step
+    return _shaped(result, cells.shape)

@@ -1,0 +1,268 @@
+"""The count law of a pixel and the shape of its histogram, by any of the methods, under two verbs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar import _validate
+from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics._pmf import Window, exact_windows, gaussian_window, poisson_window
+from mars_lidar.statistics.exposure import Exposure, refined_moments, stationary_histogram, thread_count
+from mars_lidar.system import System
+
+Method = Literal["exact", "mars", "renewal", "poisson"]
+_METHODS = ("exact", "mars", "renewal", "poisson")
+_SHAPES = ("exposure", "stationary", "chain")
+_REARMS = ("centre", "edge")
+
+
+class CountLaw:
+    """Law of the number N of registrations in an exposure, for cells of shape (...); made by `count_law`.
+
+    Attributes
+    ----------
+    method
+        What computed it.
+    cumulants
+        (..., 4) mean, variance, third and fourth cumulant of N.
+    exposure
+        The `Exposure` behind an exact law (its histogram has a single bin), else None.
+
+    `support`, `pmf` and `cdf` are computed when first asked for, and kept.
+    """
+
+    def __init__(
+        self,
+        method: str,
+        cumulants: FloatArray,
+        windows: Callable[[], list[Window]],
+        exposure: Exposure | None = None,
+    ) -> None:
+        self.method = method
+        self.cumulants = cumulants
+        self.exposure = exposure
+        self._evaluate = windows
+
+    @property
+    def mean(self) -> FloatArray:
+        """E N (...)."""
+        return self.cumulants[..., 0]
+
+    @property
+    def variance(self) -> FloatArray:
+        """Var N (...)."""
+        return self.cumulants[..., 1]
+
+    @cached_property
+    def _windows(self) -> list[Window]:
+        return self._evaluate()
+
+    @cached_property
+    def support(self) -> IndexArray:
+        """Counts (..., w) to which `pmf` and `cdf` refer, consecutive; each cell has its own first count."""
+        first = np.array([window.first for window in self._windows]).reshape(self._shape)
+        return np.asarray(first[..., None] + np.arange(self._width), dtype=np.int64)
+
+    @cached_property
+    def pmf(self) -> FloatArray:
+        """P(N = n) (..., w) for n in `support`; no more than `outside` lies elsewhere.
+
+        For the Gaussian laws ("mars", "renewal") the normal density integrated from n - 1/2 to n + 1/2, what
+        lies below 0 included in P(0).
+        """
+        out = np.zeros((len(self._windows), self._width))
+        for row, window in zip(out, self._windows, strict=True):
+            row[: window.pmf.size] = window.pmf
+        return out.reshape(*self._shape, self._width)
+
+    @cached_property
+    def cdf(self) -> FloatArray:
+        """P(N <= n) (..., w) for n in `support`."""
+        return np.minimum(np.cumsum(self.pmf, axis=-1), 1.0)
+
+    @cached_property
+    def outside(self) -> FloatArray:
+        """Bound (...) on the probability outside of `support`, and so on the aliasing of an exact pmf."""
+        return np.array([window.outside for window in self._windows]).reshape(self._shape)
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        return self.cumulants.shape[:-1]
+
+    @cached_property
+    def _width(self) -> int:
+        return max(window.pmf.size for window in self._windows)
+
+    def __repr__(self) -> str:
+        if self._shape:
+            return f"CountLaw(method={self.method!r}, cells of shape {self._shape})"
+        return f"CountLaw(method={self.method!r}, mean {self.mean:.6g}, variance {self.variance:.6g})"
+
+
+def count_law(
+    signal: ArrayLike | None,
+    background: ArrayLike,
+    system: System,
+    method: Method = "exact",
+    *,
+    delay_ns: ArrayLike | None = None,
+    waveform: ArrayLike | None = None,
+    rearm: Literal["centre", "edge"] | None = None,
+    tolerance: float = 1e-4,
+    threads: int | None = None,
+) -> CountLaw:
+    """Law of the number of registrations in one exposure.
+
+    Parameters
+    ----------
+    signal, background
+        S and B, photons per period in [0, 1e6]: scalars or arrays that broadcast to (...).
+    system
+        Laser, detector and histogram (whose bins do not matter here).
+    method
+        - ``"exact"``: finite exposure, start and end included, any dead time (docs/theory_exposure.md),
+        - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure,
+        - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
+          lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
+        - ``"poisson"``: no dead time.
+    delay_ns
+        Delay of the return, ns; None: half the period. With ``"exact"`` an array may broadcast with S and B:
+        an armed start makes the law depend on the delay.
+    waveform
+        Photons per period in T equal parts of the period, instead of `signal` (None) and `delay_ns`:
+        (..., T), or (T,) for ``"mars"``.
+    rearm
+        ``"centre"`` (default) or ``"edge"`` of the bin, for ``"mars"`` only: where its chain re-arms.
+    tolerance
+        For ``"exact"``: see `exposure_moments`.
+    threads
+        Threads to run on; default: all processors that this process may use.
+
+    Returns
+    -------
+    CountLaw
+        For cells of shape (...).
+    """
+    _validate.choice("method", method, _METHODS)
+    edge = _rearm(rearm, method == "mars", f"method {method!r}")
+    cells = Cells.of(signal, background, system, delay_ns=delay_ns, waveform=waveform)
+    team = thread_count(threads)
+    if method == "exact":
+        exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team)
+        flat, bins = exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1)
+        return CountLaw(method, exposure.cumulants, lambda: exact_windows(cells, flat, bins, team), exposure)
+    if method == "poisson":
+        means = system.cycles * (cells.signal + cells.background)
+        cumulants = np.repeat(means[:, None], 4, axis=1).reshape(*cells.shape, 4)
+        return CountLaw(method, cumulants, lambda: [poisson_window(float(m)) for m in means])
+    mean, variance = _gaussian_moments(method, cells, edge)
+    cumulants = np.zeros((*cells.shape, 4))
+    cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
+    return CountLaw(
+        method,
+        cumulants,
+        lambda: [gaussian_window(float(m), float(v)) for m, v in zip(mean, variance, strict=True)],
+    )
+
+
+def registration_pdf(
+    signal: ArrayLike | None,
+    background: ArrayLike,
+    system: System,
+    method: Literal["exposure", "stationary", "chain"] = "exposure",
+    *,
+    delay_ns: ArrayLike | None = None,
+    waveform: ArrayLike | None = None,
+    rearm: Literal["centre", "edge"] | None = None,
+    tolerance: float = 1e-4,
+    threads: int | None = None,
+) -> FloatArray:
+    """Shape of the mean histogram: the distribution of registrations over the bins of the period.
+
+    Parameters
+    ----------
+    signal, background, delay_ns, waveform, tolerance, threads
+        As `count_law`; arrays broadcast to (...).
+    method
+        - ``"exposure"``: mean histogram of the finite exposure, which is what a measurement averages to,
+        - ``"stationary"``: that of a pixel which has been running for long,
+        - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500).
+    rearm
+        ``"centre"`` (default) or ``"edge"`` of the bin, for ``"chain"`` only.
+
+    Returns
+    -------
+    NDArray
+        (..., bins), non-negative; sums to 1 over the last axis. A cell without any flux has the uniform
+        shape, the limit of little background.
+    """
+    _validate.choice("method", method, _SHAPES)
+    edge = _rearm(rearm, method == "chain", f"method {method!r}")
+    cells = Cells.of(signal, background, system, delay_ns=delay_ns, waveform=waveform)
+    if method == "exposure":
+        exposure = refined_moments(cells, system.bins, tolerance=tolerance, threads=threads)
+        shape = exposure.histogram.reshape(cells.size, system.bins)
+    elif method == "stationary":
+        shape = stationary_histogram(cells, system.bins, tolerance=tolerance, threads=threads)
+    else:
+        shape = _chain_shapes(cells, edge)
+    total = shape.sum(-1, keepdims=True)
+    dark = total == 0.0
+    shape = np.where(dark, 1.0 / system.bins, shape / np.where(dark, 1.0, total))
+    return np.asarray(shape.reshape(*cells.shape, system.bins), dtype=np.float64)
+
+
+def _rearm(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"]:
+    if rearm is None:
+        return "centre"
+    if not used:
+        raise ValueError(f"rearm must be None for {by}, which has no such choice, got {rearm!r}")
+    return "edge" if _validate.choice("rearm", rearm, _REARMS) == "edge" else "centre"
+
+
+def _gaussian_moments(
+    method: str, cells: Cells, edge: Literal["centre", "edge"]
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance (cells,) of the Gaussian laws."""
+    if method == "renewal":
+        from mars_lidar.statistics.baselines import renewal_moments
+
+        return renewal_moments(cells.signal, cells.background, cells.system)
+    from mars_lidar.statistics.renewal import mars_moments
+
+    mean, variance = np.empty(cells.size), np.empty(cells.size)
+    for k in range(cells.size):
+        signal, waveform, delay = _pixel(cells, k)
+        mean[k], variance[k] = mars_moments(
+            signal, cells.background[k], cells.system, rearm=edge, delay_ns=delay, waveform=waveform
+        )
+    return mean, variance
+
+
+def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
+    """Registrations per period (cells, bins), by the chain on its grid, summed into histogram bins."""
+    from mars_lidar.statistics.chain import PhaseChain
+
+    bins = cells.system.bins
+    out = np.zeros((cells.size, bins))
+    for k in range(cells.size):
+        if cells.signal[k] + cells.background[k] == 0.0:
+            continue
+        signal, waveform, delay = _pixel(cells, k)
+        chain = PhaseChain.from_flux(
+            signal, float(cells.background[k]), cells.system, rearm=edge, delay_ns=delay, waveform=waveform
+        )
+        out[k] = chain.stationary().pdf.reshape(bins, -1).sum(-1)
+    return out
+
+
+def _pixel(cells: Cells, k: int) -> tuple[float | None, FloatArray | None, float | None]:
+    """Signal, waveform and delay of one cell as the chain takes them."""
+    if cells.waveform is not None:
+        return None, cells.signal[k] * cells.waveform[cells.row[k]], None
+    return float(cells.signal[k]), None, float(cells.delay[k]) * cells.system.period_ns

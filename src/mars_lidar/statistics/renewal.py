@@ -1,0 +1,241 @@
+"""Markov-renewal theory of the count: holding times, their covariances, and the Gaussian count law of MaRS.
+
+Equation numbers refer to docs/theory.md, section 3. Inner functions work on a `PhaseChain`, in laser periods;
+`mars_moments` takes the flux and the system.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar.statistics._feedback import cyclic_recursion
+from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
+from mars_lidar.statistics.grid import cell_name, default_bins, photons_per_bin
+from mars_lidar.system import System
+
+FloatArray = NDArray[np.float64]
+
+_AGREEMENT = 1e-7  # two independent routes to a moment may differ by this much, relative to its largest term
+_MAX_DENSE = 8192
+
+
+@dataclass(frozen=True, eq=False)
+class MomentMatrices:
+    """Moments of the holding time W given the step i -> j, dense (n, n), in periods (3.1-3.3).
+
+    `mean` mu_ij and `variance` sigma_ij^2 of W; `q_mu` = P.mean, `q_mu2` = P.mean.mean and
+    `q_s2` = P.variance, element by element.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    q_mu: FloatArray
+    q_mu2: FloatArray
+    q_s2: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class HoldingTimes:
+    """Moments of the stationary sequence of holding times, in periods.
+
+    Attributes
+    ----------
+    stationary
+        Stationary phases, with their convergence.
+    mean
+        (n,) expected holding time after a registration in each bin, the row sums of Q_mu.
+    variance
+        (n,) variance of the holding time after a registration in each bin.
+    mu
+        Mean holding time.
+    sigma_ss2
+        Variance of one holding time (3.5).
+    sigma2
+        Variance per registration of their sum, covariances included (3.9): a sum of squares, never negative.
+    covariance_sum
+        Sum of all lag covariances gamma_1 + gamma_2 + ..., without truncation (3.10).
+    relative_value
+        (n,) the solution z of (I - P + 1 pi) z = Q_mu 1 - mu.
+    defect
+        Largest relative disagreement among independent routes to the same figures: mu from pi and from the
+        feedback equation, the residual of the equation for z, sigma2 and sigma_ss2 + 2 covariance_sum.
+    """
+
+    stationary: Stationary
+    mean: FloatArray
+    variance: FloatArray
+    mu: float
+    sigma_ss2: float
+    sigma2: float
+    covariance_sum: float
+    relative_value: FloatArray
+    defect: float
+
+
+def moment_matrices(chain: PhaseChain) -> MomentMatrices:
+    """Dense moments of the holding time, for studies and tests: O(n^2) memory, n at most 8192."""
+    n = chain.bins
+    if n > _MAX_DENSE:
+        raise ValueError(f"bins must be at most {_MAX_DENSE} for dense matrices, got {n}")
+    matrix = chain.dense()
+    j = np.arange(n)
+    arm = (j + chain.shift) % n
+    ahead = (j[None, :] - arm[:, None]) % n
+    # M and Sigma away from the re-arming bin: a geometric number of further periods (3.1, 3.2)
+    loss, passed = -math.expm1(-chain.total), math.exp(-chain.total)
+    mean = (chain.blind_bins + ahead) / n + passed / loss
+    variance = np.full((n, n), passed / loss**2)
+    # the re-arming bin is met once in part, then whole every period (3.3)
+    p, refire = -np.expm1(-chain.photons), -np.expm1(-(1.0 - chain.fraction) * chain.photons)
+    lead = p * np.exp(chain.fraction * chain.photons) / loss
+    again = lead * passed
+    there = refire + again
+    with np.errstate(invalid="ignore", divide="ignore"):
+        first = np.where(there > 0, again / loss / there, 0.0)
+        second = np.where(there > 0, again * (1.0 + passed) / loss**2 / there, 0.0)
+    mean[j, arm] = chain.blind_bins / n + first[arm]
+    variance[j, arm] = (second - first**2)[arm]
+    return MomentMatrices(mean, variance, matrix * mean, matrix * mean * mean, matrix * variance)
+
+
+def row_moments(chain: PhaseChain) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance (n,), (n,) of the holding time after a registration in each bin, O(n) (3.4)."""
+    n, keep, fire = chain.bins, chain.keep, chain.fire
+    refire, rekeep = chain.refire, chain.rekeep
+    # in bins, armed at the start of a bin: fire at once, or pass one bin and go on
+    wait = cyclic_recursion(keep, keep, chain.loss, backward=True)
+    passing = 1.0 + np.roll(wait, -1)
+    spread = cyclic_recursion(keep, keep * fire * passing**2, chain.loss, backward=True)
+    mean = chain.blind_bins + chain.at_rearming(rekeep * passing)
+    variance = chain.at_rearming(rekeep * np.roll(spread, -1) + refire * rekeep * passing**2)
+    return mean / n, variance / n**2
+
+
+def weighted_waits(chain: PhaseChain, distribution: FloatArray) -> FloatArray:
+    """The row vector x Q_mu (n,): waits of `distribution` x (n,) by the bin that ends them, O(n) (3.6)."""
+    arming = chain.rekeep * chain.rearmed(distribution)
+    mass = cyclic_recursion(chain.keep, arming, chain.loss)
+    # mass times bins since re-arming: every bin passed adds one
+    since = cyclic_recursion(chain.keep, chain.keep * mass + arming, chain.loss)
+    ended = mass * chain.fire + chain.refire * chain.rearmed(distribution)
+    return (chain.blind_bins * ended + chain.fire * since) / chain.bins
+
+
+def lag_covariances(chain: PhaseChain, times: HoldingTimes, lags: int) -> FloatArray:
+    """gamma_1 .. gamma_lags (lags,), exact for the chain, in periods squared, O(n) a lag (3.7)."""
+    row = weighted_waits(chain, times.stationary.pdf) - times.mu * times.stationary.pdf
+    value = times.mean - times.mu
+    out = np.empty(lags)
+    for k in range(lags):
+        out[k] = row @ value
+        value = chain.right(value)
+        value -= times.stationary.pdf @ value  # rounding must not put back the mean that has been taken out
+    return out
+
+
+def holding_times(chain: PhaseChain) -> HoldingTimes:
+    """All moments of the holding times without truncation, from two feedback solutions, O(n).
+
+    Raises
+    ------
+    ConvergenceError
+        Where a solution did not converge.
+
+    Warns
+    -----
+    RuntimeWarning
+        Where independent routes to one figure disagree by more than 1e-7; the message names the cell.
+    """
+    n = chain.bins
+    forward, dual = chain.solve(adjoint=False), chain.solve(adjoint=True)
+    stationary = stationary_from(chain, forward)
+    pdf = stationary.pdf
+    mean, variance = row_moments(chain)
+    mu = float(pdf @ mean)
+
+    # (3.8): u is the value of firing in a bin less that of passing it, scaled so that one period closes
+    jump = dual.x * (-float(n) / float(chain.fire @ dual.x))
+    # (3.9): a martingale; what it gains in each bin has variance keep fire u^2
+    chance = chain.armed(pdf) * chain.fire * chain.keep
+    chance += chain.rearmed(pdf) * chain.refire * chain.rekeep
+    sigma2 = float(np.sum(chance * jump**2)) / n**2
+
+    # z from u: V falls by 1 + p u a bin (3.10)
+    steps = 1.0 + chain.fire * jump
+    value = (jump - np.cumsum(steps)) / n
+    value -= pdf @ value
+    row = weighted_waits(chain, pdf) - mu * pdf
+    covariance_sum = float(row @ value)
+    between = float(pdf @ (mean - mu) ** 2)
+    sigma_ss2 = float(pdf @ variance) + between
+
+    rest = value - chain.right(value) - (mean - mu)
+    defect = max(
+        abs(mu * stationary.rate - 1.0),
+        float(np.abs(rest).max()) / (mu + float(np.abs(value).max())),
+        # below 1e-13 mu^2 the variances of one step are rounding, and cancel to it
+        abs(sigma_ss2 + 2.0 * covariance_sum - sigma2) / (max(sigma_ss2, sigma2) + 1e-6 * mu**2),
+    )
+    if not defect <= _AGREEMENT:
+        warnings.warn(
+            f"holding times at {chain.describe()}: independent routes agree to {defect:.1e} only "
+            f"(mu = {mu:g}, sigma2 = {sigma2:g} periods)",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    for array in (mean, variance, value):
+        array.flags.writeable = False
+    return HoldingTimes(stationary, mean, variance, mu, sigma_ss2, sigma2, covariance_sum, value, defect)
+
+
+def mars_moments(
+    signal: ArrayLike | None,
+    background: ArrayLike,
+    system: System,
+    *,
+    rearm: Rearm = "centre",
+    bins: int | None = None,
+    delay_ns: float | None = None,
+    waveform: ArrayLike | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of the MaRS count law N ~ Normal(t / mu, t sigma^2 / mu^3), t the exposure (3.11).
+
+    The asymptotic law of a long exposure: it knows neither the start of the exposure nor, but for the grid,
+    the delay.
+
+    Parameters
+    ----------
+    signal, background
+        S and B, photons per period: scalars or arrays that broadcast.
+    rearm
+        ``"centre"``, or ``"edge"`` for the re-arming of Rapp's code.
+    bins, delay_ns, waveform
+        As `photons_per_bin`.
+
+    Returns
+    -------
+    tuple
+        mean, variance: arrays of the broadcast shape (0-d for scalars); 0, 0 where there is no flux.
+    """
+    _validate.choice("rearm", rearm, ("centre", "edge"))
+    given = np.asarray(np.nan if signal is None else signal, dtype=np.float64)
+    s, b = np.broadcast_arrays(given, np.asarray(background, dtype=np.float64))
+    mean, variance = np.zeros(s.shape), np.zeros(s.shape)
+    if bins is None and waveform is None:
+        bins = default_bins(system)
+    for index in np.ndindex(s.shape):
+        one, other = None if signal is None else float(s[index]), float(b[index])
+        photons = photons_per_bin(one, other, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
+        if not photons.any():
+            continue
+        cell = cell_name(one, other, system)
+        times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, cell))
+        mean[index] = system.cycles / times.mu
+        variance[index] = system.cycles * times.sigma2 / times.mu**3
+    return mean, variance

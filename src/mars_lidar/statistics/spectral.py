@@ -1,0 +1,206 @@
+"""Covariance of holding times and its spectral truncation, the scale part of MaRS (arXiv 2512.04924).
+
+Equation numbers refer to docs/theory.md, section 4.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar.statistics.chain import PhaseChain, Rearm
+from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covariances, weighted_waits
+from mars_lidar.system import System
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_MAX_LAGS = 100_000
+_MAX_EIG = 4096
+_MOST_MODES = 12  # the automatic rule looks no deeper into the spectrum
+
+
+@dataclass(frozen=True, eq=False)
+class HoldingTimeCovariance:
+    """Lag covariances of the holding times of one pixel, and their sum by every rule.
+
+    Times in ns, covariances in ns^2. `spectral_sum`, `automatic_sum` and `eigenvalues` decompose the dense
+    transition matrix on first use, O(n^3), once per object; nothing else does.
+
+    Attributes
+    ----------
+    gamma
+        (lags,) covariances gamma_1 .. gamma_lags, by O(n) products.
+    mu
+        Mean holding time.
+    sigma_ss2
+        Variance of one holding time.
+    exact_sum
+        gamma_1 + gamma_2 + ... without truncation, from one O(n) solution.
+    sigma2
+        sigma_ss2 + 2 exact_sum, computed as a sum of squares: never negative.
+    defect
+        Relative disagreement of independent routes to mu, exact_sum and sigma2 (see `HoldingTimes`).
+    """
+
+    gamma: FloatArray
+    mu: float
+    sigma_ss2: float
+    exact_sum: float
+    sigma2: float
+    defect: float
+    _chain: PhaseChain
+    _times: HoldingTimes
+    _unit: float  # ns^2 per period^2
+
+    @property
+    def stationary_pdf(self) -> FloatArray:
+        """Stationary distribution of the phases (bins,)."""
+        return self._times.stationary.pdf
+
+    def cutoff_sum(self, cutoff: int) -> float:
+        """gamma_1 + ... + gamma_cutoff: the fixed cut-off (4.1); 0 for a cut-off of 0."""
+        cutoff = _validate.integer("cutoff", cutoff, low=0, high=_MAX_LAGS)
+        if cutoff <= self.gamma.size:
+            return float(self.gamma[:cutoff].sum())
+        return float(lag_covariances(self._chain, self._times, cutoff).sum()) * self._unit
+
+    @property
+    def eigenvalues(self) -> ComplexArray:
+        """Eigenvalues of P (bins,), by falling magnitude; the first is 1."""
+        return self._modes[0]
+
+    def spectral_sum(self, lags: int = 6, modes: int = 5) -> float:
+        """gamma_1 .. gamma_lags exactly, the tail from the leading `modes` eigenvalues, 1 included (4.2).
+
+        A conjugate pair is never split: one more mode is taken where `modes` would. The paper's rule is
+        L = 6, p = 5.
+        """
+        lags = _validate.integer("lags", lags, low=0, high=_MAX_LAGS)
+        modes = _validate.integer("modes", modes, low=1, high=self._chain.bins)
+        values, weights = self._modes
+        count = self._whole_pairs(modes)
+        kept, weight = values[1:count], weights[1:count]
+        tail = np.sum(weight * kept**lags / (1.0 - kept))
+        return self.cutoff_sum(lags) + float(tail.real)
+
+    def automatic_rule(self, tolerance: float = 1e-3) -> tuple[int, int]:
+        """The cheapest (lags, modes) whose neglected modes stay below `tolerance` x sigma_ss2 (4.3).
+
+        The neglected part is bounded through the gap: |gamma_l| <= sigma_ss2, and modes beyond the p-th fall
+        at least like |lambda_(p+1)|^l. The bound is rigorous for a normal P; P is not, so the first lags, in
+        which non-normality shows, are summed exactly: at least six.
+        """
+        tolerance = _validate.real("tolerance", tolerance, low=0.0, high=1.0, strict_low=True)
+        size = np.abs(self.eigenvalues)
+        best: tuple[int, int] | None = None
+        for modes in range(1, min(_MOST_MODES, size.size - 1) + 1):
+            count = self._whole_pairs(modes)
+            next_size = float(size[count]) if count < size.size else 0.0
+            if next_size >= 1.0:
+                continue
+            lags = 6
+            if next_size > 0.0:
+                lags = max(6, math.ceil(math.log(tolerance * (1.0 - next_size)) / math.log(next_size)))
+            if lags <= _MAX_LAGS and (best is None or lags + count < sum(best)):
+                best = lags, count
+        if best is None:
+            raise ArithmeticError(
+                f"{self._chain.describe()}: no gap in the first {_MOST_MODES} eigenvalues; use exact_sum"
+            )
+        return best
+
+    def automatic_sum(self, tolerance: float = 1e-3) -> float:
+        """`spectral_sum` at the lags and modes of `automatic_rule`."""
+        lags, modes = self.automatic_rule(tolerance)
+        return self.spectral_sum(lags, modes)
+
+    def _whole_pairs(self, modes: int) -> int:
+        values = self.eigenvalues
+        if modes < values.size and modes > 1:
+            last, following = values[modes - 1], values[modes]
+            paired = abs(last.imag) > 0 and abs(following - last.conjugate()) <= 1e-9 * abs(last)
+            # a pair is in order (+, -); a count that ends on its first half takes the second as well
+            if paired and np.count_nonzero(values[1:modes].imag) % 2 == 1:
+                return modes + 1
+        return modes
+
+    @cached_property
+    def _modes(self) -> tuple[ComplexArray, ComplexArray]:
+        """Eigenvalues and the weights (pi Q_mu v_k)(u_k Q_mu 1) in ns^2, by falling magnitude (4.2)."""
+        from scipy.linalg import eig
+
+        if self._chain.bins > _MAX_EIG:
+            raise ValueError(
+                f"bins must be at most {_MAX_EIG} for an eigen-decomposition, got {self._chain.bins}; "
+                f"exact_sum and cutoff_sum need none"
+            )
+        # Left eigenvectors from inv(V) have given negative variances: P is strongly non-normal (4.4)
+        found: Any = eig(self._chain.dense(), left=True, right=True)
+        values, left, right = found
+        order = np.argsort(-np.round(np.abs(values), 12), kind="stable")  # keeps conjugates side by side
+        values, left, right = values[order], left[:, order], right[:, order]
+        pdf, times = self._times.stationary.pdf, self._times
+        row = weighted_waits(self._chain, pdf) - times.mu * pdf
+        with np.errstate(divide="ignore", invalid="ignore"):  # the many modes of lambda = 0 are defective
+            overlap = np.sum(left.conj() * right, axis=0)
+            weights = (row @ right) * (left.conj().T @ (times.mean - times.mu)) / overlap
+        return values, weights * self._unit
+
+
+def holding_time_covariance(
+    signal: float | None,
+    background: float,
+    system: System,
+    *,
+    lags: int = 20,
+    rearm: Rearm = "centre",
+    bins: int | None = None,
+    delay_ns: float | None = None,
+    waveform: ArrayLike | None = None,
+) -> HoldingTimeCovariance:
+    """Covariances of the times between registrations, and their sum by every rule.
+
+    Parameters
+    ----------
+    signal, background
+        S and B, photons per period, not both 0.
+    lags
+        Lag covariances to compute, >= 0.
+    rearm
+        ``"centre"``, or ``"edge"`` for the re-arming of Rapp's code.
+    bins, delay_ns, waveform
+        As `photons_per_bin`; the delay only shifts the phases on the grid.
+
+    Raises
+    ------
+    ValueError
+        For arguments out of range, and for a flux of 0: without registrations there are no holding times.
+    ConvergenceError
+        Where a solution did not converge; the message names the cell.
+    """
+    lags = _validate.integer("lags", lags, low=0, high=_MAX_LAGS)
+    chain = PhaseChain.from_flux(
+        signal, background, system, rearm=rearm, bins=bins, delay_ns=delay_ns, waveform=waveform
+    )
+    times = holding_times(chain)
+    unit = system.period_ns**2
+    gamma = lag_covariances(chain, times, lags) * unit
+    gamma.flags.writeable = False
+    return HoldingTimeCovariance(
+        gamma=gamma,
+        mu=times.mu * system.period_ns,
+        sigma_ss2=times.sigma_ss2 * unit,
+        exact_sum=times.covariance_sum * unit,
+        sigma2=times.sigma2 * unit,
+        defect=times.defect,
+        _chain=chain,
+        _times=times,
+        _unit=unit,
+    )

@@ -1,0 +1,213 @@
+"""The instrument: laser, detector and histogram, as one frozen object that goes along with every result."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar.pulse import Pulse, pulse_from_dict
+
+SPEED_OF_LIGHT_M_PER_NS = 0.299792458
+_MODES = ("nonparalyzable",)
+_STARTS = ("armed", "stationary")
+_MAX_CYCLES = 100_000_000  # the sampler counts periods in 32 bits: ten seconds at 10 MHz
+_MAX_BINS = 2**20
+_MAX_DEAD_PERIODS = 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detector:
+    """A single-photon detector pixel.
+
+    Parameters
+    ----------
+    dead_time_ns
+        After a registration the pixel is blind for this long, across period edges. 0, a fraction of the
+        laser period or many periods.
+    mode
+        ``"nonparalyzable"``: free running; photons that arrive while the pixel is blind have no effect.
+    """
+
+    dead_time_ns: float
+    mode: Literal["nonparalyzable"] = "nonparalyzable"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dead_time_ns", _validate.real("dead_time_ns", self.dead_time_ns, low=0.0))
+        _validate.choice("mode", self.mode, _MODES)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `Detector.from_dict` makes an equal detector."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Detector:
+        """The detector that `to_dict` described."""
+        return cls(**_validate.known_keys("detector", data, ("dead_time_ns", "mode")))
+
+
+@dataclass(frozen=True, kw_only=True)
+class System:
+    """Laser, detector and histogram.
+
+    Parameters
+    ----------
+    period_ns
+        Laser period t_r, ns.
+    cycles
+        Laser periods per exposure N_r; the exposure lasts ``cycles * period_ns``.
+    bins
+        Histogram bins over one period n_b.
+    pulse
+        Shape of the returned pulse, detector response included.
+    detector
+        Dead time and mode of the pixel.
+    start
+        State of the pixel at the start of the exposure: ``"armed"`` (ready at t = 0) or ``"stationary"``
+        (warmed up). The two differ by up to half a count in the mean.
+    """
+
+    period_ns: float
+    cycles: int
+    bins: int
+    pulse: Pulse
+    detector: Detector
+    start: Literal["armed", "stationary"] = "armed"
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        set_field(self, "period_ns", _validate.real("period_ns", self.period_ns, low=0.0, strict_low=True))
+        set_field(self, "cycles", _validate.integer("cycles", self.cycles, low=1, high=_MAX_CYCLES))
+        set_field(self, "bins", _validate.integer("bins", self.bins, low=1, high=_MAX_BINS))
+        if not isinstance(self.pulse, Pulse):
+            raise TypeError(f"pulse must be a GaussianPulse or a SampledPulse, got {self.pulse!r}")
+        if not isinstance(self.detector, Detector):
+            raise TypeError(f"detector must be a Detector, got {self.detector!r}")
+        _validate.choice("start", self.start, _STARTS)
+        self.pulse.check(self.period_ns)
+        if self.dead_time_periods > _MAX_DEAD_PERIODS:
+            raise ValueError(
+                f"dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
+                f"got {self.detector.dead_time_ns:g} ns"
+            )
+
+    @property
+    def bin_ns(self) -> float:
+        """Width of a histogram bin, ns."""
+        return self.period_ns / self.bins
+
+    @property
+    def exposure_ns(self) -> float:
+        """Length of one exposure, ns."""
+        return self.period_ns * self.cycles
+
+    @property
+    def dead_time_periods(self) -> float:
+        """Dead time in laser periods, t_d / t_r."""
+        return self.detector.dead_time_ns / self.period_ns
+
+    @property
+    def unambiguous_range_m(self) -> float:
+        """Depth c t_r / 2 beyond which returns wrap into the next period, m."""
+        return 0.5 * SPEED_OF_LIGHT_M_PER_NS * self.period_ns
+
+    @property
+    def time_ns(self) -> NDArray[np.float64]:
+        """Centres of the histogram bins (bins,), ns."""
+        return (np.arange(self.bins, dtype=np.float64) + 0.5) * self.bin_ns
+
+    def delay_ns(self, depth_m: ArrayLike) -> NDArray[np.float64]:
+        """Round-trip time 2 z / c of depths (...) in m, in ns, not wrapped."""
+        return 2.0 / SPEED_OF_LIGHT_M_PER_NS * np.asarray(depth_m, dtype=np.float64)
+
+    def depth_m(self, delay_ns: ArrayLike) -> NDArray[np.float64]:
+        """Depth c tau / 2 of delays (...) in ns, in m."""
+        return 0.5 * SPEED_OF_LIGHT_M_PER_NS * np.asarray(delay_ns, dtype=np.float64)
+
+    @property
+    def max_bin_count(self) -> float:
+        """Most registrations that one bin can hold: inf for a dead time of 0.
+
+        A bin is open for one bin width per period, which fits floor(width / t_d) + 1 registrations, and an
+        exposure fits floor(exposure / t_d) + 1 in all.
+        """
+        dead = self.detector.dead_time_ns
+        if dead == 0.0:
+            return math.inf
+        return min(self.cycles * (self.bin_ns // dead + 1), self.exposure_ns // dead + 1)
+
+    @property
+    def histogram_dtype(self) -> np.dtype[Any]:
+        """uint16, or uint32 where a bin could exceed 65535; a function of the system alone."""
+        return np.dtype(np.uint16 if self.max_bin_count <= np.iinfo(np.uint16).max else np.uint32)
+
+    def replace(self, **changes: Any) -> System:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, JSON and YAML ready, from which `System.from_dict` makes an equal system."""
+        return {
+            "period_ns": self.period_ns,
+            "cycles": self.cycles,
+            "bins": self.bins,
+            "pulse": self.pulse.to_dict(),
+            "detector": self.detector.to_dict(),
+            "start": self.start,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Any) -> System:
+        """The system that `to_dict` described; unknown or missing keys are errors that name them."""
+        names = tuple(field.name for field in dataclasses.fields(cls))
+        known = dict(_validate.known_keys("system", data, names))
+        missing = [name for name in names if name not in known and name != "start"]
+        if missing:
+            raise ValueError(f"system must give {missing[0]}; needed: {', '.join(names[:-1])}")
+        known["pulse"] = pulse_from_dict(known["pulse"])
+        known["detector"] = Detector.from_dict(known["detector"])
+        return cls(**known)
+
+    def to_json(self) -> str:
+        """One line of JSON; floats are written so that they read back to the same bits."""
+        return json.dumps(self.to_dict())
+
+    @classmethod
+    def from_json(cls, text: str) -> System:
+        """The system that `to_json` wrote."""
+        return cls.from_dict(json.loads(text))
+
+    def save(self, path: str | Path) -> None:
+        """Write to a ``.json``, ``.yaml`` or ``.yml`` file."""
+        target = Path(path)
+        if target.suffix == ".json":
+            target.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
+        elif target.suffix in (".yaml", ".yml"):
+            import yaml
+
+            target.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False))
+        else:
+            raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
+
+    @classmethod
+    def load(cls, path: str | Path) -> System:
+        """Read what `save` wrote; an error names the file and the key."""
+        source = Path(path)
+        if source.suffix not in (".json", ".yaml", ".yml"):
+            raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
+        text = source.read_text()
+        try:
+            if source.suffix == ".json":
+                return cls.from_dict(json.loads(text))
+            import yaml
+
+            return cls.from_dict(yaml.safe_load(text))
+        except Exception as error:
+            raise ValueError(f"{source}: {error}") from error

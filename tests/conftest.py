@@ -1,0 +1,44 @@
+"""Shared fixtures, and the account of the statistical checks at the end of a run."""
+
+from __future__ import annotations
+
+import pytest
+
+from mars_lidar import Detector, Flux, GaussianPulse, System
+
+pytest.register_assert_rewrite("harness")
+
+from harness import ledger  # noqa: E402  (after the line above, so that its assertions explain themselves)
+
+
+@pytest.fixture
+def system() -> System:
+    """The system of the MaRS paper, shortened."""
+    return System(
+        period_ns=1e3 / 7.5,
+        cycles=200,
+        bins=64,
+        pulse=GaussianPulse(sigma_ns=0.5),
+        detector=Detector(dead_time_ns=85.0),
+    )
+
+
+@pytest.fixture
+def flux() -> Flux:
+    """A small image: dim, bright, without signal, without anything."""
+    return Flux(
+        [[0.5, 3.0, 0.0], [10.0, 0.01, 0.0]], [[0.5, 0.1, 1.0], [2.0, 0.0, 0.0]], [[10, 60, 0], [133, 90, 5]]
+    )
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    lines = ledger.summary()
+    if lines:
+        terminalreporter.section("statistical checks")
+        for line in lines:
+            terminalreporter.line(line)
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    if ledger.number() * ledger.LEVEL > ledger.FAMILY_LEVEL and exitstatus == 0:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED

@@ -1,0 +1,65 @@
+"""One statistical harness for all engines.
+
+`check(engine, case, oracle, ...)` draws realizations with a fixed seed and compares them with an oracle: an
+independent simulator's statistics (`Reference`), a closed form (`Law`) or another engine's draws (any
+`Engine`). An engine declares what it claims to reproduce (`COUNTS`, `SHAPE`, `JOINT`, `INTERVALS`); nothing
+else is asked of it.
+
+Every comparison yields one p-value of known size, and every p-value that a test relies on goes through
+`ledger.require`, which counts it. Each is compared with `LEVEL`, so that N checks raise a false alarm, for a
+new choice of seeds, with a probability of at most N x LEVEL; the terminal summary prints both numbers.
+"""
+
+from harness.cases import (
+    PERIOD_NS,
+    Case,
+    flux_of,
+    measured_pulse,
+    random_cases,
+    shared,
+    two_lobes,
+    waveform_flux,
+)
+from harness.check import COUNTS, INTERVALS, JOINT, SHAPE, check, compare
+from harness.laws import Law, armed_count_pmf, constant_rate_moments, first_arrival, stationary_count_pmf
+from harness.ledger import FAMILY_LEVEL, LEVEL, rejected, require
+from harness.pvalues import bonferroni, counts_against_law, goodness, mean_vector, same_law, two_mean_vectors
+from harness.reference import REFERENCE_NAMES, Reference
+from harness.sample import Sample, draw, task_of
+
+__all__ = [
+    "COUNTS",
+    "FAMILY_LEVEL",
+    "INTERVALS",
+    "JOINT",
+    "LEVEL",
+    "PERIOD_NS",
+    "REFERENCE_NAMES",
+    "SHAPE",
+    "Case",
+    "Law",
+    "Reference",
+    "Sample",
+    "armed_count_pmf",
+    "bonferroni",
+    "check",
+    "compare",
+    "constant_rate_moments",
+    "counts_against_law",
+    "draw",
+    "first_arrival",
+    "flux_of",
+    "goodness",
+    "mean_vector",
+    "measured_pulse",
+    "random_cases",
+    "rejected",
+    "require",
+    "same_law",
+    "shared",
+    "stationary_count_pmf",
+    "task_of",
+    "two_lobes",
+    "two_mean_vectors",
+    "waveform_flux",
+]

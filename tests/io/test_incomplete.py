@@ -1,0 +1,140 @@
+"""What is half written never looks complete, whatever stopped the process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from store_cases import SUFFIXES, SYSTEM, one_return
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.io import recipe
+
+
+def _interrupt_after(exposures: int):
+    def progress(done: int, total: int) -> None:
+        if done >= exposures:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Blocks of one image, so that a stop half way leaves half of them."""
+    monkeypatch.setattr(recipe, "BLOCK_BYTES", 4000)
+    monkeypatch.setattr("mars_lidar.io.zarr_store._CHUNK_BYTES", 4000)
+
+
+def test_an_interrupted_zarr_is_left_incomplete(tmp_path, small_blocks):
+    path = tmp_path / "cube.zarr"
+    with pytest.raises(io.Interrupted, match=r"cube\.zarr is left behind, marked incomplete"):
+        io.simulate_to(path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90))
+    with pytest.raises(io.IncompleteFileError, match=r"is incomplete: .*at least 2 of 4 chunks are written"):
+        io.load(path)
+    with io.load(path, allow_incomplete=True) as cube:
+        assert not cube.complete
+        assert cube.registrations is None
+        assert np.array_equal(cube.histogram[0:2], ml.simulate(one_return(), SYSTEM, realizations=2))
+        assert not np.asarray(cube.histogram[2:]).any()
+    with xarray.open_zarr(path) as data:
+        assert data.attrs["complete"] is False
+    io.simulate_to(path, one_return(), SYSTEM, overwrite=True)
+    io.load(path).close()
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".npz"])
+def test_an_interrupted_file_leaves_what_was_there(tmp_path, small_blocks, suffix):
+    path = tmp_path / f"cube{suffix}"
+    with pytest.raises(io.Interrupted, match="nothing was left at"):
+        io.simulate_to(path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90))
+    assert list(tmp_path.iterdir()) == []
+    io.simulate_to(path, one_return(), SYSTEM, seed=5)
+    with pytest.raises(io.Interrupted, match="is what it was before"):
+        io.simulate_to(
+            path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90), overwrite=True
+        )
+    assert list(tmp_path.iterdir()) == [path]
+    with io.load(path) as cube:
+        assert cube.seed == 5
+
+
+_SCRIPT = """
+import os, signal, sys
+import numpy as np, mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.io import recipe, zarr_store, hdf5
+path, how = sys.argv[1:]
+recipe.BLOCK_BYTES = zarr_store._CHUNK_BYTES = hdf5._CHUNK_BYTES = 2**17 if how.isdigit() else 20000
+system = ml.System(period_ns=100.0, cycles=2000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
+                   detector=ml.Detector(dead_time_ns=10.0))
+flux = ml.Flux(np.full((32, 32), 5.0), 1.0, 40.0)
+def progress(done, total):
+    if how == "kill" and done > 0.6 * total:
+        os.kill(os.getpid(), signal.SIGKILL)
+if how.isdigit():
+    import resource
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(how), int(how)))
+try:
+    io.simulate_to(path, flux, system, realizations=2, progress=progress)
+except io.WriteError as error:
+    print("WriteError:", error.strerror)
+"""
+
+
+def _run(path: Path, how: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", _SCRIPT, str(path), how], capture_output=True, text=True)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_kill_9_leaves_nothing_that_looks_complete(tmp_path, suffix):
+    path = tmp_path / f"cube{suffix}"
+    assert _run(path, "kill").returncode == -signal.SIGKILL
+    with pytest.raises(io.IncompleteFileError, match=r"cube.* (is incomplete|was never finished)"):
+        io.load(path)
+    if suffix == ".zarr":
+        assert not io.load(path, allow_incomplete=True).complete
+    else:
+        leftover = tmp_path / f"cube{suffix}.incomplete"
+        assert list(tmp_path.iterdir()) == [leftover]
+        with pytest.raises(io.IncompleteFileError, match="incomplete"):
+            io.load(leftover)
+    io.simulate_to(path, one_return(), SYSTEM, overwrite=True)  # the leftover is in nobody's way
+    with io.load(path) as cube:
+        assert io.verify(cube)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_full_disk_is_told_and_leaves_nothing_that_looks_complete(tmp_path, suffix):
+    path = tmp_path / f"cube{suffix}"
+    done = _run(path, "25000")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("WriteError: File too large; ")
+    if suffix == ".zarr":
+        assert "marked incomplete" in done.stdout
+        with pytest.raises(io.IncompleteFileError):
+            io.load(path)
+    else:
+        assert "nothing was left" in done.stdout
+        assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_disk_that_is_full_from_the_start_is_told(tmp_path, suffix):
+    done = _run(tmp_path / f"cube{suffix}", "700")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("WriteError: ")
+    assert "nothing was left" in done.stdout
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,287 @@
+"""RGB-D files: values, units, gaps, and what is said of bad files."""
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from mars_lidar.io.rgbd import read_rgbd
+from mars_lidar.scene import Scene
+
+SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "rgbd"
+NAN = np.nan
+
+needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"real RGB-D inputs are absent: {SHARED}")
+
+
+def srgb(value):
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+
+
+@pytest.fixture
+def millimetres() -> np.ndarray:
+    return np.array([[0, 1000, 1500], [65535, 2500, 1]], dtype=np.uint16)
+
+
+METRES = [[NAN, 1.0, 1.5], [65.535, 2.5, 0.001]]
+
+
+def png(path: Path, array: np.ndarray) -> Path:
+    iio.imwrite(path, array, plugin="pillow")
+    return path
+
+
+# --- depth -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+def test_16_bit_depth_is_millimetres_and_zero_is_no_return(tmp_path, millimetres, suffix):
+    depth, reflectivity, background = read_rgbd(png(tmp_path / f"d{suffix}", millimetres))
+    np.testing.assert_allclose(depth, METRES, rtol=1e-15)
+    assert (reflectivity == 1.0).all()
+    assert background is None
+
+
+def test_other_units(tmp_path, millimetres):
+    depth, _, _ = read_rgbd(png(tmp_path / "d.png", millimetres), depth_unit_m=1 / 5000)
+    np.testing.assert_allclose(depth, np.array(METRES) / 5, rtol=1e-14)
+    np.save(tmp_path / "d.npy", millimetres)
+    depth, _, _ = read_rgbd(tmp_path / "d.npy", depth_unit_m=1e-3)
+    np.testing.assert_allclose(depth, METRES, rtol=1e-15)
+
+
+def test_npy_depth_is_metres_and_zero_nan_inf_are_no_return(tmp_path):
+    np.save(tmp_path / "d.npy", np.array([[0.0, NAN, np.inf, 2.5]], dtype=np.float32))
+    depth, _, _ = read_rgbd(str(tmp_path / "d.npy"))
+    np.testing.assert_array_equal(depth, [[NAN, NAN, NAN, 2.5]])
+
+
+def test_npz(tmp_path):
+    depth, share, light = np.full((2, 2), 3.0), np.full((2, 2), 0.25), np.array([[1.0, 2.0], [0.0, 4.0]])
+    np.savez(tmp_path / "s.npz", depth=depth, reflectivity=share, background=light)
+    scene = Scene.from_rgbd(tmp_path / "s.npz")
+    np.testing.assert_array_equal(scene.depth_m, depth)
+    np.testing.assert_array_equal(scene.reflectivity, share)
+    np.testing.assert_array_equal(scene.background, light)
+    np.savez(tmp_path / "i.npz", depth=depth, image=np.full((2, 2, 3), 188, dtype=np.uint8))
+    np.testing.assert_allclose(Scene.from_rgbd(tmp_path / "i.npz").reflectivity, srgb(188 / 255), rtol=1e-14)
+    np.savez(tmp_path / "d.npz", depth=depth)
+    assert (Scene.from_rgbd(tmp_path / "d.npz").reflectivity == 1.0).all()
+
+
+def test_focal_length_turns_depth_into_range(tmp_path):
+    np.save(tmp_path / "d.npy", np.full((3, 5), 2.0))
+    depth, _, _ = read_rgbd(tmp_path / "d.npy", focal_px=4.0)
+    assert depth[1, 2] == 2.0
+    assert depth[1, 4] == pytest.approx(2.0 * np.sqrt(1 + 4 / 16), rel=1e-15)
+    assert depth[0, 0] == pytest.approx(2.0 * np.sqrt(1 + (4 + 1) / 16), rel=1e-15)
+    np.testing.assert_allclose(depth, depth[::-1, ::-1], rtol=1e-15)
+
+
+# --- reflectivity ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("pixel", "expected"),
+    [
+        ((255, 255, 255), 1.0),
+        ((0, 0, 0), 0.0),
+        ((10, 10, 10), 10 / 255 / 12.92),
+        ((255, 0, 0), 0.2126),
+        ((0, 255, 0), 0.7152),
+        ((0, 0, 255), 0.0722),
+        ((200, 100, 50), 0.2126 * srgb(200 / 255) + 0.7152 * srgb(100 / 255) + 0.0722 * srgb(50 / 255)),
+    ],
+)
+def test_reflectivity_is_linear_luminance(tmp_path, pixel, expected):
+    depth = png(tmp_path / "d.png", np.full((1, 1), 1000, dtype=np.uint16))
+    for name, colour in (("rgb.png", pixel), ("rgba.png", (*pixel, 7))):
+        image = png(tmp_path / name, np.array([[colour]], dtype=np.uint8))
+        assert read_rgbd(depth, image)[1][0, 0] == pytest.approx(expected, abs=1e-15, rel=1e-13)
+
+
+def test_grey_images_of_8_and_16_bits(tmp_path):
+    depth = png(tmp_path / "d.png", np.full((1, 2), 1000, dtype=np.uint16))
+    eight = png(tmp_path / "8.png", np.array([[0, 128]], dtype=np.uint8))
+    sixteen = png(tmp_path / "16.png", np.array([[0, 128 * 257]], dtype=np.uint16))
+    for image in (eight, sixteen):
+        np.testing.assert_allclose(read_rgbd(depth, image)[1], [[0.0, srgb(128 / 255)]], rtol=1e-14)
+
+
+def test_palette_images(tmp_path):
+    from PIL import Image
+
+    depth = png(tmp_path / "d.png", np.full((1, 2), 1000, dtype=np.uint16))
+    palette = Image.new("P", (2, 1))
+    palette.putpalette([255, 0, 0, 0, 255, 0])
+    palette.putdata([1, 0])
+    palette.save(tmp_path / "p.png")
+    np.testing.assert_allclose(read_rgbd(depth, tmp_path / "p.png")[1], [[0.7152, 0.2126]], rtol=1e-14)
+
+
+def test_npy_reflectivity_is_linear_and_overrides_the_archive(tmp_path):
+    np.savez(tmp_path / "s.npz", depth=np.ones((1, 2)), reflectivity=np.zeros((1, 2)))
+    np.save(tmp_path / "r.npy", np.array([[0.125, 0.5]], dtype=np.float32))
+    assert read_rgbd(tmp_path / "s.npz", tmp_path / "r.npy")[1].tolist() == [[0.125, 0.5]]
+    np.save(tmp_path / "i.npy", np.array([[0, 255]], dtype=np.uint8))
+    assert read_rgbd(tmp_path / "s.npz", tmp_path / "i.npy")[1].tolist() == [[0.0, 1.0]]
+
+
+def test_size_takes_nearest_depth_and_mean_light(tmp_path):
+    depth = png(tmp_path / "d.png", np.array([[1000, 1000, 9000, 0]] * 2, dtype=np.uint16))
+    image = np.array([[0, 255, 255, 255], [255, 0, 255, 255]], dtype=np.uint8)
+    scene = Scene.from_rgbd(depth, png(tmp_path / "i.png", image), size=(1, 2))
+    np.testing.assert_array_equal(scene.depth_m, [[1.0, NAN]])
+    np.testing.assert_allclose(scene.reflectivity, [[0.5, 1.0]], rtol=1e-15)  # linear light, not grey levels
+    assert Scene.from_rgbd(depth, size=2).shape == (1, 2)
+
+
+# --- Middlebury --------------------------------------------------------------------------------------------
+
+
+def middlebury(folder: Path, dmin: str = "200\n") -> Path:
+    folder.mkdir(exist_ok=True)
+    png(folder / "disp1.png", np.array([[0, 100, 174]], dtype=np.uint8))
+    png(folder / "view1.png", np.array([[[0, 0, 0], [255, 255, 255], [0, 255, 0]]], dtype=np.uint8))
+    (folder / "dmin.txt").write_text(dmin)
+    return folder
+
+
+def test_middlebury_folder(tmp_path):
+    scene = Scene.from_rgbd(middlebury(tmp_path / "a"))
+    np.testing.assert_allclose(scene.depth_m, [[NAN, 3740 * 0.16 / 300, 1.6]], rtol=1e-14)
+    np.testing.assert_allclose(scene.reflectivity, [[0.0, 1.0, 0.7152]], atol=1e-15)
+    other = png(tmp_path / "other.png", np.full((1, 3), 255, dtype=np.uint8))
+    assert (Scene.from_rgbd(tmp_path / "a", other).reflectivity == 1.0).all()
+
+
+@pytest.mark.parametrize("name", ["disp1.png", "view1.png", "dmin.txt"])
+def test_middlebury_folder_with_a_file_missing(tmp_path, name):
+    folder = middlebury(tmp_path / "a")
+    (folder / name).unlink()
+    with pytest.raises(ValueError, match=rf"{name} not found.*Middlebury"):
+        read_rgbd(folder)
+
+
+@pytest.mark.parametrize("text", ["", "two hundred", "nan", "-3", "1 2"])
+def test_bad_dmin(tmp_path, text):
+    with pytest.raises(ValueError, match=r"dmin.txt: must hold one number >= 0"):
+        read_rgbd(middlebury(tmp_path / "a", text))
+
+
+def test_depth_unit_does_not_apply_to_middlebury(tmp_path):
+    with pytest.raises(ValueError, match="depth_unit_m does not apply"):
+        read_rgbd(middlebury(tmp_path / "a"), depth_unit_m=0.001)
+
+
+# --- bad files: the message names the file and the reason --------------------------------------------------
+
+
+def refused(told: str, *paths: Path, **options):
+    with pytest.raises(ValueError, match=told) as caught:
+        Scene.from_rgbd(*paths, **options)
+    return str(caught.value)
+
+
+def test_missing_files(tmp_path, millimetres):
+    assert str(tmp_path / "no.png") in refused("no such file", tmp_path / "no.png")
+    depth = png(tmp_path / "d.png", millimetres)
+    assert str(tmp_path / "no.jpg") in refused("no such file", depth, tmp_path / "no.jpg")
+
+
+@pytest.mark.parametrize("name", ["d.png", "d.npy", "d.npz", "d.tiff"])
+@pytest.mark.parametrize("content", [b"", b"not an image at all", b"\x89PNG\r\n\x1a\n garbage", b"\x93NUMPY"])
+def test_damaged_depth_files(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    assert refused("cannot be read", tmp_path / name).startswith(str(tmp_path / name))
+
+
+def test_truncated_image(tmp_path):
+    whole = png(tmp_path / "d.png", np.random.default_rng(0).integers(1, 60000, (64, 64)).astype(np.uint16))
+    (tmp_path / "cut.png").write_bytes(whole.read_bytes()[:3000])
+    refused(r"cut\.png: cannot be read", tmp_path / "cut.png")
+
+
+def test_pickles_are_not_loaded(tmp_path):
+    np.save(tmp_path / "d.npy", np.array([[None]], dtype=object), allow_pickle=True)
+    refused(r"d\.npy: cannot be read", tmp_path / "d.npy")
+
+
+def test_depth_of_the_wrong_kind(tmp_path):
+    refused("16-bit integers in one channel.*uint8", png(tmp_path / "8.png", np.ones((2, 2), dtype=np.uint8)))
+    refused("16-bit integers in one channel", png(tmp_path / "rgb.png", np.ones((2, 2, 3), dtype=np.uint8)))
+    np.save(tmp_path / "i.npy", np.ones((2, 2), dtype=np.uint16))
+    refused(r"i\.npy: depth is uint16.*depth_unit_m", tmp_path / "i.npy")
+    np.save(tmp_path / "n.npy", np.array([[1.0, -2.0]]))
+    refused(r"n\.npy: depth must not be negative, got -2 m", tmp_path / "n.npy")
+    np.save(tmp_path / "3.npy", np.ones((2, 2, 2)))
+    refused(r"3\.npy: depth must be real numbers \(H, W\), got shape \(2, 2, 2\)", tmp_path / "3.npy")
+    np.save(tmp_path / "e.npy", np.ones((0, 2)))
+    refused(r"e\.npy: depth must be real numbers", tmp_path / "e.npy")
+    np.save(tmp_path / "0.npy", np.zeros((2, 2)))
+    refused(r"0\.npy: no pixel has a depth", tmp_path / "0.npy")
+    jpg = png(tmp_path / "d.jpg", np.ones((4, 4), dtype=np.uint8))
+    refused(r"d\.jpg: depth must be a \.png", jpg)
+
+
+def test_bad_archives(tmp_path):
+    depth = np.ones((2, 2))
+    for name, arrays, told in (
+        ("a", {"z": depth}, "must hold an array 'depth', got z"),
+        ("b", {"depth": depth, "reflectivity": depth, "image": depth}, "one of 'reflectivity' and 'image'"),
+        ("c", {"depth": depth, "reflectivity": 2 * depth}, r"reflectivity must lie in \[0, 1\], got 2 to 2"),
+        ("d", {"depth": depth, "reflectivity": np.ones((3, 2))}, "size of depth, 2 x 2, got 3 x 2"),
+        ("e", {"depth": depth, "background": -depth}, "background must be finite and >= 0"),
+        ("f", {"depth": depth, "image": np.full((2, 2), 7.0)}, r"floats must lie in \[0, 1\]"),
+        ("g", {"depth": depth, "image": np.ones((2, 2), dtype=np.int32)}, "8 or 16 bits per channel"),
+        ("h", {"depth": depth, "image": np.ones((2, 2, 5))}, "grey or RGB"),
+    ):
+        np.savez(tmp_path / name, **arrays)
+        assert refused(told, tmp_path / f"{name}.npz").startswith(str(tmp_path / f"{name}.npz"))
+
+
+def test_sizes_must_agree(tmp_path, millimetres):
+    depth = png(tmp_path / "d.png", millimetres)
+    image = png(tmp_path / "i.png", np.ones((3, 2), dtype=np.uint8))
+    told = refused("must have the size of the depth, 2 x 3", depth, image)
+    assert told.startswith(str(image))
+    assert "got 3 x 2" in told
+
+
+@pytest.mark.parametrize("option", ["depth_unit_m", "focal_px"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_bad_options(tmp_path, millimetres, option, value):
+    refused(f"{option} must be", png(tmp_path / "d.png", millimetres), **{option: value})
+
+
+def test_bad_size_is_refused_before_reading(tmp_path):
+    refused("size must be", tmp_path / "absent.png", size=0)
+
+
+# --- real inputs -------------------------------------------------------------------------------------------
+
+
+@needs_shared
+def test_nyu_frame():
+    paths = SHARED / "nyuv2_00001_depth.png", SHARED / "nyuv2_00001_colors.png"
+    scene = Scene.from_rgbd(*paths)
+    assert scene.shape == (480, 640)
+    assert scene.valid.all()
+    assert (scene.depth_m.min(), scene.depth_m.max()) == (pytest.approx(1.123), pytest.approx(2.609))
+    assert 0.1 < scene.reflectivity.mean() < 0.6
+    small = Scene.from_rgbd(*paths, size=128)
+    assert small.shape == (96, 128)
+    assert small.reflectivity.mean() == pytest.approx(scene.reflectivity.mean(), rel=1e-12)
+
+
+@needs_shared
+def test_middlebury_art():
+    scene = Scene.from_rgbd(SHARED / "middlebury_art")
+    assert scene.shape == (555, 695)
+    assert (~scene.valid).sum() == 886
+    z = scene.depth_m[scene.valid]
+    assert (z.min(), z.max()) == (pytest.approx(598.4 / 424), pytest.approx(598.4 / 273))
+    # The rim of the paper cup spans columns 534 to 621 at half size, a focal length of 1870 px.
+    width = (621 - 534) / 1870 * scene.depth_m[425, 575]
+    assert 0.06 < width < 0.09

@@ -1,0 +1,312 @@
+"""Files: what is written comes back and makes the same cube again; bad input is refused and named."""
+
+from __future__ import annotations
+
+import json
+import warnings
+
+import h5py
+import numpy as np
+import pytest
+import xarray
+import zarr
+from store_cases import SUFFIXES, SYSTEM, one_return
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.io import memory, recipe
+
+
+def several_returns() -> ml.Flux:
+    first = one_return()
+    return ml.Flux.multi(first, ml.Flux(0.3, 0.1, 70.0), ml.Flux(0.1, 0.0, 99.9))
+
+
+def waveform() -> ml.Flux:
+    return ml.Flux(waveform=np.random.default_rng(2).uniform(0.0, 0.05, (6, 5, 40)), background=0.2)
+
+
+def same_flux(a: ml.Flux, b: ml.Flux) -> bool:
+    names = ("signal", "background", "delay_ns", "returns_signal", "returns_delay_ns")
+    pairs = [(getattr(a, name), getattr(b, name)) for name in names]
+    if (a.waveform is None) != (b.waveform is None):
+        return False
+    if a.waveform is not None and b.waveform is not None:
+        pairs.append((a.waveform, b.waveform))
+    return all(np.array_equal(x, y, equal_nan=True) for x, y in pairs)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("make", [one_return, several_returns, waveform])
+def test_a_file_holds_the_cube_and_makes_it_again(tmp_path, suffix, make):
+    flux = make()
+    path = tmp_path / f"cube{suffix}"
+    arguments = {"engine": "exact", "realizations": 3, "first_realization": 2, "seed": 2**64 - 1}
+    written = io.simulate_to(path, flux, SYSTEM, **arguments)
+    expected = ml.simulate(flux, SYSTEM, **arguments)
+    with io.load(path) as cube:
+        assert np.array_equal(np.asarray(cube.histogram), expected)
+        assert np.array_equal(np.asarray(cube.histogram[1, 2:4, 3]), expected[1, 2:4, 3])
+        assert cube.histogram.dtype == expected.dtype
+        assert cube.registrations == written.registrations == expected.sum()
+        assert cube.complete
+        assert (cube.system, cube.engine, cube.seed) == (SYSTEM, "exact", 2**64 - 1)
+        assert cube.version == ml.__version__
+        assert cube.recipe.first_realization == 2
+        assert same_flux(cube.flux, flux)
+        assert io.verify(cube)
+        part = io.regenerate(cube, realizations=slice(1, 2), rows=slice(2, 5))
+        assert np.array_equal(part, expected[1:2, 2:5])
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_measured_pulse_and_the_maps_come_back(tmp_path, suffix):
+    values = np.exp(-np.arange(30) / 7.0) * (1 + np.sin(np.arange(30)))
+    system = SYSTEM.replace(pulse=ml.SampledPulse(values, 0.37, "centroid"), start="stationary")
+    flux = one_return()
+    depth, reflectivity = np.full(flux.shape, 3.7), np.linspace(0.0, 1.0, 30).reshape(6, 5)
+    path = tmp_path / f"cube{suffix}"
+    io.simulate_to(path, flux, system, depth_m=depth, reflectivity=reflectivity, source="a test")
+    with io.load(path) as cube:
+        assert cube.system == system
+        assert np.array_equal(cube.depth_m, depth)
+        assert np.array_equal(cube.reflectivity, reflectivity)
+        assert (cube.recipe.source, cube.flux.info) == ("a test", {"made": "by hand", "sbr": 2.5})
+        assert io.verify(cube)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_depth_follows_the_delay_where_no_scene_gives_it(tmp_path, suffix):
+    flux = one_return()
+    io.simulate_to(tmp_path / f"cube{suffix}", flux, SYSTEM)
+    with io.load(tmp_path / f"cube{suffix}") as cube:
+        assert np.array_equal(cube.depth_m, SYSTEM.depth_m(flux.delay_ns), equal_nan=True)
+        assert cube.reflectivity is None
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("block_bytes", [1, 2000, 9000])
+def test_streaming_in_blocks_changes_no_count(tmp_path, monkeypatch, suffix, block_bytes):
+    flux, index = one_return(), 1000 + np.arange(30)
+    expected = ml.simulate(flux, SYSTEM, realizations=4, pixel_index=index, seed=3)
+    monkeypatch.setattr(recipe, "BLOCK_BYTES", block_bytes)
+    monkeypatch.setattr("mars_lidar.io.zarr_store._CHUNK_BYTES", 1500)
+    monkeypatch.setattr("mars_lidar.io.hdf5._CHUNK_BYTES", 1500)
+    told: list[tuple[int, int]] = []
+    path = tmp_path / f"cube{suffix}"
+    io.simulate_to(
+        path, flux, SYSTEM, realizations=4, pixel_index=index, seed=3, progress=lambda *at: told.append(at)
+    )
+    with io.load(path) as cube:
+        assert np.array_equal(np.asarray(cube.histogram), expected)
+        assert io.verify(cube)
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert told[-1] == (120, 120)
+
+
+@pytest.mark.parametrize(
+    ("shape", "target"),
+    [((1, 128, 128), 2**22), ((500, 1, 1), 2**14), ((3, 7, 9), 1), ((2, 5, 300), 2**12), ((5, 2, 2), 1200)],
+)
+def test_blocks_cover_the_cube_in_order_and_in_whole_chunks(monkeypatch, shape, target):
+    monkeypatch.setattr(recipe, "BLOCK_BYTES", 40_000)
+    made = io.Recipe(system=SYSTEM, flux=ml.Flux(np.ones(shape[1:]), 0.1, 5.0), realizations=shape[0])
+    chunks = made.chunks(target)
+    seen = np.zeros(shape[:2], int)
+    order = []
+    for images, rows in made.blocks(chunks):
+        seen[images, rows] += 1
+        order.append((images.start, rows.start))
+        assert images.start % chunks[0] == 0
+        assert rows.start % chunks[1] == 0
+        assert images.stop - images.start == 1 or (rows.start, rows.stop) == (0, shape[1])
+    assert (seen == 1).all()
+    assert order == sorted(order)
+    assert chunks[0] == 1 or chunks[1:3] == shape[1:]
+
+
+def test_xarray_opens_a_zarr_with_names_and_units_and_no_warning(tmp_path):
+    flux = several_returns()
+    path = tmp_path / "cube.zarr"
+    white = np.ones(flux.shape)
+    io.simulate_to(path, flux, SYSTEM, realizations=2, first_realization=5, reflectivity=white)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with xarray.open_zarr(path) as data:
+            assert data.histogram.dims == ("realization", "y", "x", "time")
+            assert set(data.coords) == {"realization", "y", "x", "time"}
+            assert data.histogram.dtype == np.uint16
+            assert np.array_equal(data.time, SYSTEM.time_ns)
+            assert list(data.realization) == [5, 6]
+            units = {name: data[name].attrs["units"] for name in data.variables}
+            assert all("long_name" in data[name].attrs for name in data.variables)
+            assert data.attrs["complete"] is True
+            assert ml.System.from_json(data.attrs["system"]) == SYSTEM
+            assert data.histogram.isel(realization=0, y=0, x=0).sum() == ml.simulate(
+                flux, SYSTEM, first_realization=5
+            )[0, 0, 0].sum()
+    photons = "photons per laser period"
+    assert units | {"signal": photons, "background": photons, "returns_signal": photons} == units
+    assert units | {"time": "ns", "delay": "ns", "depth": "m", "reflectivity": "1"} == units
+    assert units["histogram"] == "count"
+
+
+def test_zarr_chunks_are_rows_of_one_image_with_all_bins(tmp_path):
+    flux = ml.Flux(np.ones((128, 128)), 0.1, 5.0)
+    chunks = io.Recipe(system=SYSTEM.replace(bins=1024), flux=flux, realizations=3).chunks(4 * 2**20)
+    assert chunks == (1, 16, 128, 1024)
+
+
+def test_h5py_reads_names_scales_and_units(tmp_path):
+    io.simulate_to(tmp_path / "cube.h5", one_return(), SYSTEM)
+    with h5py.File(tmp_path / "cube.h5") as file:
+        counts = file["histogram"]
+        assert [dim.label for dim in counts.dims] == ["realization", "y", "x", "time"]
+        assert np.array_equal(counts.dims[3]["time"][...], SYSTEM.time_ns)
+        assert file["time"].attrs["units"] == "ns"
+        assert counts.compression == "gzip"
+        assert counts.shuffle
+        assert file.attrs["complete"] == 1
+
+
+def test_numpy_reads_an_npz_and_its_labels(tmp_path):
+    io.simulate_to(tmp_path / "cube.npz", one_return(), SYSTEM)
+    with np.load(tmp_path / "cube.npz", allow_pickle=False) as archive:
+        attrs = json.loads(archive["attributes"].item())
+        assert archive["histogram"].shape == (1, 6, 5, 64)
+    assert attrs["variables"]["depth"] == {"dims": ["y", "x"], "long_name": "depth", "units": "m"}
+    assert attrs["complete"] is True
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_cube_in_memory_is_saved(tmp_path, suffix):
+    flux = one_return()
+    made = io.Recipe(system=SYSTEM, flux=flux, engine="poisson", seed=9, realizations=2)
+    counts = ml.simulate(flux, SYSTEM, engine="poisson", realizations=2, seed=9)
+    io.save(tmp_path / f"cube{suffix}", io.Cube(histogram=counts, recipe=made))
+    with io.load(tmp_path / f"cube{suffix}") as cube:
+        assert np.array_equal(np.asarray(cube.histogram), counts)
+        assert cube.registrations == counts.sum()
+        assert io.verify(cube)
+
+
+def test_verify_sees_a_single_changed_count(tmp_path):
+    io.simulate_to(tmp_path / "cube.zarr", one_return(), SYSTEM)
+    counts = zarr.open_group(tmp_path / "cube.zarr")["histogram"]
+    counts[0, 5, 4, 63] = counts[0, 5, 4, 63] + 1
+    with io.load(tmp_path / "cube.zarr") as cube:
+        assert not io.verify(cube)
+
+
+def test_counts_that_do_not_belong_to_the_recipe_are_refused(tmp_path):
+    made = io.Recipe(system=SYSTEM, flux=one_return())
+    with pytest.raises(ValueError, match=r"histogram must have the shape \(1, 6, 5, 64\)"):
+        io.Cube(histogram=np.zeros((1, 6, 5, 65), np.uint16), recipe=made)
+    wrong = io.Cube(histogram=np.zeros((1, 6, 5, 64), np.float32), recipe=made)
+    with pytest.raises(TypeError, match="histogram must be uint16 for this system, got float32"):
+        io.save(tmp_path / "cube.h5", wrong)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"system": 3}, TypeError, "system must be a System, got 3"),
+        ({"flux": 3}, TypeError, "flux must be a Flux, got 3"),
+        ({"seed": -1}, ValueError, r"seed must be an integer in \[0, 18446744073709551615\], got -1"),
+        ({"realizations": 0}, ValueError, r"realizations must be an integer in \[1, .*got 0"),
+        ({"first_realization": 2**32}, ValueError, r"first_realization must be .*got 4294967296"),
+        ({"engine": None}, TypeError, "engine must be the name of an engine, got None"),
+        ({"depth_m": np.zeros((2, 2))}, ValueError, r"depth_m must have .* \(6, 5\), got \(2, 2\)"),
+        ({"reflectivity": np.zeros(5)}, ValueError, r"reflectivity must have the flux's shape"),
+        ({"pixel_index": np.arange(4)}, ValueError, "pixel_index must be 30 integers.*got 4 of"),
+        ({"pixel_index": np.zeros(30)}, ValueError, "pixel_index must be 30 integers.*float64"),
+    ],
+)
+def test_a_recipe_checks_its_fields(changes, error, message):
+    with pytest.raises(error, match=message):
+        io.Recipe(**({"system": SYSTEM, "flux": one_return()} | changes))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_bad_arguments_leave_nothing_on_disk(tmp_path, suffix):
+    with pytest.raises(ValueError, match="engine must be one of"):
+        io.simulate_to(tmp_path / f"cube{suffix}", one_return(), SYSTEM, engine="quick")
+    with pytest.raises(ValueError, match="threads must be"):
+        io.simulate_to(tmp_path / f"cube{suffix}", one_return(), SYSTEM, threads=0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_place_to_write_to_is_checked_first(tmp_path):
+    flux = one_return()
+    with pytest.raises(ValueError, match=r"out must end in one of \.zarr, \.h5, .*, got .*cube\.mat"):
+        io.simulate_to(tmp_path / "cube.mat", flux, SYSTEM)
+    with pytest.raises(FileNotFoundError, match="out must lie in an existing folder"):
+        io.simulate_to(tmp_path / "nowhere" / "cube.h5", flux, SYSTEM)
+    (tmp_path / "photos.zarr").mkdir()
+    (tmp_path / "photos.zarr" / "holiday.jpg").write_text("dear")
+    with pytest.raises(FileExistsError, match="not a Zarr store; it will not be overwritten"):
+        io.simulate_to(tmp_path / "photos.zarr", flux, SYSTEM, overwrite=True)
+    assert (tmp_path / "photos.zarr" / "holiday.jpg").read_text() == "dear"
+    (tmp_path / "folder.h5").mkdir()
+    with pytest.raises(FileExistsError, match="not a file"):
+        io.simulate_to(tmp_path / "folder.h5", flux, SYSTEM, overwrite=True)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_an_existing_file_is_replaced_only_on_request(tmp_path, suffix):
+    path = tmp_path / f"cube{suffix}"
+    io.simulate_to(path, one_return(), SYSTEM, seed=1)
+    with pytest.raises(FileExistsError, match="exists already"):
+        io.simulate_to(path, one_return(), SYSTEM, seed=2)
+    with io.load(path) as cube:
+        assert cube.seed == 1
+    io.simulate_to(path, one_return(4, 3), SYSTEM, seed=2, overwrite=True)
+    with io.load(path) as cube:
+        assert (cube.seed, cube.shape) == (2, (1, 4, 3, 64))
+        assert io.verify(cube)
+
+
+@pytest.mark.parametrize("content", ["nothing", "not a cube"])
+def test_files_that_are_not_cubes_are_named(tmp_path, content):
+    for suffix in SUFFIXES:
+        path = tmp_path / f"cube{suffix}"
+        if content == "nothing":
+            with pytest.raises(FileNotFoundError, match=r"cube.* does not exist"):
+                io.load(path)
+            continue
+        if suffix == ".zarr":
+            zarr.create_group(path)
+        elif suffix == ".h5":
+            h5py.File(path, "w").close()
+        else:
+            np.savez(path, a=np.zeros(3))
+        with pytest.raises(ValueError, match=r"cube.* is not a cube written by mars-lidar"):
+            io.load(path)
+        if suffix != ".zarr":
+            path.write_bytes(b"garbage")
+            with pytest.raises(ValueError, match=r"cube.* is not an"):
+                io.load(path)
+
+
+def test_a_layout_from_the_future_is_refused(tmp_path):
+    io.simulate_to(tmp_path / "cube.h5", one_return(), SYSTEM)
+    with h5py.File(tmp_path / "cube.h5", "a") as file:
+        file.attrs["format_version"] = 2
+    with pytest.raises(ValueError, match="layout version 2; version 1 can be read"):
+        io.load(tmp_path / "cube.h5")
+
+
+def test_an_npz_that_memory_cannot_hold_is_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "available_bytes", lambda: 1000)
+    with pytest.raises(MemoryError, match=r"need .* GiB .*; a \.zarr or \.h5 is written and read in parts"):
+        io.simulate_to(tmp_path / "cube.npz", one_return(), SYSTEM)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_part_to_regenerate_must_exist():
+    made = io.Recipe(system=SYSTEM, flux=one_return())
+    with pytest.raises(ValueError, match=r"rows must select a run of at least one of 6, got slice\(7, 9"):
+        io.regenerate(made, rows=slice(7, 9))
+    with pytest.raises(ValueError, match="realizations must select"):
+        io.regenerate(made, realizations=slice(0, 1, 2))

@@ -1,0 +1,309 @@
+"""Exact moments of a finite exposure (docs/theory_exposure.md): closed forms, order, settling, extremes."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from mars_lidar import _core
+from mars_lidar.statistics import ConvergenceError, PhaseChain
+from mars_lidar.statistics import _cells as cells_module
+from mars_lidar.statistics import exposure as exposure_module
+from mars_lidar.statistics._cells import Cells
+from mars_lidar.statistics.exposure import exposure_moments, stationary_histogram
+
+REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
+
+
+def make_system(dead, *, cycles=1000, bins=64, sigma=0.00375, start="armed", pulse=None):
+    """Times in periods of 100 ns."""
+    return ml.System(
+        period_ns=100.0,
+        cycles=cycles,
+        bins=bins,
+        pulse=pulse or ml.GaussianPulse(sigma_ns=100.0 * sigma),
+        detector=ml.Detector(dead_time_ns=100.0 * dead),
+        start=start,
+    )
+
+
+def on_grid(signal, background, system, n, *, level="", settle=True, delay_ns=None):
+    """Cumulants (4,) on one grid of n bins, and after how many periods they settled."""
+    cells = Cells.of(signal, background, system, delay_ns=delay_ns)
+    whole = math.floor(system.dead_time_periods)
+    position = (system.dead_time_periods - whole) * n
+    grid = _core.ExposureGrid(
+        cycles=system.cycles, max_periods=10**9, whole=whole, bins=n, out_bins=1, shift=math.floor(position),
+        fraction=position % 1.0, stationary=system.start == "stationary", tolerance=1e-12 if settle else -1.0,
+    )  # fmt: skip
+    energy, row = cells.energies(n)
+    cumulants, rates = np.empty((1, 4)), np.empty((1, 4))
+    settled = np.empty(1, np.int64)
+    _core.exposure_moments(
+        grid=grid, signal=cells.signal, background=cells.background, shape=row, shapes=energy,
+        cumulants=cumulants, cumulant_rates=rates, histogram=np.empty((1, 1)),
+        histogram_rate=np.empty((1, 1)), settled=settled, threads=1, level=level, progress=None,
+    )  # fmt: skip
+    return cumulants[0], int(settled[0])
+
+
+def constant_rate(total, dead, cycles, start):
+    """Mean and variance of a constant-rate pixel in a long exposure."""
+    x = total * dead
+    mean, variance = total * cycles / (1 + x), total * cycles / (1 + x) ** 3
+    if start == "stationary":
+        return mean, variance + x**2 * (6 + 4 * x + x**2) / (6 * (1 + x) ** 4)
+    return (
+        mean + x**2 / (2 * (1 + x) ** 2),
+        variance + x**2 * (18 + 4 * x + x**2) / (12 * (1 + x) ** 4),
+    )
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(
+    ("total", "dead", "cycles"),
+    [
+        (2.0, 0.6375, 1000),
+        (2.0, math.pi / 5, 1000),
+        (20.0, 0.3137, 1000),
+        (0.01, 2.3, 1000),
+        (5.0, 1.7321, 2000),
+        (3.0, 0.0123, 100),
+        (3.0, 1e-4, 100),
+        (30.0, 0.001, 10),
+        (1e-6, 0.7, 10**6),
+        (0.5, 11.3, 20000),
+    ],
+)
+def test_constant_rate(total, dead, cycles, start):
+    result = exposure_moments(0.0, total, make_system(dead, cycles=cycles, start=start), tolerance=1e-6)
+    mean, variance = constant_rate(total, dead, cycles, start)
+    assert result.mean == pytest.approx(mean, rel=1e-9)
+    assert result.variance == pytest.approx(variance, rel=1e-6)
+    np.testing.assert_allclose(result.histogram, mean / 64, rtol=5e-3 if start == "armed" else 1e-9)
+    assert result.histogram.sum() == pytest.approx(result.mean, rel=1e-12)
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize("dead", [0.6375, 0.633333, 1.62, 2.0])
+def test_order_of_convergence(dead, start):
+    system = make_system(dead, sigma=0.02, cycles=40, start=start)
+    values = np.array([on_grid(3.0, 0.7, system, n, delay_ns=33.3)[0] for n in (64, 128, 256, 2048)])
+    errors = np.abs(values[:3, :2] - values[3, :2])
+    order = 0.5 * np.log2(errors[0] / errors[2])  # over a factor of four: a single step may cancel errors
+    assert (order > 2.9).all(), (order, errors)
+    assert (errors[2] < 2e-6).all()
+
+
+def test_sampled_pulse_converges_at_second_order():
+    pulse = ml.SampledPulse(np.array([1.0, 5.0, 2.0, 0.5]), 1.3)
+    system = make_system(0.6375, pulse=pulse, cycles=40)
+    errors = []
+    exact = on_grid(3.0, 0.7, system, 16384, delay_ns=33.3)[0][0]
+    for n in (128, 512, 2048):
+        errors.append(abs(on_grid(3.0, 0.7, system, n, delay_ns=33.3)[0][0] - exact))
+    assert errors[2] < errors[0] / 100
+    assert errors[2] < 1e-5
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+def test_no_dead_time_is_poisson_and_small_ones_lead_there(start):
+    system = make_system(0.0, start=start)
+    result = exposure_moments(1.5, 0.5, system, delay_ns=30.0)
+    np.testing.assert_allclose(result.cumulants, 2000.0, rtol=1e-14)
+    energy = 1.5 * system.pulse.bin_energy(30.0, 100.0, 64) + 0.5 / 64
+    np.testing.assert_allclose(result.histogram, 1000 * energy, rtol=1e-10, atol=1e-12)
+    tiny = exposure_moments(1.5, 0.5, make_system(1e-9, start=start), delay_ns=30.0)
+    np.testing.assert_allclose(tiny.cumulants, 2000.0, rtol=1e-4)
+    np.testing.assert_allclose(tiny.histogram, result.histogram, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("whole", [1, 3])
+def test_dead_time_of_whole_periods_does_not_distort(whole):
+    system = make_system(float(whole), start="stationary", sigma=0.01)
+    result = exposure_moments(2.0, 1.0, system)
+    rate = (2.0 * system.pulse.bin_energy(50.0, 100.0, 64) + 1.0 / 64) / (1 + 3.0 * whole)
+    np.testing.assert_allclose(result.histogram, 1000 * rate, rtol=1e-5, atol=1e-9)
+
+
+def test_single_registration():
+    """An exposure shorter than the dead time registers once or not at all."""
+    result = exposure_moments(0.7, 0.4, make_system(5.5, cycles=4), delay_ns=99.9)
+    p = -math.expm1(-4 * 1.1)
+    exact = [p, p * (1 - p), p * (1 - p) * (1 - 2 * p), p * (1 - p) * (1 - 6 * p * (1 - p))]
+    np.testing.assert_allclose(result.cumulants, exact, rtol=1e-10)
+    assert result.settled == -1
+
+
+@pytest.mark.parametrize(("dead", "cycles"), [(0.6372, 700), (1.9, 900), (0.0004, 300), (10.9, 20000)])
+def test_extrapolation_equals_running_to_the_end(dead, cycles):
+    system = make_system(dead, cycles=cycles, sigma=0.02)
+    fast, settled = on_grid(2.0, 0.8, system, 128)
+    slow, never = on_grid(2.0, 0.8, system, 128, settle=False)
+    assert never == -1
+    assert settled == -1 or settled >= 3 * (math.floor(dead) + 1)
+    np.testing.assert_allclose(fast, slow, rtol=1e-9, atol=1e-9)
+
+
+def test_settling_is_not_deceived_by_long_dead_times():
+    """For t_d = 10.9 periods nothing happens for periods on end, again and again: far from settled."""
+    system = make_system(10.9, cycles=100_000, sigma=0.02)
+    result, settled = on_grid(2.0, 0.8, system, 128)
+    assert settled > 1000
+    # many periods blind, then a wait: mean rate 1 / (t_d + mean wait), as the stationary state says
+    cells = Cells.of(2.0, 0.8, system)
+    rate = stationary_histogram(cells, 1, tolerance=1e-4, threads=1)[0, 0]
+    assert result[0] / 100_000 == pytest.approx(rate, rel=1e-4)
+
+
+def test_millions_of_cycles_by_rates():
+    short, long = (exposure_moments(1.0, 1.0, make_system(0.6375, cycles=n)) for n in (10**3, 10**7))
+    np.testing.assert_allclose(
+        long.cumulants, short.cumulants + (10**7 - 10**3) * short.cumulant_rates, rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        long.histogram, short.histogram + (10**7 - 10**3) * short.histogram_rate, rtol=1e-9
+    )
+    assert 0 < short.settled < 100
+
+
+def test_stationary_start():
+    system = make_system(1.6375, start="stationary", bins=128)
+    result = exposure_moments(1.0, 0.5, system, delay_ns=30.0)
+    cells = Cells.of(1.0, 0.5, system, delay_ns=30.0)
+    rate = stationary_histogram(cells, 128, tolerance=1e-6, threads=1)[0]
+    np.testing.assert_allclose(result.histogram, 1000 * rate, rtol=1e-6)
+    chain = PhaseChain.from_flux(1.0, 0.5, system, delay_ns=30.0, bins=8192).stationary()
+    assert 0.5 * np.abs(chain.pdf.reshape(128, -1).sum(-1) - rate / rate.sum()).sum() < 2e-4
+    assert chain.rate == pytest.approx(rate.sum(), rel=1e-5)
+    # the mean does not depend on the delay, the shape moves with it; the variance depends on the phase at
+    # which the exposure begins and ends, but the more cycles the less
+    moved = exposure_moments(1.0, 0.5, system, delay_ns=30.0 + 100.0 * 17 / 128)
+    assert moved.mean == pytest.approx(result.mean, rel=1e-6)
+    assert moved.variance == pytest.approx(result.variance, rel=1e-3)
+    np.testing.assert_allclose(moved.cumulant_rates, result.cumulant_rates, rtol=1e-4, atol=1e-8)
+    np.testing.assert_allclose(moved.histogram, np.roll(result.histogram, 17), rtol=1e-5)
+    armed = exposure_moments(1.0, 0.5, system.replace(start="armed"), delay_ns=[30.0, 80.0])
+    assert abs(armed.mean[0] - armed.mean[1]) > 0.01
+
+
+def test_locked_pixels_keep_their_digits():
+    """Mean 1000, variance 0.045 and below: nothing is lost by cancellation, nothing is negative."""
+    values = [on_grid(10.0, 0.1, make_system(0.976562), n)[0] for n in (1024, 2048)]
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-8)
+    assert values[1][1] == pytest.approx(0.045129528, rel=1e-7)
+    # almost a Bernoulli variable each period, almost never 0: the cumulants are those of -Poisson
+    assert values[1][2] == pytest.approx(-values[1][1], rel=2e-3)
+    locked = exposure_moments(300.0, 1e-3, make_system(0.9))
+    assert locked.mean == pytest.approx(1000.0, abs=1e-9)
+    assert 0.0 <= locked.variance < 1e-11
+
+
+@pytest.mark.parametrize("level", ["vector128", "avx2", "avx512"])
+def test_vector_levels_agree(level):
+    system = make_system(0.6372, cycles=200)
+    scalar = on_grid(1.3, 0.6, system, 256, level="scalar")[0]
+    if level not in _core.levels():
+        pytest.skip(f"this processor does not run {level}")
+    np.testing.assert_allclose(on_grid(1.3, 0.6, system, 256, level=level)[0], scalar, rtol=1e-11)
+
+
+def test_batch_equals_single():
+    system = make_system(0.6375, bins=7)
+    signal, background = np.array([[0.0], [0.3], [8.0]]), np.array([0.0, 0.01, 2.0])
+    batch = exposure_moments(signal, background, system, delay_ns=20.0, threads=2)
+    assert batch.cumulants.shape == (3, 3, 4)
+    assert batch.histogram.shape == (3, 3, 7)
+    for i, j in np.ndindex(3, 3):
+        single = exposure_moments(signal[i, 0], background[j], system, delay_ns=20.0, threads=1)
+        if single.bins == batch.bins[i, j]:
+            np.testing.assert_allclose(batch.cumulants[i, j], single.cumulants, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(batch.histogram[i, j], single.histogram, rtol=1e-9, atol=1e-12)
+    assert (batch.cumulants[0, 0] == 0).all()
+    assert (batch.histogram >= 0).all()
+    np.testing.assert_allclose(batch.histogram.sum(-1), batch.mean, rtol=1e-10)
+    assert (batch.movement <= 1e-4).all()
+
+
+def test_waveforms():
+    system = make_system(0.6375, bins=32, sigma=0.01)
+    sampled = 2.0 * system.pulse.bin_energy(40.0, 100.0, 4096)
+    by_pulse = exposure_moments(2.0, 0.3, system, delay_ns=40.0)
+    by_waveform = exposure_moments(None, 0.3, system, waveform=np.stack([sampled, 0.5 * sampled]))
+    np.testing.assert_allclose(by_waveform.cumulants[0], by_pulse.cumulants, rtol=1e-5)
+    np.testing.assert_allclose(by_waveform.histogram[0], by_pulse.histogram, rtol=1e-4, atol=1e-6)
+    flat = exposure_moments(None, 0.5, system, waveform=np.full(10, 0.15))
+    np.testing.assert_allclose(flat.cumulants, exposure_moments(0.0, 2.0, system).cumulants, rtol=1e-6)
+
+
+def test_convergence_errors_name_the_cell(monkeypatch):
+    monkeypatch.setattr(exposure_module, "_MAX_BINS", 256)
+    with pytest.raises(ConvergenceError, match=r"S = 200, B = 1 .* still move"):
+        exposure_moments([200.0], 1.0, make_system(0.001, bins=1, sigma=0.05), tolerance=1e-8)
+    monkeypatch.undo()
+    monkeypatch.setattr(cells_module, "_MAX_STEPS", 1)
+    slow = make_system(1.97, cycles=10**6, bins=1)
+    with pytest.raises(ConvergenceError, match=r"S = 10, B = 0.01 .*does not repeat"):
+        exposure_moments(10.0, 0.01, slow)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"signal": -1.0}, ValueError, r"signal must lie in \[0, 1e\+06\].*-1"),
+        ({"signal": np.nan}, ValueError, "signal must lie.*nan"),
+        ({"signal": "3"}, TypeError, "signal must be real numbers"),
+        ({"signal": None}, ValueError, "signal must be given"),
+        ({"background": [1.0, -2.0]}, ValueError, "background must lie.*-2"),
+        ({"signal": [1.0, 2.0], "background": [1.0, 2.0, 3.0]}, ValueError, r"broadcast.*\(2,\).*\(3,\)"),
+        ({"delay_ns": np.inf}, ValueError, "delay_ns must be finite.*inf"),
+        ({"delay_ns": np.nan}, ValueError, "delay_ns must be finite.*nan"),
+        ({"waveform": [1.0]}, ValueError, "waveform replaces signal"),
+        ({"signal": None, "waveform": [1.0, -1.0]}, ValueError, "waveform must lie.*-1"),
+        ({"signal": None, "waveform": 1.0}, ValueError, r"waveform must be \(\.\.\., T\)"),
+        ({"system": 3}, TypeError, "system must be a System, got int"),
+        ({"tolerance": 0.0}, ValueError, r"tolerance must be .*\[1e-09, 0.1\].*0"),
+        ({"threads": 0}, ValueError, r"threads must be an integer in \[1, 1024\], got 0"),
+    ],
+)
+def test_bad_input(change, error, message):
+    given = {"signal": 1.0, "background": 1.0, "system": make_system(0.6)} | change
+    with pytest.raises(error, match=message):
+        exposure_moments(**given)
+
+
+def test_history_that_cannot_fit_is_refused():
+    with pytest.raises(MemoryError, match=r"t_d = 900000 periods.*GiB"):
+        exposure_moments(1.0, 1.0, make_system(900_000.0, cycles=10**6))
+
+
+def test_progress_can_stop_the_run():
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        exposure_moments(np.linspace(0.1, 1, 64), 1.0, make_system(0.6), progress=stop)
+
+
+@pytest.mark.skipif(not REFERENCE.is_dir(), reason="the reference cases are not beside this checkout")
+@pytest.mark.parametrize("path", sorted(REFERENCE.glob("*.json")), ids=lambda path: path.stem)
+def test_reference(path):
+    """Ten cases of an independent simulator: 4 standard errors; shape by chi-square at 1e-5."""
+    from scipy.stats import chi2
+
+    case = json.loads(path.read_text())
+    system = make_system(case["dead"], cycles=case["cycles"], bins=case["bins"], sigma=case["sigma"])
+    result = exposure_moments(case["S"], case["B"], system, delay_ns=100.0 * case["tau"])
+    values = np.array([int(n) for n in case["count"]])
+    weights = np.array(list(case["count"].values()), dtype=float)
+    reals, offset = weights.sum(), values - float(result.mean)
+    second, fourth = (weights * offset**2).sum() / reals, (weights * offset**4).sum() / reals
+    assert abs((weights * offset).sum() / reals) < 4 * math.sqrt(second / reals)
+    assert abs(second - result.variance) < 4 * math.sqrt((fourth - second**2) / reals)
+    seen = np.array(case["hist_mean"]) * reals > 50
+    error = np.sqrt(np.array(case["hist_var"])[seen] / reals)
+    square = (((np.array(case["hist_mean"]) - result.histogram)[seen] / error) ** 2).sum()
+    assert chi2.sf(square, seen.sum()) > 1e-5

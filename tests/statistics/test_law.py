@@ -1,0 +1,276 @@
+"""Count laws and shapes under their two verbs (docs/theory_exposure.md, sections 8 and 9)."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import mars_lidar as ml
+from mars_lidar.statistics import ConvergenceError, mars_moments
+from mars_lidar.statistics import _pmf as pmf_module
+from mars_lidar.statistics.law import count_law, registration_pdf
+
+REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
+
+
+def make_system(dead, *, cycles=1000, bins=64, sigma=0.00375, start="armed", pulse=None):
+    """Times in periods of 100 ns."""
+    return ml.System(
+        period_ns=100.0,
+        cycles=cycles,
+        bins=bins,
+        pulse=pulse or ml.GaussianPulse(sigma_ns=100.0 * sigma),
+        detector=ml.Detector(dead_time_ns=100.0 * dead),
+        start=start,
+    )
+
+
+def moments_of(law):
+    """Mean, variance, third and fourth cumulant from the pmf."""
+    mean = (law.pmf * law.support).sum(-1)
+    offset = law.support - mean[..., None]
+    second, third, fourth = ((law.pmf * offset**k).sum(-1) for k in (2, 3, 4))
+    return mean, second, third, fourth - 3 * second**2
+
+
+def g_test(counts, law):
+    """p-value of observed counts (n,) under the law; counts expected below 5 are pooled."""
+    observed = (counts[:, None] == law.support).sum(0)
+    expected = law.pmf * counts.size
+    common = expected >= 5
+    o = np.append(observed[common], counts.size - observed[common].sum())
+    e = np.append(expected[common], max(counts.size - expected[common].sum(), 1e-12))
+    g = 2 * times_log(o, o / e).sum()
+    return float(stats.chi2.sf(g, max(common.sum() - (e[-1] < 1e-3), 1)))
+
+
+def times_log(x, y):
+    return np.where(x > 0, x * np.log(np.where(x > 0, y, 1.0)), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("total", "dead", "cycles"),
+    [(2.0, 0.6375, 100), (0.05, 0.37, 50), (30.0, 0.11, 5), (1.2, 2.3, 40), (0.3, 0.003, 60)],
+)
+def test_constant_rate_pmf(total, dead, cycles):
+    """P(N >= n) = P(Gamma(n, 1 / rate) <= t - (n - 1) t_d) for an armed start."""
+    law = count_law(0.0, total, make_system(dead, cycles=cycles), tolerance=1e-6)
+    n = np.append(law.support, law.support[-1] + 1).astype(float)
+    left = np.maximum(cycles - (n - 1) * dead, 0.0)
+    at_least = np.where(n == 0, 1.0, stats.gamma.cdf(left, np.maximum(n, 1.0), scale=1 / total))
+    np.testing.assert_allclose(law.pmf, at_least[:-1] - at_least[1:], atol=2e-6)
+    np.testing.assert_allclose(law.cdf, 1 - at_least[1:], atol=2e-6)
+    assert law.cdf[-1] == pytest.approx(1.0, abs=1e-10)
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "cycles"),
+    [
+        (1.0, 1.0, 0.6375, 1000),
+        (10.0, 0.1, 0.976562, 1000),
+        (10.0, 0.01, 1.97, 800),
+        (0.05, 0.02, 0.6375, 100),
+        (3.0, 0.5, 2.25, 700),
+        (2.0, 2.0, 0.0003, 50),
+        (1.0, 0.2, 40.5, 500),
+        (3.0, 3.0, 0.4, 1),
+        (1e-6, 0.0, 0.5, 1000),
+        (2.0, 1.0, 0.6375, 10**6),
+    ],
+)
+def test_pmf_agrees_with_cumulants(signal, background, dead, cycles, start):
+    system = make_system(dead, cycles=cycles, start=start, sigma=0.01)
+    law = count_law(signal, background, system, delay_ns=37.0)
+    assert law.pmf.shape == law.support.shape == law.cdf.shape
+    assert (law.pmf >= 0).all()
+    assert law.pmf.sum() == pytest.approx(1.0, abs=1e-8)
+    assert law.outside <= 2e-12
+    assert (np.diff(law.support) == 1).all()
+    assert law.support[0] >= 0
+    for k, found in enumerate(moments_of(law)):
+        scale = max(abs(law.cumulants[k]), float(law.variance) ** ((k + 1) / 2), 1e-12)
+        noise = 1e-13 * law.support.size ** (k + 1)  # of the transform, some 1e-15 for every count
+        assert found == pytest.approx(law.cumulants[k], abs=1e-5 * scale + noise)
+
+
+def test_single_cycle_is_bernoulli():
+    law = count_law(0.7, 0.4, make_system(5.5, cycles=4))
+    p = -math.expm1(-4.4)
+    np.testing.assert_allclose(law.pmf[:2], [1 - p, p], rtol=1e-9)
+    assert law.support[0] == 0
+
+
+def test_batches():
+    system = make_system(0.6375)
+    signal, background = np.array([[0.1], [2.0]]), np.array([0.0, 0.3, 3.0])
+    law = count_law(signal, background, system, delay_ns=20.0)
+    assert law.mean.shape == law.variance.shape == law.outside.shape == (2, 3)
+    assert law.cumulants.shape == (2, 3, 4)
+    assert law.support.shape == law.pmf.shape == law.cdf.shape
+    assert law.pmf.shape[:2] == (2, 3)
+    for i, j in np.ndindex(2, 3):
+        one = count_law(signal[i, 0], background[j], system, delay_ns=20.0)
+        size = one.pmf.size
+        np.testing.assert_array_equal(law.support[i, j, :size], one.support)
+        np.testing.assert_allclose(law.pmf[i, j, :size], one.pmf, atol=1e-8)
+        np.testing.assert_allclose(law.pmf[i, j, size:], 0.0)
+    delays = count_law(1.0, 1.0, system, delay_ns=[10.0, 90.0])
+    assert delays.mean.shape == (2,)
+    assert delays.mean[0] != delays.mean[1]
+    assert "cells of shape (2,)" in repr(delays)
+
+
+def test_no_flux():
+    law = count_law(0.0, 0.0, make_system(0.5))
+    assert law.mean == law.variance == 0
+    assert law.pmf[law.support == 0] == 1.0
+    np.testing.assert_allclose(registration_pdf(0.0, [0.0, 1e-9], make_system(0.5)), 1 / 64, rtol=1e-6)
+
+
+def test_poisson():
+    for dead, method in ((0.0, "exact"), (0.6, "poisson")):
+        law = count_law([1.0, 1e-4], 0.5, make_system(dead), method)
+        np.testing.assert_allclose(law.cumulants[0], 1500.0)
+        exact = stats.poisson.pmf(law.support, law.mean[:, None])
+        inside = law.pmf > 0
+        np.testing.assert_allclose(law.pmf[inside], exact[inside], rtol=1e-9)
+        np.testing.assert_allclose(law.pmf.sum(-1), 1.0, atol=1e-11)
+
+
+def test_mars_is_the_gaussian_of_the_paper():
+    system = make_system(0.6375)
+    for rearm in (None, "centre", "edge"):
+        law = count_law([1.0, 0.002], 0.001, system, "mars", rearm=rearm)
+        mean, variance = mars_moments([1.0, 0.002], 0.001, system, rearm=rearm or "centre")
+        np.testing.assert_array_equal(law.mean, mean)
+        np.testing.assert_array_equal(law.variance, variance)
+        np.testing.assert_array_equal(law.cumulants[:, 2:], 0.0)
+        edges = np.where(law.support == 0, -np.inf, law.support - 0.5)
+        normal = stats.norm(mean[:, None], np.sqrt(variance[:, None]))
+        inside = law.pmf > 0
+        exact = normal.cdf(law.support + 0.5) - normal.cdf(edges)
+        np.testing.assert_allclose(law.pmf[inside], exact[inside], atol=1e-14)
+        np.testing.assert_allclose(law.cdf[:, -1], 1.0, atol=1e-14)
+    assert count_law(1.0, 1.0, system, "mars", rearm="edge").mean > count_law(1.0, 1.0, system, "mars").mean
+
+
+def test_renewal_is_the_constant_rate_gaussian():
+    law = count_law(1.0, 1.0, make_system(0.6375), "renewal")
+    assert law.mean == pytest.approx(2000 / 2.275)
+    assert law.variance == pytest.approx(2000 / 2.275**3)
+    found = moments_of(law)
+    assert found[0] == pytest.approx(law.mean)
+    assert found[1] == pytest.approx(law.variance + 1 / 12, rel=1e-6)  # a Gaussian on integers
+
+
+def test_shapes():
+    system = make_system(0.6375, bins=128, cycles=100_000)
+    methods = ("exposure", "stationary", "chain")
+    shapes = {m: registration_pdf([0.5, 5.0], 1.0, system, m, delay_ns=30.0) for m in methods}
+    for shape in shapes.values():
+        assert shape.shape == (2, 128)
+        assert (shape >= 0).all()
+        np.testing.assert_allclose(shape.sum(-1), 1.0, atol=1e-12)
+    # a long exposure is stationary, the chain re-arms at bin centres
+    assert 0.5 * np.abs(shapes["exposure"] - shapes["stationary"]).sum(-1).max() < 1e-5
+    assert 0.5 * np.abs(shapes["chain"] - shapes["stationary"]).sum(-1).max() < 5e-4
+    edge = registration_pdf([0.5, 5.0], 1.0, system, "chain", rearm="edge", delay_ns=30.0)
+    assert np.abs(edge - shapes["chain"]).sum() > 1e-4
+    # a short one is not
+    short = registration_pdf(0.5, 1.0, system.replace(cycles=3), delay_ns=30.0)
+    assert 0.5 * np.abs(short - shapes["stationary"][0]).sum() > 0.02
+
+
+def test_waveforms_and_methods():
+    system = make_system(0.6375, sigma=0.01)
+    wave = 2.0 * system.pulse.bin_energy(40.0, 100.0, 2048)
+    for method in ("exact", "mars", "renewal", "poisson"):
+        by_wave = count_law(None, 0.3, system, method, waveform=wave)
+        by_pulse = count_law(2.0, 0.3, system, method, delay_ns=40.0)
+        np.testing.assert_allclose(by_wave.mean, by_pulse.mean, rtol=1e-5)
+        np.testing.assert_allclose(by_wave.variance, by_pulse.variance, rtol=1e-4)
+    for method in ("exposure", "stationary", "chain"):
+        by_wave = registration_pdf(None, 0.3, system, method, waveform=wave)
+        by_pulse = registration_pdf(2.0, 0.3, system, method, delay_ns=40.0)
+        assert 0.5 * np.abs(by_wave - by_pulse).sum() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda s: count_law(1.0, 1.0, s, "normal"), ValueError, "method must be one of 'exact', .*'normal'"),
+        (lambda s: registration_pdf(1.0, 1.0, s, "exact"), ValueError, "method must be one of 'exposure'"),
+        (lambda s: count_law(1.0, 1.0, s, rearm="edge"), ValueError, "rearm must be None for method 'exact'"),
+        (lambda s: count_law(1.0, 1.0, s, "mars", rearm="left"), ValueError, "rearm must be one of.*'left'"),
+        (lambda s: count_law(-1.0, 1.0, s), ValueError, "signal must lie"),
+        (lambda s: count_law(1.0, 1.0, s, "poisson", delay_ns=np.nan), ValueError, "delay_ns must be finite"),
+        (lambda s: count_law(1.0, 1.0, s, threads=1.5), TypeError, "threads must be an integer"),
+    ],
+)
+def test_bad_input(call, error, message):
+    with pytest.raises(error, match=message):
+        call(make_system(0.5))
+
+
+def test_a_pmf_that_contradicts_its_cumulants_is_refused(monkeypatch):
+    monkeypatch.setattr(pmf_module, "_TAIL", 0.2)  # too small a window: the pmf is aliased
+    with pytest.raises(ConvergenceError, match=r"S = 1, B = 1 .* disagrees with the cumulants"):
+        _ = count_law(1.0, 1.0, make_system(0.6375)).pmf
+
+
+def test_random_systems_against_the_exact_engine():
+    """Two hundred systems; the whole test fails by chance once in some ten thousand times."""
+    rng = np.random.default_rng(20261)
+    scores, p_values = [], []
+    for number in range(200):
+        signal, background = 10 ** rng.uniform(-2, 1), 10 ** rng.uniform(-3, 1)
+        kinds = [rng.uniform(0, 1), rng.uniform(1, 10), 10 ** rng.uniform(-3, 0), rng.integers(1, 4) - 0.02]
+        dead = float(rng.choice(kinds))
+        cycles, delay = int(10 ** rng.uniform(0.5, 2.7)), rng.uniform(0, 100)
+        sigma, bins = 10 ** rng.uniform(-2.5, -1), int(rng.choice([2, 16, 100]))
+        pulse = ml.SampledPulse(rng.random(12), 20 * sigma) if number % 5 == 0 else None
+        start = ("armed", "stationary")[number % 2]
+        system = make_system(dead, cycles=cycles, bins=bins, sigma=sigma, start=start, pulse=pulse)
+        law = count_law(signal, background, system, delay_ns=delay, threads=1)
+        flux = ml.Flux(signal, background, delay)
+        cube = ml.simulate(flux, system, realizations=2000, seed=number, threads=1)
+        counts = cube.sum(-1, dtype=np.int64).ravel()
+        if law.variance * counts.size < 20:  # locked: too few events for a Gaussian score
+            assert abs(counts.mean() - law.mean) < 0.02
+            continue
+        scores.append((counts.mean() - law.mean) / math.sqrt(law.variance / counts.size))
+        spread = law.cumulants[3] + 2 * law.variance**2
+        scores.append((((counts - law.mean) ** 2).mean() - law.variance) / math.sqrt(spread / counts.size))
+        p_values.append(g_test(counts, law))
+    assert len(p_values) > 150
+    assert np.abs(scores[::2]).max() < 4.9
+    assert np.abs(scores[1::2]).max() < 7  # the square's own tails are heavier
+    assert min(p_values) > 1e-7
+    assert stats.kstest(scores[::2], "norm").pvalue > 1e-5
+    assert stats.kstest(p_values, "uniform").pvalue > 1e-6  # pooled cells: uniform only roughly
+
+
+@pytest.mark.skipif(not REFERENCE.is_dir(), reason="the reference cases are not beside this checkout")
+@pytest.mark.parametrize("path", sorted(REFERENCE.glob("*.json")), ids=lambda path: path.stem)
+def test_reference(path):
+    """Total variation below the 99.9 % quantile of its bootstrap under the model, G-test p > 1e-4."""
+    case = json.loads(path.read_text())
+    system = make_system(case["dead"], cycles=case["cycles"], sigma=case["sigma"])
+    law = count_law(case["S"], case["B"], system, delay_ns=100.0 * case["tau"])
+    counts = np.repeat([int(n) for n in case["count"]], list(case["count"].values()))
+    reals, rng = counts.size, np.random.default_rng(1)
+    model = law.pmf / law.pmf.sum()
+    assert law.support[0] <= counts.min()
+    assert counts.max() <= law.support[-1]
+    observed = np.bincount(counts - law.support[0], minlength=law.support.size)
+    distance = 0.5 * np.abs(observed / reals - model).sum()
+    drawn = 0.5 * np.abs(rng.multinomial(reals, model, size=20_000) / reals - model).sum(-1)
+    assert distance < np.quantile(drawn, 0.999)
+    common = model * reals >= 5
+    o = np.append(observed[common], observed[~common].sum())
+    e = np.append(model[common], model[~common].sum()) * reals
+    assert stats.chi2.sf(2 * times_log(o, o / e).sum(), o.size - 1) > 1e-4

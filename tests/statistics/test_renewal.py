@@ -1,0 +1,314 @@
+"""Holding times, their covariances and the asymptotic count law (docs/theory.md, sections 3, 4 and 6)."""
+
+import numpy as np
+import pytest
+from scipy.stats import poisson
+
+import mars_lidar as ml
+from mars_lidar.statistics import (
+    PhaseChain,
+    holding_time_covariance,
+    holding_times,
+    mars_moments,
+    moment_matrices,
+    photons_per_bin,
+    poisson_moments,
+    poisson_pmf,
+    renewal_moments,
+    renewal_pmf,
+)
+from mars_lidar.statistics.renewal import lag_covariances, row_moments, weighted_waits
+
+# photons per period, dead time in periods, re-arming
+CASES = [
+    (2.0, 0.6375, "centre"),
+    (2.0, 0.6375, "edge"),
+    (20.0, 0.999, "centre"),
+    (5.0, 2.75, "edge"),
+    (0.01, 0.0, "centre"),
+]
+
+
+def bumpy(total, n=80, seed=3):
+    photons = np.random.default_rng(seed).random(n) ** 6
+    photons[5:9] = 0.0
+    return photons * (total / photons.sum())
+
+
+def make_system(dead_periods, cycles=1000, start="armed", sigma=0.00375):
+    return ml.System(
+        period_ns=100.0,
+        cycles=cycles,
+        bins=1024,
+        pulse=ml.GaussianPulse(sigma_ns=100.0 * sigma),
+        detector=ml.Detector(dead_time_ns=100.0 * dead_periods),
+        start=start,
+    )
+
+
+@pytest.mark.parametrize(("total", "dead", "rearm"), CASES)
+def test_moment_matrices_match_the_definition(total, dead, rearm):
+    """mu_ij and sigma_ij^2 against sums over the number of periods waited."""
+    chain = PhaseChain(bumpy(total, n=16), dead, rearm)
+    found, n = moment_matrices(chain), chain.bins
+    flux = np.concatenate([[0.0], np.cumsum(np.tile(chain.photons, 2))])
+    periods = np.arange(int(60 / total) + 60)
+    for i in range(n):
+        arm = (i + chain.shift) % n
+        start = flux[arm] + chain.fraction * chain.photons[arm]
+        for k in range(n):
+            j = arm + k
+            if chain.photons[j % n] == 0:
+                continue
+            before = np.maximum(flux[j] - start, 0.0) + periods * chain.total
+            if k == 0:  # re-arms inside this bin: a part of it first, whole and later ever after
+                before[1:] -= chain.fraction * chain.photons[arm]
+            chance = np.exp(-before) * -np.expm1(-chain.photons[j % n])
+            if k == 0:
+                chance[0] = -np.expm1(-(1 - chain.fraction) * chain.photons[arm])
+            wait = (chain.blind_bins + k) / n + periods
+            mean = np.average(wait, weights=chance)
+            assert found.mean[i, j % n] == pytest.approx(mean, rel=1e-9)
+            variance = np.average((wait - mean) ** 2, weights=chance)
+            assert found.variance[i, j % n] == pytest.approx(variance, rel=1e-8)
+            assert chain.dense()[i, j % n] == pytest.approx(chance.sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize(("total", "dead", "rearm"), CASES)
+def test_row_sums_match_the_matrices(total, dead, rearm):
+    chain = PhaseChain(bumpy(total), dead, rearm)
+    dense = moment_matrices(chain)
+    mean, variance = row_moments(chain)
+    np.testing.assert_allclose(mean, dense.q_mu.sum(1), rtol=1e-13)
+    np.testing.assert_allclose(variance, (dense.q_mu2 + dense.q_s2).sum(1) - mean**2, rtol=1e-10)
+    x = np.random.default_rng(1).random(chain.bins)
+    np.testing.assert_allclose(weighted_waits(chain, x), x @ dense.q_mu, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("total", "dead", "rearm"), CASES)
+def test_covariances_match_dense_powers(total, dead, rearm):
+    chain = PhaseChain(bumpy(total), dead, rearm)
+    times, dense = holding_times(chain), moment_matrices(chain)
+    matrix, pdf = chain.dense(), times.stationary.pdf
+    mean = dense.q_mu.sum(1)
+    mu = pdf @ mean
+    single = pdf @ (dense.q_mu2 + dense.q_s2).sum(1) - mu**2
+    gamma = [pdf @ dense.q_mu @ np.linalg.matrix_power(matrix, k) @ mean - mu**2 for k in range(6)]
+    tolerance = 1e-12 * (single + mu**2)
+    assert times.mu == pytest.approx(mu, rel=1e-13)
+    assert times.sigma_ss2 == pytest.approx(single, abs=tolerance)
+    np.testing.assert_allclose(lag_covariances(chain, times, 6), gamma, rtol=0, atol=tolerance)
+    # the definition of the exact sum, by a dense solution
+    z = np.linalg.solve(np.eye(chain.bins) - matrix + np.outer(np.ones(chain.bins), pdf), mean - mu)
+    np.testing.assert_allclose(times.relative_value, z, rtol=0, atol=1e-12 * (mu + np.abs(z).max()))
+    assert times.covariance_sum == pytest.approx(pdf @ dense.q_mu @ z, abs=10 * tolerance)
+    assert times.sigma2 == pytest.approx(single + 2 * times.covariance_sum, abs=10 * tolerance)
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "dead"),
+    [(1.0, 1.0, 0.6375), (10.0, 1.0, 1.0), (10.0, 10.0, 0.6375), (10.0, 0.01, 0.9985), (3.0, 0.05, 1.0)],
+)
+def test_exact_sum_is_the_limit_of_partial_sums(signal, background, dead):
+    terms = holding_time_covariance(signal, background, make_system(dead), lags=2000)
+    assert terms.cutoff_sum(2000) == pytest.approx(terms.exact_sum, abs=1e-10 * terms.sigma_ss2)
+    assert terms.sigma2 == pytest.approx(terms.sigma_ss2 + 2 * terms.exact_sum, rel=1e-9)
+    assert terms.defect < 1e-9
+    np.testing.assert_allclose(terms.cutoff_sum(2003), terms.exact_sum, rtol=1e-9)
+    assert terms.cutoff_sum(0) == 0.0
+
+
+def test_spectral_rules_against_the_exact_sum():
+    """t_d = t_r, S = 10, B = 1: the hardest ordinary cell."""
+    terms = holding_time_covariance(10.0, 1.0, make_system(1.0), bins=512)
+    assert abs(terms.eigenvalues[0] - 1.0) < 1e-9
+    assert np.all(np.diff(np.abs(terms.eigenvalues)) < 1e-9)
+    exact = terms.exact_sum
+    assert abs(terms.spectral_sum() - exact) < 0.015 * abs(exact)
+    assert abs(terms.spectral_sum() - exact) < 0.1 * abs(terms.cutoff_sum(6) - exact)
+    assert terms.spectral_sum(lags=6, modes=1) == pytest.approx(terms.cutoff_sum(6))
+    for tolerance in (1e-2, 1e-4, 1e-6):
+        lags, modes = terms.automatic_rule(tolerance)
+        assert lags >= 6
+        assert modes >= 1
+        assert abs(terms.automatic_sum(tolerance) - exact) < tolerance * terms.sigma_ss2
+
+
+def test_spectral_sum_keeps_conjugates_together():
+    terms = holding_time_covariance(10.0, 1.0, make_system(1.0), bins=512)
+    values = terms.eigenvalues
+    assert abs(values[1].imag) > 0
+    assert values[2] == pytest.approx(values[1].conjugate())
+    assert terms.spectral_sum(6, 2) == terms.spectral_sum(6, 3)
+
+
+def test_left_eigenvectors_where_inverting_the_right_ones_fails():
+    """P is so far from normal that V has no usable inverse; left eigenvectors of their own are exact."""
+    terms = holding_time_covariance(10.0, 1.0, make_system(1.0), bins=256, rearm="edge")
+    chain = PhaseChain.from_flux(10.0, 1.0, make_system(1.0), bins=256, rearm="edge")
+    assert np.linalg.cond(np.linalg.eig(chain.dense())[1]) > 1e10
+    assert terms.spectral_sum() == pytest.approx(terms.exact_sum, rel=5e-3)
+    assert terms.sigma_ss2 + 2 * terms.spectral_sum() > 0
+
+
+@pytest.mark.parametrize("x", [0.05, 0.6, 3.0])
+@pytest.mark.parametrize("dead", [0.3, 0.6371, 2.4])
+def test_constant_rate_closed_form(x, dead):
+    """Mean slope lambda / (1 + x), variance slope lambda / (1 + x)^3, second order in the bin (6.2)."""
+    rate = x / dead
+    want = holding_times(PhaseChain(np.full(2048, rate / 2048), dead))
+    assert want.mu == pytest.approx(dead + 1 / rate, rel=1e-6)
+    assert want.sigma2 == pytest.approx(1 / rate**2, rel=5e-6)
+    assert want.covariance_sum == pytest.approx(0.0, abs=1e-12 * want.mu**2)
+    mean, variance = mars_moments(0.0, rate, make_system(dead), bins=2048)
+    mean_renewal, variance_renewal = renewal_moments(0.0, rate, make_system(dead))
+    assert mean == pytest.approx(mean_renewal, rel=1e-5)
+    assert variance == pytest.approx(variance_renewal, rel=1e-5)
+
+
+def test_no_dead_time_is_poisson():
+    mean, variance = mars_moments(0.5, 0.3, make_system(0.0), bins=4096)
+    assert mean == pytest.approx(800.0, rel=3e-4)
+    assert variance == pytest.approx(mean, rel=3e-4)
+
+
+def test_whole_periods_only_wait():
+    short = holding_times(PhaseChain.from_flux(3.0, 0.5, make_system(0.6375), bins=512))
+    long = holding_times(PhaseChain.from_flux(3.0, 0.5, make_system(200.6375), bins=512))
+    assert long.mu == pytest.approx(short.mu + 200.0, rel=1e-12)
+    assert long.sigma2 == pytest.approx(short.sigma2, rel=1e-9)
+    assert long.covariance_sum == pytest.approx(short.covariance_sum, rel=1e-7)
+
+
+def test_edge_rearming_shortens_the_wait_by_half_a_bin():
+    system, n = make_system(0.6371), 512
+    flat = [holding_times(PhaseChain(np.full(n, 2.0 / n), 0.6371, rearm)) for rearm in ("centre", "edge")]
+    assert flat[0].mu - flat[1].mu == pytest.approx(0.5 / n, rel=0.01)
+    assert mars_moments(1.0, 1.0, system, rearm="edge")[0] > mars_moments(1.0, 1.0, system)[0]
+
+
+def simulate_waits(photons, dead, steps, pixels, seed):
+    """Times (steps, pixels) of registrations in continuous time, by inversion of the integrated flux."""
+    rng, n = np.random.default_rng(seed), photons.size
+    edges, flux = np.arange(n + 1) / n, np.concatenate([[0.0], np.cumsum(photons)])
+    now, out = np.zeros(pixels), np.empty((steps, pixels))
+    for k in range(steps):
+        cycle = np.floor(now)
+        target = np.interp(now - cycle, edges, flux) + rng.exponential(size=pixels)
+        more = np.floor(target / flux[-1])
+        now = cycle + more + np.interp(target - more * flux[-1], flux, edges)
+        out[k] = now
+        now = now + dead
+    return out
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "dead"),
+    [(1.0, 1.0, 0.6375), (5.0, 1.0, 0.983), (2.0, 5.0, 0.1), (1.0, 0.5, 1.53125)],
+)
+def test_moments_against_simulation(signal, background, dead):
+    """Mean and variance of the time of 250 registrations: 4 standard errors, false alarm 1e-4."""
+    system, steps, warm, pixels = make_system(dead, sigma=0.01), 290, 40, 6000
+    fine = photons_per_bin(signal, background, system, bins=8192)
+    times = simulate_waits(fine, dead, steps + 1, pixels, seed=20)
+    waited = times[-1] - times[warm]
+    count = steps - warm
+    chain = PhaseChain.from_flux(signal, background, system, bins=4096)
+    law = holding_times(chain)
+    gamma = lag_covariances(chain, law, count - 1)
+    variance = count * law.sigma_ss2 + 2 * np.sum((count - np.arange(1, count)) * gamma)
+    assert abs(waited.mean() - count * law.mu) < 4 * np.sqrt(variance / pixels)
+    assert abs(waited.var() / variance - 1) < 4 * np.sqrt(2 / pixels)
+    # and the covariances are not decoration: without them, or without the factor 2, the variance is wrong
+    assert law.sigma2 == pytest.approx(variance / count, rel=0.05)
+
+
+def test_mars_moments_of_arrays():
+    system = make_system(0.6375)
+    signal, background = np.array([[0.0], [1.0]]), np.array([0.0, 0.5, 2.0])
+    mean, variance = mars_moments(signal, background, system, bins=256)
+    assert mean.shape == variance.shape == (2, 3)
+    assert mean[0, 0] == variance[0, 0] == 0.0
+    one = mars_moments(1.0, 0.5, system, bins=256)
+    assert (mean[1, 1], variance[1, 1]) == (one[0], one[1])
+    terms = holding_time_covariance(1.0, 0.5, system, bins=256)
+    assert mean[1, 1] == pytest.approx(1000 * 100.0 / terms.mu)
+    assert variance[1, 1] == pytest.approx(1000 * 100.0 * terms.sigma2 / terms.mu**3)
+
+
+def test_waveforms_and_sampled_pulses_go_the_same_way():
+    system = make_system(0.6375)
+    wave = photons_per_bin(2.0, 0.0, system, bins=1024)
+    by_wave = mars_moments(None, 0.5, system, waveform=wave)
+    by_pulse = mars_moments(2.0, 0.5, system, bins=1024)
+    np.testing.assert_allclose(by_wave, by_pulse, rtol=1e-12)
+    box = system.replace(pulse=ml.SampledPulse(np.ones(4), bin_ns=0.25))
+    terms = holding_time_covariance(2.0, 0.5, box)
+    assert terms.sigma2 > 0
+    assert terms.defect < 1e-9
+
+
+def test_random_cells_never_give_a_negative_variance():
+    rng = np.random.default_rng(8)
+    for _ in range(120):
+        signal, background = 10.0 ** rng.uniform(-6, 2.5, 2) * (rng.random(2) > 0.1)
+        if signal + background == 0:
+            continue
+        dead = rng.choice([rng.random(), 10 * rng.random(), rng.integers(0, 5), 1 - 0.003 * rng.random()])
+        rearm = "edge" if rng.random() < 0.5 else "centre"
+        chain = PhaseChain.from_flux(signal, background, make_system(dead), bins=512, rearm=rearm)
+        law = holding_times(chain)  # warnings are errors here
+        assert law.sigma2 >= 0
+        assert law.sigma_ss2 >= 0
+        assert law.mu >= dead - 0.5 / 512
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(("rate", "dead", "cycles"), [(0.4, 0.6375, 200), (3.0, 1.7, 300), (0.05, 0.3, 40)])
+def test_renewal_pmf_has_the_closed_form_moments(start, rate, dead, cycles):
+    system = make_system(dead, cycles=cycles, start=start)
+    support = np.arange(400)
+    pmf = renewal_pmf(rate, 0.0, system, support)
+    mean, variance = renewal_moments(rate, 0.0, system, start_up=True)
+    assert pmf.sum() == pytest.approx(1.0, abs=1e-11)
+    assert pmf @ support == pytest.approx(mean, abs=1e-8)
+    assert pmf @ (support - pmf @ support) ** 2 == pytest.approx(variance, abs=1e-5)
+    plain = renewal_moments(rate, 0.0, system)
+    assert abs(plain[0] - mean) <= 0.5
+
+
+def test_baselines_without_dead_time_or_flux():
+    system, support = make_system(0.0, cycles=30), np.arange(60)
+    for start in ("armed", "stationary"):
+        pmf = renewal_pmf([0.4, 0.0], [0.1, 0.0], system.replace(start=start), support)
+        np.testing.assert_allclose(pmf[0], poisson.pmf(support, 15.0), atol=1e-13)
+        np.testing.assert_allclose(pmf[1], support == 0)
+    np.testing.assert_allclose(poisson_pmf(0.4, 0.1, system, support), poisson.pmf(support, 15.0), atol=1e-14)
+    mean, variance = poisson_moments([0.4, 0.0], 0.1, system)
+    np.testing.assert_allclose(mean, [15.0, 3.0])
+    np.testing.assert_allclose(variance, mean)
+
+
+def test_bad_input_is_named():
+    system = make_system(0.6)
+    with pytest.raises(ValueError, match="photons must not all be 0"):
+        holding_time_covariance(0.0, 0.0, system)
+    with pytest.raises(ValueError, match="lags must be an integer in"):
+        holding_time_covariance(1.0, 0.0, system, lags=-1)
+    with pytest.raises(ValueError, match="rearm must be one of"):
+        mars_moments(0.0, 0.0, system, rearm="middle")
+    with pytest.raises(ValueError, match="signal must be"):
+        mars_moments(-1.0, 0.0, system)
+    with pytest.raises(ValueError, match="background must be finite and >= 0"):
+        renewal_moments(1.0, -2.0, system)
+    with pytest.raises(ValueError, match="support must be >= 0, got -1"):
+        renewal_pmf(1.0, 0.0, system, [-1, 2])
+    with pytest.raises(TypeError, match="support must be"):
+        poisson_pmf(1.0, 0.0, system, [0.5])
+    with pytest.raises(ValueError, match="bins must be at most"):
+        moment_matrices(PhaseChain(np.full(9000, 1e-4), 0.5))
+    terms = holding_time_covariance(1.0, 1.0, system, bins=32)
+    with pytest.raises(ValueError, match="tolerance must be"):
+        terms.automatic_sum(0.0)
+    with pytest.raises(ValueError, match="cutoff must be"):
+        terms.cutoff_sum(-1)

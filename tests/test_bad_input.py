@@ -1,0 +1,304 @@
+"""Bad input, argument by argument: the message names it, the value and what is allowed, before any work."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+
+GOOD = {
+    "period_ns": 100.0,
+    "cycles": 10,
+    "bins": 8,
+    "pulse": ml.GaussianPulse(sigma_ns=1.0),
+    "detector": ml.Detector(dead_time_ns=50.0),
+}
+SYSTEM = ml.System(**GOOD)
+FLUX = ml.Flux(np.ones((2, 3)), 0.5, 20.0)
+NAN, INF = math.nan, math.inf
+
+
+def refused(call: Callable[[], Any], kind: type[Exception], *fragments: str) -> None:
+    with pytest.raises(kind) as error:
+        call()
+    told = str(error.value)
+    for fragment in fragments:
+        assert fragment in told, f"{fragment!r} is not in {told!r}"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "kind", "fragments"),
+    [
+        ("period_ns", 0.0, ValueError, ["(0, inf]", "got 0.0"]),
+        ("period_ns", -1.0, ValueError, ["(0, inf]", "got -1.0"]),
+        ("period_ns", NAN, ValueError, ["finite", "got nan"]),
+        ("period_ns", INF, ValueError, ["finite", "got inf"]),
+        ("period_ns", "100", TypeError, ["number", "got '100'", "str"]),
+        ("period_ns", True, TypeError, ["number", "got True"]),
+        ("period_ns", None, TypeError, ["number", "got None"]),
+        ("period_ns", 1 + 0j, TypeError, ["number", "complex"]),
+        ("cycles", 0, ValueError, ["[1, ", "got 0"]),
+        ("cycles", -5, ValueError, ["[1, ", "got -5"]),
+        ("cycles", 2**40, ValueError, ["[1, ", f"got {2**40}"]),
+        ("cycles", 1000.0, TypeError, ["integer", "got 1000.0", "float"]),
+        ("cycles", "10", TypeError, ["integer", "got '10'"]),
+        ("cycles", True, TypeError, ["integer", "got True"]),
+        ("bins", 0, ValueError, ["[1, 1048576]", "got 0"]),
+        ("bins", 2**20 + 1, ValueError, ["[1, 1048576]", "got 1048577"]),
+        ("bins", 64.5, TypeError, ["integer", "got 64.5"]),
+        ("pulse", None, TypeError, ["GaussianPulse", "SampledPulse", "got None"]),
+        ("pulse", 0.5, TypeError, ["GaussianPulse", "got 0.5"]),
+        ("detector", 50.0, TypeError, ["Detector", "got 50.0"]),
+        ("detector", {"dead_time_ns": 5.0}, TypeError, ["Detector", "dead_time_ns"]),
+        ("start", "warm", ValueError, ["'armed'", "'stationary'", "got 'warm'"]),
+        ("start", None, ValueError, ["'armed'", "got None"]),
+    ],
+)
+def test_system(field: str, value: Any, kind: type[Exception], fragments: list[str]):
+    refused(lambda: ml.System(**GOOD | {field: value}), kind, field, *fragments)
+
+
+def test_system_needs_all_its_fields_by_name():
+    for field in GOOD:
+        rest = {k: v for k, v in GOOD.items() if k != field}
+        refused(lambda rest=rest: ml.System(**rest), TypeError, field)
+    refused(lambda: ml.System(100.0), TypeError)
+    refused(lambda: ml.System(**GOOD, colour="red"), TypeError, "colour")
+
+
+def test_system_as_a_whole():
+    def gaussian(sigma: float) -> Callable[[], ml.System]:
+        return lambda: ml.System(**GOOD | {"pulse": ml.GaussianPulse(sigma_ns=sigma)})
+
+    refused(gaussian(5e-5), ValueError, "sigma_ns", "[0.0001, 100] ns", "got 5e-05")
+    refused(gaussian(101.0), ValueError, "sigma_ns", "[0.0001, 100] ns", "got 101")
+    long = ml.SampledPulse(np.ones(11), 10.0)
+    refused(
+        lambda: ml.System(**GOOD | {"pulse": long}), ValueError, "values", "100 ns", "11 samples", "110 ns"
+    )
+    dead = ml.Detector(dead_time_ns=2e8)
+    refused(
+        lambda: ml.System(**GOOD | {"detector": dead}), ValueError, "dead_time_ns", "1048576 periods", "2e+08"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "fragments"),
+    [
+        ({"dead_time_ns": -0.1}, ValueError, ["dead_time_ns", "[0, inf]", "got -0.1"]),
+        ({"dead_time_ns": NAN}, ValueError, ["dead_time_ns", "finite", "got nan"]),
+        ({"dead_time_ns": INF}, ValueError, ["dead_time_ns", "finite", "got inf"]),
+        ({"dead_time_ns": "5 ns"}, TypeError, ["dead_time_ns", "number", "got '5 ns'"]),
+        ({"mode": "paralyzable"}, ValueError, ["mode", "'nonparalyzable'", "got 'paralyzable'"]),
+        ({"mode": None}, ValueError, ["mode", "'nonparalyzable'", "got None"]),
+    ],
+)
+def test_detector(changes: dict[str, Any], kind: type[Exception], fragments: list[str]):
+    refused(lambda: ml.Detector(**{"dead_time_ns": 5.0} | changes), kind, *fragments)
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "fragments"),
+    [
+        (lambda: ml.GaussianPulse(sigma_ns=0.0), ValueError, ["sigma_ns", "(0, inf]", "got 0.0"]),
+        (lambda: ml.GaussianPulse(sigma_ns=-1.0), ValueError, ["sigma_ns", "(0, inf]", "got -1.0"]),
+        (lambda: ml.GaussianPulse(sigma_ns=NAN), ValueError, ["sigma_ns", "finite", "got nan"]),
+        (lambda: ml.GaussianPulse(sigma_ns="1"), TypeError, ["sigma_ns", "number", "got '1'"]),
+        (lambda: ml.GaussianPulse(sigma_ns=np.ones(2)), TypeError, ["sigma_ns", "number", "ndarray"]),
+        (lambda: ml.GaussianPulse.from_fwhm(fwhm_ns=0.0), ValueError, ["fwhm_ns", "(0, inf]", "got 0.0"]),
+        (lambda: ml.SampledPulse([], 1.0), ValueError, ["values", "at least one sample", "(0,)"]),
+        (lambda: ml.SampledPulse([[1.0]], 1.0), ValueError, ["values", "1-D", "(1, 1)"]),
+        (lambda: ml.SampledPulse(3.0, 1.0), ValueError, ["values", "1-D", "()"]),
+        (
+            lambda: ml.SampledPulse([1.0, -2.0], 1.0),
+            ValueError,
+            ["values", "non-negative", "values[1] = -2.0"],
+        ),
+        (lambda: ml.SampledPulse([1.0, NAN], 1.0), ValueError, ["values", "finite", "values[1] = nan"]),
+        (lambda: ml.SampledPulse([1.0, INF], 1.0), ValueError, ["values", "finite", "values[1] = inf"]),
+        (lambda: ml.SampledPulse([0.0, 0.0], 1.0), ValueError, ["values", "positive", "got 0.0"]),
+        (lambda: ml.SampledPulse([1.0], 0.0), ValueError, ["bin_ns", "(0, inf]", "got 0.0"]),
+        (lambda: ml.SampledPulse([1.0], NAN), ValueError, ["bin_ns", "finite", "got nan"]),
+        (lambda: ml.SampledPulse([1.0], "1"), TypeError, ["bin_ns", "number", "got '1'"]),
+        (lambda: ml.SampledPulse([1.0], 1.0, "middle"), ValueError, ["origin", "'centroid'", "got 'middle'"]),
+        (lambda: ml.SampledPulse(np.ones(4), 1.0, "centroid"), ValueError, ["centroid", "flat"]),
+    ],
+)
+def test_pulse(make: Callable[[], Any], kind: type[Exception], fragments: list[str]):
+    refused(make, kind, *fragments)
+
+
+def flux_call(*args: Any, **kwargs: Any) -> Callable[[], ml.Flux]:
+    return lambda: ml.Flux(*args, **kwargs)
+
+
+RANGE = "[0, 1e+06] photons per period"
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "fragments"),
+    [
+        (flux_call(-1.0, 0.0, 5.0), ValueError, ["signal", RANGE, "got -1.0"]),
+        (flux_call(NAN, 0.0, 5.0), ValueError, ["signal", RANGE, "got nan"]),
+        (flux_call(2e6, 0.0, 5.0), ValueError, ["signal", RANGE, "got 2000000.0"]),
+        (flux_call([[1.0, 1.0], [1.0, INF]], 0.0, 5.0), ValueError, ["signal", RANGE, "got inf", "(1, 1)"]),
+        (flux_call("1", 0.0, 5.0), TypeError, ["signal", "real numbers", "<U1"]),
+        (flux_call(1j, 0.0, 5.0), TypeError, ["signal", "real numbers", "complex128"]),
+        (flux_call(np.ones((1, 1, 1)), 0.0, 5.0), ValueError, ["signal", "(H, W)", "(1, 1, 1)"]),
+        (flux_call(np.ones((0, 3)), 0.0, 5.0), ValueError, ["signal", "at least one pixel", "(0, 3)"]),
+        (flux_call(), ValueError, ["signal must be given", "waveform"]),
+        (flux_call(1.0, -0.5, 5.0), ValueError, ["background", RANGE, "got -0.5"]),
+        (flux_call(1.0, NAN, 5.0), ValueError, ["background", RANGE, "got nan"]),
+        (flux_call(1.0, None, 5.0), TypeError, ["background", "real numbers", "object"]),
+        (flux_call(1.0, 0.0), ValueError, ["delay_ns", "signal > 0"]),
+        (flux_call(1.0, 0.0, INF), ValueError, ["delay_ns", "finite", "got inf"]),
+        (
+            flux_call([[1.0, 1.0]], 0.0, [[NAN, 1.0]]),
+            ValueError,
+            ["delay_ns", "finite", "NaN at pixel (0, 0)"],
+        ),
+        (flux_call(1.0, 0.0, "soon"), TypeError, ["delay_ns", "real numbers"]),
+        (
+            flux_call(np.ones((2, 3)), np.ones((3, 2)), 5.0),
+            ValueError,
+            ["signal (2, 3)", "background (3, 2)"],
+        ),
+        (flux_call(1.0, waveform=[1.0]), ValueError, ["waveform replaces signal"]),
+        (flux_call(delay_ns=1.0, waveform=[1.0]), ValueError, ["waveform replaces", "delay_ns"]),
+        (flux_call(waveform=[1.0, -1.0]), ValueError, ["waveform", RANGE, "got -1.0", "(1,)"]),
+        (flux_call(waveform=[NAN]), ValueError, ["waveform", RANGE, "got nan"]),
+        (flux_call(waveform=np.full(1000, 2e3)), ValueError, ["waveform summed over a period", RANGE]),
+        (flux_call(waveform=[]), ValueError, ["waveform", "(H, W, T)", "(0,)"]),
+        (flux_call(waveform=1.0), ValueError, ["waveform", "(T,)", "()"]),
+        (flux_call(waveform=np.ones((1,) * 4)), ValueError, ["waveform", "(H, W, T)", "(1, 1, 1, 1)"]),
+        (flux_call(waveform=["a"]), TypeError, ["waveform", "real numbers"]),
+        (
+            flux_call(waveform=np.ones((2, 3, 4)), background=np.ones((5, 3))),
+            ValueError,
+            ["waveform (2, 3)", "(5, 3)"],
+        ),
+        (lambda: ml.Flux.multi(), TypeError, ["multi", "Flux", "got ()"]),
+        (lambda: ml.Flux.multi(FLUX, 1.0), TypeError, ["multi", "Flux"]),
+        (lambda: ml.Flux.multi(FLUX, ml.Flux(waveform=[1.0])), ValueError, ["multi", "waveforms", "returns"]),
+        (
+            lambda: ml.Flux.multi(ml.Flux(waveform=[1.0]), ml.Flux(waveform=[1.0, 1.0])),
+            ValueError,
+            ["equal", "[1, 2]"],
+        ),
+        (lambda: ml.Flux.multi(FLUX, ml.Flux(np.ones((4, 3)), 0.0, 1.0)), ValueError, ["fluxes[1] (4, 3)"]),
+        (lambda: FLUX[2], IndexError, ["2", "2 pixels"]),
+        (lambda: FLUX[0, -4], IndexError, ["-4", "3 pixels"]),
+        (lambda: FLUX[0, 0, 0], IndexError, ["rows, columns", "3"]),
+        (lambda: FLUX[[0, 1]], IndexError, ["integers and slices", "[0, 1]"]),
+        (lambda: FLUX[1:1], IndexError, ["no pixel", "(2, 3)"]),
+    ],
+)
+def test_flux(make: Callable[[], Any], kind: type[Exception], fragments: list[str]):
+    refused(make, kind, *fragments)
+
+
+CALLS = [
+    ("engine", "fast", ValueError, ["'exact'", "'sequential'", "'poisson'", "got 'fast'"]),
+    ("engine", None, ValueError, ["'exact'", "got None"]),
+    ("seed", -1, ValueError, [f"[0, {2**64 - 1}]", "got -1"]),
+    ("seed", 2**64, ValueError, [f"[0, {2**64 - 1}]", f"got {2**64}"]),
+    ("seed", 1.0, TypeError, ["integer", "got 1.0"]),
+    ("seed", None, TypeError, ["integer", "got None"]),
+    ("threads", 0, ValueError, ["[1, 1024]", "got 0"]),
+    ("threads", 5000, ValueError, ["[1, 1024]", "got 5000"]),
+    ("threads", 2.0, TypeError, ["integer", "got 2.0"]),
+    ("progress", 5, TypeError, ["callable", "done, total", "got 5"]),
+    ("pixel_index", [0, 1, 2], ValueError, ["(6,) or (2, 3)", "got (3,)"]),
+    ("pixel_index", np.zeros((3, 2), int), ValueError, ["(6,) or (2, 3)", "got (3, 2)"]),
+    ("pixel_index", [-1, 0, 1, 2, 3, 4], ValueError, ["[0, 2**32)", "got -1 to 4"]),
+    ("pixel_index", [0, 1, 2, 3, 4, 2**32], ValueError, ["[0, 2**32)", f"to {2**32}"]),
+    ("pixel_index", np.arange(6.0), TypeError, ["integers", "float64"]),
+]
+HISTOGRAM_CALLS = [
+    ("realizations", 0, ValueError, ["[1, 4294967296]", "got 0"]),
+    ("realizations", 2**32 + 1, ValueError, ["[1, 4294967296]", f"got {2**32 + 1}"]),
+    ("realizations", 1.5, TypeError, ["integer", "got 1.5"]),
+    ("first_realization", -1, ValueError, ["[0, 4294967295]", "got -1"]),
+    ("first_realization", 2**32, ValueError, ["[0, 4294967295]", f"got {2**32}"]),
+    ("first_realization", "0", TypeError, ["integer", "got '0'"]),
+    ("out", [0], TypeError, ["NumPy array or memory map", "list"]),
+    ("out", np.zeros((1, 2, 3, 9), np.uint16), ValueError, ["(1, 2, 3, 8)", "uint16", "got (1, 2, 3, 9)"]),
+    ("out", np.zeros((1, 2, 3, 8), np.uint32), ValueError, ["(1, 2, 3, 8)", "uint16", "uint32"]),
+    ("out", np.zeros((1, 2, 3, 8), ">u2"), ValueError, ["uint16", ">u2"]),
+    ("out", np.zeros((1, 2, 3, 8), np.uint16, order="F"), ValueError, ["C-contiguous"]),
+    ("out", np.zeros((1, 2, 3, 16), np.uint16)[..., ::2], ValueError, ["C-contiguous"]),
+]
+
+
+@pytest.mark.parametrize(("argument", "value", "kind", "fragments"), CALLS + HISTOGRAM_CALLS)
+def test_simulate(argument: str, value: Any, kind: type[Exception], fragments: list[str]):
+    refused(lambda: ml.simulate(FLUX, SYSTEM, **{argument: value}), kind, argument, *fragments)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value", "kind", "fragments"),
+    [
+        *CALLS,
+        ("realization", -1, ValueError, ["[0, 4294967295]", "got -1"]),
+        ("realization", 2**32, ValueError, ["[0, 4294967295]", f"got {2**32}"]),
+        ("realization", 0.5, TypeError, ["integer", "got 0.5"]),
+    ],
+)
+def test_simulate_timestamps(argument: str, value: Any, kind: type[Exception], fragments: list[str]):
+    with pytest.raises(kind) as error:
+        ml.simulate_timestamps(FLUX, SYSTEM, **{argument: value})
+    told = str(error.value)
+    assert told.startswith(f"{argument} must "), told  # the caller's word for it
+    for fragment in fragments:
+        assert fragment in told
+
+
+@pytest.mark.parametrize("verb", [ml.simulate, ml.simulate_timestamps])
+def test_what_is_simulated(verb: Callable[..., Any]):
+    refused(lambda: verb(np.ones((2, 3)), SYSTEM), TypeError, "flux must be a Flux", "ndarray")
+    refused(lambda: verb(FLUX, {"bins": 8}), TypeError, "system must be a System", "dict")
+    refused(lambda: verb(FLUX), TypeError, "system")
+    refused(lambda: verb(FLUX, SYSTEM, 3), TypeError)  # options by name only
+    refused(lambda: verb(FLUX, SYSTEM, colour="red"), TypeError, "colour")
+    many = ml.Flux.multi(*[FLUX] * 17)
+    refused(lambda: verb(many, SYSTEM), ValueError, "flux", "at most 16 returns", "got 17", "waveform")
+    endless = SYSTEM.replace(cycles=10**8, detector=ml.Detector(dead_time_ns=0.0))
+    bright = ml.Flux(1000.0, 0.0, 5.0)
+    refused(
+        lambda: verb(bright, endless),
+        ValueError,
+        "2.15e+09 expected registrations",
+        "got 1e+11",
+        "1000 photons",
+    )
+
+
+def test_realizations_end_at_the_last_number():
+    """first_realization + realizations may not pass 2**32: the stream is keyed by 32 bits."""
+    kwargs = {"first_realization": 2**32 - 2}
+    refused(
+        lambda: ml.simulate(FLUX, SYSTEM, realizations=3, **kwargs),
+        ValueError,
+        "realizations",
+        "[1, 2]",
+        "got 3",
+    )
+    assert ml.simulate(FLUX, SYSTEM, realizations=2, **kwargs).shape[0] == 2
+
+
+def test_read_only_out_is_refused():
+    out = np.zeros((1, 2, 3, 8), np.uint16)
+    out.flags.writeable = False
+    refused(lambda: ml.simulate(FLUX, SYSTEM, out=out), ValueError, "out", "writeable")
+
+
+def test_no_work_is_done_for_bad_input():
+    """`out` stays as it was."""
+    out = np.full((1, 2, 3, 8), 7, np.uint16)
+    refused(lambda: ml.simulate(FLUX, SYSTEM, out=out, seed=-1), ValueError, "seed")
+    assert (out == 7).all()

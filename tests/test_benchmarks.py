@@ -1,0 +1,138 @@
+"""The benchmarks run and their tables are whole; no time is asserted."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks are run from the checkout, not installed
+from benchmarks import __main__ as command
+from benchmarks import memory_child, numpy_loop, workload
+from benchmarks.config import Config
+from benchmarks.floor import LANES, operations
+from benchmarks.report import Goal, Section, table
+from benchmarks.timing import Timing, in_turn
+
+from mars_lidar import _core
+
+TINY = Config(
+    mode="tiny",
+    side=8,
+    bins=64,
+    cycles=50,
+    repeats=2,
+    seconds=0.0,
+    budget=2000,
+    fluxes=(0.1, 10.0),
+    exposures=(5, 50),
+    images=(1, 8),
+    loop_pixels=4,
+    chain_bins=128,
+    dense_bins=64,
+    table_entries=2,
+    starts=1,
+    commands=1,
+)
+IN_PROCESS = ("exact", "numpy", "flux", "cycles", "pixels", "paths", "exposure", "stationary")
+TIMING_COLUMNS = {
+    "case", "engine", "level", "threads", "pixels", "cycles", "S + B", "registrations", "ms", "ms least",
+    "CPU ms", "ns/reg/core", "x reference", "MiB written", "write floor ms", "ops/reg least",
+    "ops floor ns/reg", "turns",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def report():
+    return command.run(TINY, IN_PROCESS)
+
+
+def test_every_section_has_a_whole_table(report):
+    assert len(report.sections) == len(IN_PROCESS)
+    for name, section in zip(IN_PROCESS, report.sections, strict=True):
+        assert section.rows, name
+        for row in section.rows:
+            assert list(row) == list(section.rows[0]), name
+            assert row["ms"] > 0
+        if name not in ("exposure", "stationary"):
+            assert set(section.rows[0]) == TIMING_COLUMNS
+
+
+def test_every_level_and_engine_is_in_the_sweeps(report):
+    for section in report.sections[2:5]:
+        assert {row["level"] for row in section.rows if row["engine"] == "exact"} == set(_core.levels())
+        assert "sequential" in {row["engine"] for row in section.rows}
+
+
+def test_goals_stand_beside_measured_values(report):
+    text = report.markdown()
+    assert len(report.goals) >= 8
+    for goal in report.goals:
+        assert np.isfinite(goal.measured)
+        assert goal.what in text
+    for key in ("processor", "vector levels", "NumPy", "date", "meanwhile"):
+        assert report.machine[key]
+
+
+def test_command_saves_markdown_and_json(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "QUICK", TINY)
+    command.main(["--quick", "--only", "exact", "--only", "numpy", "--out", str(tmp_path)])
+    assert (tmp_path / "tiny-exact-numpy.md").read_text() in capsys.readouterr().out
+    data = json.loads((tmp_path / "tiny-exact-numpy.json").read_text())
+    titles = [section["title"] for section in data["sections"]]
+    assert titles == ["Exact engine, canonical cube", "Beside NumPy"]
+    assert {goal["met"] for goal in data["goals"]} <= {True, False}
+
+
+def test_unknown_section_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        command.main(["--only", "nonsense"])
+    assert "nonsense" in capsys.readouterr().err
+
+
+def test_imports_are_timed_in_a_fresh_interpreter():
+    section = command.run(TINY, ("import",)).sections[0]
+    assert [row["case"] for row in section.rows] == ["import numpy", "import mars_lidar"]
+
+
+def test_memory_child_prints_its_sizes(capsys):
+    memory_child.main("exact", 8, 50, 64, 1)
+    found = json.loads(capsys.readouterr().out)
+    assert found["output"] == 8 * 8 * 64 * 2
+    assert found["peak"] >= found["output"]
+
+
+def test_numpy_loop_agrees_with_the_exact_engine():
+    load = workload.canonical(TINY, cycles=1000)
+    pixels = np.arange(load.pixels)
+    total = numpy_loop.photon_by_photon(load, pixels).sum()
+    # two independent draws; their counts have less than Poisson variance: 5 sigma is beyond 1e-6
+    assert abs(int(total) - load.registrations) < 5 * np.sqrt(2 * load.registrations)
+
+
+def test_turns_are_paired_and_counted():
+    calls = []
+    cases = {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}
+    times = in_turn(cases, Config(mode="", repeats=3))
+    assert len(times["a"].wall) == len(times["b"].wall) == 3
+    assert "".join(calls) == "ab" + "ab" + "ba" + "ab"  # one to warm up, then each begins with another case
+
+
+def test_ratios_are_taken_within_a_turn():
+    assert Timing((2.0, 8.0, 4.0), (1.0, 1.0, 1.0)).ratio(Timing((1.0, 2.0, 4.0), (1.0, 1.0, 1.0))) == 2.0
+
+
+def test_wider_levels_need_fewer_operations():
+    counts = [operations(level).total for level in LANES]
+    assert counts == sorted(counts)
+
+
+def test_goals_are_computed():
+    assert Goal("time", 2.0, 3.0, "s").met
+    assert not Goal("time", 4.0, 3.0, "s").met
+    assert Goal("ratio", 21.0, 20.0, "", at_least=True).met
+    assert "**not met**" in table([Goal("time", 4.0, 3.0, "s").row()])
+    assert Section("Empty").markdown() == "## Empty"

@@ -1,0 +1,324 @@
+"""The command: what it writes, what it says, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from typer.testing import CliRunner
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.cli import app
+from mars_lidar.cli.system_options import DEFAULT_SYSTEM
+
+SMALL = ["--size", "12", "--cycles", "50", "--bins", "64"]
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def command(*arguments: object) -> list[str]:
+    code = "import sys; sys.argv[0] = 'mars-lidar'; from mars_lidar.cli import main; main()"
+    return [sys.executable, "-c", code, *(str(a) for a in arguments)]
+
+
+def test_one_command_writes_a_cube_and_a_picture(tmp_path):
+    done = run("simulate", "--scene", "room", *SMALL, "--seed", 3, "-o", tmp_path / "room.zarr")
+    assert done.exit_code == 0, done.output
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["room.png", "room.zarr"]
+    assert (tmp_path / "room.png").read_bytes().startswith(b"\x89PNG")
+    for word in ("registrations", "ns per registration", "room.zarr", "room.png"):
+        assert word in done.output
+    scene = ml.Scene.example("room", size=12)
+    system = DEFAULT_SYSTEM.replace(cycles=50, bins=64)
+    expected = ml.simulate(scene.flux(system, signal=1.0, sbr=1.0), system, seed=3)
+    with xarray.open_zarr(tmp_path / "room.zarr") as data:
+        assert np.array_equal(data.histogram, expected)
+        assert np.array_equal(data.depth, scene.depth_m)
+        assert np.array_equal(data.reflectivity, scene.reflectivity)
+        assert json.loads(data.attrs["system"]) == system.to_dict()
+        assert (data.attrs["engine"], data.attrs["seed"], data.attrs["complete"]) == ("exact", 3, True)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".npz", ".zarr"])
+def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
+    np.save(tmp_path / "irf.npy", np.exp(-np.arange(50) / 9.0))
+    out = tmp_path / f"cube{suffix}"
+    done = run(
+        "simulate", "--scene", "room", "--size", 10, "--scene-seed", 4, "--period-ns", 80,
+        "--dead-time-ns", 20,
+        "--cycles", 40, "--bins", 32, "--pulse-file", tmp_path / "irf.npy", "--pulse-bin-ns", 0.1,
+        "--pulse-origin", "centroid", "--start", "stationary", "--signal", 0.7, "--sbr", 2.5,
+        "--attenuation", "inverse_square", "--ambient", "reflectivity", "--dark-counts", 1e5,
+        "--engine", "sequential", "--realizations", 3, "--seed", 8, "--threads", 1, "--no-picture", "-o", out,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert not out.with_suffix(".png").exists()
+    pulse = ml.SampledPulse(np.exp(-np.arange(50) / 9.0), 0.1, "centroid")
+    system = ml.System(
+        period_ns=80.0,
+        cycles=40,
+        bins=32,
+        pulse=pulse,
+        detector=ml.Detector(dead_time_ns=20.0),
+        start="stationary",
+    )
+    flux = ml.Scene.example("room", size=10, seed=4).flux(
+        system,
+        signal=0.7,
+        sbr=2.5,
+        attenuation="inverse_square",
+        ambient="reflectivity",
+        dark_counts_per_s=1e5,
+    )
+    with io.load(out) as cube:
+        assert cube.system == system
+        assert (cube.engine, cube.seed, cube.shape) == ("sequential", 8, (3, 10, 10, 32))
+        assert np.array_equal(cube.flux.background, flux.background)
+        expected = ml.simulate(flux, system, engine="sequential", realizations=3, seed=8)
+        assert np.array_equal(np.asarray(cube.histogram), expected)
+        assert "seed 4" in cube.recipe.source
+
+
+def test_depth_and_image_files_are_a_scene(tmp_path):
+    np.save(tmp_path / "depth.npy", np.linspace(1.0, 4.0, 48).reshape(6, 8))
+    done = run("simulate", "--depth", tmp_path / "depth.npy", *SMALL[2:], "-o", tmp_path / "a.npz")
+    assert done.exit_code == 0, done.output
+    with io.load(tmp_path / "a.npz") as cube:
+        assert cube.shape == (1, 6, 8, 64)
+        assert "depth.npy" in cube.recipe.source
+
+
+def test_warnings_are_one_line(tmp_path):
+    depth = np.full((6, 8), 2.0)
+    depth[0, 0] = np.nan
+    np.save(tmp_path / "depth.npy", depth)
+    out = tmp_path / "a.h5"
+    done = run("simulate", "--depth", tmp_path / "depth.npy", *SMALL[2:], "--no-picture", "-o", out)
+    assert done.exit_code == 0
+    assert "mars-lidar: warning: 1 of 48 pixels have no return" in done.stderr
+    assert "scene.py" not in done.stderr
+
+
+def test_a_system_file_and_options_on_top_of_it(tmp_path):
+    assert run("init", tmp_path / "spad.yaml").exit_code == 0
+    assert ml.System.load(tmp_path / "spad.yaml") == DEFAULT_SYSTEM
+    text = (tmp_path / "spad.yaml").read_text().replace("dead_time_ns: 75.0", "dead_time_ns: 33.0")
+    (tmp_path / "spad.yaml").write_text(text)
+    done = run(
+        "simulate", "--scene", "room", *SMALL, "--system", tmp_path / "spad.yaml", "--pulse-fwhm-ns", 2,
+        "--no-picture", "-o", tmp_path / "a.zarr",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    with io.load(tmp_path / "a.zarr") as cube:
+        assert cube.system.detector.dead_time_ns == 33.0
+        assert cube.system.cycles == 50
+        assert cube.system.pulse == ml.GaussianPulse.from_fwhm(fwhm_ns=2.0)
+
+
+def test_init_does_not_overwrite(tmp_path):
+    (tmp_path / "mine.yaml").write_text("mine")
+    done = run("init", tmp_path / "mine.yaml")
+    assert done.exit_code == 2
+    assert "exists already" in done.stderr
+    assert (tmp_path / "mine.yaml").read_text() == "mine"
+    assert run("init", tmp_path / "mine.yaml", "--overwrite").exit_code == 0
+    assert run("init", tmp_path / "mine.json").exit_code == 2
+
+
+def test_info_tells_what_is_in_a_file(tmp_path):
+    for name in ("a.zarr", "a.h5", "a.npz"):
+        out = tmp_path / name
+        assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0
+        done = run("info", out)
+        assert done.exit_code == 0
+        for words in (
+            "complete       yes",
+            "1 × 12 × 12 × 64",
+            "engine         exact, seed 0",
+            "GaussianPulse(sigma_ns=0.5)",
+            "dead time 75 ns",
+            f"mars_lidar.io.load('{out}')",
+        ):
+            assert words in done.output, words
+        with io.load(out) as cube:
+            assert f"registrations  {cube.registrations:,}" in done.output
+        assert ("xarray.open_zarr" in done.output) == (out.suffix == ".zarr")
+    verified = run("info", "--verify", tmp_path / "a.h5")
+    assert verified.exit_code == 0
+    assert "every count is the same" in verified.output
+
+
+def test_verify_fails_where_a_count_differs(tmp_path):
+    import zarr
+
+    out = tmp_path / "a.zarr"
+    assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0
+    counts = zarr.open_group(tmp_path / "a.zarr")["histogram"]
+    counts[0, 0, 0, 0] = 9999
+    done = run("info", "--verify", tmp_path / "a.zarr")
+    assert done.exit_code == 1
+    assert "NO: counts differ" in done.output
+
+
+def test_view_draws_a_cube(tmp_path):
+    cube = tmp_path / "a.npz"
+    assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", cube).exit_code == 0
+    done = run("view", cube, "-o", tmp_path / "v.png", "--pixel", "3,4", "--pixel", "0,11")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "v.png").read_bytes().startswith(b"\x89PNG")
+    assert run("view", cube, "-o", tmp_path / "v.pdf").exit_code == 0
+    assert (tmp_path / "v.pdf").read_bytes().startswith(b"%PDF")
+    for wrong, words in (
+        (("-o", tmp_path / "v.png"), "exists already"),
+        (("-o", tmp_path / "w.gif"), "--out must end in .png, .pdf or .svg"),
+        (("-o", tmp_path / "w.png", "--pixel", "3"), "--pixel must be two integers Y,X (row, column), got"),
+        (("-o", tmp_path / "w.png", "--pixel", "12,0"), "pixel must lie in y 0 to 11"),
+        (("-o", tmp_path / "w.png", "--realization", "1"), "realization must be"),
+    ):
+        done = run("view", cube, *wrong)
+        assert done.exit_code == 2
+        assert words in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "the scene is one of --scene and --depth, got neither"),
+        (["--scene", "room", "--depth", "d.png"], "got both"),
+        (["--scene", "moon"], "name must be one of 'room', got 'moon'"),
+        (["--scene", "room", "--image", "a.png"], "--image belongs to --depth"),
+        (["--depth", "nowhere.png"], "nowhere.png"),
+        (["--scene", "room", "--engine", "quick"], "engine must be one of"),
+        (["--scene", "room", "--bins", "0"], "bins must be an integer in [1, "),
+        (["--scene", "room", "--start", "cold"], "start must be one of 'armed', 'stationary', got 'cold'"),
+        (["--scene", "room", "--dead-time-ns", "-1"], "dead_time_ns must be"),
+        (["--scene", "room", "--sbr", "0"], "sbr must be"),
+        (["--scene", "room", "--attenuation", "fog"], "attenuation must be one of"),
+        (["--scene", "room", "--system", "nowhere.yaml"], "nowhere.yaml"),
+        (["--scene", "room", "--pulse-sigma-ns", "1", "--pulse-fwhm-ns", "1"], "the pulse is given once"),
+        (["--scene", "room", "--pulse-bin-ns", "1"], "belong to --pulse-file"),
+        (["--scene", "room", "--pulse-file", "irf.npy"], "needs --pulse-bin-ns"),
+        (["--scene", "room", "--pulse-file", "irf.csv", "--pulse-bin-ns", "1"], "1-D .npy array, got"),
+        (["--scene", "room", "--seed", "-1"], "seed must be an integer in [0, "),
+        (["--scene", "room", "--realizations", "0"], "realizations must be an integer in [1, "),
+        (["--scene", "room", "--out", "cube.mat"], "out must end in one of .zarr, .h5, .hdf5, .npz"),
+        (["--scene", "room", "--out", "nowhere/cube.h5"], "out must lie in an existing folder"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_exit_code_2(tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    out = [] if "--out" in arguments else ["-o", "cube.zarr"]
+    done = run("simulate", *SMALL[:2], *arguments, *out)
+    assert done.exit_code == 2, done.output
+    assert done.stderr.startswith("mars-lidar: ")
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_usage_errors_are_exit_code_2():
+    assert run("simulate", "--scene", "room").exit_code == 2
+    assert run("simulate", "--bins", "many", "-o", "a.zarr").exit_code == 2
+    assert run("fly").exit_code == 2
+
+
+def test_existing_output_is_refused(tmp_path):
+    out = tmp_path / "a.zarr"
+    assert run("simulate", "--scene", "room", *SMALL, "-o", out).exit_code == 0
+    done = run("simulate", "--scene", "room", *SMALL, "--seed", 1, "-o", out)
+    assert done.exit_code == 2
+    assert "a.png exists already; give --overwrite" in done.stderr
+    done = run("simulate", "--scene", "room", *SMALL, "--seed", 1, "-o", out, "--no-picture")
+    assert done.exit_code == 2
+    assert "a.zarr exists already; give --overwrite" in done.stderr
+    assert run("simulate", "--scene", "room", *SMALL, "--seed", 1, "-o", out, "--overwrite").exit_code == 0
+    with io.load(out) as cube:
+        assert cube.seed == 1
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path):
+    (tmp_path / "junk.h5").write_bytes(b"junk")
+    wrong = {"none.zarr": "does not exist", "junk.h5": "is not an HDF5 file", "a.txt": "must end in"}
+    for name, words in wrong.items():
+        done = run("info", tmp_path / name)
+        assert done.exit_code == 2
+        assert words in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_full_disk_is_exit_code_1(tmp_path, monkeypatch):
+    from mars_lidar.io.zarr_store import ZarrWriter
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ZarrWriter, "write", full)
+    done = run("simulate", "--scene", "room", *SMALL, "-o", tmp_path / "a.zarr")
+    assert done.exit_code == 1
+    left = f"{tmp_path / 'a.zarr'} is left behind, marked incomplete"
+    assert done.stderr == f"mars-lidar: failed: No space left on device; {left}\n"
+    assert "complete       NO: the simulation did not finish" in run("info", tmp_path / "a.zarr").output
+    done = run("view", tmp_path / "a.zarr", "-o", tmp_path / "a.png")
+    assert done.exit_code == 2
+    assert "is incomplete" in done.stderr
+
+
+def test_info_says_when_only_a_leftover_is_there(tmp_path):
+    (tmp_path / "a.h5.incomplete").write_bytes(b"")
+    for name in ("a.h5", "a.h5.incomplete"):
+        done = run("info", tmp_path / name)
+        assert done.exit_code == 0
+        assert "complete       NO: " in done.output
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_run_is_left_incomplete(tmp_path, how):
+    out = tmp_path / "a.zarr"
+    long = ["--scene", "room", "--size", 128, "--cycles", 1_000_000, "--bins", 64]  # minutes
+    process = subprocess.Popen(command("simulate", *long, "-o", out), stderr=subprocess.PIPE, text=True)
+    _wait_for(out / "histogram" / "zarr.json")
+    time.sleep(0.3)
+    stopped = time.monotonic()
+    process.send_signal(how)
+    _, told = process.communicate(timeout=30)
+    if how == signal.SIGINT:
+        assert time.monotonic() - stopped < 5.0  # promised within a second; test machines are busy
+        assert process.returncode == 130
+        assert told == f"mars-lidar: interrupted; {out} is left behind, marked incomplete\n"
+    else:
+        assert process.returncode == -signal.SIGKILL
+    assert not (tmp_path / "a.png").exists()
+    done = run("info", out)
+    assert done.exit_code == 0
+    assert "complete       NO: the simulation did not finish; at least 0 of 1 chunks" in done.output
+
+
+def _wait_for(path: Path) -> None:
+    end = time.monotonic() + 30.0
+    while not path.exists():
+        assert time.monotonic() < end, f"{path} did not appear"
+        time.sleep(0.05)
+
+
+def test_help_teaches_and_starts_light():
+    text = run("simulate", "--help").output
+    for words in ("--dead-time-ns", "Default: 75", "Examples", "simulate --scene room -o room.zarr"):
+        assert words in text
+    assert run("--version").output == f"mars-lidar {ml.__version__}\n"
+    heavy = {"matplotlib", "zarr", "h5py", "xarray", "scipy", "imageio", "yaml", "torch"}
+    code = f"import sys, mars_lidar.cli; print(*({heavy!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""

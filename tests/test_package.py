@@ -1,0 +1,92 @@
+"""The package as a whole: version, what an import loads, documentation of every public name."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import mars_lidar as ml
+
+ROOT = Path(__file__).parents[1]
+HEAVY = (
+    "scipy",
+    "matplotlib",
+    "zarr",
+    "xarray",
+    "h5py",
+    "imageio",
+    "typer",
+    "rich",
+    "yaml",
+    "torch",
+    "pandas",
+)
+
+
+def test_version_is_that_of_the_project():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert ml.__version__ == project["version"]
+    try:
+        installed = metadata.version("mars-lidar")
+    except metadata.PackageNotFoundError:
+        return  # run from the source tree
+    assert ml.__version__ == installed
+
+
+def test_import_is_light():
+    """`import mars_lidar` needs NumPy and the native core only, so that the command line answers at once."""
+    code = f"import sys, mars_lidar; print(*[name for name in {HEAVY!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_simulation_is_light():
+    """Neither does a simulation load anything heavier."""
+    code = (
+        "import sys, mars_lidar as ml\n"
+        "s = ml.System(period_ns=100.0, cycles=10, bins=8, pulse=ml.GaussianPulse(sigma_ns=1.0),"
+        " detector=ml.Detector(dead_time_ns=50.0))\n"
+        "ml.simulate(ml.Flux(1.0, 1.0, 50.0), s)\n"
+        f"print(*[name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_public_names_exist_and_are_sorted():
+    assert len(set(ml.__all__)) == len(ml.__all__)
+    assert all(hasattr(ml, name) for name in ml.__all__)
+    assert [n for n in ml.__all__ if not n.startswith("_")] == sorted(
+        n for n in ml.__all__ if not n.startswith("_")
+    )
+
+
+@pytest.mark.parametrize("name", [n for n in ml.__all__ if n != "__version__"])
+def test_public_names_are_documented(name: str):
+    thing = getattr(ml, name)
+    assert inspect.getdoc(thing)
+    if inspect.isclass(thing):
+        for member, value in vars(thing).items():
+            is_method = inspect.isfunction(value) or isinstance(value, (property, classmethod, staticmethod))
+            if not member.startswith("_") and is_method:
+                assert inspect.getdoc(getattr(thing, member)), f"{name}.{member}"
+
+
+@pytest.mark.parametrize("name", ["simulate", "simulate_timestamps"])
+def test_every_argument_is_documented_and_typed(name: str):
+    function = getattr(ml, name)
+    text = inspect.getdoc(function)
+    for parameter in inspect.signature(function).parameters.values():
+        assert parameter.annotation is not inspect.Parameter.empty
+        if name == "simulate":  # the other refers to it
+            assert f"\n{parameter.name}\n" in text
+
+
+def test_package_is_marked_as_typed():
+    assert (Path(ml.__file__).parent / "py.typed").exists()

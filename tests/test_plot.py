@@ -1,0 +1,156 @@
+"""Pictures: the numbers behind them are right, every kind of cube can be drawn, nothing global is touched."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import mars_lidar as ml
+from mars_lidar import io, plot
+from mars_lidar.plot import data
+
+SYSTEM = ml.System(
+    period_ns=100.0,
+    cycles=300,
+    bins=128,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
+    detector=ml.Detector(dead_time_ns=30.0),
+)
+
+
+def cube_of(
+    flux: ml.Flux, system: ml.System = SYSTEM, engine: str = "exact", realizations: int = 1
+) -> io.Cube:
+    counts = ml.simulate(flux, system, engine=engine, realizations=realizations)
+    return io.Cube(
+        histogram=counts,
+        recipe=io.Recipe(system=system, flux=flux, engine=engine, realizations=realizations),
+    )
+
+
+def step(height: int = 9, width: int = 12) -> ml.Flux:
+    """Two planes, the right one farther and darker; one pixel without return."""
+    right = np.arange(width) >= width // 2
+    s = np.tile(np.where(right, 0.5, 2.0), (height, 1))
+    tau = np.tile(np.where(right, 60.0, 20.0), (height, 1))
+    s[0, 0], tau[0, 0] = 0.0, np.nan
+    return ml.Flux(s, 0.2, tau)
+
+
+FLUXES = {
+    "one return": step(),
+    "several returns": ml.Flux.multi(step(), ml.Flux(0.4, 0.0, 99.5)),
+    "waveform": ml.Flux(
+        waveform=np.random.default_rng(0).gamma(0.3, 0.05, (9, 12, 40)), background=0.1
+    ),
+    "no signal": ml.Flux(np.zeros((4, 5)), 0.3, np.nan),
+    "nothing at all": ml.Flux(0.0, 0.0, np.nan),
+    "one pixel": ml.Flux(2.0, 0.5, 99.9),
+    "few photons": ml.Flux(np.full((3, 3), 1e-3), 1e-3, 50.0),
+}
+
+
+@pytest.mark.parametrize("name", FLUXES)
+def test_every_kind_of_cube_can_be_drawn(tmp_path, name):
+    cube = cube_of(FLUXES[name])
+    figure = plot.overview(cube)
+    assert isinstance(figure, Figure)
+    figure.savefig(tmp_path / "overview.png", dpi=40)
+    plot.pixel_histogram(cube, 0, 0).savefig(tmp_path / "pixel.png", dpi=40)
+    assert (tmp_path / "overview.png").stat().st_size > 2000
+    labels = [ax.get_xlabel() for ax in figure.axes]
+    assert "time in the laser period (ns)" in labels
+    assert "counts per bin" in [ax.get_ylabel() for ax in figure.axes]
+
+
+def test_a_map_has_a_colour_bar_with_its_unit(tmp_path):
+    figure = plot.map_image(np.array([[1.0, np.nan], [2.0, 3.0]]), "depth (m)")
+    figure.savefig(tmp_path / "map.png", dpi=40)
+    assert figure.axes[0].child_axes[0].get_ylabel() == "depth (m)"
+    with pytest.raises(ValueError, match=r"values must be a map \(H, W\), got shape \(3,\)"):
+        plot.map_image(np.zeros(3), "depth (m)")
+
+
+def test_the_users_settings_and_pyplot_are_left_alone():
+    before = dict(mpl.rcParams)
+    plot.overview(cube_of(FLUXES["one return"]))
+    assert dict(mpl.rcParams) == before
+    code = "import sys, mars_lidar.plot.figures; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_only_the_realization_asked_for_is_drawn():
+    cube = cube_of(step(), realizations=3)
+    totals, _ = plot.count_maps(cube, 2)
+    assert np.array_equal(totals, np.asarray(cube.histogram)[2].sum(-1))
+    assert "realization 2" in plot.overview(cube, realization=2).texts[0].get_text()
+    with pytest.raises(ValueError, match=r"realization must be an integer in \[0, 2\], got 3"):
+        plot.overview(cube, realization=3)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [([(9, 0)], r"pixel must lie in y 0 to 8, x 0 to 11, got \(9, 0\)"), ([], "pixels must be 1 to 6 pairs")],
+)
+def test_pixels_outside_are_named(pixels, message):
+    with pytest.raises(ValueError, match=message):
+        plot.overview(cube_of(step()), pixels=pixels)
+
+
+def test_maps_are_read_in_bands(monkeypatch):
+    cube = cube_of(step())
+    whole = plot.count_maps(cube)
+    monkeypatch.setattr(data, "_READ_BYTES", 1)
+    for a, b in zip(whole, plot.count_maps(cube), strict=True):
+        assert np.array_equal(a, b, equal_nan=True)
+
+
+@pytest.mark.parametrize("origin", ["peak", "centroid", "first"])
+def test_peak_depth_knows_what_the_delay_of_a_measured_pulse_refers_to(origin):
+    values = np.concatenate([np.zeros(30), [1.0, 4.0, 9.0, 4.0], np.exp(-np.arange(40) / 12.0)])
+    system = SYSTEM.replace(pulse=ml.SampledPulse(values, 0.5, origin), bins=400, cycles=3000)
+    flux = ml.Flux(np.full((4, 4), 0.5), 0.05, np.linspace(1.0, 99.0, 16).reshape(4, 4))
+    cube = cube_of(flux, system, engine="poisson")
+    _, estimate = plot.count_maps(cube)
+    # the sample of the peak is two bins wide: either of them may hold most counts
+    assert np.abs(plot.depth_error_m(cube, estimate)).max() < system.depth_m(0.6)
+
+
+def test_depth_is_missing_where_nothing_was_counted():
+    _, estimate = plot.count_maps(cube_of(FLUXES["nothing at all"]))
+    assert np.isnan(estimate).all()
+
+
+def test_depth_errors_are_modulo_the_range():
+    cube = cube_of(ml.Flux(1.0, 0.0, 250.3))  # two periods and a half away
+    span = SYSTEM.unambiguous_range_m
+    error = plot.depth_error_m(cube, SYSTEM.depth_m(np.array([[50.5]])))
+    assert error == pytest.approx(SYSTEM.depth_m(0.2), abs=1e-9)
+    assert abs(plot.depth_error_m(cube, np.array([[0.0]])))[0, 0] <= span / 2
+
+
+def test_incident_rates_add_up_to_all_photons():
+    for name, flux in FLUXES.items():
+        rate = plot.incident_rate(flux, SYSTEM, 0, 0)
+        assert rate.shape == (SYSTEM.bins,), name
+        assert rate.sum() == pytest.approx(flux.total[0, 0], abs=1e-12), name
+    # Poisson histograms have this mean: chi-square of 128 bins, false alarm 1e-6
+    flux = ml.Flux(waveform=np.linspace(0.0, 0.2, 40), background=0.5)
+    counts = ml.simulate(flux, SYSTEM, engine="poisson", realizations=200)[:, 0, 0].sum(0)
+    mean = plot.incident_rate(flux, SYSTEM, 0, 0) * SYSTEM.cycles * 200
+    assert ((counts - mean) ** 2 / mean).sum() < 220.0
+
+
+def test_example_pixels_are_bright_dim_and_at_the_edge():
+    flux = step()
+    chosen = plot.example_pixels(flux, SYSTEM.depth_m(flux.delay_ns))
+    assert flux.signal[chosen["bright"]] == 2.0
+    assert flux.signal[chosen["dim"]] == 0.5
+    assert chosen["edge"][1] in (5, 6)
+    assert plot.example_pixels(ml.Flux(0.0, 1.0, 0.0), np.zeros((1, 1))) == {"first": (0, 0)}
+    assert plot.example_pixels(ml.Flux(1.0, 1.0, 0.0), np.zeros((1, 1))) == {"bright": (0, 0)}

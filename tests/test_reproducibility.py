@@ -1,0 +1,203 @@
+"""Same seed, same bits: threads, parts, vector widths, and the committed bits of a few small cubes."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mars_lidar as ml
+from mars_lidar import _core
+from mars_lidar.engines import ENGINES
+from mars_lidar.engines.base import Records, Task
+from mars_lidar.engines.exact import ExactEngine
+
+SHAPE = (6, 11)  # not a multiple of any number of lanes
+# two lobes with a gap; whole numbers, because NumPy's exp differs between processors
+LOBES = np.array([1, 4, 19, 55, 80, 61, 30, 9, 2] + [0] * 12 + [1, 6, 14, 20, 17, 9, 3, 1] + [0] * 7, float)
+
+
+def image(kind: str) -> tuple[ml.Flux, ml.System]:
+    """A mixture of dark, dim and bright pixels, so that lanes end at different times."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    signal = np.where((x + y) % 5 == 0, 0.0, 0.01 * 2.0 ** ((3 * x + 7 * y) % 13))
+    background = np.where((2 * x + y) % 7 == 0, 0.0, 0.02 * 3.0 ** ((x + 5 * y) % 6))
+    delay = 9.7 * x - 31.3 * y
+    system = ml.System(
+        period_ns=100.0, cycles=120, bins=50, pulse=ml.GaussianPulse(sigma_ns=0.75),
+        detector=ml.Detector(dead_time_ns=63.75),
+    )  # fmt: skip
+    flux = ml.Flux(signal, background, delay)
+    if kind == "sampled":
+        system = system.replace(pulse=ml.SampledPulse(LOBES, 0.9))
+    elif kind == "returns":
+        flux = ml.Flux.multi(
+            flux, ml.Flux(0.3 * signal, 0.0, delay + 20.0), ml.Flux(0.1 * signal, 0.1, delay - 60.0)
+        )
+    elif kind == "waveform":
+        wave = signal[..., None] * np.roll(LOBES, 7) / LOBES.sum()
+        flux = ml.Flux(waveform=wave, background=background)
+    elif kind == "stationary":
+        system = system.replace(start="stationary")
+    elif kind == "stationary waveform":
+        flux, system = image("waveform")[0], system.replace(start="stationary")
+    elif kind == "whole periods":
+        system = system.replace(detector=ml.Detector(dead_time_ns=300.0))
+    elif kind == "no dead time":
+        system = system.replace(detector=ml.Detector(dead_time_ns=0.0), cycles=7)
+    elif kind == "long dead time":
+        system = system.replace(detector=ml.Detector(dead_time_ns=777.7), start="stationary", cycles=500)
+    return flux, system
+
+
+KINDS = (
+    "gaussian", "sampled", "returns", "waveform", "stationary", "stationary waveform", "whole periods",
+    "no dead time", "long dead time",
+)  # fmt: skip
+# Start of the SHA-256 of the cubes (3 realizations, seed 2**63 + 1), as little-endian uint32.
+# A change of these bits is a change of every user's data: it belongs into the change log, as a new version.
+GOLDEN = {
+    "gaussian": "3a2089dbdc7963a9",
+    "sampled": "a2b66fbf39a8bae5",
+    "returns": "881f878d4c07cebd",
+    "waveform": "f5f7ef84dad0890e",
+    "stationary": "61fdece1ba640213",
+    "stationary waveform": "1113d46864c10a1f",
+    "whole periods": "d9691e9d1b053a3a",
+    "no dead time": "cd14e9c42c599eb5",
+    "long dead time": "fa7ec0b8c1b13470",
+    "gaussian, times": "d1a6467ae049a74b",
+    "returns, times": "363a4fbdab9ca50e",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_golden_bits(kind: str):
+    flux, system = image(kind)
+    cube = ml.simulate(flux, system, realizations=3, seed=2**63 + 1)
+    as_little_endian = cube.astype("<u4").tobytes()
+    assert hashlib.sha256(as_little_endian).hexdigest()[:16] == GOLDEN[kind]
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "returns"])
+def test_golden_times(kind: str):
+    flux, system = image(kind)
+    times = ml.simulate_timestamps(flux, system, seed=5)
+    told = hashlib.sha256(times.times_ns.astype("<f8").tobytes()).hexdigest()[:16]
+    assert told == GOLDEN[f"{kind}, times"]
+
+
+def task(kind: str, realizations: int = 3, threads: int = 1) -> Task:
+    flux, system = image(kind)
+    index = np.arange(SHAPE[0] * SHAPE[1], dtype=np.uint32)
+    return Task(flux, system, realizations, 0, index, 77, threads, None)
+
+
+def drawn(engine: ExactEngine, request: Task) -> tuple[NDArray[np.uint32], Records]:
+    out = np.full((request.items, request.system.bins), 9, request.system.histogram_dtype)
+    engine.histogram(request, out)
+    records = Records.allocate(engine.counts(request))
+    engine.timestamps(request, records)
+    return out, records
+
+
+def test_there_are_levels_to_compare():
+    """One of them is the plain one, which every processor runs."""
+    assert _core.levels()[-1] == "scalar"
+
+
+@pytest.mark.parametrize("level", _core.levels())
+@pytest.mark.parametrize("kind", KINDS)
+def test_levels_give_the_same_bits(kind: str, level: str):
+    request = task(kind)
+    expected, times = drawn(ExactEngine(level="scalar"), request)
+    out, records = drawn(ExactEngine(level=level), request)
+    assert np.array_equal(out, expected)
+    assert np.array_equal(records.times, times.times)
+    assert np.array_equal(records.cycle, times.cycle)
+    assert np.array_equal(records.bin, times.bin)
+
+
+def test_unknown_level_is_an_error():
+    with pytest.raises(ValueError, match="level must be one that this processor runs, got 'mmx'"):
+        drawn(ExactEngine(level="mmx"), task("gaussian"))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_threads_do_not_matter(engine: str, kind: str):
+    flux, system = image(kind)
+    one = ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=1)
+    for threads in (2, 5, None):
+        assert np.array_equal(
+            one, ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=threads)
+        )
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_part_has_the_bits_of_the_whole(engine: str, kind: str):
+    """Cut at random into rectangles and runs of realizations, each simulated alone."""
+    flux, system = image(kind)
+    whole = ml.simulate(flux, system, engine=engine, realizations=5, seed=3)
+    index = np.arange(SHAPE[0] * SHAPE[1]).reshape(SHAPE)
+    random = np.random.default_rng(0)
+    for _ in range(6):
+        rows, columns, run = (slice(*np.sort(random.choice(n + 1, 2, replace=False))) for n in (*SHAPE, 5))
+        part = ml.simulate(
+            flux[rows, columns], system, engine=engine, realizations=run.stop - run.start,
+            first_realization=int(run.start), pixel_index=index[rows, columns], seed=3,
+        )  # fmt: skip
+        assert np.array_equal(part, whole[run, rows, columns])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_order_of_pixels_does_not_matter(engine: str):
+    flux, system = image("gaussian")
+    whole = ml.simulate(flux, system, engine=engine, seed=3)[0].reshape(-1, system.bins)
+    order = np.random.default_rng(1).permutation(len(whole))
+    maps = [m.ravel()[order][None] for m in (flux.signal, flux.background, flux.delay_ns)]
+    mixed = ml.simulate(ml.Flux(*maps), system, engine=engine, seed=3, pixel_index=order)[0, 0]
+    assert np.array_equal(mixed, whole[order])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_seeds_pixels_and_realizations_have_their_own_streams(engine: str):
+    """Alike pixels, all different; 64-bit seeds and 32-bit indices are used in full."""
+    flux, system = ml.Flux(np.full((1, 3), 1.0), 1.0, 40.0), image("gaussian")[1]
+    rows = []
+    for seed in (0, 1, 2**32, 2**63, 2**64 - 1):
+        for first in (0, 1, 2**31, 2**32 - 1):
+            for index in ([0, 1, 2], [65_536, 2**31, 2**32 - 1]):
+                cube = ml.simulate(
+                    flux, system, engine=engine, seed=seed, first_realization=first, pixel_index=index
+                )  # fmt: skip
+                rows.extend(cube[0, 0])
+    assert len({row.tobytes() for row in rows}) == len(rows) == 120
+
+
+@pytest.mark.parametrize("engine", ["exact", "sequential"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_timestamps_are_those_of_the_cube(engine: str, kind: str):
+    flux, system = image(kind)
+    cube = ml.simulate(flux, system, engine=engine, realizations=3, seed=8)
+    for realization in range(3):
+        for threads in (1, 3):
+            times = ml.simulate_timestamps(
+                flux, system, engine=engine, realization=realization, seed=8, threads=threads
+            )  # fmt: skip
+            assert np.array_equal(times.histogram(), cube[realization])
+            assert times.histogram().dtype == cube.dtype
+
+
+def test_nothing_global_is_left_behind():
+    """NumPy's global random state is neither read nor changed; a second call gives the same."""
+    flux, system = image("gaussian")
+    np.random.seed(3)  # noqa: NPY002
+    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    first = ml.simulate(flux, system, seed=5)
+    assert np.array_equal(state, np.random.get_state()[1])  # noqa: NPY002
+    assert np.array_equal(first, ml.simulate(flux, system, seed=5))
+    assert not np.array_equal(first, ml.simulate(flux, system, seed=6))

@@ -1,0 +1,81 @@
+"""Packed timestamps: layout, limits, single pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+
+
+@pytest.mark.parametrize("engine", ["exact", "sequential"])
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+def test_layout(system: ml.System, flux: ml.Flux, engine: str, start: str):
+    system = system.replace(start=start)
+    times = ml.simulate_timestamps(flux, system, engine=engine, seed=1)
+    assert times.shape == flux.shape == (2, 3)
+    assert times.bins == system.bins
+    assert times.times_ns.dtype == np.float64
+    assert times.cycle.dtype == times.bin.dtype == np.int32
+    assert times.offsets.dtype == np.int64
+    assert times.offsets.shape == (7,)
+    assert times.offsets[0] == 0
+    assert len(times) == times.offsets[-1] == times.times_ns.size == times.cycle.size == times.bin.size
+    assert np.array_equal(times.counts, np.diff(times.offsets).reshape(2, 3))
+    assert repr(times) == f"Timestamps({len(times)} registrations, 2 x 3 pixels)"
+    assert times.times_ns.min() >= 0
+    assert times.times_ns.max() < system.exposure_ns
+    # cycle and bin say the same as the time, up to the resolution of a phase
+    periods = times.times_ns / system.period_ns
+    assert np.abs(periods - times.cycle - (times.bin + 0.5) / system.bins).max() <= 0.5 / system.bins + 1e-7
+    assert times.cycle.min() >= 0
+    assert times.cycle.max() < system.cycles
+    assert times.bin.min() >= 0
+    assert times.bin.max() < system.bins
+
+
+def test_pixels_are_views_in_order_of_time(system: ml.System, flux: ml.Flux):
+    times = ml.simulate_timestamps(flux, system, seed=2)
+    for y in range(2):
+        for x in range(3):
+            one = times.pixel(y, x)
+            assert one.shape == (1, 1)
+            assert len(one) == times.counts[y, x]
+            assert np.all(np.diff(one.times_ns) >= system.detector.dead_time_ns - 1e-4)
+            assert np.shares_memory(one.times_ns, times.times_ns) or len(one) == 0
+            assert np.array_equal(one.histogram()[0, 0], times.histogram()[y, x])
+    assert np.array_equal(times.pixel(-1, -1).times_ns, times.pixel(1, 2).times_ns)
+    assert len(times.pixel(1, 2)) == 0  # no photons there
+
+
+@pytest.mark.parametrize("place", [(2, 0), (0, 3), (-3, 0), (0, -4)])
+def test_pixel_outside_of_the_image(system: ml.System, flux: ml.Flux, place: tuple[int, int]):
+    times = ml.simulate_timestamps(flux, system)
+    with pytest.raises(IndexError, match=r"pixel \(.*\) is outside of an image of 2 x 3"):
+        times.pixel(*place)
+
+
+def test_parts_have_the_times_of_the_whole(system: ml.System, flux: ml.Flux):
+    whole = ml.simulate_timestamps(flux, system, realization=3, seed=4)
+    part = ml.simulate_timestamps(flux[1], system, realization=3, seed=4, pixel_index=[3, 4, 5])
+    assert np.array_equal(part.times_ns, whole.times_ns[whole.offsets[3] :])
+    assert not np.array_equal(whole.times_ns[:50], ml.simulate_timestamps(flux, system, seed=4).times_ns[:50])
+
+
+def test_engine_without_times_says_so(system: ml.System, flux: ml.Flux):
+    with pytest.raises(ValueError, match="engine 'poisson' draws histograms only"):
+        ml.simulate_timestamps(flux, system, engine="poisson")
+
+
+def test_units_are_nanoseconds(system: ml.System):
+    """The same draws at another period: times in proportion."""
+    flux = ml.Flux(2.0, 0.5, 50.0)
+    half = system.replace(
+        period_ns=system.period_ns / 2,
+        pulse=ml.GaussianPulse(sigma_ns=0.25),
+        detector=ml.Detector(dead_time_ns=42.5),
+    )
+    a = ml.simulate_timestamps(flux, system, seed=3)
+    b = ml.simulate_timestamps(ml.Flux(2.0, 0.5, 25.0), half, seed=3)
+    assert np.array_equal(a.times_ns, 2 * b.times_ns)
+    assert np.array_equal(a.bin, b.bin)

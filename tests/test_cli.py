@@ -32,6 +32,11 @@ def command(*arguments: object) -> list[str]:
     return [sys.executable, "-c", code, *(str(a) for a in arguments)]
 
 
+def listen_to_ctrl_c() -> None:
+    """In a child: shells start background processes, and so whole test runs, with Ctrl-C ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_one_command_writes_a_cube_and_a_picture(tmp_path):
     done = run("simulate", "--scene", "room", *SMALL, "--seed", 3, "-o", tmp_path / "room.zarr")
     assert done.exit_code == 0, done.output
@@ -288,7 +293,9 @@ def test_info_says_when_only_a_leftover_is_there(tmp_path):
 def test_a_stopped_run_is_left_incomplete(tmp_path, how):
     out = tmp_path / "a.zarr"
     long = ["--scene", "room", "--size", 128, "--cycles", 1_000_000, "--bins", 64]  # minutes
-    process = subprocess.Popen(command("simulate", *long, "-o", out), stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command("simulate", *long, "-o", out), stderr=subprocess.PIPE, text=True, preexec_fn=listen_to_ctrl_c
+    )
     _wait_for(out / "histogram" / "zarr.json")
     time.sleep(0.3)
     stopped = time.monotonic()

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from mars_lidar.io import Cube
 
 _READ_BYTES = 64 * 2**20
+_PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 10 us a period
 
 
 def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -80,6 +81,35 @@ def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.floa
         if s > 0:
             rate = rate + s * system.pulse.bin_energy(tau, system.period_ns, system.bins)
     return rate
+
+
+def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
+    """Mean histogram (bins,) of pixel (y, x) over many exposures, by the exact finite-exposure statistics.
+
+    None where that takes too long for a picture, or does not converge. The engine "poisson" has no dead time:
+    its mean is the incident rate.
+    """
+    system, flux = cube.system, cube.flux
+    if cube.engine == "poisson":
+        return incident_rate(flux, system, y, x) * system.cycles
+    if system.cycles > _PREDICTED_CYCLES:
+        return None
+    from mars_lidar.statistics import ConvergenceError, exposure_moments
+
+    background = float(flux.background[y, x])
+    waveform = None if flux.waveform is None else flux.waveform[y, x]
+    returns = zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True)
+    lit = [(s, tau) for s, tau in returns if s > 0]
+    try:
+        if waveform is None and len(lit) > 1:
+            parts = system.bins * max(1, 8192 // system.bins)
+            waveform = np.sum([s * system.pulse.bin_energy(tau, system.period_ns, parts) for s, tau in lit], axis=0)
+        if waveform is not None:
+            return exposure_moments(None, background, system, waveform=np.maximum(waveform, 0.0)).histogram
+        signal, delay = lit[0] if lit else (0.0, 0.0)
+        return exposure_moments(signal, background, system, delay_ns=delay).histogram
+    except ConvergenceError:
+        return None
 
 
 def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.plot.data import incident_rate
+from mars_lidar.plot.data import incident_rate, predicted_counts
 from mars_lidar.plot.style import INK, MUTED
 from mars_lidar.system import System
 
@@ -24,10 +24,10 @@ _LOG_FROM = 8.0  # counts: below this peak a linear axis shows more
 def draw_pixel(
     whole: Axes, zoom: Axes, cube: Cube, realization: int, pixel: tuple[int, int], colour: str, name: str
 ) -> None:
-    """Draw counts, the incident rate scaled to the same total, and the true delays.
+    """Draw counts, the predicted mean histogram, the incident rate scaled to the same total, and the true delays.
 
-    The incident rate is what the histogram would look like without dead time: what lies between the two is
-    pile-up.
+    The incident rate is what the histogram would look like without dead time: what lies between it and the
+    prediction is pile-up.
     """
     y, x = pixel
     system, flux = cube.system, cube.flux
@@ -37,13 +37,14 @@ def draw_pixel(
     returns = zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True)
     delays = [float(tau % system.period_ns) for s, tau in returns if s > 0]
 
-    _draw_whole(whole, system, counts, expected, delays, colour)
+    predicted = predicted_counts(cube, y, x)
+    _draw_whole(whole, system, counts, expected, predicted, delays, colour)
     if delays:
         centre, (low, high) = float(flux.delay_ns[y, x] % system.period_ns), _zoom_ns(system)
     else:
         centre = float(system.time_ns[rate.argmax()])
         low, high = -0.1 * system.period_ns, 0.1 * system.period_ns
-    _draw_zoom(zoom, system, counts, expected, delays, centre, (low, high), colour)
+    _draw_zoom(zoom, system, counts, expected, predicted, delays, centre, (low, high), colour)
     whole.set_title(
         f"{name} pixel (y {y}, x {x}): S = {flux.signal[y, x]:.3g}, B = {flux.background[y, x]:.3g}, "
         f"{int(counts.sum()):,} registrations".lstrip(),
@@ -66,6 +67,7 @@ def _draw_whole(
     system: System,
     counts: _Array,
     expected: _Array,
+    predicted: _Array | None,
     delays: list[float],
     colour: str,
 ) -> None:
@@ -81,7 +83,9 @@ def _draw_whole(
         means[np.maximum.reduceat(expected, starts) > 3.0 * lowest] = np.nan
         coarse = _steps(edges[np.append(starts, system.bins)], means)
         ax.plot(*coarse, color=colour, lw=1.0, label=f"counts, mean of {group} bins")
-    ax.plot(*_steps(edges, expected), color=INK, lw=0.8, label="incident rate, same total")
+    ax.plot(*_steps(edges, expected), color=MUTED, lw=0.8, label="incident rate, same total")
+    if predicted is not None:
+        ax.plot(*_steps(edges, predicted), color=INK, lw=0.9, label="predicted mean")
     for k, tau in enumerate(delays):
         ax.axvline(tau, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0, label="true delay" if k == 0 else None)
     ax.set_xlim(0.0, system.period_ns)
@@ -101,6 +105,7 @@ def _draw_zoom(
     system: System,
     counts: _Array,
     expected: _Array,
+    predicted: _Array | None,
     delays: list[float],
     centre: float,
     window: tuple[float, float],
@@ -114,7 +119,9 @@ def _draw_zoom(
     near, incident = counts[bins % system.bins], expected[bins % system.bins]
     ax.fill_between(*_steps(edges, near), color=colour, alpha=0.4, lw=0)
     ax.plot(*_steps(edges, near), color=colour, lw=0.6)
-    ax.plot(*_steps(edges, incident), color=INK, lw=0.9)
+    ax.plot(*_steps(edges, incident), color=MUTED, lw=0.9)
+    if predicted is not None:
+        ax.plot(*_steps(edges, predicted[bins % system.bins]), color=INK, lw=0.9)
     for tau in delays:
         offset = (tau - centre + 0.5 * system.period_ns) % system.period_ns - 0.5 * system.period_ns
         ax.axvline(offset, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0)

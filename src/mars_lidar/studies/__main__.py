@@ -1,0 +1,68 @@
+"""``python -m mars_lidar.studies``: run studies and write their reports."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from mars_lidar.studies import STUDIES, Request
+
+
+def _parser() -> argparse.ArgumentParser:
+    told = "\n".join(f"  {name:<12} {words}" for name, (words, _) in STUDIES.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m mars_lidar.studies",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Run studies. Each writes NAME.md, its figures and NAME.csv into the output folder.",
+        epilog=f"studies:\n{told}\n\nexample:\n"
+        "  python -m mars_lidar.studies covariance law --out docs/studies\n\n"
+        "exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted",
+    )
+    parser.add_argument(
+        "studies", nargs="+", choices=list(STUDIES), metavar="STUDY", help="one or more of the list below"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("studies"), metavar="DIR",
+        help="folder to write into, made if missing (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--quick", action="store_true", help="small grids, few realizations: a look in seconds, not for citing"
+    )
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="folder of the reference cases, *.json (study 'reference')"
+    )
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parser = _parser()
+    given = parser.parse_args(arguments)
+    if "reference" in given.studies and given.data is None:
+        parser.error("study 'reference' needs --data DIR, the folder of the reference cases")
+    if given.data is not None and not any(given.data.glob("*.json")):
+        parser.error(f"--data must be a folder with *.json cases, got {str(given.data)!r}")
+    try:
+        given.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--out must be a folder that can be made, got {str(given.out)!r}: {error.strerror}")
+    tell = partial(print, file=sys.stderr, flush=True)
+    request = Request(given.out, given.quick, given.data, tell)
+    try:
+        for name in dict.fromkeys(given.studies):
+            began = time.monotonic()
+            for path in STUDIES[name][1](request):
+                print(path)
+            tell(f"{name}: done in {time.monotonic() - began:.0f} s")
+    except KeyboardInterrupt:
+        tell("interrupted")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,109 @@
+"""Distance of a count law to simulated counts, and what of it is sampling noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.statistics._pmf import gaussian_window
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+_POOLED = 5.0  # expected counts below which cells of a G-test are pooled
+_NEGLIGIBLE = 1e-10  # probability left out of the bootstrap's classes, in one class of its own
+
+
+@dataclass(frozen=True, eq=False)
+class Pmf:
+    """Probabilities (w,) of the counts `first`, `first` + 1, ...; of simulated counts their frequencies."""
+
+    first: int
+    p: FloatArray
+
+    @classmethod
+    def of_counts(cls, counts: NDArray[np.integer]) -> Pmf:
+        """Frequencies of simulated counts (n,)."""
+        first = int(counts.min())
+        return cls(first, np.bincount((counts - first).astype(np.int64)) / counts.size)
+
+    @classmethod
+    def gaussian(cls, mean: float, variance: float) -> Pmf:
+        """The normal law on the integers, as `count_law` understands it."""
+        window = gaussian_window(mean, variance)
+        return cls(window.first, window.pmf)
+
+    def on(self, low: int, high: int) -> FloatArray:
+        """Probabilities of the counts low .. high (inclusive)."""
+        out = np.zeros(high - low + 1)
+        begin, end = max(low, self.first), min(high, self.last)
+        if begin <= end:
+            out[begin - low : end - low + 1] = self.p[begin - self.first : end - self.first + 1]
+        return out
+
+    @property
+    def last(self) -> int:
+        """The largest count with an entry."""
+        return self.first + self.p.size - 1
+
+
+def total_variation(a: Pmf, b: Pmf) -> float:
+    """Half the sum of |difference| over all counts."""
+    if a.last < b.first or b.last < a.first:
+        return 0.5 * float(a.p.sum() + b.p.sum())
+    low, high = min(a.first, b.first), max(a.last, b.last)
+    return 0.5 * float(np.abs(a.on(low, high) - b.on(low, high)).sum())
+
+
+def sampling_floor(law: Pmf, size: int, draws: int, random: np.random.Generator) -> FloatArray:
+    """Total variation (draws,) to `law` of samples of `size` counts drawn from it: its parametric bootstrap."""
+    kept = law.p > _NEGLIGIBLE / size
+    p = np.append(law.p[kept], max(1.0 - float(law.p[kept].sum()), 0.0))
+    p /= p.sum()
+    found = np.empty(draws)
+    step = max(1, 2**22 // p.size)
+    for start in range(0, draws, step):
+        drawn = random.multinomial(size, p, size=min(step, draws - start))
+        found[start : start + step] = 0.5 * np.abs(drawn / size - p).sum(-1)
+    return found
+
+
+def g_test(law: Pmf, sample: Pmf, size: int) -> float:
+    """p-value of a sample of `size` counts under the law; counts expected fewer than 5 times are pooled.
+
+    1 where the law leaves nothing to test: a single class.
+    """
+    from scipy.stats import chi2
+
+    low, high = min(law.first, sample.first), max(law.last, sample.last)
+    expected, observed = law.on(low, high) * size, sample.on(low, high) * size
+    common = expected >= _POOLED
+    e = np.append(expected[common], max(size - float(expected[common].sum()), 0.0))
+    o = np.append(observed[common], max(size - float(observed[common].sum()), 0.0))
+    if e[-1] < _POOLED and e.size > 2:  # too rare on its own: with the rarest of the others
+        rarest = int(e[:-1].argmin())
+        e[rarest] += e[-1]
+        o[rarest] += o[-1]
+        e, o = e[:-1], o[:-1]
+    if e.size < 2 or e.min() < 1e-3:
+        return 1.0
+    ratio = np.where(o > 0, o / e, 1.0)
+    return float(chi2.sf(2.0 * float((o * np.log(ratio)).sum()), e.size - 1))
+
+
+def mean_score(law_mean: float, law_variance: float, mean: float, size: int) -> float:
+    """Standard scores by which a sample mean differs from the law's; 0 where both are certain and agree."""
+    error = mean - law_mean
+    return error / math.sqrt(law_variance / size) if law_variance > 0 else (0.0 if error == 0 else math.inf)
+
+
+def variance_score(cumulants: FloatArray, sample: Pmf, size: int) -> float:
+    """Standard scores by which the mean square about the law's mean differs from the law's variance."""
+    counts = sample.first + np.arange(sample.p.size)
+    square = float((sample.p * (counts - cumulants[0]) ** 2).sum())
+    spread = float(cumulants[3] + 2.0 * cumulants[1] ** 2)
+    error = square - float(cumulants[1])
+    return error / math.sqrt(spread / size) if spread > 0 else (0.0 if error == 0 else math.inf)

@@ -11,13 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-
 Tell = Callable[[str], object]
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a study: folder to write into, quick or full, reference data, who hears of progress."""
+    """What is asked of a study: output folder, quick or full, reference data, who hears of progress."""
 
     out: Path
     quick: bool = False
@@ -29,21 +28,21 @@ Study = Callable[[Request], list[Path]]
 
 
 def _covariance(request: Request) -> list[Path]:
-    from mars_lidar.studies import covariance_report
+    from mars_lidar.studies.covariance_report import run
 
-    return covariance_report.run(request)
+    return run(request)
 
 
 def _law(request: Request) -> list[Path]:
-    from mars_lidar.studies import law_report
+    from mars_lidar.studies.law_report import run
 
-    return law_report.run(request)
+    return run(request)
 
 
 def _reference(request: Request) -> list[Path]:
-    from mars_lidar.studies import reference
+    from mars_lidar.studies.reference import run
 
-    return reference.run(request)
+    return run(request)
 
 
 STUDIES: dict[str, tuple[str, Study]] = {

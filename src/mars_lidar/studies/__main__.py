@@ -30,7 +30,7 @@ def _parser() -> argparse.ArgumentParser:
         help="folder to write into, made if missing (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--quick", action="store_true", help="small grids, few realizations: a look in seconds, not for citing"
+        "--quick", action="store_true", help="small grids, few realizations: seconds, not for citing"
     )
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help="folder of the reference cases, *.json (study 'reference')"

@@ -55,7 +55,7 @@ class Settings:
     seed: int = 20264
 
     def system(self, period_ns: float, dead_ns: float) -> System:
-        """The system of a cell. Cycles do not enter: these are statistics of one holding time after another."""
+        """The system of a cell. Its cycles do not enter: these are statistics of holding times."""
         return System(
             period_ns=period_ns,
             cycles=1000,
@@ -84,7 +84,7 @@ FULL = Settings(
         Grid("locked", PERIOD_NS, _log(8), _log(8), _periods(0.0, 0.5, 0.9, 0.95, 0.98, 0.99, 0.999)),
     ),
     decay_dead=(0.0, 0.1875, 0.5, 0.6375, 0.95, 0.99),
-    dense_random=5,
+    dense_random=2,
 )
 QUICK = Settings(
     grids=(
@@ -100,7 +100,7 @@ QUICK = Settings(
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One pixel: times in ns, covariances in ns^2; `sums` by rule, `rules` the (L, p) of the automatic ones."""
+    """One pixel: times in ns, covariances in ns^2; `sums` by rule, `rules` the (L, p) of the automatic."""
 
     grid: Grid
     signal: float
@@ -177,17 +177,16 @@ def _cell(
         rule = terms.automatic_rule(tolerance)
         rules[automatic_name(tolerance)] = rule
         sums[automatic_name(tolerance)] = terms.spectral_sum(*rule)
-    return Cell(
-        grid, signal, background, system.detector.dead_time_ns, rearm, terms, np.abs(terms.eigenvalues), sums, rules
-    )
+    sizes = np.abs(terms.eigenvalues)
+    return Cell(grid, signal, background, system.detector.dead_time_ns, rearm, terms, sizes, sums, rules)
 
 
 @dataclass(frozen=True)
 class DenseCheck:
     """One cell by the paper's way, dense matrices and LAPACK, beside the O(n) way.
 
-    Differences of sums are relative to sigma^2. `inverse` is the relative error of sigma^2 by the paper's
-    rule with left vectors from inv(V), `negative` whether that sigma^2 is below 0.
+    Differences of sums are relative to sigma^2. `inverse` is what left vectors from inv(V) in place of
+    LAPACK's change of sigma^2 by the paper's rule, relative to it; `negative` whether it is below 0.
     """
 
     cell: Cell
@@ -199,22 +198,21 @@ class DenseCheck:
     negative: bool
 
 
-def dense_checks(settings: Settings, cells: list[Cell], tell: Tell) -> list[DenseCheck]:
-    """The slowest cell of each grid and dead time, and some at random, the paper's way."""
-    chosen = list(_chosen(settings, cells))
-    found = [_dense_check(cell) for cell in chosen]
-    tell(f"covariance: {len(found)} cells by dense matrices")
+def dense_checks(settings: Settings, cells: list[Cell], extra: int, tell: Tell) -> list[DenseCheck]:
+    """The slowest cell of each grid and dead time, and `extra` at random of each grid, the paper's way."""
+    found = [_dense_check(cell) for cell in _chosen(settings, cells, extra)]
+    tell(f"covariance: {len(found)} cells by dense matrices, re-arming at the {cells[0].rearm}")
     return found
 
 
-def _chosen(settings: Settings, cells: list[Cell]) -> Iterator[Cell]:
+def _chosen(settings: Settings, cells: list[Cell], extra: int) -> Iterator[Cell]:
     random = np.random.default_rng(settings.seed)
     for grid in settings.grids:
         here = [cell for cell in cells if cell.grid is grid]
         slowest = [max((c for c in here if c.dead_ns == d), key=lambda c: c.sizes[1]) for d in grid.dead_ns]
         rest = [cell for cell in here if cell not in slowest]
         yield from slowest
-        for k in random.choice(len(rest), settings.dense_random, replace=False):
+        for k in random.choice(len(rest), extra, replace=False):
             yield rest[k]
 
 
@@ -234,7 +232,7 @@ def _dense_check(cell: Cell) -> DenseCheck:
         spectral=2.0 * abs(paper - cell.sums[spectral_name()]) / sigma2,
         exact=2.0 * abs(_by_solve(cell) - terms.exact_sum) / sigma2,
         summed=2.0 * abs(dense.cutoff_sum(3000) - terms.exact_sum) / sigma2,
-        inverse=2.0 * (inverse - terms.exact_sum) / sigma2,
+        inverse=2.0 * (inverse - paper) / sigma2,
         negative=terms.sigma_ss2 + 2.0 * inverse < 0.0,
     )
 
@@ -272,5 +270,6 @@ def _by_inverse(cell: Cell) -> float:
     if abs(values[order[count - 1]].imag) > 0 and np.count_nonzero(values[order[1:count]].imag) % 2:
         count += 1
     kept = order[1:count]
-    tail = np.sum((row @ vectors[:, kept]) * (inverse[kept] @ value) * values[kept] ** SPECTRAL[0] / (1.0 - values[kept]))
+    weight = (row @ vectors[:, kept]) * (inverse[kept] @ value)
+    tail = np.sum(weight * values[kept] ** SPECTRAL[0] / (1.0 - values[kept]))
     return cell.terms.cutoff_sum(SPECTRAL[0]) + float(tail.real) * cell.grid.period_ns**2

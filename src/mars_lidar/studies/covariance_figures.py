@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar.plot.style import COLOURS, DPI, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED, style
 from mars_lidar.studies.covariance import (
     CUTOFFS,
     TOLERANCES,
@@ -19,12 +18,9 @@ from mars_lidar.studies.covariance import (
     one_cell,
     spectral_name,
 )
+from mars_lidar.studies.draw import heat, panels
 from mars_lidar.studies.report import save_figure
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-_WIDTH = 7.0  # inches
 _DECAY = ((1.0, 1.0), (10.0, 0.1))  # S, B
 _DECAY_LAGS = 20
 _FLOOR = 1e-9  # of sigma_ss^2; below it covariances are not drawn
@@ -41,19 +37,9 @@ def draw_all(folder: Path, settings: Settings, cells: Sequence[Cell]) -> list[Pa
         ]
 
 
-def _figure(columns: int, height: float, rows: int = 1, **options: Any) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(_WIDTH, height), dpi=DPI, layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
-    for ax in axes.flat:
-        ax.spines[["top", "right"]].set_visible(False)
-    return figure, axes
-
-
 def _decay(path: Path, settings: Settings) -> Path:
     """|gamma_l| / sigma_ss^2 against the lag, sign in the marker."""
-    figure, axes = _figure(len(_DECAY), 2.7, sharey=True)
+    figure, axes = panels(2.7, 1, len(_DECAY), sharey=True)
     lags = np.arange(1, _DECAY_LAGS + 1)
     for ax, (signal, background) in zip(axes[0], _DECAY, strict=True):
         for k, dead in enumerate(settings.decay_dead):
@@ -70,7 +56,7 @@ def _decay(path: Path, settings: Settings) -> Path:
         ax.set_title(f"S = {signal:g}, B = {background:g} photons per period", loc="left")
     axes[0, 0].set_ylabel(r"$|\gamma_l|\,/\,\sigma_{ss}^2$")
     axes[0, -1].legend(
-        title="$t_d / t_r$", frameon=False, ncols=1, loc="center left", bbox_to_anchor=(1.0, 0.5), title_fontsize=7
+        title="$t_d / t_r$", title_fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5)
     )
     axes[0, 0].annotate(
         "filled: positive\nopen: negative", (0.97, 0.97), xycoords="axes fraction", ha="right", va="top",
@@ -81,7 +67,7 @@ def _decay(path: Path, settings: Settings) -> Path:
 
 def _eigenvalues(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     """Magnitudes of the leading eigenvalues: every cell a point, median and largest as lines."""
-    figure, axes = _figure(len(settings.grids), 2.5, sharey=True)
+    figure, axes = panels(2.5, 1, len(settings.grids), sharey=True)
     random = np.random.default_rng(0)
     for ax, grid in zip(axes[0], settings.grids, strict=True):
         size = np.array([cell.sizes[:12] for cell in cells if cell.grid is grid])
@@ -98,14 +84,15 @@ def _eigenvalues(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     axes[0, 0].set_ylabel(r"$|\lambda_k|$")
     axes[0, -1].legend(frameon=False, loc="upper right")
     axes[0, 0].annotate(
-        "0.7", (0.97, 0.7), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7, color=MUTED
-    )
+        "0.7", (0.97, 0.7), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7,
+        color=MUTED,
+    )  # fmt: skip
     return save_figure(path, figure)
 
 
 def _truncation(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     """Mean absolute error of the sum against the fixed cut-off, with the other rules as levels."""
-    figure, axes = _figure(len(settings.grids), 2.7, sharey=True)
+    figure, axes = panels(2.7, 1, len(settings.grids), sharey=True)
     levels = [(spectral_name(), COLOURS[1], "-")]
     levels += [
         (automatic_name(t), c, "--") for t, c in zip(TOLERANCES, (COLOURS[2], COLOURS[3]), strict=True)
@@ -129,13 +116,13 @@ def _truncation(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
 
 
 def _map(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
-    """Relative error of sigma^2 over (S, B) for three rules, at the slowest-mixing dead times of all grids."""
+    """Relative error of sigma^2 over (S, B) for three rules, at each dead time of the last grid."""
     from matplotlib.colors import LogNorm
 
     rules = ("cut-off 0", "cut-off 20", spectral_name())
     grid = settings.grids[-1]
     dead = grid.dead_ns
-    figure, axes = _figure(len(dead), 3.9, rows=len(rules), sharex=True, sharey=True)
+    figure, axes = panels(3.3, len(rules), len(dead), sharex=True, sharey=True)
     norm, mesh = LogNorm(1e-6, 1.0), None
     for row, rule in zip(axes, rules, strict=True):
         for ax, dead_ns in zip(row, dead, strict=True):
@@ -143,27 +130,15 @@ def _map(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
                 [_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.signal]
                 for b in grid.background
             ])  # fmt: skip
-            mesh = ax.pcolormesh(
-                grid.signal, grid.background, np.clip(np.abs(error), 1e-6, None), norm=norm, cmap="magma_r",
-                shading="nearest", rasterized=True,
-            )  # fmt: skip
-            ax.set(xscale="log", yscale="log")
-            _square(ax)
+            mesh = heat(ax, grid.signal, grid.background, np.abs(error), norm)
     for ax, dead_ns in zip(axes[0], dead, strict=True):
-        ax.set_title(f"{dead_ns / grid.period_ns:g} $t_r$")
+        ax.set_title(f"$t_d$ = {dead_ns / grid.period_ns:g} $t_r$", fontsize=7)
     for row, rule in zip(axes, rules, strict=True):
         row[0].set_ylabel(f"{rule.replace('spectral ', '')}\nB")
     figure.supxlabel("S, photons per period", fontsize=7.5)
     bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=40, pad=0.01)
     bar.set_label(r"|relative error of $\sigma^2$|")
     return save_figure(path, figure)
-
-
-def _square(ax: Axes) -> None:
-    ax.set_box_aspect(1)
-    ax.set_xticks([0.01, 0.1, 1, 10], ["0.01", "", "", "10"])
-    ax.set_yticks([0.01, 0.1, 1, 10], ["0.01", "", "", "10"])
-    ax.tick_params(which="minor", length=0)
 
 
 def _at(cells: Sequence[Cell], grid: str, signal: float, background: float, dead_ns: float) -> Cell:

@@ -41,7 +41,8 @@ def configuration(settings: Mapping[str, Any]) -> str:
     from mars_lidar._version import __version__
 
     lines = [f"- {name}: {value}" for name, value in settings.items()]
-    lines.append(f"- versions: mars_lidar {__version__}, numpy {numpy.__version__}, scipy {scipy.__version__}")
+    versions = {"mars_lidar": __version__, "numpy": numpy.__version__, "scipy": scipy.__version__}
+    lines.append("- versions: " + ", ".join(f"{name} {version}" for name, version in versions.items()))
     lines.append(f"- date: {datetime.datetime.now(datetime.UTC):%Y-%m-%d}")
     return "\n".join(lines)
 
@@ -53,12 +54,12 @@ def save_text(path: Path, parts: Sequence[str]) -> Path:
 
 
 def save_csv(path: Path, rows: Sequence[Row]) -> Path:
-    """Write rows that share their keys; floats with seven significant figures. Returns `path`."""
+    """Write rows that share their keys; floats with six significant figures. Returns `path`."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(rows[0])
         for row in rows:
-            writer.writerow([f"{v:.7g}" if isinstance(v, float) else v for v in row.values()])
+            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in row.values()])
     return path
 
 

@@ -1,0 +1,32 @@
+"""What README promises runs as written."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT.joinpath("README.md").read_text()
+
+
+def test_ten_lines_of_python():
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    space: dict[str, object] = {}
+    exec(code, space)
+    assert space["cube"].shape == (2, 128, 128, 1024)
+    assert (space["times"].histogram() == space["cube"][0]).all()
+
+
+def test_commands_that_the_checks_run_are_there():
+    for name in ("main", "tests"):
+        found = subprocess.run(
+            [sys.executable, ROOT / ".ci" / "readme_command.py", name], capture_output=True, text=True, check=True
+        )
+        assert ".venv/bin/" in found.stdout
+
+
+def test_links_lead_somewhere():
+    for target in re.findall(r"\]\(([^)#]+?)\)", README):
+        assert target.startswith("https://") or ROOT.joinpath(target).exists(), target

@@ -128,7 +128,7 @@ def _text(
         "squared bins "
         f"(t_r / {settings.bins}). *match* is the least fixed cut-off tried that does as well as the "
         "spectral rule.",
-        *found,
+        "\n".join(found),
         "## Every rule",
         "Re-arming at the bin centre. *relative* is the error of $\\sigma^2 = \\sigma_{ss}^2 + "
         "2\\sum\\gamma$ relative to "

@@ -115,7 +115,7 @@ def _text(
         "*Poisson*. A Gaussian on the integers "
         "is its integral from n - 1/2 to n + 1/2, what lies below 0 counted as 0.",
         "## Result",
-        *findings,
+        "\n".join(findings),
         table([_law_row(cells, name) for name in LAWS]),
         f"*within limit*: the law cannot be told from the simulation with {size} realizations; for the exact "
         "law 0.1 % of the cells "

@@ -51,8 +51,8 @@ def test_covariance_figures_make_sense(quick):
         assert float(row["defect"]) < 1e-9
         single = float(row["sigma_ss2_ns2"])
         assert sigma2 == pytest.approx(single + 2 * exact, rel=1e-4, abs=1e-5 * single)
-        assert abs(float(row["error_cut-off_0_ns2"])) == pytest.approx(abs(exact), rel=1e-5, abs=1e-9)
-        assert abs(float(row["error_cut-off_500_ns2"])) < 1e-6 * sigma2
+        assert abs(float(row["error_cutoff_0_ns2"])) == pytest.approx(abs(exact), rel=1e-5, abs=1e-9)
+        assert abs(float(row["error_cutoff_500_ns2"])) < 1e-6 * sigma2
         assert abs(float(row["error_automatic_1e-06_ns2"])) < 1e-3 * sigma2
         assert 0 <= float(row["abs_lambda_3"]) <= float(row["abs_lambda_2"]) < 1
         if float(row["dead_time_ns"]) == 0 and float(row["signal"]) < 1 and row["rearm"] == "centre":

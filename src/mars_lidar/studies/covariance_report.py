@@ -127,7 +127,8 @@ def _text(
         "they cannot be compared in size; the ratio has no unit and can. Errors are given in ns² and in "
         "squared bins "
         f"(t_r / {settings.bins}). *match* is the least fixed cut-off tried that does as well as the "
-        "spectral rule.",
+        "spectral rule. "
+        "*Noted before* are estimates from a few cells, with which this project began.",
         "\n".join(found),
         "## Every rule",
         "Re-arming at the bin centre. *relative* is the error of $\\sigma^2 = \\sigma_{ss}^2 + "
@@ -254,5 +255,9 @@ def _csv_row(cell: Cell) -> Row:
         "exact_sum_ns2": terms.exact_sum,
         "defect": terms.defect,
         **{f"abs_lambda_{k}": float(cell.sizes[k - 1]) for k in (2, 3, 4, 5, 6)},
-        **{f"error_{rule.replace(' ', '_').replace(',', '')}_ns2": cell.error(rule) for rule in _CSV_RULES},
+        **{f"error_{_column(rule)}_ns2": cell.error(rule) for rule in _CSV_RULES},
     }
+
+
+def _column(rule: str) -> str:
+    return rule.replace(" = ", "").replace(",", "").replace("cut-off", "cutoff").replace(" ", "_")

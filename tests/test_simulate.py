@@ -91,7 +91,7 @@ def test_request_beyond_the_memory_is_refused_before_any_work(system: ml.System)
     start = time.monotonic()
     with pytest.raises(MemoryError) as error:
         ml.simulate(flux, huge, realizations=1000)
-    assert time.monotonic() - start < 5.0
+    assert time.monotonic() - start < 0.5
     told = str(error.value)
     assert "(1000, 100, 100, 1048576)" in told
     assert re.search(r"need 1\.95e\+04 GiB of memory and \S+ GiB are available", told)
@@ -155,7 +155,7 @@ def test_exception_from_progress_stops_the_run(system: ml.System, engine: str):
     start = time.monotonic()
     with pytest.raises(Enough):
         ml.simulate(flux, system.replace(cycles=1_000_000), engine=engine, progress=progress)
-    assert time.monotonic() - start < 5.0
+    assert time.monotonic() - start < 2.0
     cube = ml.simulate(ml.Flux(1.0, 1.0, 5.0), system, engine=engine)  # and nothing is broken
     assert cube.any()
 
@@ -224,4 +224,4 @@ def test_ctrl_c_stops_within_a_second(name: str, fields: dict[str, object]):
         run.wait()
     assert rest == "interrupted\n"
     assert run.returncode == 130
-    assert took < 5.0  # promised within a second; test machines are busy. Undisturbed it runs for minutes
+    assert took < 1.0

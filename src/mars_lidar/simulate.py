@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar._memory import check_memory
-from mars_lidar.engines import ENGINES, Engine
+from mars_lidar.engines import Engine, find_engine
 from mars_lidar.engines.base import Progress, Records, Task
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
@@ -24,7 +24,7 @@ def simulate(
     flux: Flux,
     system: System,
     *,
-    engine: str = "exact",
+    engine: str | Engine = "exact",
     realizations: int = 1,
     first_realization: int = 0,
     pixel_index: ArrayLike | None = None,
@@ -32,6 +32,7 @@ def simulate(
     threads: int | None = None,
     out: NDArray[Any] | None = None,
     progress: Progress | None = None,
+    report: dict[str, float] | None = None,
 ) -> NDArray[Any]:
     """Histogram cubes of an image.
 
@@ -43,7 +44,7 @@ def simulate(
         Laser, detector and histogram.
     engine
         ``"exact"`` (default), ``"sequential"`` (slow, independent gold standard) or ``"poisson"`` (no dead
-        time).
+        time), or an `Engine` of your own settings.
     realizations
         Independent exposures of the whole image.
     first_realization
@@ -59,6 +60,8 @@ def simulate(
         C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill.
     progress
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
+    report
+        A dictionary that takes what the engine has to tell beside the counts, numbers by name.
 
     Returns
     -------
@@ -75,6 +78,8 @@ def simulate(
     else:
         _check_out(out, shape, system.histogram_dtype)
     drawn_by.histogram(task, out.reshape(task.items, system.bins))
+    if report is not None:
+        report.update(task.report)
     return out
 
 
@@ -82,7 +87,7 @@ def simulate_timestamps(
     flux: Flux,
     system: System,
     *,
-    engine: str = "exact",
+    engine: str | Engine = "exact",
     realization: int = 0,
     pixel_index: ArrayLike | None = None,
     seed: int = 0,
@@ -116,7 +121,7 @@ def simulate_timestamps(
 def _task(
     flux: Flux,
     system: System,
-    engine: str,
+    engine: str | Engine,
     realizations: int,
     first_realization: int,
     pixel_index: ArrayLike | None,
@@ -129,7 +134,7 @@ def _task(
         raise TypeError(f"flux must be a Flux, got {type(flux).__name__}")
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
-    drawn_by = ENGINES[_validate.choice("engine", engine, tuple(ENGINES))]
+    drawn_by = find_engine(engine)
     first = _validate.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = _validate.integer("realizations", realizations, low=1, high=2**32 - first)
     _validate.integer("seed", seed, low=0, high=2**64 - 1)

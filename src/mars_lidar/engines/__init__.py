@@ -1,5 +1,6 @@
 """Engines: one file each, under the names that `simulate` takes."""
 
+from mars_lidar import _validate
 from mars_lidar.engines.base import Engine
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.poisson import PoissonEngine
@@ -9,4 +10,11 @@ ENGINES: dict[str, Engine] = {
     engine.name: engine for engine in (ExactEngine(), SequentialEngine(), PoissonEngine())
 }
 
-__all__ = ["ENGINES", "Engine"]
+
+
+def find_engine(engine: str | Engine) -> Engine:
+    """The engine of that name with its default settings, or the engine itself."""
+    return engine if isinstance(engine, Engine) else ENGINES[_validate.choice("engine", engine, tuple(ENGINES))]
+
+
+__all__ = ["ENGINES", "Engine", "find_engine"]

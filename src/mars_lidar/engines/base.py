@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -26,7 +26,8 @@ class Task:
     """One checked request: which pixels of which realizations of which flux, seen by which system.
 
     `pixel_index` (H * W,) uint32 names the random stream of each pixel, so that any part of an image can be
-    made alone with the bits that it has in the whole.
+    made alone with the bits that it has in the whole. `report` is where an engine writes what it has to tell
+    beside the counts: numbers by name, such as seconds of its stages or pixels that it gave to another engine.
     """
 
     flux: Flux
@@ -37,6 +38,7 @@ class Task:
     seed: int
     threads: int
     progress: Progress | None
+    report: dict[str, float] = field(default_factory=dict)
 
     @property
     def items(self) -> int:

@@ -1,6 +1,7 @@
 // The exact engine: chunks of pixels on threads, each through the widest kernel that the processor runs.
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -10,11 +11,11 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include "backward.h"
 #include "bindings.h"
 #include "exact_kernel.h"
 #include "parallel.h"
-#include "pulse_table.h"
-#include "registration.h"
+#include "pulse_view.h"
 #include "stationary.h"
 
 namespace mars {
@@ -71,26 +72,78 @@ std::vector<double> photons_on_grid(const Job& job, const PulseShape& shape, int
     return photons;
 }
 
-// Re-arming times of the items of a block that starts warmed up. The state is drawn at the start of a period
-// K + 2 periods before the exposure, which the kernel then runs through: what the grid blurs, the physics mends.
-void draw_starts(const Job& job, const PulseShape& shape, const ExactBlock& block, std::vector<int32_t>& cycle,
+// The photons of one pixel, drawn one by one.
+class Photons {
+public:
+    Photons(const Job& job, const PulseTable& pulse, int64_t pixel)
+        : gaussian_(pulse.shape.gaussian()), view_(pulse_view(pulse)), background_(job.background[pixel]) {
+        total_ = background_;
+        for (int64_t k = 0; k < job.returns; ++k) {
+            total_ += job.signal[k * job.pixels + pixel];
+            until_[k] = total_;
+            centre_[k] = job.delay[k * job.pixels + pixel] + pulse.centre;
+        }
+        returns_ = job.returns;
+    }
+
+    double total() const { return total_; }
+
+    // The least that arrive in a dead time, wherever it begins; an upper bound of it.
+    double least(double dead_time, const PulseShape& shape) const {
+        const double whole = std::floor(dead_time), rest = dead_time - whole;
+        const bool fits = rest == 0.0 || (returns_ == 1 && rest + shape.high() - shape.low() < 1.0);
+        return background_ * dead_time + (total_ - background_) * (fits ? whole : whole + 1.0);
+    }
+
+    // Phase of a photon in [0, 1).
+    double operator()(uint32_t choice, const Pair<uint32_t>& words) const {
+        const double photon = (choice + 0.5) * 0x1p-32 * total_;
+        const double u = (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
+        if (photon < background_ || returns_ == 0) return u;
+        int64_t k = 0;
+        while (k + 1 < returns_ && photon >= until_[k]) ++k;
+        const float energy = static_cast<float>(u < view_.split ? u : u - 1.0);
+        const double time = centre_[k] + (gaussian_ ? quantile<true>(view_, energy) : quantile<false>(view_, energy));
+        const double phase = time - std::floor(time);
+        return phase < 1.0 ? phase : 0.0;
+    }
+
+private:
+    bool gaussian_;
+    PulseView view_;
+    double background_, total_;
+    int64_t returns_;
+    double until_[16], centre_[16];  // photons of the background and the returns up to this one; its centre
+};
+
+// Re-arming times of the items of a block that starts warmed up: at or after t = 0 where they are drawn from the
+// arrivals before it. For a bright pixel the state is drawn at the start of a period K + 2 periods before the
+// exposure, which the kernel then runs through: what the grid blurs, the physics mends.
+void draw_starts(const Job& job, const PulseTable& pulse, const ExactBlock& block, std::vector<int32_t>& cycle,
                  std::vector<float>& phase) {
+    const PulseShape& shape = pulse.shape;
+    GapSearch search;
     const int32_t ahead = static_cast<int32_t>(job.dead_time) + 2;
     cycle.resize(block.items);
     phase.resize(block.items);
     for (int64_t i = 0; i < std::min(block.items, job.pixels); ++i) {
         if (block.stop->load(std::memory_order_relaxed)) return;
         const int64_t pixel = job.pixel(block.first_item + i);
-        const StationaryState state(photons_on_grid(job, shape, pixel), job.dead_time);
-        state.check(job.pixel_index[pixel]);
+        const Photons photons(job, pulse, pixel);
+        const bool gaps = gaps_are_near(photons.total(), photons.least(job.dead_time, shape), job.dead_time);
+        std::optional<StationaryState> state;
+        if (!gaps) {
+            state.emplace(photons_on_grid(job, shape, pixel), job.dead_time);
+            state->check(job.pixel_index[pixel]);
+        }
         for (int64_t k = i; k < block.items; k += job.pixels) {  // realizations of this pixel
             const Pair<uint32_t> key =
                 stream_key(job.seed, job.realization(block.first_item + k), job.pixel_index[pixel]);
-            const Pair<uint32_t> words = threefry<13, uint32_t>(0u, kStageStart, key.first, key.second);
-            const double u = (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
-            const double residual = state.residual(u), whole = std::floor(residual);
+            const double residual = gaps ? search.residual(photons.total(), job.dead_time, key, photons)
+                                         : state->residual(start_uniform(key));
+            const double whole = std::floor(residual);
             const float fraction = static_cast<float>(residual - whole);
-            cycle[k] = static_cast<int32_t>(whole) - ahead + (fraction >= 1.0f ? 1 : 0);
+            cycle[k] = static_cast<int32_t>(whole) - (gaps ? 0 : ahead) + (fraction >= 1.0f ? 1 : 0);
             phase[k] = fraction >= 1.0f ? 0.0f : fraction;
         }
     }
@@ -114,7 +167,7 @@ void run_exact(const BoundJob& job, const PulseTable& pulse, ExactBlock proto, i
         block.start_cycle = nullptr;
         block.start_phase = nullptr;
         if (job.stationary && job.dead_time > 0.0) {
-            draw_starts(job, pulse.shape, block, cycle, phase);
+            draw_starts(job, pulse, block, cycle, phase);
             block.start_cycle = cycle.data();
             block.start_phase = phase.data();
         }

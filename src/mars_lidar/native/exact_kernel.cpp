@@ -6,8 +6,7 @@
 #include <cstring>
 
 #include "exact_writers.h"
-#include "pulse_table.h"
-#include "registration.h"
+#include "pulse_view.h"
 
 #define MARS_JOIN2(a, b) a##b
 #define MARS_JOIN(a, b) MARS_JOIN2(a, b)
@@ -23,23 +22,7 @@ constexpr int32_t kIdleFrame = 100000001;    // every exposure has ended; + kAhe
 
 SystemView view(const Job& job, const PulseTable& pulse) {
     SystemView system{};
-    PulseView& p = system.pulse;
-    p.forward = pulse.forward.data();
-    p.inverse = pulse.inverse.data();
-    p.guide = pulse.guide.data();
-    p.upper = pulse.upper.data();
-    p.end = pulse.end.data();
-    p.periods_per_energy = pulse.periods_per_energy.data();
-    p.low = pulse.low;
-    p.cells_per_period = pulse.cells_per_period;
-    p.median = pulse.median;
-    p.split = pulse.split;
-    p.last_cell = static_cast<float>(pulse.cells + 1);
-    p.guides = pulse.guides;
-    p.last_early = pulse.last_early;
-    p.last_late = pulse.last_late;
-    p.octave_shift = kOctaveShift;
-    p.octave_base = kOctaveBase;
+    system.pulse = pulse_view(pulse);
     system.cycles = job.cycles;
     system.bins = job.bins;
     system.returns = static_cast<int32_t>(job.returns);

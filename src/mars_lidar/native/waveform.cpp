@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <vector>
 
+#include "backward.h"
 #include "bindings.h"
 #include "parallel.h"
 #include "random.h"
@@ -82,10 +83,14 @@ void walk(const Job& job, const Waveform& wave, const StationaryState* state, ui
     const double dead_fraction = job.dead_time - static_cast<double>(dead_whole);
     int64_t cycle = 0;
     double phase = 0.0;
-    if (state) {
-        const Pair<uint32_t> words = draw(0, kStageStart);
-        const double residual = state->residual((words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32);
-        cycle = static_cast<int64_t>(residual) - dead_whole - 2;
+    if (job.stationary && job.dead_time > 0.0) {
+        // as for pulses, see draw_starts in exact.cpp
+        auto place = [&](uint32_t, const Pair<uint32_t>& words) {
+            return wave.phase((words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32 * total);
+        };
+        const double residual = state ? state->residual(start_uniform(key))
+                                      : GapSearch().residual(total, job.dead_time, key, place);
+        cycle = static_cast<int64_t>(residual) - (state ? dead_whole + 2 : 0);
         phase = residual - std::floor(residual);
     }
     for (uint32_t event = 0;; ++event) {
@@ -130,14 +135,16 @@ void run_waveform(const BoundJob& job, int threads, const nb::object& progress, 
         for (int64_t pixel = first; pixel < last; ++pixel) {
             const Waveform wave(job, pixel);
             std::vector<StationaryState> state;
-            if (job.stationary && job.dead_time > 0.0) {
+            const double total = wave.total();
+            if (job.stationary && job.dead_time > 0.0 && !gaps_are_near(total, total * job.dead_time, job.dead_time)) {
                 state.emplace_back(wave.photons(), job.dead_time);
                 state.front().check(job.pixel_index[pixel]);
             }
             for (int64_t r = begin; r < end; ++r) {
                 if (stop.load(std::memory_order_relaxed)) return;
-                walk(job, wave, state.empty() ? nullptr : state.data(), job.first_realization + static_cast<uint32_t>(r),
-                     job.pixel_index[pixel], stop, make(r * job.pixels + pixel));
+                walk(job, wave, state.empty() ? nullptr : state.data(),
+                     job.first_realization + static_cast<uint32_t>(r), job.pixel_index[pixel], stop,
+                     make(r * job.pixels + pixel));
             }
         }
     });

@@ -144,7 +144,7 @@ def compare(
     engines: Sequence[str | Engine] = (),
     *,
     against: str = "exact",
-    realizations: int = 4000,
+    realizations: int = 10_000,
     repeats: int = 5,
     pixels: int | dict[str, tuple[int, int]] = 4,
     depth_m: NDArray[np.float64] | None = None,
@@ -248,7 +248,7 @@ def _statistics(
     """One engine against the prediction, and against the reference engine in what has none."""
     theirs = None if reference is None else Moments.of(reference.counts)
     counts = Moments.of(sample.counts, cumulants=None if law is None else law.cumulants, other=theirs)
-    lag1 = sample.lag1()
+    lag1 = sample.lag1
     nothing = Estimate(np.nan)
     window = Moments(nothing, nothing, nothing)
     window_ratio, lag1_error = nothing, nothing
@@ -262,7 +262,7 @@ def _statistics(
             own = window.variance
             window_ratio = Estimate(1.0, own.error / own.value if own.value > 0 else np.nan)
     if reference is not None:
-        their_lag1 = reference.lag1()
+        their_lag1 = reference.lag1
         error = float(np.hypot(lag1.error, their_lag1.error))
         difference = lag1.value - their_lag1.value
         lag1_error = Estimate(difference, error, score(difference, error))

@@ -88,6 +88,7 @@ class Sample:
         """Frequencies of the counts."""
         return Pmf.of_counts(self.counts)
 
+    @cached_property
     def lag1(self) -> Estimate:
         """Sum over all bins of Cov(h_j, h_j+1), cyclic, divided by the mean count: 0 without dead time."""
         mean, total = self.mean_histogram, float(self.mean_histogram.sum())
@@ -219,13 +220,13 @@ def _distance(value: float, null: FloatArray) -> Distance:
 
     A sum of many half-normal terms is close to normal; of few it has the tail of a gamma law, or a lighter one.
     """
-    from scipy import stats
+    from scipy.special import gammaincc, ndtri
 
     mean, variance = float(null.mean()), float(null.var())
     if variance <= 0.0:
         return Distance(value, mean, 0.0 if value <= mean + 1e-9 else _LARGEST_SCORE)
-    p = float(stats.gamma.sf(value, mean * mean / variance, scale=variance / mean))
-    return Distance(value, mean, float(np.clip(stats.norm.isf(p), -_LARGEST_SCORE, _LARGEST_SCORE)))
+    p = gammaincc(mean * mean / variance, value * mean / variance)
+    return Distance(value, mean, float(np.clip(-ndtri(p), -_LARGEST_SCORE, _LARGEST_SCORE)))
 
 
 def _cells(registrations: FloatArray) -> NDArray[np.intp]:

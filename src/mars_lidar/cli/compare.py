@@ -120,6 +120,8 @@ def compare(
         for file in (out, numbers):
             if file is not None and file.exists() and not overwrite:
                 raise FileExistsError(f"{file} exists already; give --overwrite or another name")
+            if file is not None and not file.parent.is_dir():
+                raise FileNotFoundError(f"{file} cannot be written: there is no folder {file.parent}")
         names = _names(engines)
         instrument = build_system(
             system,

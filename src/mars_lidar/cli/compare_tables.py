@@ -28,12 +28,13 @@ def show(found: Comparison) -> None:
     for pixel in found.pixels:
         _pixel_table(console, found, pixel)
     for line in (
+        "",
         f"{_MARK} deviates by more than {SIGNIFICANT:g} standard errors: from what is predicted, in window and lag-1 "
         f"from {found.against}.",
         "In brackets: standard error in the last digits. Window: +-3 sigma around the return.",
         "lag-1: covariance of neighbouring bins over the mean count, in 1/1000.",
-        "TV: total variation of the mean histogram's shape and of the law of the count, in 1/1000; in brackets "
-        "by chance.",
+        "TV: total variation of the mean histogram's shape and of the law of the count, in 1/1000;",
+        "in brackets what chance makes of it.",
     ):
         console.print(line, style="dim")
 
@@ -112,6 +113,7 @@ def _scene_table(console: Console, found: Comparison) -> None:
             f"{s.registrations:,.0f}", cell(s.bias), cell(percent), cell(s.dispersion),
             _number(1e3 * s.depth_error_m), _number(100 * s.outliers),
         )  # fmt: skip
+    console.print()
     console.print(grid)
     for name, why in found.skipped.items():
         console.print(f"{name} was not run: {why}")
@@ -138,6 +140,7 @@ def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
             name, cell(s.counts.mean), cell(s.counts.variance), cell(s.counts.fano), cell(s.window.variance),
             relative, cell(lag1), cell(s.shape), cell(s.law),
         )  # fmt: skip
+    console.print()
     console.print(grid)
     if pixel in found.unpredicted:
         console.print(f"{pixel} pixel has no prediction: {found.unpredicted[pixel]}")
@@ -154,7 +157,7 @@ def _grid(title: str, columns: tuple[str, ...]) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    grid = Table(title=Text("\n" + title, style="bold"), title_justify="left", box=None, padding=(0, 1, 0, 0),
+    grid = Table(title=Text(title, style="bold"), title_justify="left", box=None, padding=(0, 1, 0, 0),
                  pad_edge=False, header_style="dim")  # fmt: skip
     for k, name in enumerate(columns):
         grid.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")

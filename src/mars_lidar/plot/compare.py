@@ -39,7 +39,7 @@ def comparison(found: Comparison) -> Figure:
         across = max(math.ceil(maps / rows), 4)
         wide = (_WIDTH - 0.2) / across
         tall = min((wide - 0.85) * found.flux.shape[0] / found.flux.shape[1], 3.0)
-        heights = [rows * (tall + 0.25), _HISTOGRAM, _LAWS, _POINTS]
+        heights = [rows * tall + (rows - 1) * 0.25, _HISTOGRAM, _LAWS, _POINTS]
         height = _TOP + sum(heights) + _GAP * len(heights)
         figure = Figure(figsize=(_WIDTH, height), dpi=DPI)
         colours = engine_colours(found.engines)
@@ -49,7 +49,7 @@ def comparison(found: Comparison) -> Figure:
             boxes.append((top / height, (top - h) / height))
             top -= h + _GAP
         grid = figure.add_gridspec(
-            rows, across, left=0.008, right=1.0 - 0.82 / _WIDTH, top=boxes[0][0], bottom=boxes[0][1] + 0.2 / height,
+            rows, across, left=0.008, right=1.0 - 0.82 / _WIDTH, top=boxes[0][0], bottom=boxes[0][1],
             wspace=0.85 / (wide - 0.85), hspace=0.25 / tall,
         )  # fmt: skip
         _draw_maps(list(grid.subplots(squeeze=False).flat), found, colours)

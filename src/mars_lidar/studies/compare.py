@@ -23,6 +23,7 @@ from mars_lidar.engines.base import Progress
 from mars_lidar.flux import Flux
 from mars_lidar.plot.data import incident_rate
 from mars_lidar.simulate import simulate
+from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.exposure import thread_count
 from mars_lidar.studies.compare_expected import Expected, PixelLaw, expected_counts, pixel_law
 from mars_lidar.studies.compare_pixels import telling_pixels
@@ -210,11 +211,18 @@ def compare(
     expected = expected_counts(flux, system, team, budget)
     steps.done()
     scenes: dict[str, SceneStatistics] = {}
-    for name, engine in runs.items():
-        scenes[name] = scene_statistics(
-            flux, system, engine, expected, depth, cubes, _stream(seed, name), team, budget, scenes.get(against)
-        )
-        steps.done()
+    for name, engine in list(runs.items()):
+        try:
+            scenes[name] = scene_statistics(
+                flux, system, engine, expected, depth, cubes, _stream(seed, name), team, budget, scenes.get(against)
+            )
+            steps.done()
+        except (ValueError, ConvergenceError) as error:  # what an engine notices only at work
+            if name == against:
+                raise
+            skipped[name] = str(error)
+            del runs[name]
+            steps.done(1 + len(places))
     laws: dict[str, PixelLaw | None] = {}
     unpredicted: dict[str, str] = {}
     statistics: dict[str, dict[str, PixelStatistics]] = {}
@@ -361,7 +369,7 @@ class _Steps:
     def __init__(self, progress: Progress | None, total: int) -> None:
         self._progress, self._total, self._made = progress, total, 0
 
-    def done(self) -> None:
-        self._made += 1
+    def done(self, parts: int = 1) -> None:
+        self._made += parts
         if self._progress is not None:
             self._progress(self._made, self._total)

@@ -18,8 +18,11 @@ def telling_pixels(flux: Flux, depth_m: NDArray[np.float64], number: int) -> dic
     """
     count = _validate.integer("pixels", number, low=1, high=6)
     named = example_pixels(flux, depth_m)
-    lit = np.flatnonzero(flux.signal > 0)
-    some = lit if lit.size else np.arange(flux.total.size)
+    inside = np.zeros(flux.shape, bool)
+    rim = [n // 16 for n in flux.shape]  # as `example_pixels` leaves it out
+    inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
+    lit = np.flatnonzero((flux.signal > 0) & inside)
+    some = lit if lit.size else np.flatnonzero(inside)
     by_signal = some[np.argsort(flux.signal.ravel()[some], kind="stable")]
     by_total = some[np.argsort(flux.total.ravel()[some], kind="stable")]
     more = {"median": by_signal[(by_signal.size - 1) // 2], "most": by_total[-1], "least": by_total[0]}

@@ -208,11 +208,11 @@ def law_distance(sample: Sample, goal: Sample | Pmf, random: np.random.Generator
     if isinstance(goal, Pmf):
         return _distance(total_variation(sample.law, goal), sampling_floor(goal, sample.size, 4 * _DRAWS, random))
     low, high = min(sample.law.first, goal.law.first), max(sample.law.last, goal.law.last)
-    a, b = sample.law.on(low, high), goal.law.on(low, high)
-    pooled = (a * sample.size + b * goal.size) / (sample.size + goal.size)
-    kept = pooled[pooled > 0] / pooled.sum()
-    draws = [random.multinomial(s.size, kept, size=4 * _DRAWS) / s.size for s in (sample, goal)]
-    return _distance(0.5 * float(np.abs(a - b).sum()), 0.5 * np.abs(draws[0] - draws[1]).sum(1))
+    mine, theirs = (np.bincount(s.counts - low, minlength=high - low + 1) for s in (sample, goal))
+    # by permutation: frequencies of both together are too concentrated to draw new samples from where counts are rare
+    some = random.multivariate_hypergeometric(mine + theirs, sample.size, size=4 * _DRAWS)
+    apart = [np.abs(a / sample.size - (mine + theirs - a) / goal.size).sum(-1) for a in (some, mine)]
+    return _distance(0.5 * float(apart[1]), 0.5 * apart[0])
 
 
 def _distance(value: float, null: FloatArray) -> Distance:

@@ -111,7 +111,7 @@ def _scene_table(console: Console, found: Comparison) -> None:
         grid.add_row(
             name, f"{1e3 * s.median_s:.3g}", str(len(s.seconds)), f"{s.ns_per_registration:.3g}",
             f"{s.registrations:,.0f}", cell(s.bias), cell(percent), cell(s.dispersion),
-            _number(1e3 * s.depth_error_m), _number(100 * s.outliers),
+            _length(1e3 * s.depth_error_m), _number(100 * s.outliers),
         )  # fmt: skip
     console.print()
     console.print(grid)
@@ -182,7 +182,7 @@ def with_error(value: float, error: float) -> str:
     """
     if math.isnan(value):
         return "–"
-    if not (math.isfinite(error) and error > 0.0):
+    if not (math.isfinite(error) and error > 0.0) or abs(value) >= 1e7:
         return _number(value)
     lead = math.floor(math.log10(error))
     digits = (1 if error < 1.95 * 10.0**lead else 0) - lead
@@ -195,6 +195,10 @@ def with_error(value: float, error: float) -> str:
 
 def _short(value: float) -> str:
     return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}"
+
+
+def _length(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.0f}" if value >= 99.5 else f"{value:.3g}"
 
 
 def _number(value: float) -> str:

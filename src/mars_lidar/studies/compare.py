@@ -7,11 +7,9 @@ stated errors hold also between engines that would share their draws.
 
 from __future__ import annotations
 
-import time
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,83 +19,19 @@ from mars_lidar._memory import check_memory
 from mars_lidar.engines import ENGINES, Engine, find_engine
 from mars_lidar.engines.base import Progress
 from mars_lidar.flux import Flux
-from mars_lidar.plot.data import incident_rate
-from mars_lidar.simulate import simulate
 from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.exposure import thread_count
 from mars_lidar.studies.compare_expected import Expected, PixelLaw, expected_counts, pixel_law
-from mars_lidar.studies.compare_pixels import telling_pixels
-from mars_lidar.studies.compare_sample import (
-    Distance,
-    Estimate,
-    FloatArray,
-    Moments,
-    Sample,
-    law_distance,
-    ratio,
-    score,
-    shape_distance,
+from mars_lidar.studies.compare_pixel import (
+    PixelStatistics,
+    draw_pixel,
+    pixel_statistics,
+    signal_window,
+    telling_pixels,
 )
+from mars_lidar.studies.compare_sample import Sample
 from mars_lidar.studies.compare_scene import SceneStatistics, scene_statistics
-from mars_lidar.studies.distance import Pmf
 from mars_lidar.system import System
-
-_FIRST_BATCH = 200  # realizations after which the time for the rest is known
-_WINDOW_EDGE = np.exp(-4.5)  # of the largest signal rate: three standard deviations of a Gaussian pulse
-
-
-@dataclass(frozen=True, eq=False)
-class PixelStatistics:
-    """One engine at one pixel.
-
-    Attributes
-    ----------
-    engine, pixel
-        Names.
-    realizations
-        Independent exposures behind it.
-    counts
-        Of all registrations; `window` of those within the bins where the signal's rate exceeds exp(-9/2) of
-        its largest value, which is +-3 sigma of a Gaussian pulse (NaN without a signal).
-    window_ratio
-        Variance of the window count over that of the reference engine.
-    lag1, lag1_error
-        Sum over all bins of Cov(h_j, h_j+1) over the mean count, and its difference to the reference engine.
-    shape, law
-        Total variation of the mean histogram's shape, and of the law of the count.
-    mean_histogram
-        (bins,).
-    frequencies
-        Of the counts.
-    """
-
-    engine: str
-    pixel: str
-    realizations: int
-    counts: Moments
-    window: Moments
-    window_ratio: Estimate
-    lag1: Estimate
-    lag1_error: Estimate
-    shape: Distance
-    law: Distance
-    mean_histogram: FloatArray
-    frequencies: Pmf
-
-    @property
-    def scored(self) -> dict[str, Estimate | Distance]:
-        """All that is compared with something, by name."""
-        return {
-            "mean": self.counts.mean,
-            "variance": self.counts.variance,
-            "fano": self.counts.fano,
-            "window_mean": self.window.mean,
-            "window_variance": self.window.variance,
-            "window_ratio": self.window_ratio,
-            "lag1_error": self.lag1_error,
-            "shape": self.shape,
-            "law": self.law,
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,14 +165,14 @@ def compare(
         if isinstance(predicted, str):
             unpredicted[pixel] = predicted
         law = laws[pixel] = None if isinstance(predicted, str) else predicted
-        window = _window(flux, system, y, x)
+        window = signal_window(flux, system, y, x)
         found: dict[str, PixelStatistics] = {}
         reference: Sample | None = None
         for name, engine in runs.items():
-            drawn = _draw(flux, system, engine, (y, x), n, _stream(seed, name), team, budget / len(places))
+            drawn = draw_pixel(flux, system, engine, (y, x), n, _stream(seed, name), team, budget / len(places))
             sample = Sample(drawn, window)
             random = np.random.default_rng([_stream(seed, name), y, x])
-            found[name] = _statistics(name, pixel, sample, law, reference, random)
+            found[name] = pixel_statistics(name, pixel, sample, law, reference, random)
             if name == against:
                 reference = sample
             steps.done()
@@ -248,77 +182,6 @@ def compare(
         flux, system, against, seed, team, expected, {name: scenes[name] for name in order}, places, laws,
         {pixel: {name: found[name] for name in order} for pixel, found in statistics.items()}, skipped, unpredicted,
     )  # fmt: skip
-
-
-def _statistics(
-    name: str, pixel: str, sample: Sample, law: PixelLaw | None, reference: Sample | None, random: np.random.Generator
-) -> PixelStatistics:
-    """One engine against the prediction, and against the reference engine in what has none."""
-    theirs = None if reference is None else Moments.of(reference.counts)
-    counts = Moments.of(sample.counts, cumulants=None if law is None else law.cumulants, other=theirs)
-    lag1 = sample.lag1
-    nothing = Estimate(np.nan)
-    window = Moments(nothing, nothing, nothing)
-    window_ratio, lag1_error = nothing, nothing
-    has_window = bool(sample.window.any())
-    if has_window:
-        others = None if reference is None else Moments.of(reference.window_counts)
-        window = Moments.of(sample.window_counts, other=others)
-        if others is not None:
-            window_ratio = ratio(window.variance, others.variance)
-        else:
-            own = window.variance
-            window_ratio = Estimate(1.0, own.error / own.value if own.value > 0 else np.nan)
-    if reference is not None:
-        their_lag1 = reference.lag1
-        error = float(np.hypot(lag1.error, their_lag1.error))
-        difference = lag1.value - their_lag1.value
-        lag1_error = Estimate(difference, error, score(difference, error))
-    unknown = Distance(np.nan, np.nan, np.nan)
-    shape_goal, law_goal = (reference, reference) if law is None else (law.histogram, law.pmf)
-    return PixelStatistics(
-        engine=name,
-        pixel=pixel,
-        realizations=sample.size,
-        counts=counts,
-        window=window,
-        window_ratio=window_ratio,
-        lag1=lag1,
-        lag1_error=lag1_error,
-        shape=unknown if shape_goal is None else shape_distance(sample, shape_goal, random),
-        law=unknown if law_goal is None else law_distance(sample, law_goal, random),
-        mean_histogram=sample.mean_histogram,
-        frequencies=sample.law,
-    )
-
-
-def _draw(
-    flux: Flux, system: System, engine: Engine, pixel: tuple[int, int], n: int, seed: int, team: int, budget_s: float
-) -> NDArray[Any]:
-    """Histograms (up to n, bins) of one pixel; fewer where `budget_s` ends, in batches that double."""
-    y, x = pixel
-    place = np.array([y * flux.shape[1] + x], dtype=np.int64)
-    alone = flux[y : y + 1, x : x + 1]
-    out = np.empty((n, system.bins), system.histogram_dtype)
-    began, made, batch = time.perf_counter(), 0, min(n, _FIRST_BATCH)
-    while made < n:
-        part = out[made : made + batch].reshape(-1, 1, 1, system.bins)
-        simulate(
-            alone, system, engine=engine, realizations=len(part), first_realization=made, pixel_index=place,
-            seed=seed, threads=team, out=part,
-        )  # fmt: skip
-        made += len(part)
-        each = (time.perf_counter() - began) / made
-        batch = min(2 * batch, n - made, int((budget_s - each * made) / each))
-        if batch <= 0:
-            break
-    return out[:made]
-
-
-def _window(flux: Flux, system: System, y: int, x: int) -> NDArray[np.bool_]:
-    """Bins (bins,) where the signal's rate exceeds exp(-9/2) of its largest; none without a signal."""
-    signal = incident_rate(flux, system, y, x) - flux.background[y, x] / system.bins
-    return np.asarray(signal > max(_WINDOW_EDGE * float(signal.max()), 1e-12 * float(flux.total[y, x])))
 
 
 def _names(engines: Sequence[str | Engine], against: str) -> list[str]:

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from mars_lidar.studies.compare import Comparison, PixelStatistics
+    from mars_lidar.studies.compare import Comparison
+    from mars_lidar.studies.compare_pixel import PixelStatistics
 
 _PIPE = 160  # columns where nobody is watching: nothing is folded
 _MARK = "!"

@@ -40,7 +40,7 @@ def comparison(found: Comparison) -> Figure:
         wide = (_WIDTH - 0.2) / across
         tall = min((wide - 0.85) * found.flux.shape[0] / found.flux.shape[1], 3.0)
         heights = [rows * tall + (rows - 1) * 0.25, _HISTOGRAM, _LAWS, _POINTS]
-        height = _TOP + sum(heights) + _GAP * len(heights)
+        height = _TOP + sum(heights) + _GAP * (len(heights) - 1) + 0.3
         figure = Figure(figsize=(_WIDTH, height), dpi=DPI)
         colours = engine_colours(found.engines)
         boxes = []
@@ -98,7 +98,7 @@ def _draw_histograms(
     figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]
 ) -> None:
     """Mean histogram of the first pixel: the whole period, and the signal close up."""
-    grid = figure.add_gridspec(1, 2, left=0.05, right=0.99, top=box[0], bottom=box[1], wspace=0.1,
+    grid = figure.add_gridspec(1, 2, left=0.056, right=0.99, top=box[0], bottom=box[1], wspace=0.1,
                                width_ratios=(2.2, 1.0))  # fmt: skip
     whole, zoom = grid.subplots(squeeze=False)[0]
     name, (y, x) = next(iter(found.pixels.items()))
@@ -147,7 +147,7 @@ def _draw_histograms(
 
 def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]) -> None:
     """Frequencies of the count at each pixel; the exact law on top, and what lies off the scale in words."""
-    grid = figure.add_gridspec(1, len(found.pixels), left=0.05, right=0.99, top=box[0], bottom=box[1],
+    grid = figure.add_gridspec(1, len(found.pixels), left=0.056, right=0.99, top=box[0], bottom=box[1],
                                wspace=0.3)  # fmt: skip
     axes = list(grid.subplots(squeeze=False).flat)
     for ax, name in zip(axes, found.pixels, strict=True):
@@ -172,8 +172,8 @@ def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colo
             ax.plot(inside, law.pmf.on(low, last), color=INK, lw=0.8, ls=(0, (4, 1.5)))
         for k, (engine, mean) in enumerate(away):
             right = mean > moments.mean.value
-            ax.text(0.99 if right else 0.01, 0.97 - 0.12 * k, f"{engine}: {mean:.4g} →" if right else
-                    f"← {engine}: {mean:.4g}", transform=ax.transAxes, color=colours[engine],
+            ax.text(0.99 if right else 0.01, 0.97 - 0.12 * k, f"{engine}: {mean:,.0f} →" if right else
+                    f"← {engine}: {mean:,.0f}", transform=ax.transAxes, color=colours[engine],
                     ha="right" if right else "left", va="top", fontsize=6.5)  # fmt: skip
         ax.set_title(f"Law of the count, {name}", loc="left")
         ax.set_xlabel("registrations")
@@ -185,7 +185,7 @@ def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colo
 
 
 def _draw_joint(figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]) -> None:
-    grid = figure.add_gridspec(1, 4, left=0.05, right=0.99, top=box[0], bottom=box[1], wspace=0.3,
+    grid = figure.add_gridspec(1, 4, left=0.056, right=0.99, top=box[0], bottom=box[1], wspace=0.3,
                                width_ratios=(1.3, 1.3, 1.3, 1.0))  # fmt: skip
     ratios, lags, shapes, times = grid.subplots(squeeze=False)[0]
     table = found.statistics

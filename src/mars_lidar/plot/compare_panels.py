@@ -50,11 +50,14 @@ def draw_points(
                 edge, within = (0.96, "top") if above else (0.04, "bottom")
                 frame = ax.get_xaxis_transform()
                 ax.plot(at, edge, "^" if above else "v", ms=4, color=colour, transform=frame)
-                ax.annotate(f"{found.value:.2g}", (at, edge), (0, -5 if above else 5), xycoords=frame, ha="center",
-                            textcoords="offset points", va=within, fontsize=6.0, color=colour)  # fmt: skip
+                away = 5 + 7 * (k % 2)  # neighbours side by side
+                ax.annotate(f"{found.value:.2g}", (at, edge), (0, -away if above else away), xycoords=frame,
+                            textcoords="offset points", ha="center", va=within, fontsize=6.0, color=colour)  # fmt: skip
     if goal is None:
         if any(v > 0 for v in finite):
             ax.set_yscale("log")
+            low, high = ax.get_ylim()
+            ax.set_ylim(min(low, 0.3 * high), max(high, 3.0 * low))
     else:
         ax.axhline(goal, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0)
         ax.set_ylim(low, high)
@@ -71,9 +74,9 @@ def draw_times(ax: Axes, found: Comparison, colours: dict[str, str]) -> None:
     times = [1e3 * scene.median_s for scene in found.scenes.values()]
     ax.barh(range(len(names)), times, color=[colours[n] for n in names], height=0.65)
     ax.set_xscale("log")
-    ax.set_xlim(0.3 * min(times), 6.0 * max(times))
+    ax.set_xlim(0.3 * min(times), 12.0 * max(times))
     for k, t in enumerate(times):
-        ax.text(1.1 * t, k, f"{t:.3g}", va="center", fontsize=6.5)
+        ax.text(1.1 * t, k, f"{t:,.0f}" if t >= 99.5 else f"{t:.3g}", va="center", fontsize=6.5)
     ax.set_yticks(range(len(names)), names)
     ax.tick_params(axis="y", length=0)
     ax.invert_yaxis()

@@ -30,8 +30,8 @@ def show(found: Comparison) -> None:
         _pixel_table(console, found, pixel)
     for line in (
         "",
-        f"{_MARK} deviates by more than {SIGNIFICANT:g} standard errors: from what is predicted, in window and lag-1 "
-        f"from {found.against}.",
+        f"{_MARK} deviates by more than {SIGNIFICANT:g} standard errors from what is predicted, or else from "
+        f"{found.against}.",
         "In brackets: standard error in the last digits. Window: +-3 sigma around the return.",
         "lag-1: covariance of neighbouring bins over the mean count, in 1/1000.",
         "TV: total variation of the mean histogram's shape and of the law of the count, in 1/1000;",
@@ -85,7 +85,15 @@ def _predicted(found: Comparison, pixel: str) -> dict[str, Any] | None:
     law = found.laws[pixel]
     if law is None:
         return None
-    return {"mean": law.counts.mean.value, "variance": law.counts.variance.value, "fano": _plain(law.counts.fano.value)}
+    mean, variance = (None, None) if law.window is None else (float(v) for v in law.window)
+    return {
+        "mean": law.counts.mean.value,
+        "variance": law.counts.variance.value,
+        "fano": _plain(law.counts.fano.value),
+        "window_mean": mean,
+        "window_variance": variance,
+        "lag1": _plain(law.lag1),
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -131,7 +139,9 @@ def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
     if law is not None:
         known: Moments = law.counts
         exact = [f"{e.value:.6g}" for e in (known.mean, known.variance)] + [_number(known.fano.value)]
-        grid.add_row("predicted", *exact, "", "", "", "", "", style="bold")
+        window = "" if law.window is None else _number(float(law.window[1]))
+        lag = "" if math.isnan(law.lag1) else f"{1e3 * law.lag1:.3g}"
+        grid.add_row("predicted", *(f"{words} " for words in (*exact, window, "", lag)), "", "", style="bold")
     for name, s in statistics.items():
         relative = cell(s.window_ratio)
         if name == found.against and math.isfinite(s.window_ratio.value):

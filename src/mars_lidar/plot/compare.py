@@ -28,7 +28,7 @@ _SCORES = 4.0  # limit of the maps of deviations, in standard errors
 def comparison(found: Comparison) -> Figure:
     """Maps, mean histograms, count laws, joint statistics and times of a `compare` run.
 
-    Predictions are black and on top; each engine has its colour throughout. Values off the scale of a panel
+    Predictions are black, dashed and on top; each engine has its colour throughout. Values off the scale of a panel
     are written at its edge.
     """
     with style():
@@ -185,16 +185,22 @@ def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colo
 
 
 def _draw_joint(figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]) -> None:
-    grid = figure.add_gridspec(1, 4, left=0.056, right=0.99, top=box[0], bottom=box[1], wspace=0.3,
+    grid = figure.add_gridspec(1, 4, left=0.056, right=0.985, top=box[0], bottom=box[1], wspace=0.3,
                                width_ratios=(1.3, 1.3, 1.3, 1.0))  # fmt: skip
     ratios, lags, shapes, times = grid.subplots(squeeze=False)[0]
-    table = found.statistics
-    draw_points(ratios, {p: {e: s.window_ratio for e, s in row.items()} for p, row in table.items()}, colours, 1.0)
+    table, against = found.statistics, found.against
+    window = {p: {e: s.window_ratio for e, s in row.items()} for p, row in table.items()}
+    variances = {p: row[against].window.variance.value for p, row in table.items()}
+    known = {p: float(law.window[1]) / variances[p] for p, law in found.laws.items()
+             if law is not None and law.window is not None and variances[p] > 0}  # fmt: skip
+    draw_points(ratios, window, colours, 1.0, against, known)
     ratios.set_title(f"Variance of the signal window / {found.against}", loc="left")
-    draw_points(lags, {p: {e: s.lag1 for e, s in row.items()} for p, row in table.items()}, colours, 0.0)
+    lag1 = {p: {e: s.lag1 for e, s in row.items()} for p, row in table.items()}
+    known = {p: law.lag1 for p, law in found.laws.items() if law is not None}
+    draw_points(lags, lag1, colours, 0.0, against, known)
     lags.set_title("Covariance of neighbouring bins / mean count", loc="left")
     distances = {p: {e: s.shape for e, s in row.items()} for p, row in table.items()}
-    draw_points(shapes, distances, colours, None)
+    draw_points(shapes, distances, colours, None, against)
     shapes.set_title("Shape of the mean histogram: TV (– by chance)", loc="left")
     draw_times(times, found, colours)
     label_panels((ratios, lags, shapes, times))

@@ -24,18 +24,26 @@ def engine_colours(engines: Iterable[str]) -> dict[str, str]:
 
 
 def draw_points(
-    ax: Axes, rows: Mapping[str, Mapping[str, Estimate | Distance]], colours: dict[str, str], goal: float | None
+    ax: Axes,
+    rows: Mapping[str, Mapping[str, Estimate | Distance]],
+    colours: dict[str, str],
+    goal: float | None,
+    always: str,
+    known: Mapping[str, float] | None = None,
 ) -> None:
     """One point for each engine at each pixel, `rows[pixel][engine]`.
 
-    Estimates have a bar of two standard errors and a line at their goal; distances are on a log axis, each
-    with a dash at what sampling alone makes of it. A value that would flatten the rest is written at the edge.
+    Estimates have a bar of two standard errors and a line at `goal`; distances are on a log axis, each
+    with a dash at what sampling alone makes of it. `known[pixel]` is a line across its engines. A value that
+    would flatten the rest is written at the edge, but never that of engine `always`.
     """
     engines = list(next(iter(rows.values())))
     step = 0.8 / len(engines)
     finite = [v.value for row in rows.values() for v in row.values() if math.isfinite(v.value)]
-    low, high = _range(rows, goal) if goal is not None else (0.0, math.inf)
-    for column, row in enumerate(rows.values()):
+    low, high = _range(rows, goal, always) if goal is not None else (0.0, math.inf)
+    for column, (pixel, row) in enumerate(rows.items()):
+        if known is not None and math.isfinite(known.get(pixel, math.nan)):
+            ax.plot([column - 0.45, column + 0.45], [known[pixel]] * 2, color=INK, lw=0.9, ls=(0, (4, 1.5)))
         for k, (engine, found) in enumerate(row.items()):
             at = column + (k - 0.5 * (len(engines) - 1)) * step
             colour = colours[engine]
@@ -89,16 +97,18 @@ def label_panels(axes: Iterable[Axes]) -> None:
         ax.spines[["top", "right"]].set_visible(False)
 
 
-def _range(rows: Mapping[str, Mapping[str, Estimate | Distance]], goal: float) -> tuple[float, float]:
-    """Limits that keep small deviations visible: values beyond four times the median deviation stay outside."""
-    reach = sorted(
-        abs(v.value - goal) + 2.0 * v.error
-        for row in rows.values()
-        for v in row.values()
+def _range(
+    rows: Mapping[str, Mapping[str, Estimate | Distance]], goal: float, always: str
+) -> tuple[float, float]:
+    """Limits that keep small deviations visible: four times the median deviation, and all of engine `always`."""
+    reach = {
+        (pixel, engine): abs(v.value - goal) + 2.0 * v.error
+        for pixel, row in rows.items()
+        for engine, v in row.items()
         if isinstance(v, Estimate) and math.isfinite(v.value) and math.isfinite(v.error)
-    )
+    }
     if not reach:
         return goal - 1.0, goal + 1.0
-    within = [r for r in reach if r <= 4.0 * reach[(len(reach) - 1) // 2]]
-    most = 1.3 * within[-1] or 1.0
+    middle = sorted(reach.values())[(len(reach) - 1) // 2]
+    most = 1.3 * max(r for (_, engine), r in reach.items() if engine == always or r <= 4.0 * middle) or 1.0
     return goal - most, goal + most

@@ -161,11 +161,11 @@ def compare(
     unpredicted: dict[str, str] = {}
     statistics: dict[str, dict[str, PixelStatistics]] = {}
     for pixel, (y, x) in places.items():
-        predicted = pixel_law(flux, system, y, x, team)
+        window = signal_window(flux, system, y, x)
+        predicted = pixel_law(flux, system, y, x, window, team)
         if isinstance(predicted, str):
             unpredicted[pixel] = predicted
         law = laws[pixel] = None if isinstance(predicted, str) else predicted
-        window = signal_window(flux, system, y, x)
         found: dict[str, PixelStatistics] = {}
         reference: Sample | None = None
         for name, engine in runs.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.flux import Flux
 from mars_lidar.plot.data import law_arguments
-from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments
+from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments, joint_law
 from mars_lidar.studies.compare_sample import FloatArray, Moments
 from mars_lidar.studies.distance import Pmf
 from mars_lidar.system import System
@@ -19,15 +20,30 @@ from mars_lidar.system import System
 _PIXELS = 4096  # of an image, at most: a larger one is predicted on a coarser grid
 _WAVEFORMS = 256  # the same where each pixel has a shape of its own
 _CHUNK = 64
+_LAG_BINS = 2048  # beyond them the lag-1 covariance, which needs every bin as a window, takes seconds
 
 
 @dataclass(frozen=True, eq=False)
 class PixelLaw:
-    """Exact law of one pixel: cumulants (4,) and probabilities of the count, mean histogram (bins,)."""
+    """Exact law of one pixel.
+
+    Attributes
+    ----------
+    cumulants, pmf
+        (4,) cumulants and probabilities of the count.
+    histogram
+        (bins,) mean.
+    window
+        (2,) mean and variance of the count in the signal window, or None.
+    lag1
+        Sum over all bins of Cov(h_j, h_j+1), cyclic, over the mean count, or NaN.
+    """
 
     cumulants: FloatArray
     pmf: Pmf
     histogram: FloatArray
+    window: FloatArray | None
+    lag1: float
 
     @property
     def counts(self) -> Moments:
@@ -57,15 +73,31 @@ class Expected:
         return image[..., :: self.step, :: self.step]
 
 
-def pixel_law(flux: Flux, system: System, y: int, x: int, threads: int) -> PixelLaw | str:
+def pixel_law(
+    flux: Flux, system: System, y: int, x: int, window: NDArray[np.bool_], threads: int
+) -> PixelLaw | str:
     """Exact law of pixel (y, x), or why there is none: no convergence, a detector without exact statistics."""
     try:
         arguments = law_arguments(flux, system, y, x)
         law = count_law(system=system, threads=threads, **arguments)
         histogram = exposure_moments(system=system, threads=threads, **arguments).histogram
-        return PixelLaw(law.cumulants, Pmf(int(law.support[0]), law.pmf), histogram)
+        pmf = Pmf(int(law.support[0]), law.pmf)
     except (ConvergenceError, ValueError) as error:
         return str(error)
+    return PixelLaw(law.cumulants, pmf, histogram, *_joint(arguments, system, window))
+
+
+def _joint(
+    arguments: dict[str, Any], system: System, window: NDArray[np.bool_]
+) -> tuple[FloatArray | None, float]:
+    """`PixelLaw.window` and `.lag1`, as far as the closed form has them in a second or so."""
+    try:
+        joint = joint_law(system=system, **arguments)
+        moments = np.array(joint.window(window.astype(np.float64))) if window.any() else None
+    except (ConvergenceError, ValueError):
+        return None, math.nan
+    quick = system.bins <= _LAG_BINS and joint.settled >= 0  # else each window is run through the exposure
+    return moments, float(joint.lag(1).sum()) / joint.count_mean if quick and joint.count_mean > 0 else math.nan
 
 
 def expected_counts(flux: Flux, system: System, threads: int, budget_s: float) -> Expected:

@@ -49,7 +49,8 @@ class PixelStatistics:
     window_ratio
         Variance of the window count over that of the reference engine.
     lag1, lag1_error
-        Sum over all bins of Cov(h_j, h_j+1) over the mean count, and its difference to the reference engine.
+        Sum over all bins of Cov(h_j, h_j+1) over the mean count, and its difference to the prediction, or to
+        the reference engine where there is none.
     shape, law
         Total variation of the mean histogram's shape, and of the law of the count.
     mean_histogram
@@ -145,24 +146,13 @@ def pixel_statistics(
     """One engine against the prediction, and against the reference engine in what has none."""
     theirs = None if reference is None else Moments.of(reference.counts)
     counts = Moments.of(sample.counts, cumulants=None if law is None else law.cumulants, other=theirs)
-    lag1 = sample.lag1
-    nothing = Estimate(np.nan)
-    window = Moments(nothing, nothing, nothing)
-    window_ratio, lag1_error = nothing, nothing
-    has_window = bool(sample.window.any())
-    if has_window:
-        others = None if reference is None else Moments.of(reference.window_counts)
-        window = Moments.of(sample.window_counts, other=others)
-        if others is not None:
-            window_ratio = ratio(window.variance, others.variance)
-        else:
-            own = window.variance
-            window_ratio = Estimate(1.0, own.error / own.value if own.value > 0 else np.nan)
-    if reference is not None:
-        their_lag1 = reference.lag1
-        error = float(np.hypot(lag1.error, their_lag1.error))
-        difference = lag1.value - their_lag1.value
-        lag1_error = Estimate(difference, error, score(difference, error))
+    window, window_ratio = _window_moments(sample, law, reference)
+    lag1, goal = sample.lag1, Estimate(np.nan)
+    if law is not None and np.isfinite(law.lag1):
+        goal = Estimate(law.lag1, 0.0)
+    elif reference is not None:
+        goal = reference.lag1
+    error, difference = float(np.hypot(lag1.error, goal.error)), lag1.value - goal.value
     unknown = Distance(np.nan, np.nan, np.nan)
     shape_goal, law_goal = (reference, reference) if law is None else (law.histogram, law.pmf)
     return PixelStatistics(
@@ -173,9 +163,25 @@ def pixel_statistics(
         window=window,
         window_ratio=window_ratio,
         lag1=lag1,
-        lag1_error=lag1_error,
+        lag1_error=Estimate(difference, error, score(difference, error)),
         shape=unknown if shape_goal is None else shape_distance(sample, shape_goal, random),
         law=unknown if law_goal is None else law_distance(sample, law_goal, random),
         mean_histogram=sample.mean_histogram,
         frequencies=sample.law,
     )
+
+
+def _window_moments(sample: Sample, law: PixelLaw | None, reference: Sample | None) -> tuple[Moments, Estimate]:
+    """Moments of the count in the window, and its variance over that of the reference."""
+    nothing = Estimate(np.nan)
+    if not sample.window.any():
+        return Moments(nothing, nothing, nothing), nothing
+    others = None if reference is None else Moments.of(reference.window_counts)
+    known = None
+    if law is not None and law.window is not None:
+        known = np.append(law.window, (0.0, 0.0))  # a Gaussian's: they only keep errors from being too small
+    window = Moments.of(sample.window_counts, cumulants=known, other=others)
+    if others is not None:
+        return window, ratio(window.variance, others.variance)
+    own = window.variance
+    return window, Estimate(1.0, own.error / own.value if own.value > 0 else np.nan)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import mars_lidar as ml
 from harness.ledger import require
 from mars_lidar.cli import app
-from mars_lidar.cli.compare_tables import with_error
+from mars_lidar.cli.compare_tables import cell, with_error
 from mars_lidar.engines import ENGINES, Engine
 from mars_lidar.plot.compare import comparison
 from mars_lidar.studies.compare import compare
@@ -274,6 +274,8 @@ def test_the_command_prints_draws_and_writes_numbers(tmp_path):
     [
         (["--engines", "exact,fast"], "--engines must be one of"),
         (["--against", "fast"], "against must be one of"),
+        (["--pixel", "3"], "--pixel must be two integers Y,X"),
+        (["--pixel", "3,12"], "pixels must lie in the image of shape (12, 12), got '3,12'"),
         (["-o", "table.txt"], "--out must end in .png, .pdf or .svg"),
         (["--json", "no/such/folder.json"], "there is no folder no/such"),
     ],
@@ -287,6 +289,16 @@ def test_bad_input_of_the_command_is_exit_code_2(tmp_path, monkeypatch, argument
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_own_pixels_are_compared(tmp_path):
+    out = tmp_path / "c.svg"
+    own = ["--engines", "exact", "--repeats", "1", "--pixel", "3,4", "--pixel", "7,8"]
+    done = CliRunner().invoke(app, ["compare", *SMALL, *own, "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "3,4 pixel (y 3, x 4)" in done.stdout
+    assert "7,8 pixel (y 7, x 8)" in done.stdout
+    assert out.stat().st_size > 2000
+
+
 def test_numbers_are_written_to_their_error():
     assert with_error(858.4412, 0.1234) == "858.44(12)"
     assert with_error(858.4412, 0.34) == "858.4(3)"
@@ -296,5 +308,7 @@ def test_numbers_are_written_to_their_error():
     assert with_error(1.0, 0.97) == "1.0(10)"
     assert with_error(0.25, math.nan) == "0.25"
     assert with_error(math.nan, 1.0) == "–"
-    assert Estimate(1.0, 0.1, -5.1).wrong
+    wrong = cell(Estimate(1.0, 0.1, -5.1))
+    assert (wrong.plain, wrong.style) == ("1.00(10)!", "bold red")
+    assert cell(Estimate(1.0, 0.1, -4.9)).plain == "1.00(10) "
     assert not Estimate(1.0, 0.1, math.nan).wrong

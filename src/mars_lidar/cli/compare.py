@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.inspect import parsed_pixel
 from mars_lidar.cli.options import _OUTPUT, _RUN, _option
 from mars_lidar.cli.simulate import chosen_scene
 from mars_lidar.cli.system_options import build_system
@@ -58,6 +59,13 @@ Pixels = Annotated[
         help="Representative pixels: bright, dim, edge, median, most and least photons, in this order.",
     ),
 ]
+Pixel = Annotated[
+    list[str] | None,
+    _option(
+        "--pixel", panel=_RUN, metavar="Y,X",
+        help="A pixel of your own (row, column) instead; up to 6 times.",
+    ),
+]
 Repeats = Annotated[
     int, _option("--repeats", panel=_RUN, min=1, help="Timed cubes of the whole image.", default="5")
 ]
@@ -99,6 +107,7 @@ def compare(
     against: Against = "exact",
     realizations: Realizations = 10_000,
     pixels: Pixels = 4,
+    pixel: Pixel = None,
     repeats: Repeats = 5,
     budget_s: BudgetS = 4.0,
     seed: options.Seed = 0,
@@ -123,6 +132,7 @@ def compare(
             if file is not None and not file.parent.is_dir():
                 raise FileNotFoundError(f"{file} cannot be written: there is no folder {file.parent}")
         names = _names(engines)
+        places = {text.replace(" ", ""): parsed_pixel(text) for text in pixel or ()}
         instrument = build_system(
             system,
             period_ns=period_ns,
@@ -156,7 +166,7 @@ def compare(
                 against=against,
                 realizations=realizations,
                 repeats=repeats,
-                pixels=pixels,
+                pixels=places or pixels,
                 depth_m=view.depth_m,
                 seed=seed,
                 threads=threads,

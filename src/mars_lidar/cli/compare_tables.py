@@ -41,7 +41,7 @@ def show(found: Comparison) -> None:
 
 
 def as_data(found: Comparison) -> dict[str, Any]:
-    """All numbers as JSON can hold them: not-a-numbers are None, maps and histograms are left out."""
+    """All numbers as JSON can hold them: NaN is None, infinity 1e308; maps and histograms are left out."""
     expected = found.expected
     return {
         "system": found.system.to_dict(),

@@ -137,7 +137,9 @@ def compare(
         raise ValueError(f"depth_m must have the shape {flux.shape} of the flux, got {depth.shape}")
     places = pixels if isinstance(pixels, dict) else telling_pixels(flux, depth, pixels)
     _check_places(places, flux)
-    check_memory(n * system.bins * system.histogram_dtype.itemsize * 2, f"{n} histograms", "ask for fewer realizations")
+    each = system.bins * system.histogram_dtype.itemsize
+    check_memory(2 * n * each, f"{n} histograms of two engines", "ask for fewer realizations")
+    check_memory(flux.background.size * each, f"a cube of {flux.shape} pixels", "compare a smaller image")
 
     skipped = _refusals(chosen, flux, system, against)
     runs = {name: engine for name, engine in chosen.items() if name not in skipped}

@@ -123,9 +123,17 @@ def compare(
 
     Raises
     ------
-    ValueError
+    ValueError, TypeError
         A bad argument, or a reference engine that cannot do this flux and system.
+    MemoryError
+        A cube, or the histograms of a pixel, would not fit.
     """
+    if not isinstance(flux, Flux):
+        raise TypeError(f"flux must be a Flux, got {type(flux).__name__}")
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    if isinstance(engines, str):
+        raise TypeError(f"engines must be a sequence of names, got {engines!r}; one engine: [{engines!r}]")
     chosen = _engines(engines, against)
     n = _validate.integer("realizations", realizations, low=50, high=10**7)
     cubes = _validate.integer("repeats", repeats, low=1, high=1000)

@@ -24,6 +24,7 @@ SYSTEM = ml.System(
     pulse=ml.GaussianPulse(sigma_ns=1.5),
     detector=ml.Detector(dead_time_ns=63.0),
 )
+CALM = {"threads": 2, "budget_s": 600.0}  # as many exposures on a busy machine
 TRUE = ("exact", "sequential")  # engines that claim everything
 
 
@@ -89,7 +90,7 @@ class Refusing(Engine):
 @pytest.fixture(scope="module")
 def found():
     engines = ["exact", "sequential", "poisson", Dimmed()]
-    return compare(scene(), SYSTEM, engines, realizations=3000, repeats=8, pixels=3, seed=5, threads=2)
+    return compare(scene(), SYSTEM, engines, realizations=3000, repeats=8, pixels=3, seed=5, **CALM)
 
 
 @pytest.mark.parametrize("engine", TRUE)
@@ -119,7 +120,7 @@ def test_no_dead_time_is_found_in_everything(found):
 
 def test_a_wrong_joint_law_is_found_and_nothing_else():
     system, flux = SYSTEM.replace(detector=ml.Detector(dead_time_ns=10.0)), ml.Flux(np.full((2, 2), 2.0), 2.0, 20.0)
-    found = compare(flux, system, [CountTimesShape()], realizations=3000, repeats=8, pixels=1, seed=5, threads=2)
+    found = compare(flux, system, [CountTimesShape()], realizations=3000, repeats=8, pixels=1, seed=5, **CALM)
     row = found.statistics["bright"]["count-times-shape"].scored
     assert {name for name, e in row.items() if e.wrong} == {"window_variance", "window_ratio", "lag1_error"}
     right = ("mean", "variance", "fano", "window_mean", "shape", "law")
@@ -153,7 +154,7 @@ def test_predictions_are_those_of_the_count_law(found):
 
 def test_a_seed_gives_the_same_numbers_whoever_runs_beside(found):
     alone = compare(
-        scene(), SYSTEM, ["sequential"], realizations=3000, repeats=8, pixels=3, seed=5, threads=1, budget_s=60.0
+        scene(), SYSTEM, ["sequential"], realizations=3000, repeats=8, pixels=3, seed=5, **{**CALM, "threads": 1}
     )
     assert alone.engines == ["exact", "sequential"]
     for pixel, row in alone.statistics.items():
@@ -173,7 +174,7 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_flux_is_compared_and_drawn(tmp_path, kind):
-    found = compare(KINDS[kind], SYSTEM, TRUE, realizations=200, repeats=2, threads=2)
+    found = compare(KINDS[kind], SYSTEM, TRUE, realizations=200, repeats=2, **CALM)
     for row in found.statistics.values():
         for engine in TRUE:
             assert not [name for name, e in row[engine].scored.items() if e.wrong]
@@ -185,7 +186,7 @@ def test_every_kind_of_flux_is_compared_and_drawn(tmp_path, kind):
 
 
 def test_a_large_image_is_predicted_on_a_grid():
-    found = compare(scene(70, 66), SYSTEM.replace(bins=8, cycles=20), ["exact"], realizations=50, repeats=1, pixels=1)
+    found = compare(scene(70, 66), SYSTEM.replace(bins=8, cycles=20), ["exact"], realizations=50, repeats=1, pixels=1, **CALM)
     assert found.expected.step == 2
     assert found.expected.mean.shape == (35, 33)
     assert found.expected.known.all()
@@ -195,7 +196,7 @@ def test_a_large_image_is_predicted_on_a_grid():
 
 def test_engines_that_cannot_are_skipped_and_told():
     for late, words in ((False, "cycles must be odd"), (True, "outside of the table")):
-        found = compare(scene(), SYSTEM, ["exact", Refusing(late)], realizations=50, repeats=1, pixels=1)
+        found = compare(scene(), SYSTEM, ["exact", Refusing(late)], realizations=50, repeats=1, pixels=1, **CALM)
         assert found.engines == ["exact"]
         assert words in found.skipped["refusing"]
         with pytest.raises(ValueError, match=words):
@@ -204,7 +205,7 @@ def test_engines_that_cannot_are_skipped_and_told():
 
 def test_without_a_prediction_the_reference_engine_is_the_goal(monkeypatch, capsys):
     monkeypatch.setattr("mars_lidar.studies.compare.pixel_law", lambda *_: "it does not settle")
-    found = compare(scene(), SYSTEM, [*TRUE, "poisson"], realizations=1000, repeats=2, pixels=2, seed=8, threads=2)
+    found = compare(scene(), SYSTEM, [*TRUE, "poisson"], realizations=1000, repeats=2, pixels=2, seed=8, **CALM)
     assert found.unpredicted == {"bright": "it does not settle", "dim": "it does not settle"}
     for pixel, row in found.statistics.items():
         assert all(math.isnan(e.z) for e in row["exact"].scored.values())

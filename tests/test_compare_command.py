@@ -12,7 +12,8 @@ from mars_lidar.cli import app
 from mars_lidar.cli.compare_tables import cell, with_error
 from mars_lidar.studies.compare_sample import Estimate
 
-SMALL = ["--scene", "room", "--size", "12", "--cycles", "50", "--bins", "64", "--realizations", "300"]
+SMALL = ["--scene", "room", "--size", "12", "--cycles", "50", "--bins", "64"]
+SMALL += ["--realizations", "300", "--budget-s", "600"]
 
 
 def test_the_command_prints_draws_and_writes_numbers(tmp_path):

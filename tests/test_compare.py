@@ -186,7 +186,8 @@ def test_every_kind_of_flux_is_compared_and_drawn(tmp_path, kind):
 
 
 def test_a_large_image_is_predicted_on_a_grid():
-    found = compare(scene(70, 66), SYSTEM.replace(bins=8, cycles=20), ["exact"], realizations=50, repeats=1, pixels=1, **CALM)
+    system = SYSTEM.replace(bins=8, cycles=20)
+    found = compare(scene(70, 66), system, ["exact"], realizations=50, repeats=1, pixels=1, **CALM)
     assert found.expected.step == 2
     assert found.expected.mean.shape == (35, 33)
     assert found.expected.known.all()

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _SWEEPS = 200  # beyond, a factorisation is cheaper
-_TOLERANCE = 1e-11
+_TOLERANCE = 1e-10  # of a solution, relative to its largest value
 _GOOD = 1e-9  # relative residual with which a solution is accepted
 
 
@@ -130,16 +130,18 @@ class FoldedGrid:
     @cached_property
     def _flat(self) -> tuple[FloatArray, float]:
         """(2, n) and its total worth: the transposed solution for a window of ones."""
-        y = self._adjoint(np.ones((1, self.bins)), None)[0]
+        y = self._adjoint(np.ones((1, self.bins)), None, _TOLERANCE)[0]
         return y, float(self.worth(y).sum())
 
     def worth(self, y: FloatArray) -> FloatArray:
         """(..., n) what being armed at the start of a bin is worth: alpha of (5.3)."""
         return np.asarray(self.response[0] * y[..., 0, :] + self.response[3] * y[..., 1, :])
 
-    def adjoint(self, mass: FloatArray, moment: FloatArray | None = None) -> FloatArray:
+    def adjoint(
+        self, mass: FloatArray, moment: FloatArray | None = None, tolerance: float = _TOLERANCE
+    ) -> FloatArray:
         """(m, 2, n) solution of the transposed equations (5.4) for sources (m, n)."""
-        y = self._adjoint(mass, moment)
+        y = self._adjoint(mass, moment, tolerance)
         if self.whole:
             flat, total = self._flat
             share = self.whole * self.worth(y).sum(-1) / (1.0 + self.whole * total)
@@ -167,7 +169,7 @@ class FoldedGrid:
         self._judge(source - self._apply(x), x)
         return x
 
-    def _adjoint(self, mass: FloatArray, moment: FloatArray | None) -> FloatArray:
+    def _adjoint(self, mass: FloatArray, moment: FloatArray | None, tolerance: float) -> FloatArray:
         from mars_lidar import _core
 
         m, n = mass.shape
@@ -179,10 +181,10 @@ class FoldedGrid:
             done, error = np.empty(m, np.int64), np.empty(m)
             _core.joint_adjoint(
                 response=self.response, shift=self.shift, fraction=self.fraction, mass_in=mass, moment_in=moment,
-                mass=first, moment=second, sweeps=_SWEEPS, tolerance=_TOLERANCE, done=done, error=error,
+                mass=first, moment=second, sweeps=_SWEEPS, tolerance=tolerance, done=done, error=error,
             )  # fmt: skip
             y[:, 0], y[:, 1] = first, second
-            self.direct = not (error <= _TOLERANCE).all()
+            self.direct = not (error <= tolerance).all()
             self.sweeps = max(self.sweeps, int(done.max()))
         if self.direct:
             source = np.zeros((m, 2, n))

@@ -106,7 +106,7 @@ class JointLaw:
         (bins,) expected registrations.
     movement
         How far the result moved when the grid was last halved: the largest change of the variance of some twelve
-        windows (relative), of their means (in standard deviations, or in thousandths of the mean where that is
+        windows (relative, or to a millionth of the mean where that is more), of their means (in standard deviations, or in thousandths of the mean where that is
         more), and of the mean histogram (total variation). The error of the result is smaller.
     grid_bins
         Bins per period of the grid that was needed, which is not the histogram's.
@@ -308,8 +308,8 @@ def _movement(coarse: _Pixel, fine: _Pixel) -> float:
     weights = _monitors(mean, fine.cells.system.dead_time_periods)
     means = weights @ mean
     before, after = coarse.variances(weights), fine.variances(np.repeat(weights, fine.out // n, axis=-1))
-    floor = 1e-10 * np.abs(means) + np.finfo(float).tiny  # rounding: the variance of a locked pixel may be 0
-    if (after < -floor).any():
+    floor = 1e-6 * np.abs(means) + 1e-9 * total  # the variance of a locked pixel may be 0
+    if (after < -1e-3 * floor).any():
         return math.inf
     spread = np.abs(after - before) / np.maximum(after, floor)
     deviation = np.maximum(np.sqrt(np.maximum(after, 0.0)), 1e-3 * np.abs(means)) + np.finfo(float).tiny

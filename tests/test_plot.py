@@ -11,6 +11,8 @@ import pytest
 from matplotlib.figure import Figure
 
 import mars_lidar as ml
+from harness.ledger import rejected, require
+from harness.pvalues import mean_vector
 from mars_lidar import io, plot
 from mars_lidar.plot import data
 
@@ -154,3 +156,26 @@ def test_example_pixels_are_bright_dim_and_at_the_edge():
     assert chosen["edge"][1] in (5, 6)
     assert plot.example_pixels(ml.Flux(0.0, 1.0, 0.0), np.zeros((1, 1))) == {"first": (0, 0)}
     assert plot.example_pixels(ml.Flux(1.0, 1.0, 0.0), np.zeros((1, 1))) == {"bright": (0, 0)}
+
+
+LIT = {
+    "one return": ml.Flux(np.full((1, 2), 1.5), 0.3, 20.0),
+    "two returns": ml.Flux.multi(ml.Flux(np.full((1, 2), 1.0), 0.3, 20.0), ml.Flux(0.7, 0.0, 99.5)),
+    "waveform": FLUXES["waveform"][:1, :2],
+}
+
+
+@pytest.mark.parametrize("engine", ["exact", "poisson"])
+@pytest.mark.parametrize("name", LIT)
+def test_the_predicted_histogram_is_the_mean_of_many(name, engine):
+    cube = cube_of(LIT[name], engine=engine, realizations=4000)
+    for x in (0, 1):
+        predicted = data.predicted_counts(cube, 0, x)
+        drawn = cube.histogram[:, 0, x].astype(float)
+        require({"mean": mean_vector(drawn, predicted)}, f"predicted counts: {engine}, {name}, pixel {x}")
+        wrong = drawn @ np.eye(SYSTEM.bins)[:, ::-1]  # the test can tell: bins in the wrong order
+        assert rejected({"mean": mean_vector(wrong, predicted)})
+
+
+def test_no_prediction_where_it_would_take_too_long():
+    assert data.predicted_counts(cube_of(step(2, 2), SYSTEM.replace(cycles=20_001)), 0, 0) is None

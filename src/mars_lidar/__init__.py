@@ -5,7 +5,14 @@ from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.scene import Scene
 from mars_lidar.simulate import simulate, simulate_timestamps
-from mars_lidar.statistics import CountLaw, count_law, holding_time_covariance, registration_pdf
+from mars_lidar.statistics import (
+    CountLaw,
+    JointLaw,
+    count_law,
+    holding_time_covariance,
+    joint_law,
+    registration_pdf,
+)
 from mars_lidar.system import Detector, System
 from mars_lidar.timestamps import Timestamps
 
@@ -14,6 +21,7 @@ __all__ = [
     "Detector",
     "Flux",
     "GaussianPulse",
+    "JointLaw",
     "Pulse",
     "SampledPulse",
     "Scene",
@@ -22,6 +30,7 @@ __all__ = [
     "__version__",
     "count_law",
     "holding_time_covariance",
+    "joint_law",
     "registration_pdf",
     "simulate",
     "simulate_timestamps",

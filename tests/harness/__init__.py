@@ -1,7 +1,7 @@
 """One statistical harness for all engines.
 
 `check(engine, case, oracle, ...)` draws realizations with a fixed seed and compares them with an oracle: an
-independent simulator's statistics (`Reference`), a closed form (`Law`) or another engine's draws (any
+independent simulator's statistics (`Reference`), a closed form (`Law`, `JointLaw`) or another engine's draws (any
 `Engine`). An engine declares what it claims to reproduce (`COUNTS`, `SHAPE`, `JOINT`, `INTERVALS`); nothing
 else is asked of it.
 
@@ -21,6 +21,7 @@ from harness.cases import (
     waveform_flux,
 )
 from harness.check import COUNTS, INTERVALS, JOINT, SHAPE, check, compare
+from harness.joint import JointLaw
 from harness.laws import Law, armed_count_pmf, constant_rate_moments, first_arrival, stationary_count_pmf
 from harness.ledger import FAMILY_LEVEL, LEVEL, rejected, require
 from harness.pvalues import bonferroni, counts_against_law, goodness, mean_vector, same_law, two_mean_vectors
@@ -37,6 +38,7 @@ __all__ = [
     "REFERENCE_NAMES",
     "SHAPE",
     "Case",
+    "JointLaw",
     "Law",
     "Reference",
     "Sample",

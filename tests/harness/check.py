@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from harness import ledger
 from harness.cases import Case
+from harness.joint import JointLaw
 from harness.laws import Law
 from harness.pvalues import (
     bonferroni,
@@ -30,10 +31,11 @@ JOINT = "joint"  # variances and covariances of the bins
 INTERVALS = "intervals"  # single registrations: times between them, and when they happen
 
 _MOST_CELLS = 80
+_OFTEN = 500  # exposures that must differ from the rest before a number is as good as Gaussian
 
 
 def check(
-    engine: Engine, case: Case, oracle: Engine | Law | Reference, claims: Collection[str], seed: int = 1
+    engine: Engine, case: Case, oracle: Engine | JointLaw | Law | Reference, claims: Collection[str], seed: int = 1
 ) -> None:
     """Draw `case` with `engine` and fail if a claimed statistic differs from the oracle's; counted."""
     about = f"{engine.name}, {case.name}, {type(oracle).__name__}"
@@ -41,7 +43,7 @@ def check(
 
 
 def compare(
-    engine: Engine, case: Case, oracle: Engine | Law | Reference, claims: Collection[str], seed: int = 1
+    engine: Engine, case: Case, oracle: Engine | JointLaw | Law | Reference, claims: Collection[str], seed: int = 1
 ) -> dict[str, float]:
     """p-value of every claimed statistic, by name."""
     sample = draw(engine, case, seed, times=INTERVALS in claims)
@@ -49,6 +51,8 @@ def compare(
     if isinstance(oracle, Engine):
         truth = draw(oracle, case, seed + 1_000_000, times=INTERVALS in claims)
         return outcomes | _two_samples(case, sample, truth, claims)
+    if isinstance(oracle, JointLaw):
+        return outcomes | _sample_and_joint(sample, oracle, claims)
     if isinstance(oracle, Law):
         return outcomes | _sample_and_law(sample, oracle, claims)
     return outcomes | _sample_and_reference(engine, case, sample, oracle, claims, seed)
@@ -132,6 +136,43 @@ def _sample_and_law(sample: Sample, law: Law, claims: Collection[str]) -> dict[s
             if x.shape[1] > 2:
                 p["lag-1 covariance"] = mean_vector(_products(x), np.zeros(x.shape[1]))
     return p
+
+
+def _sample_and_joint(sample: Sample, oracle: JointLaw, claims: Collection[str]) -> dict[str, float]:
+    p: dict[str, float] = {}
+    law, items, cube = oracle.law, len(sample.cube), sample.cube.astype(float)
+    if COUNTS in claims:
+        p["count mean"] = _means_against_law(cube.sum(1)[:, None], law.count_mean, law.count_variance)
+    cell = oracle.cells(items, min(_MOST_CELLS, items // 25))
+    x, mean = cube @ cell.T, cell @ law.mean
+    if SHAPE in claims:
+        p["mean histogram"] = _means_against_law(x, mean, law.window(cell)[1])
+    if JOINT in claims:
+        for name, weights in (("cell variance", cell), ("window variance", oracle.windows(items))):
+            variance = law.window(weights)[1]
+            often = variance * items >= _OFTEN
+            if not often.any():
+                continue
+            score = variance_score(cube @ weights[often].T, variance[often])
+            p[name] = bonferroni(_two_sided_each(score))
+        cell = cell[law.window(cell)[1] * items >= _OFTEN]
+        if len(cell) > 2:
+            x, mean = cube @ cell.T, cell @ law.mean
+            expected = law.covariance_of(cell, np.roll(cell, -1, axis=0))
+            deviation = x - mean  # from the law's own mean: no degree of freedom is lost
+            p["lag-1 covariance"] = mean_vector(deviation * np.roll(deviation, -1, axis=1), expected)
+    return p
+
+
+def _means_against_law(x: NDArray[np.float64], mean: ArrayLike, variance: ArrayLike) -> float:
+    """Means of (items, cells); by Chebyshev's bound, valid for any law, where hardly an exposure differs."""
+    m, v = np.atleast_1d(np.asarray(mean, float)), np.atleast_1d(np.asarray(variance, float))
+    often = v * len(x) >= _OFTEN
+    rest = (x.mean(0) - m)[~often] ** 2
+    p = list(np.minimum(1.0, (v[~often] / len(x) + 1e-18 * m[~often] ** 2) / np.maximum(rest, 1e-300)))
+    if often.any():
+        p.append(mean_vector(x[:, often], m[often], variance=v[often]))
+    return bonferroni(p)
 
 
 def _sample_and_reference(

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.init import init
 from mars_lidar.cli.inspect import info, view
 from mars_lidar.cli.simulate import EPILOG, simulate
@@ -22,6 +23,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command(no_args_is_help=True, epilog=EPILOG)(simulate)
+app.command(no_args_is_help=True, epilog=COMPARE_EPILOG)(compare)
 app.command(no_args_is_help=True)(info)
 app.command(no_args_is_help=True)(view)
 app.command()(init)

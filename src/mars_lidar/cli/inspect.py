@@ -74,7 +74,7 @@ def view(
             raise ValueError(f"--out must end in .png, .pdf or .svg, got {str(out)!r}")
         if out.exists() and not overwrite:
             raise FileExistsError(f"{out} exists already; choose another name or give --overwrite")
-        pixels = None if not pixel else [_pixel(text) for text in pixel]
+        pixels = None if not pixel else [parsed_pixel(text) for text in pixel]
         from mars_lidar.io import load
 
         with load(file) as cube:
@@ -90,7 +90,8 @@ def view(
         print(f"wrote {out}")
 
 
-def _pixel(text: str) -> tuple[int, int]:
+def parsed_pixel(text: str) -> tuple[int, int]:
+    """The (y, x) of an option ``--pixel Y,X``."""
     try:
         y, x = (int(part) for part in text.split(","))
     except ValueError:

@@ -87,7 +87,7 @@ def simulate(
             pulse_bin_ns=pulse_bin_ns,
             pulse_origin=pulse_origin,
         )
-        view, source = _scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px)
+        view, source = chosen_scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px)
         flux = view.flux(
             instrument,
             signal=signal,
@@ -118,7 +118,7 @@ def simulate(
         _summary(written, png if picture else None, began)
 
 
-def _scene(
+def chosen_scene(
     name: str | None,
     size: int | None,
     seed: int,
@@ -127,6 +127,7 @@ def _scene(
     unit: float | None,
     focal: float | None,
 ) -> tuple[Scene, str]:
+    """The scene of a command line, and what it is in words."""
     from mars_lidar.scene import Scene
 
     if (name is None) == (depth is None):

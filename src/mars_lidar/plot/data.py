@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +32,13 @@ def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDA
         counts = np.asarray(cube.histogram[realization, rows])
         totals[rows] = counts.sum(-1, dtype=np.int64)
         peaks[rows] = counts.argmax(-1)
-    system = cube.system
-    delay = (system.time_ns[peaks] - _peak_offset_ns(system)) % system.period_ns
-    return totals, np.where(totals > 0, system.depth_m(delay), np.nan)
+    return totals, np.where(totals > 0, bin_depth_m(cube.system, peaks), np.nan)
+
+
+def bin_depth_m(system: System, bins: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    """Depth (...) in m of a return whose largest bins are `bins` (...), modulo the unambiguous range."""
+    delay = (system.time_ns[bins] - _peak_offset_ns(system)) % system.period_ns
+    return np.asarray(system.depth_m(delay), dtype=np.float64)
 
 
 def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[int, int]]:
@@ -96,20 +100,25 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
         return None
     from mars_lidar.statistics import ConvergenceError, exposure_moments
 
+    try:
+        return exposure_moments(system=system, **law_arguments(flux, system, y, x)).histogram
+    except ConvergenceError:
+        return None
+
+
+def law_arguments(flux: Flux, system: System, y: int, x: int) -> dict[str, Any]:
+    """Pixel (y, x) as `count_law` and `exposure_moments` take it; several returns become a fine waveform."""
     background = float(flux.background[y, x])
     waveform = None if flux.waveform is None else flux.waveform[y, x]
     returns = zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True)
-    lit = [(s, tau) for s, tau in returns if s > 0]
-    try:
-        if waveform is None and len(lit) > 1:
-            parts = system.bins * max(1, 8192 // system.bins)
-            waveform = np.sum([s * system.pulse.bin_energy(tau, system.period_ns, parts) for s, tau in lit], axis=0)
-        if waveform is not None:
-            return exposure_moments(None, background, system, waveform=np.maximum(waveform, 0.0)).histogram
-        signal, delay = lit[0] if lit else (0.0, 0.0)
-        return exposure_moments(signal, background, system, delay_ns=delay).histogram
-    except ConvergenceError:
-        return None
+    lit = [(float(s), float(tau)) for s, tau in returns if s > 0]
+    if waveform is None and len(lit) > 1:
+        parts = system.bins * max(1, 8192 // system.bins)
+        waveform = np.sum([s * system.pulse.bin_energy(tau, system.period_ns, parts) for s, tau in lit], axis=0)
+    if waveform is not None:
+        return {"signal": None, "background": background, "waveform": np.maximum(waveform, 0.0)}
+    signal, delay = lit[0] if lit else (0.0, 0.0)
+    return {"signal": signal, "background": background, "delay_ns": delay}
 
 
 def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:

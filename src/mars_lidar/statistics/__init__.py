@@ -5,6 +5,7 @@ from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewa
 from mars_lidar.statistics.chain import PhaseChain, Stationary
 from mars_lidar.statistics.exposure import Exposure, exposure_moments
 from mars_lidar.statistics.grid import photons_per_bin
+from mars_lidar.statistics.joint import JointLaw, joint_law
 from mars_lidar.statistics.law import CountLaw, count_law, registration_pdf
 from mars_lidar.statistics.renewal import (
     HoldingTimes,
@@ -21,6 +22,7 @@ __all__ = [
     "Exposure",
     "HoldingTimeCovariance",
     "HoldingTimes",
+    "JointLaw",
     "MomentMatrices",
     "PhaseChain",
     "Stationary",
@@ -28,6 +30,7 @@ __all__ = [
     "exposure_moments",
     "holding_time_covariance",
     "holding_times",
+    "joint_law",
     "mars_moments",
     "moment_matrices",
     "photons_per_bin",

@@ -1,0 +1,212 @@
+"""`mars-lidar compare`: several engines on one scene, in tables and a picture."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from mars_lidar.cli import options
+from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.inspect import parsed_pixel
+from mars_lidar.cli.options import _OUTPUT, _RUN, _option
+from mars_lidar.cli.simulate import chosen_scene
+from mars_lidar.cli.system_options import build_system
+
+if TYPE_CHECKING:
+    from mars_lidar.studies.compare import Comparison
+
+COMPARE_EPILOG = "\n\n".join(
+    (
+        "[bold]Examples[/bold]",
+        "mars-lidar compare --scene room --size 64 -o compare.png",
+        "mars-lidar compare --scene room --engines exact,poisson --signal 0.1 --realizations 40000 -o dim.png",
+        "mars-lidar compare --depth depth.png --system spad.yaml --against sequential --json numbers.json -o all.pdf",
+        "What deviates by more than 5 standard errors is red and marked with !. Numbers in brackets are the "
+        "standard error in the last digits.",
+    )
+)
+
+Out = Annotated[
+    Path, _option("-o", "--out", panel=_OUTPUT, help="The picture: .png, .pdf or .svg.")
+]
+Json = Annotated[
+    Path | None, _option("--json", panel=_OUTPUT, help="All numbers as JSON, into this file.")
+]
+Overwrite = Annotated[
+    bool, _option("--overwrite", panel=_OUTPUT, help="Replace an existing picture and JSON file.")
+]
+Engines = Annotated[
+    str | None,
+    _option("--engines", panel=_RUN, help="Engines, separated by commas.", default="all there are"),
+]
+Against = Annotated[
+    str, _option("--against", panel=_RUN, help="The reference engine, run in any case.", default="exact")
+]
+Realizations = Annotated[
+    int,
+    _option(
+        "--realizations", panel=_RUN, min=50, default="10000",
+        help="Exposures of each representative pixel and engine.",
+    ),
+]
+Pixels = Annotated[
+    int,
+    _option(
+        "--pixels", panel=_RUN, min=1, max=6, default="4",
+        help="Representative pixels: bright, dim, edge, median, most and least photons, in this order.",
+    ),
+]
+Pixel = Annotated[
+    list[str] | None,
+    _option(
+        "--pixel", panel=_RUN, metavar="Y,X",
+        help="A pixel of your own (row, column) instead; up to 6 times.",
+    ),
+]
+Repeats = Annotated[
+    int, _option("--repeats", panel=_RUN, min=1, help="Timed cubes of the whole image.", default="5")
+]
+BudgetS = Annotated[
+    float,
+    _option(
+        "--budget-s", panel=_RUN, default="4",
+        help="Seconds for an engine's cubes, and again for its pixels; then it draws fewer.",
+    ),
+]
+
+
+def compare(
+    *,
+    scene: options.Scene = None,
+    size: options.Size = None,
+    scene_seed: options.SceneSeed = 0,
+    depth: options.Depth = None,
+    image: options.Image = None,
+    depth_unit_m: options.DepthUnitM = None,
+    focal_px: options.FocalPx = None,
+    system: options.System = None,
+    period_ns: options.PeriodNs = None,
+    dead_time_ns: options.DeadTimeNs = None,
+    cycles: options.Cycles = None,
+    bins: options.Bins = None,
+    pulse_sigma_ns: options.PulseSigmaNs = None,
+    pulse_fwhm_ns: options.PulseFwhmNs = None,
+    pulse_file: options.PulseFile = None,
+    pulse_bin_ns: options.PulseBinNs = None,
+    pulse_origin: options.PulseOrigin = None,
+    start: options.Start = None,
+    signal: options.Signal = 1.0,
+    sbr: options.Sbr = 1.0,
+    attenuation: options.Attenuation = "none",
+    ambient: options.Ambient = None,
+    dark_counts: options.DarkCounts = 0.0,
+    engines: Engines = None,
+    against: Against = "exact",
+    realizations: Realizations = 10_000,
+    pixels: Pixels = 4,
+    pixel: Pixel = None,
+    repeats: Repeats = 5,
+    budget_s: BudgetS = 4.0,
+    seed: options.Seed = 0,
+    threads: options.Threads = None,
+    out: Out,
+    numbers: Json = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Run several engines on one scene: time, count and joint statistics side by side, with a picture.
+
+    Everything is compared with the exact finite-exposure statistics ("predicted"), and where there is no
+    prediction with the reference engine. The joint statistics are the variance of the count in the +-3 sigma
+    signal window and the covariance of neighbouring bins: what count x shape models get wrong.
+    """
+    with reported():
+        began = time.perf_counter()
+        if out.suffix not in (".png", ".pdf", ".svg"):
+            raise ValueError(f"--out must end in .png, .pdf or .svg, got {str(out)!r}")
+        for file in (out, numbers):
+            if file is not None and file.exists() and not overwrite:
+                raise FileExistsError(f"{file} exists already; give --overwrite or another name")
+            if file is not None and not file.parent.is_dir():
+                raise FileNotFoundError(f"{file} cannot be written: there is no folder {file.parent}")
+        names = _names(engines)
+        places = {text.replace(" ", ""): parsed_pixel(text) for text in pixel or ()}
+        instrument = build_system(
+            system,
+            period_ns=period_ns,
+            cycles=cycles,
+            bins=bins,
+            dead_time_ns=dead_time_ns,
+            start=start,
+            pulse_sigma_ns=pulse_sigma_ns,
+            pulse_fwhm_ns=pulse_fwhm_ns,
+            pulse_file=pulse_file,
+            pulse_bin_ns=pulse_bin_ns,
+            pulse_origin=pulse_origin,
+        )
+        view, source = chosen_scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px)
+        flux = view.flux(
+            instrument,
+            signal=signal,
+            sbr=sbr,
+            attenuation=attenuation,  # type: ignore[arg-type]  # checked there
+            ambient=ambient,  # type: ignore[arg-type]
+            dark_counts_per_s=dark_counts,
+        )
+        from mars_lidar.cli.compare_tables import as_data, show
+        from mars_lidar.studies.compare import compare as run
+
+        with progress_bar("comparing") as progress:
+            found = run(
+                flux,
+                instrument,
+                names,
+                against=against,
+                realizations=realizations,
+                repeats=repeats,
+                pixels=places or pixels,
+                depth_m=view.depth_m,
+                seed=seed,
+                threads=threads,
+                budget_s=budget_s,
+                progress=progress,
+            )
+        _draw(found, out)
+        if numbers is not None:
+            _write(numbers, json.dumps({"scene": source, **as_data(found)}, indent=1, allow_nan=False) + "\n")
+        show(found)
+        rows = [("picture", str(out)), ("time", f"{time.perf_counter() - began:.3g} s in all")]
+        table(rows if numbers is None else [rows[0], ("numbers", str(numbers)), rows[1]])
+
+
+def _names(engines: str | None) -> list[str]:
+    from mars_lidar import _validate
+    from mars_lidar.engines import ENGINES
+
+    if engines is None:
+        return []
+    return [_validate.choice("--engines", name.strip(), tuple(ENGINES)) for name in engines.split(",")]
+
+
+def _draw(found: Comparison, out: Path) -> None:
+    from mars_lidar.plot.compare import comparison
+
+    unfinished = out.with_name(out.name + ".incomplete")
+    try:
+        comparison(found).savefig(unfinished, format=out.suffix[1:])
+        os.replace(unfinished, out)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _write(file: Path, text: str) -> None:
+    unfinished = file.with_name(file.name + ".incomplete")
+    try:
+        unfinished.write_text(text)
+        os.replace(unfinished, file)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+

@@ -1,0 +1,216 @@
+"""Tables of a comparison for a terminal of 100 columns, and the same numbers as plain data."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from typing import TYPE_CHECKING, Any
+
+from mars_lidar.studies.compare_sample import SIGNIFICANT, Distance, Estimate, Moments
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
+    from mars_lidar.studies.compare import Comparison
+    from mars_lidar.studies.compare_pixel import PixelStatistics
+
+_PIPE = 160  # columns where nobody is watching: nothing is folded
+_MARK = "!"
+
+
+def show(found: Comparison) -> None:
+    """Print all tables on standard output; what is significantly wrong is red and marked."""
+    from rich.console import Console
+
+    console = Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_PIPE)
+    _scene_table(console, found)
+    for pixel in found.pixels:
+        _pixel_table(console, found, pixel)
+    for line in (
+        "",
+        f"{_MARK} deviates by more than {SIGNIFICANT:g} standard errors from what is predicted, or else from "
+        f"{found.against}.",
+        "In brackets: standard error in the last digits. Window: +-3 sigma around the return.",
+        "lag-1: covariance of neighbouring bins over the mean count, in 1/1000.",
+        "TV: total variation of the mean histogram's shape and of the law of the count, in 1/1000;",
+        "in brackets what chance makes of it.",
+    ):
+        console.print(line, style="dim")
+
+
+def as_data(found: Comparison) -> dict[str, Any]:
+    """All numbers as JSON can hold them: NaN is None, infinity 1e308; maps and histograms are left out."""
+    expected = found.expected
+    return {
+        "system": found.system.to_dict(),
+        "shape": list(found.flux.shape),
+        "against": found.against,
+        "seed": found.seed,
+        "threads": found.threads,
+        "significant": SIGNIFICANT,
+        "skipped": found.skipped,
+        "unpredicted": found.unpredicted,
+        "expected": {"step": expected.step, "pixels": int(expected.known.sum()), "seconds": expected.seconds},
+        "scenes": {
+            name: _plain(
+                {
+                    **{f.name: getattr(s, f.name) for f in dataclasses.fields(s) if f.name != "mean_counts"},
+                    "median_s": s.median_s,
+                    "ns_per_registration": s.ns_per_registration,
+                }
+            )
+            for name, s in found.scenes.items()
+        },
+        "pixels": {
+            pixel: {
+                "y": y,
+                "x": x,
+                "signal": float(found.flux.signal[y, x]),
+                "background": float(found.flux.background[y, x]),
+                "predicted": _predicted(found, pixel),
+                "engines": {
+                    name: {"realizations": s.realizations, "lag1": _plain(s.lag1)}
+                    | {key: _plain(value) for key, value in s.scored.items()}
+                    for name, s in found.statistics[pixel].items()
+                },
+            }
+            for pixel, (y, x) in found.pixels.items()
+        },
+    }
+
+
+def _predicted(found: Comparison, pixel: str) -> dict[str, Any] | None:
+    law = found.laws[pixel]
+    if law is None:
+        return None
+    mean, variance = (None, None) if law.window is None else (float(v) for v in law.window)
+    return {
+        "mean": law.counts.mean.value,
+        "variance": law.counts.variance.value,
+        "fano": _plain(law.counts.fano.value),
+        "window_mean": mean,
+        "window_variance": variance,
+        "lag1": _plain(law.lag1),
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None if math.isnan(value) else math.copysign(1e308, value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return value
+
+
+def _scene_table(console: Console, found: Comparison) -> None:
+    known = int(found.expected.known.sum())
+    height, width = found.flux.shape
+    goal = f"against the exact mean of {known:,} pixels" if known > 1 else f"against {found.against}"
+    grid = _grid(f"Whole image, {width} × {height} pixels, {found.threads} threads; bias {goal}",
+                 ("engine", "ms", "cubes", "ns/count", "registrations", "bias/sd", "bias %", "dispersion", "depth mm",
+                  "outliers %"))  # fmt: skip
+    for name, s in found.scenes.items():
+        percent = Estimate(100 * s.relative_bias.value, 100 * s.relative_bias.error, s.relative_bias.z)
+        grid.add_row(
+            name, f"{1e3 * s.median_s:.3g}", str(len(s.seconds)), f"{s.ns_per_registration:.3g}",
+            f"{s.registrations:,.0f}", cell(s.bias), cell(percent), cell(s.dispersion),
+            _length(1e3 * s.depth_error_m), _number(100 * s.outliers),
+        )  # fmt: skip
+    console.print()
+    console.print(grid)
+    for name, why in found.skipped.items():
+        console.print(f"{name} was not run: {why}")
+
+
+def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
+    y, x = found.pixels[pixel]
+    statistics, law = found.statistics[pixel], found.laws[pixel]
+    grid = _grid(
+        f"{pixel} pixel (y {y}, x {x}): S = {found.flux.signal[y, x]:.3g}, "
+        f"B = {found.flux.background[y, x]:.3g}; {_realizations(statistics)}",
+        ("engine", "mean", "variance", "Fano", "window var", f"/ {found.against}", "lag-1", "TV shape", "TV count"),
+    )  # fmt: skip
+    if law is not None:
+        known: Moments = law.counts
+        exact = [f"{e.value:.6g}" for e in (known.mean, known.variance)] + [_number(known.fano.value)]
+        window = "" if law.window is None else _number(float(law.window[1]))
+        lag = "" if math.isnan(law.lag1) else f"{1e3 * law.lag1:.3g}"
+        grid.add_row("predicted", *(f"{words} " for words in (*exact, window, "", lag)), "", "", style="bold")
+    for name, s in statistics.items():
+        relative = cell(s.window_ratio)
+        if name == found.against and math.isfinite(s.window_ratio.value):
+            relative = cell(Estimate(1.0))
+        lag1 = Estimate(1e3 * s.lag1.value, 1e3 * s.lag1.error, s.lag1_error.z)
+        grid.add_row(
+            name, cell(s.counts.mean), cell(s.counts.variance), cell(s.counts.fano), cell(s.window.variance),
+            relative, cell(lag1), cell(s.shape), cell(s.law),
+        )  # fmt: skip
+    console.print()
+    console.print(grid)
+    if pixel in found.unpredicted:
+        console.print(f"{pixel} pixel has no prediction: {found.unpredicted[pixel]}")
+
+
+def _realizations(statistics: dict[str, PixelStatistics]) -> str:
+    drawn = {name: s.realizations for name, s in statistics.items()}
+    most = max(drawn.values())
+    fewer = "".join(f", {name} {n:,}" for name, n in drawn.items() if n < most)
+    return f"{most:,} exposures{fewer}"
+
+
+def _grid(title: str, columns: tuple[str, ...]) -> Any:
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table(title=Text(title, style="bold"), title_justify="left", box=None, padding=(0, 1, 0, 0),
+                 pad_edge=False, header_style="dim")  # fmt: skip
+    for k, name in enumerate(columns):
+        grid.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")
+    return grid
+
+
+def cell(found: Estimate | Distance) -> Text:
+    """A value with its error, or a distance (in 1/1000) with its floor; red with a mark where it is wrong."""
+    from rich.text import Text
+
+    if isinstance(found, Distance):
+        words = "–" if math.isnan(found.value) else f"{_short(1e3 * found.value)} ({_short(1e3 * found.floor)})"
+    else:
+        words = with_error(found.value, found.error)
+    return Text(words + _MARK, style="bold red") if found.wrong else Text(words + " ")
+
+
+def with_error(value: float, error: float) -> str:
+    """The value with its standard error in brackets, in units of the last digit: 858.44(12), 858.4(3).
+
+    One digit of the error, two where it begins with 1, so that rounding changes it by no more than a third.
+    """
+    if math.isnan(value):
+        return "–"
+    if not (math.isfinite(error) and error > 0.0) or abs(value) >= 1e7:
+        return _number(value)
+    lead = math.floor(math.log10(error))
+    digits = (1 if error < 1.95 * 10.0**lead else 0) - lead
+    if digits > 8:
+        return f"{value:.3g}"
+    if digits <= 0:
+        return f"{value:.0f}({error:.0f})"
+    return f"{value:.{digits}f}({round(error * 10**digits)})"
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}"
+
+
+def _length(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.0f}" if value >= 99.5 else f"{value:.3g}"
+
+
+def _number(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.3g}"

@@ -1,0 +1,32 @@
+// Solutions of the transposed feedback equation for several windows at once, one function per vector level.
+#pragma once
+#include <atomic>
+#include <cstdint>
+
+namespace mars {
+
+// Windows [first, first + count), count at most the level's lanes. Arrays are (windows, n).
+struct AdjointBlock {
+    const double* response;  // (6, n)
+    int32_t bins, shift;
+    double fraction;
+    int64_t first, count;
+    const double* mass_in;
+    const double* moment_in;  // or null: zero
+    double* mass;
+    double* moment;
+    int64_t sweeps;    // at most
+    double tolerance;  // of the estimated error, relative to the largest value
+    int64_t* done;     // (windows) sweeps
+    double* error;     // (windows) estimated relative error
+    const std::atomic<bool>* stop;
+};
+
+#define MARS_DECLARE_JOINT(level) void joint_adjoint_##level(const AdjointBlock& block);
+
+MARS_DECLARE_JOINT(scalar)
+MARS_DECLARE_JOINT(vector128)
+MARS_DECLARE_JOINT(avx2)
+MARS_DECLARE_JOINT(avx512)
+
+}  // namespace mars

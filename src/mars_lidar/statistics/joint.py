@@ -106,8 +106,9 @@ class JointLaw:
         (bins,) expected registrations.
     movement
         How far the result moved when the grid was last halved: the largest change of the variance of some twelve
-        windows (relative, or to a millionth of the mean where that is more), of their means (in standard deviations, or in thousandths of the mean where that is
-        more), and of the mean histogram (total variation). The error of the result is smaller.
+        windows (relative, or to a millionth of the mean where that is more), of their means (in standard
+        deviations, or in thousandths of the mean where that is more), and of the mean histogram (total variation).
+        The error of the result is smaller.
     grid_bins
         Bins per period of the grid that was needed, which is not the histogram's.
     settled

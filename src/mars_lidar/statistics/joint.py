@@ -130,7 +130,7 @@ class JointLaw:
 
     @property
     def residual(self) -> float:
-        """Largest relative residual of the equations solved so far."""
+        """Largest relative residual of the solutions that are checked: mean, first windows, all that is factorised."""
         return 0.0 if self._pixel is None else self._pixel.grid.residual
 
     @property
@@ -240,6 +240,7 @@ class _Pixel:
     def __init__(self, cells: Cells, bins: int, out: int) -> None:
         from mars_lidar import _core
 
+        cells.check_history(bins)
         self.cells, self.out = cells, out
         self.grid = grid = FoldedGrid.of(cells, bins)
         try:

@@ -7,7 +7,7 @@ A reference case holds, beside what study `reference` reads, ``bins``, ``reals``
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,13 @@ class Outcome:
     lags: FloatArray
     lag_index: NDArray[np.intp]
     leading: dict[str, float] = field(default_factory=dict)
+    inputs: tuple[float, float, float, System] | None = None
+
+    def scores(self) -> dict[str, float]:
+        """Every z by name."""
+        bins = {f"variance of bin {j}": float(z) for z, j in zip(self.bins, self.bin_index, strict=True)}
+        lags = {f"covariance at {j}": float(z) for z, j in zip(self.lags, self.lag_index, strict=True)}
+        return self.single | bins | lags
 
     def chosen(self, kind: str, random: np.random.Generator) -> float | None:
         """z of one bin or lag at random: independent between systems, unlike those of one system."""
@@ -69,10 +76,7 @@ class Outcome:
 
     def worst(self) -> tuple[float, str]:
         """The largest |z| of all, and what it belongs to."""
-        found = [(abs(z), name) for name, z in self.single.items()]
-        found += [(abs(float(z)), f"variance of bin {j}") for z, j in zip(self.bins, self.bin_index, strict=True)]
-        found += [(abs(float(z)), f"covariance at {j}") for z, j in zip(self.lags, self.lag_index, strict=True)]
-        return max(found, default=(0.0, "nothing varies"))
+        return max(((abs(z), name) for name, z in self.scores().items()), default=(0.0, "nothing varies"))
 
 
 def system_of(sigma: float, dead: float, cycles: int, bins: int, start: str = "armed") -> System:
@@ -101,16 +105,25 @@ def random_systems(settings: Settings, tell: Tell) -> list[Outcome]:
         cycles = int(np.exp(random.uniform(*np.log(settings.cycles))))
         start = "stationary" if k % 2 else "armed"
         system = system_of(sigma, dead, cycles, settings.bins, start)
-        found.append(_compare(k, float(signal), float(background), float(delay), system, settings, random))
+        found.append(_compare(k, float(signal), float(background), float(delay), system, settings))
         if k % 20 == 19:
             tell(f"joint: {k + 1} of {settings.systems} systems")
     return found
 
 
+def second_look(o: Outcome, settings: Settings) -> float | None:
+    """The worst z of a system again, from other and four times as many exposures: chance does not come back."""
+    assert o.inputs is not None
+    more = replace(settings, exposures=4 * settings.exposures, seed=settings.seed + 1_000_000)
+    return _compare(int(o.name), *o.inputs, more, weights=settings.seed).scores().get(o.worst()[1])
+
+
 def _compare(
     k: int, signal: float, background: float, delay: float, system: System, settings: Settings,
-    random: np.random.Generator,
+    weights: int | None = None,
 ) -> Outcome:  # fmt: skip
+    """System number `k`; `weights` is the seed of the random weights, by default that of the settings."""
+    random = np.random.default_rng([settings.seed if weights is None else weights, k])
     law = joint_law(signal, background, system, delay_ns=delay * PERIOD_NS, tolerance=TOLERANCE)
     flux = Flux(signal=signal, background=background, delay_ns=delay * PERIOD_NS)
     cube = simulate(flux, system, realizations=settings.exposures, seed=settings.seed + k)
@@ -118,9 +131,9 @@ def _compare(
     centre = (np.arange(system.bins) + 0.5) / system.bins
     reach = max(3.0 * system.pulse.sigma_ns / PERIOD_NS, 1.0 / system.bins)  # type: ignore[attr-defined]
     window = (np.abs((centre - delay + 0.5) % 1.0 - 0.5) <= reach).astype(float)
-    weights = {"count": np.ones(system.bins), "window": window, "random weights": random.normal(size=system.bins)}
+    windows = {"count": np.ones(system.bins), "window": window, "random weights": random.normal(size=system.bins)}
     single = {}
-    for name, w in weights.items():
+    for name, w in windows.items():
         mean, variance = law.window(w)
         if name == "random weights" or variance * len(x) >= OFTEN:
             value = x @ w
@@ -145,6 +158,7 @@ def _compare(
         bin_index=np.flatnonzero(often),
         lags=np.asarray((product[:, pairs].mean(0) - law.lag(1)[pairs]) / error),
         lag_index=np.flatnonzero(pairs),
+        inputs=(signal, background, delay, system),
     )  # fmt: skip
 
 

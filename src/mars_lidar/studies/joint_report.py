@@ -26,6 +26,7 @@ from mars_lidar.studies.joint import (
     Settings,
     random_systems,
     reference_case,
+    second_look,
     system_of,
 )
 from mars_lidar.studies.report import Row, configuration, save_csv, save_figure, save_text, table
@@ -93,7 +94,8 @@ def _text(
         f"reach some {stats.norm.isf(0.5 / numbers):.2f}. {settled} of {len(systems)} exposures forget their "
         "start; the others were run through period by period.",
         "The systems with the largest |z|:",
-        table([_worst_row(o) for o in by_z[:_WORST]]),
+        table([_worst_row(o, second_look(o, settings)) for o in by_z[:_WORST]]),
+        "*again*: z of the same number from four times as many other exposures; what was chance does not come back.",
         *_reference_text(cases),
         "## A look",
         "![closed form and simulation](joint.png)",
@@ -134,13 +136,14 @@ def _law_row(name: str, z: FloatArray) -> Row:
     }
 
 
-def _worst_row(o: Outcome) -> Row:
+def _worst_row(o: Outcome, again: float | None) -> Row:
     z, what = o.worst()
     given = {k: v if isinstance(v, str) else f"{v:.4g}" for k, v in o.settings.items()}
     numbers = len(o.single) + o.bins.size + o.lags.size
     return {
-        "system": o.name, **given, "abs z": f"{z:.2f}", "of": what, "among": numbers,
+        "system": o.name, **given, "z": f"{o.scores()[what]:+.2f}" if numbers else "", "of": what, "among": numbers,
         "p, Bonferroni": f"{min(1.0, 2 * numbers * stats.norm.sf(z)):.2g}",
+        "again": "" if again is None else f"{again:+.2f}",
     }  # fmt: skip
 
 

@@ -122,9 +122,8 @@ class ExposureColumn {
             const int64_t j = (n - back % n) % n;
             return Pair{state_[2 * j], state_[2 * j + 1]};
         };
-        auto reaches = [&](int64_t back) {  // what it is worth: nothing beyond `far`
-            const int64_t row = history * n - back;
-            return back <= far ? Pair{mass_[row], moment_[row]} : Pair{};
+        auto reaches = [&](int64_t back) {  // what it is worth
+            return Pair{mass_[history * n - back], moment_[history * n - back]};
         };
         double mean = 0.0;
         for (int64_t back = 1; back <= far; ++back) {

@@ -19,6 +19,7 @@ from harness import (
     REFERENCE_NAMES,
     SHAPE,
     Case,
+    JointLaw,
     Law,
     Reference,
     armed_count_pmf,
@@ -100,6 +101,25 @@ def test_reference(engine: str, name: str):
     reference = Reference.load(name)
     case = reference.case(photons=8e6 if engine == TRUTH else 3e7)
     check(ENGINES[engine], case, reference, CLAIMS[engine] - {INTERVALS})
+
+
+# The closed-form covariance of the histogram
+
+
+JOINT_ENGINES = [name for name in WITH_DEAD_TIME if JOINT in CLAIMS[name]]
+
+
+@pytest.mark.parametrize("name", REFERENCE_NAMES)
+@pytest.mark.parametrize("engine", JOINT_ENGINES)
+def test_reference_system_has_the_joint_law(engine: str, name: str):
+    case = Reference.load(name).case(photons=8e6 if engine == TRUTH else 3e7)
+    check(ENGINES[engine], case, JointLaw.of(case), CLAIMS[engine] - {INTERVALS}, seed=2)
+
+
+@pytest.mark.parametrize("case", RANDOM[::2], ids=lambda case: case.name)
+@pytest.mark.parametrize("engine", JOINT_ENGINES)
+def test_random_system_has_the_joint_law(engine: str, case: Case):
+    check(ENGINES[engine], case, JointLaw.of(case), CLAIMS[engine] - {INTERVALS}, seed=3)
 
 
 # Closed forms

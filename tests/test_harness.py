@@ -22,6 +22,7 @@ from harness import (
     PERIOD_NS,
     SHAPE,
     Case,
+    JointLaw,
     Reference,
     armed_count_pmf,
     bonferroni,
@@ -178,6 +179,25 @@ def test_faults_of_the_joint_law_are_found_there_only(case: Case):
     """Count x multinomial has the right counts and the right mean shape: only the joint law shows it."""
     expected = {"histogram variance", "window", "lag-1 covariance"}
     assert found(CountTimesMultinomial(), case, HISTOGRAMS) == expected
+
+
+@pytest.mark.parametrize(
+    ("engine", "case", "expected"),
+    [
+        (CountTimesMultinomial(), replace(MID, items=24_000), {"window variance", "lag-1 covariance"}),
+        (CountTimesMultinomial(), REPELLING, {"cell variance", "window variance", "lag-1 covariance"}),
+        (DeadTimeOff(), REPELLING, {"count mean", "mean histogram"}),
+        (WiderPulse(), MID, {"mean histogram"}),
+        (OneCycleShort(), MID, {"count mean"}),
+        (IndependentBins(), MID, {"count variance", "cell variance", "window variance", "lag-1 covariance"}),
+    ],
+    ids=lambda x: type(x).__name__ if isinstance(x, Engine) else "",
+)
+def test_wrong_engine_is_found_by_the_closed_form(engine: Engine, case: Case, expected: set[str]):
+    wrong = rejected(compare(engine, case, JointLaw.of(case), HISTOGRAMS))
+    assert expected <= wrong
+    if isinstance(engine, CountTimesMultinomial):
+        assert not wrong & {"count mean", "count variance", "mean histogram"}
 
 
 def test_wrong_count_law_with_the_right_moments_is_found():

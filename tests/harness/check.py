@@ -143,6 +143,8 @@ def _sample_and_joint(sample: Sample, oracle: JointLaw, claims: Collection[str])
     law, items, cube = oracle.law, len(sample.cube), sample.cube.astype(float)
     if COUNTS in claims:
         p["count mean"] = _means_against_law(cube.sum(1)[:, None], law.count_mean, law.count_variance)
+        if law.count_variance * items >= _OFTEN:
+            p["count variance"] = _two_sided(variance_score(sample.counts, law.count_variance))
     cell = oracle.cells(items, min(_MOST_CELLS, items // 25))
     x, mean = cube @ cell.T, cell @ law.mean
     if SHAPE in claims:

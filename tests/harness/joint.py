@@ -49,11 +49,11 @@ class JointLaw:
         return (cell == np.arange(cell[-1] + 1)[:, None]).astype(float)
 
     def windows(self, items: int) -> NDArray[np.float64]:
-        """(windows, bins) weights: all, half of the registrations in the fewest bins, six bins or fewer."""
+        """(windows, bins) weights: half of the registrations in the fewest bins, and single bins, six or fewer."""
         mean = self.law.mean
         order = np.argsort(-mean, kind="stable")
         brightest = np.zeros(mean.size)
         brightest[order[: int(np.searchsorted(np.cumsum(mean[order]), 0.5 * mean.sum())) + 1]] = 1.0
         often = order[mean[order] * items >= 500][:200]
         single = np.eye(mean.size)[often[:: max(1, often.size // 6)][:6]]
-        return np.vstack([np.ones(mean.size), brightest, single])
+        return np.vstack([brightest, single])

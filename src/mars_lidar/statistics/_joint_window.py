@@ -108,6 +108,11 @@ class SettledLaw:
         half -= (0.5 * ends) * np.outer(a.expected, a.expected)
         return np.asarray(half + half.T)
 
+    def leading(self, weights: FloatArray) -> float:
+        """Variance of one window of `weights` (n,) without the terms of the two ends: N_r times that of a period."""
+        y = self.grid.adjoint(weights[None])
+        return float(self.grid.cycles * (y * _product(self._noise, y)).sum())
+
     @property
     def _old_spread(self) -> FloatArray:
         m = _spread(self.grid.state)[:, self._old]

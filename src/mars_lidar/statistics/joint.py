@@ -18,14 +18,10 @@ from mars_lidar import _validate
 from mars_lidar._memory import check_memory
 from mars_lidar.statistics._cells import Cells, FloatArray
 from mars_lidar.statistics._feedback import ConvergenceError
-from mars_lidar.statistics._joint_grid import FoldedGrid
-from mars_lidar.statistics._joint_window import SettledLaw, Windows
+from mars_lidar.statistics._joint_pixel import Pixel, movement
 from mars_lidar.system import System
 
 _MAX_BINS = 2**20  # of the grid, unless the histogram itself has more
-_SETTLED = 1e-9  # distance from the stationary state (total variation) at which the start is forgotten
-_MAX_STEPS = 4_000_000_000  # bins x periods after which an exposure counts as not settling
-_MAX_RECURSION = 2**25  # bins x periods of an exposure that is run through for every window
 _BLOCK = 64  # windows solved at a time
 
 
@@ -79,10 +75,10 @@ def joint_law(
         return _poisson(cells)
     out = system.bins
     bins = cells.first_bins(out)
-    coarse = _Pixel(cells, bins // 2, math.gcd(bins // 2, out))
+    coarse = Pixel(cells, bins // 2, math.gcd(bins // 2, out))
     while True:
-        fine = _Pixel(cells, bins, out)
-        moved = _movement(coarse, fine)
+        fine = Pixel(cells, bins, out)
+        moved = movement(coarse, fine)
         if moved <= tolerance:
             return JointLaw(system, fine.mean, moved, bins, fine.settled, _pixel=fine)
         bins *= 2
@@ -106,8 +102,9 @@ class JointLaw:
         (bins,) expected registrations.
     movement
         How far the result moved when the grid was last halved: the largest change of the variance of some twelve
-        windows (relative, or to a millionth of the mean where that is more), of their means (in standard deviations, or in thousandths of the mean where that is
-        more), and of the mean histogram (total variation). The error of the result is smaller.
+        windows (relative, or to a millionth of the mean where that is more), of their means (in standard
+        deviations, or in thousandths of the mean where that is more), and of the mean histogram (total variation).
+        The error of the result is smaller.
     grid_bins
         Bins per period of the grid that was needed, which is not the histogram's.
     settled
@@ -120,7 +117,7 @@ class JointLaw:
     movement: float
     grid_bins: int
     settled: int
-    _pixel: _Pixel | None = field(repr=False)
+    _pixel: Pixel | None = field(repr=False)
 
     @property
     def sweeps(self) -> int:
@@ -129,7 +126,7 @@ class JointLaw:
 
     @property
     def residual(self) -> float:
-        """Largest relative residual of the equations solved so far."""
+        """Largest relative residual of the solutions that are checked: mean, first windows, all that is factorised."""
         return 0.0 if self._pixel is None else self._pixel.grid.residual
 
     @property
@@ -231,106 +228,6 @@ class JointLaw:
         if not np.isfinite(rows).all():
             raise ValueError(f"{name} must be finite, got {rows[~np.isfinite(rows)][0]}")
         return rows, array.shape[:-1]
-
-
-class _Pixel:
-    """One pixel on one grid, windows on `out` bins: by the closed form, or through all periods."""
-
-    def __init__(self, cells: Cells, bins: int, out: int) -> None:
-        from mars_lidar import _core
-
-        self.cells, self.out = cells, out
-        self.grid = grid = FoldedGrid.of(cells, bins)
-        try:
-            self.state = np.ascontiguousarray(grid.state.T)
-            total = np.zeros(bins)
-            self.settled = int(
-                _core.joint_settle(
-                    response=grid.response, whole=grid.whole, shift=grid.shift, fraction=grid.fraction,
-                    cycles=grid.cycles, state=self.state, tolerance=_SETTLED, max_steps=_MAX_STEPS, total=total,
-                )
-            )  # fmt: skip
-            self.law = SettledLaw(grid) if self.settled >= 0 else None
-        except ConvergenceError as error:
-            raise ConvergenceError(f"joint law of {cells.name(0)}: {error}") from None
-        if self.law is None:
-            if self.settled == -2 or bins * (grid.cycles + grid.whole) > _MAX_RECURSION:
-                raise ConvergenceError(
-                    f"joint law of {cells.name(0)}: the pixel does not forget its start before the exposure ends, "
-                    f"and {bins} bins x {grid.cycles} periods are too many to run through"
-                )
-            fine = grid.cycles * grid.state[0] if grid.warm else total
-        else:
-            fine = self.law.registrations[0]
-        self.mean = np.maximum(fine.reshape(out, -1).sum(-1), 0.0)
-
-    def variances(self, weights: FloatArray) -> FloatArray:
-        if self.law is None:
-            return np.asarray(np.einsum("ki,ki->k", weights, self._columns(weights)))
-        windows = self._windows(weights)
-        return self.law.covariance(windows, windows)
-
-    def covariances(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        if self.law is None:
-            return np.asarray(np.einsum("ki,ki->k", second, self._columns(first)))
-        return self.law.covariance(self._windows(first), self._windows(second))
-
-    def matrix(self) -> FloatArray:
-        eye = np.eye(self.out)
-        if self.law is None:
-            found = self._columns(eye)
-            return np.asarray(0.5 * (found + found.T))
-        return self.law.matrix(self._windows(eye))
-
-    def _windows(self, weights: FloatArray) -> Windows:
-        assert self.law is not None
-        return self.law.windows(np.repeat(weights, self.grid.bins // self.out, axis=-1))
-
-    def _columns(self, weights: FloatArray) -> FloatArray:
-        """(m, out) covariances of windows with every bin (6.1)-(6.4)."""
-        from mars_lidar import _core
-
-        grid = self.grid
-        columns = np.empty(weights.shape)
-        _core.joint_exposure(
-            response=grid.response, whole=grid.whole, shift=grid.shift, fraction=grid.fraction, cycles=grid.cycles,
-            state=self.state if grid.warm else None, weights=np.ascontiguousarray(weights), columns=columns,
-        )  # fmt: skip
-        return columns
-
-
-def _movement(coarse: _Pixel, fine: _Pixel) -> float:
-    """`JointLaw.movement` from one grid to the next; infinite where a bin or a variance is negative."""
-    n = coarse.out
-    mean = fine.mean.reshape(n, -1).sum(-1)
-    total = max(float(mean.sum()), np.finfo(float).tiny)
-    shape = 0.5 * float(np.abs(mean - coarse.mean).sum()) / total
-    weights = _monitors(mean, fine.cells.system.dead_time_periods)
-    means = weights @ mean
-    before, after = coarse.variances(weights), fine.variances(np.repeat(weights, fine.out // n, axis=-1))
-    floor = 1e-6 * np.abs(means) + 1e-9 * total  # the variance of a locked pixel may be 0
-    if (after < -1e-3 * floor).any():
-        return math.inf
-    spread = np.abs(after - before) / np.maximum(after, floor)
-    deviation = np.maximum(np.sqrt(np.maximum(after, 0.0)), 1e-3 * np.abs(means)) + np.finfo(float).tiny
-    drift = np.abs(means - weights @ coarse.mean) / deviation
-    return max(shape, float(spread.max()), float(drift.max()))
-
-
-def _monitors(mean: FloatArray, dead: float) -> FloatArray:
-    """(m, n) windows that show an error: all, halves, the brightest bin, its echo, their neighbours."""
-    n = mean.size
-    j = np.arange(n)
-    windows = [np.ones(n)]
-    for start in (0, n // 2):
-        windows.append(((j - start) % n < (n + 1) // 2).astype(float))
-    peak = int(np.argmax(mean))
-    echo = int(peak + dead % 1.0 * n) % n
-    for centre in (peak, echo):
-        for width in (1, 2, max(1, n // 50)):
-            for side in (0, 1):
-                windows.append(((j - centre + side * (width - 1) + side) % n < width).astype(float))
-    return np.unique(np.array(windows), axis=0)
 
 
 def _poisson(cells: Cells) -> JointLaw:

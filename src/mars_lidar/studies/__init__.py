@@ -45,8 +45,15 @@ def _reference(request: Request) -> list[Path]:
     return run(request)
 
 
+def _joint(request: Request) -> list[Path]:
+    from mars_lidar.studies.joint_report import run
+
+    return run(request)
+
+
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
+    "joint": ("the histogram's covariance in closed form against simulation; --data adds reference cases", _joint),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
 }

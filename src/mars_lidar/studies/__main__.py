@@ -33,7 +33,7 @@ def _parser() -> argparse.ArgumentParser:
         "--quick", action="store_true", help="small grids, few realizations: seconds, not for citing"
     )
     parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="folder of the reference cases, *.json (study 'reference')"
+        "--data", type=Path, metavar="DIR", help="folder of the reference cases, *.json (studies 'reference', 'joint')"
     )
     return parser
 

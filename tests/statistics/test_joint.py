@@ -1,0 +1,241 @@
+"""The closed-form covariance of the histogram: against closed forms, other derivations and other numerics.
+
+Oracles: constant rate; t_d = 0 and whole periods; the count law's recursion (`exposure_moments`: another
+expansion); a weighted delay recursion and a dense matrix, both on plain bins, written here; ten cases of an
+independent simulator. Engines are compared with it in tests/test_engines.py.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import mars_lidar as ml
+from harness import Reference, constant_rate_moments, require
+from harness.reference import REFERENCE_NAMES
+from mars_lidar.statistics import exposure_moments, joint_law
+
+PERIOD = 100.0
+
+
+def system(dead: float, cycles: int = 1000, bins: int = 64, sigma: float = 0.02, start: str = "armed") -> ml.System:
+    return ml.System(
+        period_ns=PERIOD, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD), start=start,
+    )  # fmt: skip
+
+
+def photons(signal: float, background: float, at: ml.System, bins: int) -> np.ndarray:
+    return signal * at.pulse.bin_energy(0.5 * PERIOD, PERIOD, bins) + background / bins
+
+
+# Closed forms
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(
+    ("rate", "dead", "cycles"), [(2.0, 0.3, 200), (0.5, 0.013, 50), (5.0, 0.11, 400), (1.0, 2.37, 600), (3.0, 2.0, 900)]
+)
+def test_constant_rate(rate: float, dead: float, cycles: int, start: str):
+    """Terms of the two ends of the exposure included."""
+    law = joint_law(0.0, rate, system(dead, cycles, bins=16, start=start), tolerance=1e-6)
+    mean, variance = constant_rate_moments(rate, dead, cycles, stationary=start == "stationary")
+    assert law.settled >= 0
+    assert law.count_mean == pytest.approx(mean, rel=1e-8)
+    assert law.count_variance == pytest.approx(variance, rel=2e-6)
+
+
+def test_no_dead_time_is_poisson():
+    law = joint_law(1.5, 0.5, system(0.0, cycles=70))
+    expected = 70 * photons(1.5, 0.5, system(0.0), 64)
+    assert law.mean == pytest.approx(expected, rel=1e-12)
+    assert law.covariance() == pytest.approx(np.diag(expected), rel=1e-12)
+    w, v = np.random.default_rng(0).normal(size=(2, 64))
+    assert law.window(w) == pytest.approx((w @ expected, w**2 @ expected), rel=1e-12)
+    assert law.covariance_of(w, v) == pytest.approx((w * v) @ expected, rel=1e-12)
+    assert not law.lag(3).any()
+
+
+def test_tends_to_poisson_with_the_dead_time():
+    """Dead times down to a thousandth of a bin of the grid, where a bin re-arms into itself."""
+    poisson = joint_law(1.5, 0.5, system(0.0))
+    change = [
+        joint_law(1.5, 0.5, system(dead), tolerance=1e-5).count_variance / poisson.count_variance - 1
+        for dead in (1e-4, 1e-5, 1e-6)
+    ]
+    assert change[0] / 1e-4 == pytest.approx(change[1] / 1e-5, rel=1e-2)
+    assert change[1] / 1e-5 == pytest.approx(change[2] / 1e-6, rel=1e-2)
+
+
+@pytest.mark.parametrize("whole", [1, 3])
+def test_whole_periods_of_dead_time(whole: int):
+    """t_d = k t_r: T = 1 - k lambda 1' / (1 + k Lambda), r = lambda / (1 + k Lambda), in closed form (3.4)."""
+    cycles = 10**6
+    law = joint_law(2.0, 0.7, system(float(whole), cycles, bins=32, sigma=0.05, start="stationary"), tolerance=1e-5)
+    flux = photons(2.0, 0.7, law.system, 32)
+    scale = 1.0 + whole * 2.7
+    feedback = np.eye(32) - whole * np.outer(flux, np.ones(32)) / scale
+    expected = cycles * feedback @ np.diag(flux / scale) @ feedback.T
+    assert law.mean == pytest.approx(cycles * flux / scale, rel=1e-5)
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs(law.covariance() - expected).max() < 1e-4 * size.max()
+    assert law.variance == pytest.approx(np.diag(expected), rel=3e-4, abs=1e-6 * cycles / 32)
+
+
+# Other derivations
+
+
+def systems(number: int, seed: int, **changes: object) -> list[tuple[float, float, ml.System, float]]:
+    random = np.random.default_rng(seed)
+    found = []
+    for k in range(number):
+        dead = 10 ** random.uniform(-2, np.log10(4))
+        if k % 4 == 0:
+            dead = max(1, round(dead)) - 10 ** random.uniform(-3, -1) * random.choice([-1, 0, 1])
+        if k % 4 == 1:
+            dead = 10 ** random.uniform(-5, -2)
+        at = system(
+            dead, int(10 ** random.uniform(0, 3.5)), sigma=10 ** random.uniform(-2.3, -1),
+            start="stationary" if k % 2 else "armed",
+        ).replace(**changes)  # fmt: skip
+        flux = 10 ** random.uniform(-2, 1), 10 ** random.uniform(-3, 1)
+        found.append((*flux, at, random.uniform(0, PERIOD)))
+    return found
+
+
+@pytest.mark.parametrize(("signal", "background", "at", "delay"), systems(40, seed=3))
+def test_count_and_mean_agree_with_the_count_law(signal: float, background: float, at: ml.System, delay: float):
+    """Exposures of one period and more, start-up and end included, settled or not."""
+    law = joint_law(signal, background, at, delay_ns=delay, tolerance=1e-4)
+    exact = exposure_moments(signal, background, at, delay_ns=delay, tolerance=1e-6)
+    assert law.movement <= 1e-4
+    assert law.residual < 1e-9
+    assert law.count_variance == pytest.approx(float(exact.variance), rel=1e-4, abs=1e-9)
+    assert np.abs(law.mean - exact.histogram).sum() < 1e-4 * float(exact.mean)
+
+
+@pytest.mark.parametrize(("signal", "background", "at", "delay"), systems(16, seed=4, cycles=1500))
+def test_closed_form_is_the_limit_of_the_exact_recursion(signal, background, at, delay):
+    """The O(n) formula and the recursion through all periods, on one grid: any window with every bin."""
+    law = joint_law(signal, background, at, delay_ns=delay)
+    assert law.settled >= 0
+    window = (np.arange(64) % 7 < 3).astype(float)
+    columns = law._pixel._columns(window[None])[0]
+    found = law.covariance_of(window, np.eye(64))
+    assert np.abs(found - columns).max() < 1e-7 * np.abs(columns).max()
+
+
+def weighted_recursion(
+    flux: np.ndarray, dead: int, cycles: int, weights: np.ndarray, history: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance of windows (m, n) on plain bins, by E[e^{s w.H}] to second order in s.
+
+    Armed at the start, or with `history` (n,) stationary registrations per period.
+    """
+    n, m = flux.size, len(weights)
+    p, q = -np.expm1(-flux), 1.0 + np.expm1(-flux) / flux
+    fired = np.zeros((cycles * n + dead, 3, m))  # registrations and their derivatives, history first
+    armed = np.zeros((3, m))
+    armed[0] = 1.0
+    if history is not None:
+        fired[:dead, 0] = np.resize(np.roll(history, dead % n), dead)[:, None]
+        armed[0] -= fired[:dead, 0].sum(0)
+
+    def after(t: int) -> np.ndarray:
+        r = fired[t]
+        if t < dead:
+            return r
+        w = weights[:, (t - dead) % n]
+        return np.array([r[0], r[1] + w * r[0], r[2] + 2 * w * r[1] + w**2 * r[0]])
+
+    for t in range(dead, cycles * n + dead):
+        again = after(t - dead)
+        j = (t - dead) % n
+        fired[t] = p[j] * armed + q[j] * again
+        armed = armed + again - fired[t]
+    total = armed + sum(after(t) for t in range(cycles * n, cycles * n + dead))
+    assert total[0] == pytest.approx(np.ones(m), abs=1e-10)
+    return total[1], total[2] - total[1] ** 2
+
+
+def plain_feedback(flux: np.ndarray, dead: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T (n, n), stationary registrations and their noise (n,) on plain bins, dead time in bins: dense matrices."""
+    n = flux.size
+    p, q = -np.expm1(-flux), 1.0 + np.expm1(-flux) / flux
+    back = (np.arange(n)[:, None] - np.arange(n)) % n
+    blinds = dead // n + ((back >= 1) & (back <= dead % n))
+    again = (back == dead % n).astype(float)
+    solution = np.linalg.inv(np.eye(n) + p[:, None] * blinds - q[:, None] * again)
+    fired = solution @ p
+    return solution, fired, p * (1 - p) * (1 - blinds @ fired) + q * (1 - q) * (again @ fired)
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "cycles"), [(2.0, 1.0, 0.625, 3), (6.0, 0.3, 0.25, 2), (1.0, 0.5, 1.375, 4)]
+)
+def test_short_exposures_by_another_recursion(signal, background, dead, cycles, start):
+    """Variances of windows of unsettled exposures: generating function, plain bins, Richardson."""
+    law = joint_law(
+        signal, background, system(dead, cycles, bins=16, sigma=0.06, start=start), tolerance=1e-6
+    )
+    assert law.settled == -1
+    random = np.random.default_rng(5)
+    weights = np.vstack([np.ones(16), np.eye(16)[[7, 8, 15]], random.normal(size=(4, 16))])
+    found = []
+    for n in (128, 256):
+        flux = photons(signal, background, law.system, n)
+        history = plain_feedback(flux, int(dead * n))[1] if start == "stationary" else None
+        fine = np.repeat(weights, n // 16, axis=1)
+        found.append(np.array(weighted_recursion(flux, int(dead * n), cycles, fine, history)))
+    mean, variance = found[1] + (found[1] - found[0]) / 3.0
+    spread = np.abs(found[1] - found[0]).max(0)
+    got = np.array(law.window(weights))
+    assert np.all(np.abs(got[0] - mean) < 0.05 * spread + 1e-6)
+    assert np.all(np.abs(got[1] - variance) < 0.05 * spread + 1e-6 * variance)
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "dead"), [(1.0, 1.0, 0.640625), (5.0, 0.5, 0.984375), (2.0, 5.0, 0.125), (2.0, 0.5, 2.25)]
+)
+def test_matrix_by_dense_algebra(signal: float, background: float, dead: float):
+    """The whole matrix, leading term: T diag(v) T' on plain bins, Richardson."""
+    cycles = 10**8
+    law = joint_law(signal, background, system(dead, cycles, bins=32, sigma=0.05, start="stationary"))
+    found = []
+    for n in (256, 512):
+        solution, _, noise = plain_feedback(photons(signal, background, law.system, n), round(dead * n))
+        joined = solution.reshape(32, -1, n).sum(1)
+        found.append(cycles * (joined * noise) @ joined.T)
+    expected = found[1] + (found[1] - found[0]) / 3.0
+    error = np.abs(law.covariance() - expected)
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.all(error < 0.1 * np.abs(found[1] - found[0]) + 1e-4 * size)
+
+
+@pytest.mark.parametrize("name", REFERENCE_NAMES)
+def test_reference(name: str):
+    """Count and bins of an independent simulator; errors of the variances by the moments of the law itself."""
+    reference = Reference.load(name)
+    case, size = reference.case(), reference.realizations
+    law = joint_law(
+        reference.signal, reference.background, case.system, delay_ns=reference.delay * PERIOD, tolerance=1e-4
+    )
+    often = law.variance * size >= 500
+    pairs = often & np.roll(often, -1)
+    v, lag = law.variance, law.lag(1)
+    z = {
+        "count mean": (reference.count_mean - law.count_mean) / np.sqrt(law.count_variance / size),
+        "means": ((reference.mean - law.mean) / np.sqrt(np.maximum(v, 1e-300) / size))[often],
+        "variances": (np.log(reference.variance / np.maximum(v, 1e-300)) / np.sqrt((2 + 1 / v) / size))[often],
+        "lag 1": ((reference.lag1 - lag) / np.sqrt((v * np.roll(v, -1) + lag**2) / size))[pairs],
+    }
+    n = np.arange(reference.count.size)
+    p = reference.count / size
+    kurtosis = p @ (n - p @ n) ** 4 / reference.count_var**2 - 1.0
+    z["count variance"] = np.log(reference.count_var / law.count_variance) / np.sqrt(kurtosis / size)
+    require(
+        {k: min(1.0, 2 * np.size(s) * stats.norm.sf(np.abs(s).max())) for k, s in z.items() if np.size(s)},
+        f"joint law, {name}",
+    )

@@ -12,6 +12,7 @@
 
 #include "bindings.h"
 #include "exact_kernel.h"
+#include "mode_start.h"
 #include "parallel.h"
 #include "pulse_table.h"
 #include "registration.h"
@@ -22,7 +23,7 @@ namespace {
 
 struct Level {
     const char* name;
-    ExactKernel kernel;
+    ExactKernel kernel, modes;  // free running, and all other modes
 };
 
 // Widest first.
@@ -31,28 +32,30 @@ std::vector<Level> levels() {
 #if defined(MARS_HAS_avx512)
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        found.push_back({"avx512", exact_kernel_avx512});
+        found.push_back({"avx512", exact_kernel_avx512, exact_modes_kernel_avx512});
 #endif
 #if defined(MARS_HAS_avx2)
-    if (__builtin_cpu_supports("avx2")) found.push_back({"avx2", exact_kernel_avx2});
+    if (__builtin_cpu_supports("avx2")) found.push_back({"avx2", exact_kernel_avx2, exact_modes_kernel_avx2});
 #endif
 #if defined(MARS_HAS_vector128)
-    found.push_back({"vector128", exact_kernel_vector128});
+    found.push_back({"vector128", exact_kernel_vector128, exact_modes_kernel_vector128});
 #endif
-    found.push_back({"scalar", exact_kernel_scalar});
+    found.push_back({"scalar", exact_kernel_scalar, exact_modes_kernel_scalar});
     return found;
 }
 
-ExactKernel kernel_of(const std::string& name) {
+ExactKernel kernel_of(const std::string& name, DetectorMode mode) {
     for (const Level& level : levels())
-        if (name.empty() || name == level.name) return level.kernel;
+        if (name.empty() || name == level.name)
+            return mode == DetectorMode::kNonparalyzable ? level.kernel : level.modes;
     throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
 }
 
-// Photons in the parts of a grid fine enough for the pulse.
+// Photons in the parts of a grid fine enough for the pulse and the gate.
 std::vector<double> photons_on_grid(const Job& job, const PulseShape& shape, int64_t pixel) {
     int64_t n = 1024;
-    while (n < 16384 && static_cast<double>(n) * shape.equivalent_width() < 7.0) n *= 2;
+    const double gate = job.mode == DetectorMode::kGated ? job.gate.width : 1.0;
+    while (n < 16384 && static_cast<double>(n) * std::min(shape.equivalent_width() / 7.0, gate / 64.0) < 1.0) n *= 2;
     const double cells = static_cast<double>(n);
     std::vector<double> photons(n, job.background[pixel] / cells);
     for (int64_t k = 0; k < job.returns; ++k) {
@@ -71,35 +74,78 @@ std::vector<double> photons_on_grid(const Job& job, const PulseShape& shape, int
     return photons;
 }
 
-// Re-arming times of the items of a block that starts warmed up. The state is drawn at the start of a period
-// K + 2 periods before the exposure, which the kernel then runs through: what the grid blurs, the physics mends.
+// Photons of a pixel in [from, to), 0 <= from <= to <= 1.
+double photons_between(const Job& job, const PulseShape& shape, int64_t pixel, double from, double to) {
+    double photons = job.background[pixel] * (to - from);
+    for (int64_t k = 0; k < job.returns; ++k) {
+        const double s = job.signal[k * job.pixels + pixel], tau = job.delay[k * job.pixels + pixel];
+        if (s > 0.0) photons += s * std::max(0.0, shape.periodic(to - tau) - shape.periodic(from - tau));
+    }
+    return photons;
+}
+
+// What a pixel that has been running for long is doing at the start of a period.
+class WarmedUp {
+public:
+    WarmedUp(const Job& job, const PulseShape& shape, int64_t pixel) : job_(job) {
+        const double dead = job.dead_time, total = photons_between(job, shape, pixel, 0.0, 1.0);
+        if (job.mode == DetectorMode::kParalyzable) {
+            start_ = -paralyzable_warm_up(dead, total);
+        } else if (job.mode == DetectorMode::kSynchronous) {
+            const double early = photons_between(job, shape, pixel, 0.0, 1.0 - (dead - std::floor(dead)));
+            synchronous_.emplace_back(dead, total, early);
+        } else {
+            std::vector<double> photons = photons_on_grid(job, shape, pixel);
+            if (job.mode == DetectorMode::kGated)
+                apply_gate(job.gate, photons,
+                           [&](double a, double b) { return photons_between(job, shape, pixel, a, b); });
+            // drawn at the start of a period K + 2 periods before the exposure, which the kernel then runs through:
+            // what the grid blurs, the physics mends
+            start_ = -(static_cast<int64_t>(dead) + 2);
+            blind_.emplace_back(photons, dead);
+            blind_.front().check(job.pixel_index[pixel]);
+        }
+    }
+
+    // Cycle and phase from which on the arrivals of an item matter.
+    void draw(int64_t item, int32_t& cycle, float& phase) const {
+        const Pair<uint32_t> key =
+            stream_key(job_.seed, job_.realization(item), job_.pixel_index[job_.pixel(item)]);
+        const Pair<uint32_t> words = threefry<13, uint32_t>(0u, kStageStart, key.first, key.second);
+        const double u = (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
+        const double residual = !blind_.empty()         ? blind_.front().residual(u)
+                                : !synchronous_.empty() ? static_cast<double>(synchronous_.front().periods(u))
+                                                        : 0.0;
+        const double whole = std::floor(residual);
+        const float fraction = static_cast<float>(residual - whole);
+        cycle = static_cast<int32_t>(static_cast<int64_t>(whole) + start_ + (fraction >= 1.0f ? 1 : 0));
+        phase = fraction >= 1.0f ? 0.0f : fraction;
+    }
+
+private:
+    const Job& job_;
+    int64_t start_ = 0;
+    std::vector<StationaryState> blind_;  // one at most; likewise
+    std::vector<SynchronousStart> synchronous_;
+};
+
+// Where the items of a block that starts warmed up begin.
 void draw_starts(const Job& job, const PulseShape& shape, const ExactBlock& block, std::vector<int32_t>& cycle,
                  std::vector<float>& phase) {
-    const int32_t ahead = static_cast<int32_t>(job.dead_time) + 2;
     cycle.resize(block.items);
     phase.resize(block.items);
     for (int64_t i = 0; i < std::min(block.items, job.pixels); ++i) {
         if (block.stop->load(std::memory_order_relaxed)) return;
-        const int64_t pixel = job.pixel(block.first_item + i);
-        const StationaryState state(photons_on_grid(job, shape, pixel), job.dead_time);
-        state.check(job.pixel_index[pixel]);
-        for (int64_t k = i; k < block.items; k += job.pixels) {  // realizations of this pixel
-            const Pair<uint32_t> key =
-                stream_key(job.seed, job.realization(block.first_item + k), job.pixel_index[pixel]);
-            const Pair<uint32_t> words = threefry<13, uint32_t>(0u, kStageStart, key.first, key.second);
-            const double u = (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
-            const double residual = state.residual(u), whole = std::floor(residual);
-            const float fraction = static_cast<float>(residual - whole);
-            cycle[k] = static_cast<int32_t>(whole) - ahead + (fraction >= 1.0f ? 1 : 0);
-            phase[k] = fraction >= 1.0f ? 0.0f : fraction;
-        }
+        const WarmedUp state(job, shape, job.pixel(block.first_item + i));
+        for (int64_t k = i; k < block.items; k += job.pixels)  // realizations of this pixel
+            state.draw(block.first_item + k, cycle[k], phase[k]);
     }
 }
 
 // Cuts a job into blocks of consecutive items and runs them.
 void run_exact(const BoundJob& job, const PulseTable& pulse, ExactBlock proto, int threads, const std::string& level,
                const nb::object& progress) {
-    const ExactKernel kernel = kernel_of(level);
+    const ExactKernel kernel = kernel_of(level, job.mode);
     proto.job = &job;
     proto.pulse = &pulse;
     const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
-from mars_lidar.detector import Detector
+from mars_lidar.detector import Detector as Detector
 from mars_lidar.pulse import Pulse, pulse_from_dict
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458

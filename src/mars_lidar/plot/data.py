@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,7 +69,7 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
 
 
 def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
-    """Photons per period in each bin (bins,) that reach pixel (y, x), before dead time."""
+    """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
     background = np.full(system.bins, flux.background[y, x] / system.bins)
     if flux.waveform is not None:
         wave = flux.waveform[y, x]
@@ -86,15 +87,19 @@ def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.floa
 def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
     """Mean histogram (bins,) of pixel (y, x) over many exposures, by the exact finite-exposure statistics.
 
-    None where that takes too long for a picture, or does not converge. The engine "poisson" has no dead time:
-    its mean is the incident rate.
+    None where that takes too long for a picture, does not converge, or is not known: behind a gate that moves. The
+    engine "poisson" has no dead time: its mean is the incident rate, inside of the gate.
     """
     system, flux = cube.system, cube.flux
-    if cube.engine == "poisson":
-        return incident_rate(flux, system, y, x) * system.cycles
-    if system.cycles > _PREDICTED_CYCLES:
+    if system.detector.gate_moves:
         return None
-    from mars_lidar.statistics import ConvergenceError, exposure_moments
+    if cube.engine == "poisson" and system.detector.mode != "gated":
+        return incident_rate(flux, system, y, x) * system.cycles
+    if system.cycles > _PREDICTED_CYCLES and system.detector.mode in ("nonparalyzable", "gated"):
+        return None
+    if cube.engine == "poisson":
+        system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))
+    from mars_lidar.statistics import ConvergenceError, mean_histogram
 
     background = float(flux.background[y, x])
     waveform = None if flux.waveform is None else flux.waveform[y, x]
@@ -105,9 +110,9 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
             parts = system.bins * max(1, 8192 // system.bins)
             waveform = np.sum([s * system.pulse.bin_energy(tau, system.period_ns, parts) for s, tau in lit], axis=0)
         if waveform is not None:
-            return exposure_moments(None, background, system, waveform=np.maximum(waveform, 0.0)).histogram
+            return mean_histogram(None, background, system, waveform=np.maximum(waveform, 0.0))
         signal, delay = lit[0] if lit else (0.0, 0.0)
-        return exposure_moments(signal, background, system, delay_ns=delay).histogram
+        return mean_histogram(signal, background, system, delay_ns=delay)
     except ConvergenceError:
         return None
 

@@ -5,7 +5,9 @@ from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewa
 from mars_lidar.statistics.chain import PhaseChain, Stationary
 from mars_lidar.statistics.exposure import Exposure, exposure_moments
 from mars_lidar.statistics.grid import photons_per_bin
+from mars_lidar.statistics.histogram import mean_histogram
 from mars_lidar.statistics.law import CountLaw, count_law, registration_pdf
+from mars_lidar.statistics.paralyzable import ParalyzableMoments, paralyzable_moments
 from mars_lidar.statistics.renewal import (
     HoldingTimes,
     MomentMatrices,
@@ -22,6 +24,7 @@ __all__ = [
     "HoldingTimeCovariance",
     "HoldingTimes",
     "MomentMatrices",
+    "ParalyzableMoments",
     "PhaseChain",
     "Stationary",
     "count_law",
@@ -29,7 +32,9 @@ __all__ = [
     "holding_time_covariance",
     "holding_times",
     "mars_moments",
+    "mean_histogram",
     "moment_matrices",
+    "paralyzable_moments",
     "photons_per_bin",
     "poisson_moments",
     "poisson_pmf",

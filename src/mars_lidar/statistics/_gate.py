@@ -23,9 +23,9 @@ FloatArray = NDArray[np.float64]
 PLAIN: tuple[Mode, ...] = ("nonparalyzable",)
 _INSTEAD = {
     "nonparalyzable": "",
-    "paralyzable": "; paralyzable_moments has its mean, variance and histogram, registration_pdf its shape",
-    "synchronous": "; count_law and registration_pdf have its exact law",
-    "gated": "; count_law, exposure_moments and registration_pdf have its exact law",
+    "paralyzable": "; paralyzable_moments, mean_histogram and registration_pdf have its exact statistics",
+    "synchronous": "; count_law, mean_histogram and registration_pdf have its exact statistics",
+    "gated": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
 }
 
 

@@ -30,6 +30,35 @@ DETECTORS: dict[str, dict[str, Any]] = {
 # Start of the SHA-256 of the cubes (2 realizations, seed 2**63 + 1), as little-endian uint32; see
 # test_reproducibility.py.
 GOLDEN = {
+    "paralyzable gaussian": "81ba71f608f6",
+    "paralyzable returns": "b3f0ed01997e",
+    "paralyzable sampled": "9e08554de809",
+    "paralyzable waveform": "f6f8399dc89a",
+    "paralyzable stationary": "f52ccf0c4da8",
+    "paralyzable stationary waveform": "4e8f9e452c3b",
+    "paralyzable whole periods": "cf866d618c14",
+    "paralyzable long dead time": "4e54bbb1bc1a",
+    "synchronous gaussian": "b87b9d6581cf",
+    "synchronous returns": "5b1dc23eec1e",
+    "synchronous sampled": "6bea0d141827",
+    "synchronous waveform": "ee1fcb64e233",
+    "synchronous stationary": "25ad1046e795",
+    "synchronous stationary waveform": "0046b3456d89",
+    "synchronous whole periods": "97dd3d32e5ae",
+    "synchronous long dead time": "d94fa31b3989",
+    "gated gaussian": "8d3b891be7d7",
+    "gated returns": "f81a5258fb17",
+    "gated sampled": "630dad5bc7be",
+    "gated waveform": "abc2a80584fd",
+    "gated stationary": "38b0fa8cfe88",
+    "gated stationary waveform": "890a8a12c901",
+    "gated whole periods": "082281f9b5d4",
+    "gated long dead time": "bb90526ab6b9",
+    "moving gaussian": "592e3aa16f37",
+    "moving returns": "aa010005e204",
+    "moving sampled": "2029437c22a4",
+    "moving waveform": "5779805a7127",
+    "moving whole periods": "3684c14ec58f",
 }
 KINDS = [
     (mode, kind)

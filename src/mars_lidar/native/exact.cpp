@@ -54,8 +54,9 @@ ExactKernel kernel_of(const std::string& name, DetectorMode mode) {
 // Photons in the parts of a grid fine enough for the pulse and the gate.
 std::vector<double> photons_on_grid(const Job& job, const PulseShape& shape, int64_t pixel) {
     int64_t n = 1024;
-    const double gate = job.mode == DetectorMode::kGated ? job.gate.width : 1.0;
-    while (n < 16384 && static_cast<double>(n) * std::min(shape.equivalent_width() / 7.0, gate / 64.0) < 1.0) n *= 2;
+    const bool gated = job.mode == DetectorMode::kGated;
+    const double parts = gated ? 28.0 : 7.0, narrowest = gated ? job.gate.width / 64.0 : 1.0;
+    while (n < 16384 && static_cast<double>(n) * std::min(shape.equivalent_width() / parts, narrowest) < 1.0) n *= 2;
     const double cells = static_cast<double>(n);
     std::vector<double> photons(n, job.background[pixel] / cells);
     for (int64_t k = 0; k < job.returns; ++k) {

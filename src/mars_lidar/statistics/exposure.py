@@ -22,7 +22,7 @@ from mars_lidar.system import System
 
 Progress = Callable[[int, int], object]
 
-RECURSION: tuple[Mode, ...] = ("nonparalyzable", "gated")  # modes that the delay recursion treats
+_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")  # that the delay recursion treats
 _ORDERS = 4
 _MAX_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
 _UNSETTLED = -2  # the native core's code: gave up
@@ -109,14 +109,13 @@ def exposure_moments(
 
     Raises
     ------
-    ValueError
-        Naming the argument out of range, or a mode other than ``"nonparalyzable"`` and ``"gated"``.
-    ConvergenceError
-        Naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
+    ValueError, ConvergenceError
+        For a mode other than ``"nonparalyzable"`` and ``"gated"``; and
+        naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
         repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
     """
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="exposure_moments", modes=RECURSION
+        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="exposure_moments", modes=_MODES
     )
     return refined_moments(cells, system.bins, tolerance=tolerance, threads=threads, progress=progress)
 

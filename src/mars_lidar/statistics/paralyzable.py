@@ -127,7 +127,7 @@ class _Grid:
         self.before = self._photons(self.edges)  # C(x)
         self.total = float(self.before[-1])
         photons = np.diff(self.before)
-        # photons within the dead time before each edge, t_d = K + f (8)
+        # photons within the dead time before each edge, t_d = K + f (1)
         shifted = self.edges - self.rest
         earlier = self._photons(np.where(shifted < 0.0, shifted + 1.0, shifted))
         within = self.before - earlier + self.total * ((shifted < 0.0) + self.whole)
@@ -148,7 +148,7 @@ class _Grid:
         return np.asarray(photons_before(self.cell, at)[0], dtype=np.float64)
 
     def _exposure(self) -> FloatArray:
-        """Registrations of each bin in the whole exposure (9)."""
+        """Registrations of each bin in the whole exposure (2)."""
         if not self.armed:
             return self.cycles * self.rate
         start = min(self.whole, self.cycles)  # periods that lie within the dead time of a start at 0
@@ -175,7 +175,7 @@ class _Grid:
         return np.where(early, -np.expm1(-lit), -math.expm1(-reached) + steady - at_end)
 
     def _pairs(self) -> float:
-        """Integral of r(t) [R(t) - R(t - t_d)]: pairs closer than the dead time, of independent photons (11)."""
+        """Integral of r(t) [R(t) - R(t - t_d)]: pairs closer than the dead time, which do not exist (3)."""
         total, first = 0.0, 0
         if self.armed:  # up to t_d, where R(t - t_d) = 0, it is R^2 / 2
             end = min(self.whole, self.cycles)

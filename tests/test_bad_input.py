@@ -94,7 +94,7 @@ def test_system_as_a_whole():
         ({"dead_time_ns": NAN}, ValueError, ["dead_time_ns", "finite", "got nan"]),
         ({"dead_time_ns": INF}, ValueError, ["dead_time_ns", "finite", "got inf"]),
         ({"dead_time_ns": "5 ns"}, TypeError, ["dead_time_ns", "number", "got '5 ns'"]),
-        ({"mode": "paralyzable"}, ValueError, ["mode", "'nonparalyzable'", "got 'paralyzable'"]),
+        ({"mode": "paralysable"}, ValueError, ["mode", "'nonparalyzable'", "'paralyzable'", "got 'paralysable'"]),
         ({"mode": None}, ValueError, ["mode", "'nonparalyzable'", "got None"]),
     ],
 )

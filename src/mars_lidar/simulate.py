@@ -144,6 +144,7 @@ def _task(
     if len(flux.returns_signal) > 16:
         raise ValueError(f"flux must have at most 16 returns, got {len(flux.returns_signal)}; use a waveform")
     _check_registrations(flux, system)
+    drawn_by.check_mode(system)
     drawn_by.check(flux, system)
     index = _pixel_index(pixel_index, flux.shape)
     return Task(flux, system, number, first, index, seed, team, progress), drawn_by
@@ -164,11 +165,13 @@ def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArr
 
 
 def _check_registrations(flux: Flux, system: System) -> None:
-    photons = float(flux.total.max())
-    most = photons * system.cycles / (1.0 + photons * system.dead_time_periods)
+    photons, dead = float(flux.total.max()), system.dead_time_periods
+    most, what = photons * system.cycles / (1.0 + photons * dead), "registrations"
+    if system.detector.mode == "paralyzable":  # each arrival is an event, seen or not
+        most, what = photons * (system.cycles + dead), "arrivals of mode 'paralyzable'"
     if most > 0.5 * _MAX_REGISTRATIONS:
         raise ValueError(
-            f"a pixel must have at most {0.5 * _MAX_REGISTRATIONS:.3g} expected registrations, "
+            f"a pixel must have at most {0.5 * _MAX_REGISTRATIONS:.3g} expected {what}, "
             f"got {most:.3g} ({photons:g} photons per period, {system.cycles} cycles)"
         )
 

@@ -13,44 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar.detector import Detector as Detector
 from mars_lidar.pulse import Pulse, pulse_from_dict
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
-_MODES = ("nonparalyzable",)
 _STARTS = ("armed", "stationary")
 _MAX_CYCLES = 100_000_000  # the sampler counts periods in 32 bits: ten seconds at 10 MHz
 _MAX_BINS = 2**20
 _MAX_DEAD_PERIODS = 2**20
-
-
-@dataclass(frozen=True, kw_only=True)
-class Detector:
-    """A single-photon detector pixel.
-
-    Parameters
-    ----------
-    dead_time_ns
-        After a registration the pixel is blind for this long, across period edges. 0, a fraction of the
-        laser period or many periods.
-    mode
-        ``"nonparalyzable"``: free running; photons that arrive while the pixel is blind have no effect.
-    """
-
-    dead_time_ns: float
-    mode: Literal["nonparalyzable"] = "nonparalyzable"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "dead_time_ns", _validate.real("dead_time_ns", self.dead_time_ns, low=0.0))
-        _validate.choice("mode", self.mode, _MODES)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data from which `Detector.from_dict` makes an equal detector."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> Detector:
-        """The detector that `to_dict` described."""
-        return cls(**_validate.known_keys("detector", data, ("dead_time_ns", "mode")))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +38,7 @@ class System:
     pulse
         Shape of the returned pulse, detector response included.
     detector
-        Dead time and mode of the pixel.
+        Dead time, mode and gate of the pixel.
     start
         State of the pixel at the start of the exposure: ``"armed"`` (ready at t = 0) or ``"stationary"``
         (warmed up). The two differ by up to half a count in the mean.
@@ -97,6 +67,7 @@ class System:
                 f"dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
                 f"got {self.detector.dead_time_ns:g} ns"
             )
+        self.detector.check(self.period_ns, self.start)
 
     @property
     def bin_ns(self) -> float:
@@ -136,9 +107,12 @@ class System:
         """Most registrations that one bin can hold: inf for a dead time of 0.
 
         A bin is open for one bin width per period, which fits floor(width / t_d) + 1 registrations, and an
-        exposure fits floor(exposure / t_d) + 1 in all.
+        exposure fits floor(exposure / t_d) + 1 in all. A synchronous pixel registers once in
+        max(1, ceil(t_d / t_r)) periods.
         """
         dead = self.detector.dead_time_ns
+        if self.detector.mode == "synchronous":
+            return math.ceil(self.cycles / max(1, math.ceil(self.dead_time_periods - 1e-9)))
         if dead == 0.0:
             return math.inf
         return min(self.cycles * (self.bin_ns // dead + 1), self.exposure_ns // dead + 1)

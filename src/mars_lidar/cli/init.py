@@ -39,6 +39,15 @@ pulse:
 detector:
   dead_time_ns: 75.0  # blind after each registration, across periods; 0, a fraction of a period, or many
   mode: nonparalyzable  # free running: photons that arrive while blind have no effect
+# Other modes: paralyzable (every photon restarts the dead time), synchronous (armed at the start of each period,
+# first photon only), and gated (photons outside of the gate do not exist):
+# detector:
+#   dead_time_ns: 75.0
+#   mode: gated
+#   gate_start_ns: 30.0  # opens here in each period
+#   gate_width_ns: 20.0  # for this long; may reach round the end of the period
+#   gate_step_ns: 0.0    # moves by this ...
+#   gate_cycles: 1       # ... every so many periods (more than 1 only with a step)
 
 # State of the pixel at the start of an exposure: armed (ready), or stationary (warmed up).
 start: armed

@@ -11,6 +11,7 @@ import typer
 from mars_lidar.cli.console import reported, table
 
 if TYPE_CHECKING:
+    from mars_lidar.detector import Detector
     from mars_lidar.io import Cube
 
 
@@ -139,6 +140,7 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
             f"dead time {dead:.6g} ns ({system.dead_time_periods:.4g} periods), {system.detector.mode}, "
             f"start {system.start}",
         ),
+        *_gate(system.detector),
         ("bins", f"{1e3 * system.bin_ns:.5g} ps, {system.depth_m(system.bin_ns):.3g} m of depth each"),
         ("flux", photons),
     ]
@@ -154,6 +156,16 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
     else:
         rows.append(("open with", f"{mine}  or  {opener}" if opener else mine))
     return rows
+
+
+def _gate(detector: Detector) -> list[tuple[str, str]]:
+    if detector.gate_start_ns is None:
+        return []
+    told = f"{detector.gate_width_ns:.6g} ns from {detector.gate_start_ns:.6g} ns of each period"
+    if detector.gate_moves:
+        every = "every period" if detector.gate_cycles == 1 else f"every {detector.gate_cycles} periods"
+        told += f", moved by {detector.gate_step_ns:.6g} ns {every}"
+    return [("gate", told)]
 
 
 def _on_disk(cube: Cube) -> int:

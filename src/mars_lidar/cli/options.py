@@ -77,6 +77,30 @@ DeadTimeNs = Annotated[
     float | None,
     _option("--dead-time-ns", panel=_SYSTEM, help="Dead time after a registration, ns.", default="75"),
 ]
+Mode = Annotated[
+    str | None,
+    _option(
+        "--mode", panel=_SYSTEM, default="nonparalyzable",
+        help="When the pixel registers: nonparalyzable, paralyzable (every arrival restarts the dead time), "
+        "synchronous (armed at each pulse, first photon only) or gated (with --gate-start-ns, --gate-width-ns).",
+    ),
+]
+GateStartNs = Annotated[
+    float | None,
+    _option("--gate-start-ns", panel=_SYSTEM, help="Mode gated: opening of the gate in each period, ns."),
+]
+GateWidthNs = Annotated[
+    float | None,
+    _option("--gate-width-ns", panel=_SYSTEM, help="Mode gated: width of the gate, at most the period, ns."),
+]
+GateStepNs = Annotated[
+    float | None,
+    _option("--gate-step-ns", panel=_SYSTEM, help="Mode gated: the opening advances by this, ns ...", default="0"),
+]
+GateCycles = Annotated[
+    int | None,
+    _option("--gate-cycles", panel=_SYSTEM, help="... every so many periods.", default="1"),
+]
 Cycles = Annotated[
     int | None,
     _option("--cycles", panel=_SYSTEM, help="Laser periods per exposure.", default="1000"),

@@ -25,6 +25,11 @@ def build_system(
     cycles: int | None,
     bins: int | None,
     dead_time_ns: float | None,
+    mode: str | None,
+    gate_start_ns: float | None,
+    gate_width_ns: float | None,
+    gate_step_ns: float | None,
+    gate_cycles: int | None,
     start: str | None,
     pulse_sigma_ns: float | None,
     pulse_fwhm_ns: float | None,
@@ -41,9 +46,26 @@ def build_system(
         "start": start,
         "pulse": _pulse(pulse_sigma_ns, pulse_fwhm_ns, pulse_file, pulse_bin_ns, pulse_origin),
     }
-    if dead_time_ns is not None:
-        changes["detector"] = Detector(dead_time_ns=dead_time_ns, mode=base.detector.mode)
+    detector = {
+        "dead_time_ns": dead_time_ns,
+        "mode": mode,
+        "gate_start_ns": gate_start_ns,
+        "gate_width_ns": gate_width_ns,
+        "gate_step_ns": gate_step_ns,
+        "gate_cycles": gate_cycles,
+    }
+    given = {name: value for name, value in detector.items() if value is not None}
+    if given:
+        changes["detector"] = _detector(base.detector, given)
     return base.replace(**{name: value for name, value in changes.items() if value is not None})
+
+
+def _detector(base: Detector, given: dict[str, Any]) -> Detector:
+    """`base` with what is given in place of its values; a gate of the file goes with its mode."""
+    known = base.to_dict()
+    if given.get("mode", base.mode) != base.mode:
+        known = {"dead_time_ns": base.dead_time_ns}
+    return Detector.from_dict(known | given)
 
 
 def _pulse(

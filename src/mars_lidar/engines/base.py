@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.detector import MODES, Mode
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
 
@@ -60,6 +61,8 @@ class Task:
         delay = np.ascontiguousarray(flux.returns_delay_ns.reshape(-1, pixels)) / self.system.period_ns
         delay = np.nan_to_num(delay - np.floor(delay), nan=0.0)
         wave = flux.waveform
+        detector = self.system.detector
+        start, step, width = detector.gate_periods(self.system.period_ns)
         return _core.Job(
             signal=signal,
             delay=delay,
@@ -73,6 +76,11 @@ class Task:
             bins=self.system.bins,
             dead_time=self.system.dead_time_periods,
             stationary=self.system.start == "stationary",
+            mode=MODES.index(detector.mode),
+            gate_start=start,
+            gate_width=width,
+            gate_step=step,
+            gate_cycles=detector.gate_cycles or 1,
         )
 
 
@@ -102,9 +110,22 @@ class Engine(ABC):
 
     name: ClassVar[str]
     description: ClassVar[str]
+    modes: ClassVar[tuple[Mode, ...]] = ("nonparalyzable",)  # of the detector, that the engine reproduces
 
     def check(self, flux: Flux, system: System) -> None:  # noqa: B027  (most engines take everything)
         """Raise ValueError, naming the field, for what this engine cannot do."""
+
+    def check_mode(self, system: System) -> None:
+        """Raise ValueError, naming the engines to use, where the detector's mode is not among `modes`."""
+        mode = system.detector.mode
+        if mode not in self.modes:
+            from mars_lidar.engines import ENGINES
+
+            able = " or ".join(repr(name) for name, engine in ENGINES.items() if mode in engine.modes)
+            raise ValueError(
+                f"engine {self.name!r} does not do mode {mode!r} of the detector, only "
+                f"{', '.join(map(repr, self.modes))}; use {able}"
+            )
 
     @abstractmethod
     def histogram(self, task: Task, out: NDArray[Any]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _core
+from mars_lidar.detector import MODES
 from mars_lidar.engines.base import Engine, Records, Task
 
 
@@ -21,6 +22,7 @@ class ExactEngine(Engine):
 
     name = "exact"
     description = "every registered photon, nothing approximated; the default"
+    modes = MODES
 
     def __init__(self, level: str = "") -> None:
         self.level = level

@@ -7,18 +7,32 @@ from typing import Any
 from numpy.typing import NDArray
 
 from mars_lidar import _core
+from mars_lidar.detector import MODES
 from mars_lidar.engines.base import Engine, Task
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
 
 
 class PoissonEngine(Engine):
     """Independent Poisson counts of mean N_r l_j in every bin: the law of the *arrivals*.
 
     The baseline "Poisson" of the MaRS paper (arXiv 2512.04924): N ~ Poisson(Lambda N_r), shape lambda / Lambda.
-    It ignores the dead time of the system. Reproducible on one processor family.
+    It ignores when the detector registers, in every mode: its dead time and, if it is synchronous, that it sees one
+    photon a period. Only a gate is not ignored, since arrivals outside of it do not exist; it must not move.
+    Reproducible on one processor family.
     """
 
     name = "poisson"
     description = "arrivals without dead time, independent bins: a baseline"
+    modes = MODES
+
+    def check(self, flux: Flux, system: System) -> None:
+        """A gate that moves is an error."""
+        if system.detector.gate_moves:
+            raise ValueError(
+                "engine 'poisson' needs a gate that repeats every period, got "
+                f"gate_step_ns={system.detector.gate_step_ns:g}; use 'exact' or 'sequential'"
+            )
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every bin on its own."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _core
+from mars_lidar.detector import MODES
 from mars_lidar.engines.base import Engine, Records, Task
 
 
@@ -20,6 +21,7 @@ class SequentialEngine(Engine):
 
     name = "sequential"
     description = "every arrival drawn, sorted and rejected one by one: slow, independent gold standard"
+    modes = MODES
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every arrival that finds the pixel armed."""

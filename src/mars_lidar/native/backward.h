@@ -28,10 +28,12 @@ inline bool gaps_are_near(double photons, double least, double dead_time) {
     return photons * (std::floor(dead_time) + 1.0) * growth < kMostArrivals;
 }
 
-// The uniform number that draws a state of stationary.h.
+// A uniform number on (0, 1) of 64 bits.
+inline double unit(const Pair<uint32_t>& words) { return (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32; }
+
+// The uniform number that draws a state of stationary.h or mode_start.h.
 inline double start_uniform(const Pair<uint32_t>& key) {
-    const Pair<uint32_t> words = threefry<13, uint32_t>(0u, kStageStart, key.first, key.second);
-    return (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
+    return unit(threefry<13, uint32_t>(0u, kStageStart, key.first, key.second));
 }
 
 // Draws residual dead times. `place(choice, words)` turns random words into the phase in [0, 1) of an arrival.

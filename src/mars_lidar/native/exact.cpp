@@ -1,7 +1,6 @@
 // The exact engine: chunks of pixels on threads, each through the widest kernel that the processor runs.
 #include <algorithm>
 #include <cmath>
-#include <optional>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -11,19 +10,18 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
-#include "backward.h"
 #include "bindings.h"
 #include "exact_kernel.h"
+#include "exact_start.h"
 #include "parallel.h"
-#include "pulse_view.h"
-#include "stationary.h"
+#include "pulse_table.h"
 
 namespace mars {
 namespace {
 
 struct Level {
     const char* name;
-    ExactKernel kernel;
+    ExactKernel kernel, modes;  // free running, and all other modes
 };
 
 // Widest first.
@@ -32,127 +30,29 @@ std::vector<Level> levels() {
 #if defined(MARS_HAS_avx512)
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        found.push_back({"avx512", exact_kernel_avx512});
+        found.push_back({"avx512", exact_kernel_avx512, exact_modes_kernel_avx512});
 #endif
 #if defined(MARS_HAS_avx2)
-    if (__builtin_cpu_supports("avx2")) found.push_back({"avx2", exact_kernel_avx2});
+    if (__builtin_cpu_supports("avx2")) found.push_back({"avx2", exact_kernel_avx2, exact_modes_kernel_avx2});
 #endif
 #if defined(MARS_HAS_vector128)
-    found.push_back({"vector128", exact_kernel_vector128});
+    found.push_back({"vector128", exact_kernel_vector128, exact_modes_kernel_vector128});
 #endif
-    found.push_back({"scalar", exact_kernel_scalar});
+    found.push_back({"scalar", exact_kernel_scalar, exact_modes_kernel_scalar});
     return found;
 }
 
-ExactKernel kernel_of(const std::string& name) {
+ExactKernel kernel_of(const std::string& name, DetectorMode mode) {
     for (const Level& level : levels())
-        if (name.empty() || name == level.name) return level.kernel;
+        if (name.empty() || name == level.name)
+            return mode == DetectorMode::kNonparalyzable ? level.kernel : level.modes;
     throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
-}
-
-// Photons in the parts of a grid fine enough for the pulse.
-std::vector<double> photons_on_grid(const Job& job, const PulseShape& shape, int64_t pixel) {
-    int64_t n = 1024;
-    while (n < 16384 && static_cast<double>(n) * shape.equivalent_width() < 7.0) n *= 2;
-    const double cells = static_cast<double>(n);
-    std::vector<double> photons(n, job.background[pixel] / cells);
-    for (int64_t k = 0; k < job.returns; ++k) {
-        const double s = job.signal[k * job.pixels + pixel], tau = job.delay[k * job.pixels + pixel];
-        if (!(s > 0.0)) continue;
-        // only where the pulse is: at most once round the period
-        const int64_t first = static_cast<int64_t>(std::floor((tau + shape.low()) * cells));
-        const int64_t last = std::min(first + n, static_cast<int64_t>(std::ceil((tau + shape.high()) * cells)));
-        double before = shape.periodic(static_cast<double>(first) / cells - tau);
-        for (int64_t j = first; j < last; ++j) {
-            const double after = shape.periodic(static_cast<double>(j + 1) / cells - tau);
-            photons[((j % n) + n) % n] += s * std::max(0.0, after - before);
-            before = after;
-        }
-    }
-    return photons;
-}
-
-// The photons of one pixel, drawn one by one.
-class Photons {
-public:
-    Photons(const Job& job, const PulseTable& pulse, int64_t pixel)
-        : gaussian_(pulse.shape.gaussian()), view_(pulse_view(pulse)), background_(job.background[pixel]) {
-        total_ = background_;
-        for (int64_t k = 0; k < job.returns; ++k) {
-            total_ += job.signal[k * job.pixels + pixel];
-            until_[k] = total_;
-            centre_[k] = job.delay[k * job.pixels + pixel] + pulse.centre;
-        }
-        returns_ = job.returns;
-    }
-
-    double total() const { return total_; }
-
-    // The least that arrive in a dead time, wherever it begins; an upper bound of it.
-    double least(double dead_time, const PulseShape& shape) const {
-        const double whole = std::floor(dead_time), rest = dead_time - whole;
-        const bool fits = rest == 0.0 || (returns_ == 1 && rest + shape.high() - shape.low() < 1.0);
-        return background_ * dead_time + (total_ - background_) * (fits ? whole : whole + 1.0);
-    }
-
-    // Phase of a photon in [0, 1).
-    double operator()(uint32_t choice, const Pair<uint32_t>& words) const {
-        const double photon = (choice + 0.5) * 0x1p-32 * total_;
-        const double u = (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
-        if (photon < background_ || returns_ == 0) return u;
-        int64_t k = 0;
-        while (k + 1 < returns_ && photon >= until_[k]) ++k;
-        const float energy = static_cast<float>(u < view_.split ? u : u - 1.0);
-        const double time = centre_[k] + (gaussian_ ? quantile<true>(view_, energy) : quantile<false>(view_, energy));
-        const double phase = time - std::floor(time);
-        return phase < 1.0 ? phase : 0.0;
-    }
-
-private:
-    bool gaussian_;
-    PulseView view_;
-    double background_, total_;
-    int64_t returns_;
-    double until_[16], centre_[16];  // photons of the background and the returns up to this one; its centre
-};
-
-// Re-arming times of the items of a block that starts warmed up: at or after t = 0 where they are drawn from the
-// arrivals before it. For a bright pixel the state is drawn at the start of a period K + 2 periods before the
-// exposure, which the kernel then runs through: what the grid blurs, the physics mends.
-void draw_starts(const Job& job, const PulseTable& pulse, const ExactBlock& block, std::vector<int32_t>& cycle,
-                 std::vector<float>& phase) {
-    const PulseShape& shape = pulse.shape;
-    GapSearch search;
-    const int32_t ahead = static_cast<int32_t>(job.dead_time) + 2;
-    cycle.resize(block.items);
-    phase.resize(block.items);
-    for (int64_t i = 0; i < std::min(block.items, job.pixels); ++i) {
-        if (block.stop->load(std::memory_order_relaxed)) return;
-        const int64_t pixel = job.pixel(block.first_item + i);
-        const Photons photons(job, pulse, pixel);
-        const bool gaps = gaps_are_near(photons.total(), photons.least(job.dead_time, shape), job.dead_time);
-        std::optional<StationaryState> state;
-        if (!gaps) {
-            state.emplace(photons_on_grid(job, shape, pixel), job.dead_time);
-            state->check(job.pixel_index[pixel]);
-        }
-        for (int64_t k = i; k < block.items; k += job.pixels) {  // realizations of this pixel
-            const Pair<uint32_t> key =
-                stream_key(job.seed, job.realization(block.first_item + k), job.pixel_index[pixel]);
-            const double residual = gaps ? search.residual(photons.total(), job.dead_time, key, photons)
-                                         : state->residual(start_uniform(key));
-            const double whole = std::floor(residual);
-            const float fraction = static_cast<float>(residual - whole);
-            cycle[k] = static_cast<int32_t>(whole) - (gaps ? 0 : ahead) + (fraction >= 1.0f ? 1 : 0);
-            phase[k] = fraction >= 1.0f ? 0.0f : fraction;
-        }
-    }
 }
 
 // Cuts a job into blocks of consecutive items and runs them.
 void run_exact(const BoundJob& job, const PulseTable& pulse, ExactBlock proto, int threads, const std::string& level,
                const nb::object& progress) {
-    const ExactKernel kernel = kernel_of(level);
+    const ExactKernel kernel = kernel_of(level, job.mode);
     proto.job = &job;
     proto.pulse = &pulse;
     const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));

@@ -1,4 +1,5 @@
-// The exact engine's inner loop, one function per vector level (exact_kernel.cpp is compiled once for each).
+// The exact engine's inner loop, two functions per vector level (exact_kernel.cpp and exact_modes_kernel.cpp are
+// compiled once for each): free-running pixels, and all other modes.
 #pragma once
 #include <atomic>
 #include <cstdint>
@@ -33,15 +34,19 @@ using ExactKernel = void (*)(const ExactBlock&);
 
 #ifdef MARS_HAS_scalar
 void exact_kernel_scalar(const ExactBlock& block);
+void exact_modes_kernel_scalar(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_vector128
 void exact_kernel_vector128(const ExactBlock& block);
+void exact_modes_kernel_vector128(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_avx2
 void exact_kernel_avx2(const ExactBlock& block);
+void exact_modes_kernel_avx2(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_avx512
 void exact_kernel_avx512(const ExactBlock& block);
+void exact_modes_kernel_avx512(const ExactBlock& block);
 #endif
 
 }  // namespace mars

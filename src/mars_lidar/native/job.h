@@ -4,6 +4,16 @@
 
 namespace mars {
 
+// When a pixel registers an arrival (docs/detectors.md).
+enum class DetectorMode : int32_t { kNonparalyzable, kParalyzable, kSynchronous, kGated };
+
+// The open part of each period: arrivals outside of it do not exist. In period n it is [s, s + width) round the
+// period, s = start + step * floor(n / cycles); start and step in [0, 1).
+struct Gate {
+    double start = 0.0, width = 1.0, step = 0.0;
+    int32_t cycles = 1;
+};
+
 struct Job {
     int64_t pixels = 0;
     int64_t returns = 0;       // 0 with a waveform
@@ -14,6 +24,8 @@ struct Job {
     int32_t bins = 1;
     double dead_time = 0.0;
     bool stationary = false;   // warmed up at t = 0, else armed
+    DetectorMode mode = DetectorMode::kNonparalyzable;
+    Gate gate;                 // of kGated
     const double* signal = nullptr;       // (returns, pixels)
     const double* delay = nullptr;        // (returns, pixels), finite, any number of periods
     const double* background = nullptr;   // (pixels)

@@ -13,7 +13,8 @@ void bind_job(nb::module_& module) {
             [](BoundJob* self, Matrix<const double> signal, Matrix<const double> delay,
                Vector<const double> background, std::optional<Matrix<const double>> waveform,
                Vector<const uint32_t> pixel_index, int64_t realizations, uint32_t first_realization,
-               uint64_t seed, int32_t cycles, int32_t bins, double dead_time, bool stationary) {
+               uint64_t seed, int32_t cycles, int32_t bins, double dead_time, bool stationary, int32_t mode,
+               double gate_start, double gate_width, double gate_step, int32_t gate_cycles) {
                 const size_t pixels = background.shape(0);
                 if (signal.shape(1) != pixels || delay.shape(0) != signal.shape(0) || delay.shape(1) != pixels ||
                     pixel_index.shape(0) != pixels || (waveform && waveform->shape(0) != pixels))
@@ -28,6 +29,8 @@ void bind_job(nb::module_& module) {
                 self->bins = bins;
                 self->dead_time = dead_time;
                 self->stationary = stationary;
+                self->mode = static_cast<DetectorMode>(mode);
+                self->gate = {gate_start, gate_width, gate_step, gate_cycles};
                 self->signal = signal.data();
                 self->delay = delay.data();
                 self->background = background.data();
@@ -39,7 +42,8 @@ void bind_job(nb::module_& module) {
             nb::kw_only(), nb::arg("signal"), nb::arg("delay"), nb::arg("background"),
             nb::arg("waveform").none(), nb::arg("pixel_index"), nb::arg("realizations"),
             nb::arg("first_realization"), nb::arg("seed"), nb::arg("cycles"), nb::arg("bins"),
-            nb::arg("dead_time"), nb::arg("stationary"))
+            nb::arg("dead_time"), nb::arg("stationary"), nb::arg("mode") = 0, nb::arg("gate_start") = 0.0,
+            nb::arg("gate_width") = 1.0, nb::arg("gate_step") = 0.0, nb::arg("gate_cycles") = 1)
         .def_prop_ro("items", [](const BoundJob& self) { return self.items(); });
 }
 

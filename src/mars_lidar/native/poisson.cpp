@@ -46,6 +46,10 @@ public:
     void set(const PulseShape& pulse, int64_t pixel) {
         for (const int32_t bin : lit) signal[bin] = 0.0;
         lit.clear();
+        if (job_.mode == DetectorMode::kGated) {
+            set_gated(pulse, pixel);
+            return;
+        }
         background = job_.background[pixel] / job_.bins * job_.cycles;
         for (int64_t k = 0; k < job_.returns; ++k) {
             const double photons = job_.signal[k * job_.pixels + pixel] * job_.cycles;
@@ -81,6 +85,43 @@ private:
             from = to;
             if (++bin == job_.bins) bin = 0;
         }
+    }
+
+    // Behind a gate nothing is uniform: all photons are in `signal`, bin by bin.
+    void set_gated(const PulseShape& pulse, int64_t pixel) {
+        const double end = job_.gate.start + job_.gate.width, bins = job_.bins;
+        background = 0.0;
+        const double parts[2][2] = {{job_.gate.start, std::min(end, 1.0)}, {0.0, std::max(0.0, end - 1.0)}};
+        for (const auto& [opens, closes] : parts) {
+            for (int32_t bin = static_cast<int32_t>(opens * bins); bin < job_.bins; ++bin) {
+                const double from = std::max(opens, bin / bins), to = std::min(closes, (bin + 1) / bins);
+                if (bin / bins >= closes) break;
+                if (from < to) add(bin, photons_between(pulse, pixel, from, to) * job_.cycles);
+            }
+        }
+    }
+
+    // Photons of one period in [from, to), 0 <= from <= to <= 1.
+    double photons_between(const PulseShape& pulse, int64_t pixel, double from, double to) const {
+        double photons = job_.background[pixel] * (to - from);
+        for (int64_t k = 0; k < job_.returns; ++k) {
+            const double all = job_.signal[k * job_.pixels + pixel];
+            if (!(all > 0.0)) continue;
+            double phase = job_.delay[k * job_.pixels + pixel];
+            phase -= std::floor(phase);
+            // the pulses of all periods that reach into this one
+            for (double at = phase + std::floor(from - phase - pulse.high()); at + pulse.low() < to; at += 1.0) {
+                if (at + pulse.high() <= from) continue;
+                photons += all * (pulse.gaussian() ? gaussian_energy(from - at, to - at, pulse.sigma)
+                                                   : pulse.cumulative(to - at) - pulse.cumulative(from - at));
+            }
+        }
+        if (!job_.waveform) return photons;
+        const double samples = static_cast<double>(job_.samples);
+        for (int64_t i = static_cast<int64_t>(from * samples); i < job_.samples && i / samples < to; ++i)
+            photons += job_.waveform[pixel * job_.samples + i] *
+                       std::max(0.0, std::min(to * samples, i + 1.0) - std::max(from * samples, i + 0.0));
+        return photons;
     }
 
     // In units of 1 / (samples * bins) period, sample i covers [i bins, (i + 1) bins) and bin j

@@ -34,8 +34,16 @@ struct PulseView {
     int32_t guides, last_early, last_late, octave_shift, octave_base;
 };
 
+// Positions of the gate in units of 2^-64 period, which add up and wrap exactly.
+struct GateView {
+    uint64_t start, step;
+    float width;
+    uint32_t cycles;  // periods at each position
+};
+
 struct SystemView {
     PulseView pulse;
+    GateView gate;
     int32_t cycles, bins, returns;
     int32_t dead_whole;   // dead time: whole periods ...
     float dead_fraction;  // ... and the rest

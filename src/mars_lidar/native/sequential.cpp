@@ -5,11 +5,11 @@
 // its nature; otherwise as fast as we know how. Written apart from the exact engine, see arrivals.h.
 #include <stdexcept>
 
-#include "arrivals.h"
 #include "bindings.h"
 #include "histogram_output.h"
 #include "parallel.h"
 #include "pulse_table.h"  // nanobind wants the complete type; only the shape inside is used
+#include "sequential_pixel.h"
 
 namespace mars {
 namespace {
@@ -25,55 +25,8 @@ constexpr double kChunkPhotons = 1 << 20;  // some 20 ms of work
 constexpr double kSettle = 256.0;
 constexpr double kSpread = 64.0;
 
-// A time as a whole cycle and a phase in units of 2^-52 period: as fine after 5e8 cycles as at the start.
-struct Time {
-    int64_t cycle;
-    uint64_t phase;
-
-    Time plus(double periods) const {
-        const double whole = std::floor(periods);
-        const uint64_t sum = phase + static_cast<uint64_t>(static_cast<int64_t>((periods - whole) * 0x1p52));
-        return {cycle + static_cast<int64_t>(whole) + static_cast<int64_t>(sum >> kPhaseBits),
-                sum & kPhaseMask};
-    }
-    Time plus(const Time& other) const {
-        const uint64_t sum = phase + other.phase;
-        return {cycle + other.cycle + static_cast<int64_t>(sum >> kPhaseBits), sum & kPhaseMask};
-    }
-    // In the units of a block that starts at cycle `start`; beyond every arrival if later than the block.
-    uint64_t after(int64_t start) const {
-        if (cycle < start) return 0;
-        if (cycle - start >= kMaxBlockCycles) return UINT64_MAX;
-        return static_cast<uint64_t>(cycle - start) << kPhaseBits | phase;
-    }
-};
-
-// One pixel of a non-paralyzable free-running detector.
-class Pixel {
-public:
-    explicit Pixel(double dead_time) : dead_time_(Time{0, 0}.plus(dead_time)) {}
-
-    Time ready{0, 0};  // armed from here on
-
-    // Passes the sorted arrivals of a block; calls registered(cycle, phase) for each that is seen. After a
-    // registration at T the pixel is blind on (T, T + dead time).
-    template <class Registered>
-    void pass(const std::vector<uint64_t>& times, int64_t start, const Registered& registered) {
-        uint64_t earliest = ready.after(start);
-        for (const uint64_t time : times) {
-            if (time < earliest) continue;
-            const Time now{start + static_cast<int64_t>(time >> kPhaseBits), time & kPhaseMask};
-            registered(now.cycle, phase_of(time));
-            ready = now.plus(dead_time_);
-            earliest = ready.after(start);
-        }
-    }
-
-private:
-    Time dead_time_;
-};
-
 // One item (a pixel in a realization) after the other; one of these per thread and chunk.
+template <class Pixel>
 class Simulator {
 public:
     Simulator(const Job& job, const PulseShape& pulse, const std::atomic<bool>& stop)
@@ -87,7 +40,7 @@ public:
         Arrivals arrivals(job_, pulse_, index);
         if (arrivals.photons_per_period() == 0.0) return;
         Xoshiro256 random(job_.seed, job_.realization(item), job_.pixel_index[index]);
-        Pixel pixel(job_.dead_time);
+        Pixel pixel(job_);
         if (job_.stationary && job_.dead_time > 0.0) warm_up(arrivals, random, pixel);
         const int64_t block = arrivals.block_cycles(kBlockPhotons);
         for (int64_t start = 0; start < job_.cycles && !stop_.load(std::memory_order_relaxed);
@@ -111,12 +64,23 @@ private:
     // and where phases drift slowly (a bright pulse, hardly any background, a dead time just short of a whole
     // number of periods) the memory of more than kSettle dead times.
     void warm_up(Arrivals& arrivals, Xoshiro256& random, Pixel& pixel) {
+        if constexpr (Pixel::kForgets) {  // nothing before the last dead time matters
+            const int64_t enough = static_cast<int64_t>(job_.dead_time) + 2;
+            const int64_t block = arrivals.block_cycles(kBlockPhotons);
+            for (int64_t start = -enough; start < 0 && !stop_.load(std::memory_order_relaxed); start += block) {
+                const int64_t cycles = std::min(block, -start);
+                draw(arrivals, cycles, random);
+                pixel.pass(times_, start, [](int64_t, double) {});
+            }
+            return;
+        }
         const double length = (job_.dead_time + 1.0) * (kSettle + kSpread * random.uniform());
         pixel.ready = Time{0, 0}.plus(-length);
         int64_t start = pixel.ready.cycle;
         const double x = arrivals.photons_per_period() * job_.dead_time;
         if (random.uniform() * (1.0 + x) < x)
             pixel.ready = pixel.ready.plus(random.uniform() * job_.dead_time);
+        pixel.ready = pixel.armed(pixel.ready);
         const int64_t block = arrivals.block_cycles(kWarmUpBlockPhotons);
         while (!stop_.load(std::memory_order_relaxed)) {
             start = std::max(start, pixel.ready.cycle);  // what arrives while blind changes nothing
@@ -141,8 +105,8 @@ private:
 };
 
 // Calls work(simulator, item, stop) for all items, in chunks of about equal work.
-template <class Work>
-void for_items(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
+template <class Pixel, class Work>
+void for_pixels(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
                const Work& work) {
     double photons = 0.0;
     const int64_t looks = std::min<int64_t>(job.pixels, 64);  // a sample of the image will do
@@ -154,10 +118,21 @@ void for_items(const Job& job, const PulseShape& pulse, int threads, const nb::o
     const int64_t items = job.items();
     run_chunks(
         (items + size - 1) / size, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-            Simulator simulator(job, pulse, stop);
+            Simulator<Pixel> simulator(job, pulse, stop);
             for (int64_t item = chunk * size; item < std::min(items, (chunk + 1) * size) && !stop; ++item)
                 work(simulator, item, stop);
         });
+}
+
+template <class Work>
+void for_items(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
+               const Work& work) {
+    switch (job.mode) {
+        case DetectorMode::kNonparalyzable: return for_pixels<FreePixel>(job, pulse, threads, progress, work);
+        case DetectorMode::kParalyzable: return for_pixels<ParalyzablePixel>(job, pulse, threads, progress, work);
+        case DetectorMode::kSynchronous: return for_pixels<SynchronousPixel>(job, pulse, threads, progress, work);
+        case DetectorMode::kGated: return for_pixels<GatedPixel>(job, pulse, threads, progress, work);
+    }
 }
 
 inline int32_t bin_of(double phase, int32_t bins) {
@@ -170,7 +145,7 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
     check_histogram(job, out);
     Count* const cube = out.data();
     for_items(job, shape_of(pulse), threads, progress,
-              [&](Simulator& simulator, int64_t item, const std::atomic<bool>&) {
+              [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
                   Count* const row = cube + item * job.bins;
                   std::fill_n(row, job.bins, Count{0});
                   simulator.run(item, [&](int64_t, double phase) {
@@ -186,7 +161,7 @@ void counts(const BoundJob& job, const PulseTable& pulse, Vector<int64_t> out, i
         throw nb::value_error("out must have one count per item");
     int64_t* const total = out.data();
     for_items(job, shape_of(pulse), threads, progress,
-              [&](Simulator& simulator, int64_t item, const std::atomic<bool>&) {
+              [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
                   int64_t count = 0;
                   simulator.run(item, [&](int64_t, double) { ++count; });
                   total[item] = count;
@@ -202,7 +177,7 @@ void timestamps(const BoundJob& job, const PulseTable& pulse, Vector<const int64
         cycle.shape(0) != total || bin.shape(0) != total)
         throw nb::value_error("offsets must have items + 1 values, and the other arrays offsets[-1]");
     for_items(job, shape_of(pulse), threads, progress,
-              [&](Simulator& simulator, int64_t item, const std::atomic<bool>& stop) {
+              [&](auto& simulator, int64_t item, const std::atomic<bool>& stop) {
                   int64_t k = offset[item];
                   const int64_t end = offset[item + 1];
                   simulator.run(item, [&](int64_t c, double phase) {

@@ -50,7 +50,6 @@ public:
                                      " did not converge; use start='armed'");
     }
 
-private:
     // 1 - e^-l without libm: a series for small l, else repeated squaring of e^-(l/2^k).
     static double one_minus_exp(double l) {
         if (l > 40.0) return 1.0;
@@ -66,6 +65,7 @@ private:
         return p;
     }
 
+private:
     // One sweep round the circle: h is replaced by what follows from it.
     void sweep(std::vector<double>& h) const {
         const int64_t n = static_cast<int64_t>(h.size());

@@ -5,15 +5,18 @@
 // same bits on every machine.
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <stdexcept>
 #include <vector>
 
 #include "backward.h"
 #include "bindings.h"
+#include "mode_start.h"
 #include "parallel.h"
 #include "random.h"
 #include "registration.h"
 #include "stationary.h"
+#include "waveform_modes.h"
 
 namespace mars {
 namespace {
@@ -53,9 +56,10 @@ public:
         return x < 1.0 ? x : std::nextafter(1.0, 0.0);
     }
 
-    std::vector<double> photons() const {
-        // at least 1024 parts, a whole number of them in each sample
-        const int64_t split = std::max<int64_t>(1, 1024 / samples_);
+    // In at least 1024 parts, or `least` up to 16384; a whole number of them in each sample.
+    std::vector<double> photons(double least) const {
+        const int64_t wanted = static_cast<int64_t>(std::min(std::max(least, 1024.0), 16384.0));
+        const int64_t split = std::max<int64_t>(1, wanted / samples_);
         std::vector<double> parts;
         parts.reserve(samples_ * split);
         for (int64_t j = 0; j < samples_; ++j)
@@ -69,29 +73,60 @@ private:
     std::vector<int64_t> guide_;
 };
 
+// What a pixel that has been running for long is doing at the start of a period; null pointers: armed.
+struct WarmedUp {
+    std::unique_ptr<StationaryState> blind;
+    std::unique_ptr<SynchronousStart> synchronous;
+    int64_t cycle = 0;  // at which that is
+    bool gaps = false;  // drawn from the arrivals before the exposure
+
+    WarmedUp(const Job& job, const Waveform& wave, uint32_t pixel) {
+        if (!job.stationary || !(job.dead_time > 0.0)) return;
+        const double dead = job.dead_time;
+        if (job.mode == DetectorMode::kParalyzable) {
+            cycle = -paralyzable_warm_up(dead, wave.total());
+        } else if (job.mode == DetectorMode::kSynchronous) {
+            const double early = wave.energy(1.0 - (dead - std::floor(dead)));
+            synchronous = std::make_unique<SynchronousStart>(dead, wave.total(), early);
+        } else {
+            if (job.mode == DetectorMode::kNonparalyzable && gaps_are_near(wave.total(), wave.total() * dead, dead)) {
+                gaps = true;
+                return;
+            }
+            std::vector<double> photons = wave.photons(job.mode == DetectorMode::kGated ? 64.0 / job.gate.width : 0.0);
+            if (job.mode == DetectorMode::kGated)
+                apply_gate(job.gate, photons,
+                           [&](double a, double b) { return wave.energy(b) - wave.energy(a); });
+            cycle = -static_cast<int64_t>(dead) - 2;
+            blind = std::make_unique<StationaryState>(photons, dead);
+            blind->check(pixel);
+        }
+    }
+
+    Instant draw(double u) const {
+        if (!blind) return {cycle + (synchronous ? synchronous->periods(u) : 0), 0.0};
+        const double residual = blind->residual(u);
+        return {cycle + static_cast<int64_t>(residual), residual - std::floor(residual)};
+    }
+};
+
 // Walks through the registrations of one item; write(cycle, phase) for those inside the exposure.
-template <class Write>
-void walk(const Job& job, const Waveform& wave, const StationaryState* state, uint32_t realization, uint32_t pixel,
-          const std::atomic<bool>& stop, Write write) {
+template <class Mode, class Write>
+void walk(const Job& job, const Waveform& wave, Mode mode, const WarmedUp& state, uint32_t realization,
+          uint32_t pixel, const std::atomic<bool>& stop, Write write) {
     const double total = wave.total();
     if (!(total >= 1e-30)) return;
     const Pair<uint32_t> key = stream_key(job.seed, realization, pixel);
     auto draw = [&](uint32_t event, uint32_t stage) {
         return threefry<13, uint32_t>(event, stage, key.first, key.second);
     };
-    const int64_t dead_whole = static_cast<int64_t>(job.dead_time);
-    const double dead_fraction = job.dead_time - static_cast<double>(dead_whole);
-    int64_t cycle = 0;
-    double phase = 0.0;
-    if (job.stationary && job.dead_time > 0.0) {
-        // as for pulses, see draw_starts in exact.cpp
-        auto place = [&](uint32_t, const Pair<uint32_t>& words) {
-            return wave.phase((words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32 * total);
-        };
-        const double residual = state ? state->residual(start_uniform(key))
-                                      : GapSearch().residual(total, job.dead_time, key, place);
-        cycle = static_cast<int64_t>(residual) - (state ? dead_whole + 2 : 0);
-        phase = residual - std::floor(residual);
+    Instant from{};
+    if (state.gaps) {
+        auto place = [&](uint32_t, const Pair<uint32_t>& words) { return wave.phase(unit(words) * total); };
+        const double residual = GapSearch().residual(total, job.dead_time, key, place), periods = std::floor(residual);
+        from = {static_cast<int64_t>(periods), residual - periods};
+    } else {
+        from = state.draw(start_uniform(key));
     }
     for (uint32_t event = 0;; ++event) {
         if ((event & 0xffff) == 0xffff && stop.load(std::memory_order_relaxed)) return;
@@ -104,27 +139,20 @@ void walk(const Job& job, const Waveform& wave, const StationaryState* state, ui
             const double v = (words.second + 0.5) * 0x1p-32;
             fraction = v - 0.5 * total * v * (1.0 - v) * (1.0 - total * (1.0 - 2.0 * v) / 3.0);
         }
-        cycle += static_cast<int64_t>(whole);
-        double energy = wave.energy(phase) + fraction * total;
+        double energy = wave.energy(from.phase) + fraction * total;
         const bool carry = energy >= total;
         if (carry) energy -= total;
         const double arrival = wave.phase(std::max(0.0, std::min(energy, total)));
-        phase = carry ? arrival : std::max(arrival, phase);  // rounding must not turn time back
-        cycle += carry ? 1 : 0;
-        if (cycle >= job.cycles) return;
-        if (cycle >= 0) write(static_cast<int32_t>(cycle), phase);
-        phase += dead_fraction;
-        cycle += dead_whole;
-        if (phase >= 1.0) {
-            phase -= 1.0;
-            ++cycle;
-        }
+        const Instant hit = {from.cycle + static_cast<int64_t>(whole) + (carry ? 1 : 0),
+                             carry ? arrival : std::max(arrival, from.phase)};  // rounding must not turn time back
+        if (hit.cycle >= job.cycles) return;
+        if (mode(hit, from) && hit.cycle >= 0) write(static_cast<int32_t>(hit.cycle), hit.phase);
     }
 }
 
 // Runs over the pixels of a job; make(item) gives the writer of an item.
-template <class Make>
-void run_waveform(const BoundJob& job, int threads, const nb::object& progress, const Make& make) {
+template <class Mode, class Make>
+void run_mode(const BoundJob& job, int threads, const nb::object& progress, const Make& make) {
     const int64_t pixels = std::max<int64_t>(1, std::min<int64_t>(64, job.pixels / (4 * std::max(threads, 1))));
     const int64_t across = (job.pixels + pixels - 1) / pixels;
     const int64_t realizations = std::max<int64_t>(1, 256 / pixels);
@@ -134,20 +162,24 @@ void run_waveform(const BoundJob& job, int threads, const nb::object& progress, 
         const int64_t begin = (chunk / across) * realizations, end = std::min(job.realizations, begin + realizations);
         for (int64_t pixel = first; pixel < last; ++pixel) {
             const Waveform wave(job, pixel);
-            std::vector<StationaryState> state;
-            const double total = wave.total();
-            if (job.stationary && job.dead_time > 0.0 && !gaps_are_near(total, total * job.dead_time, job.dead_time)) {
-                state.emplace_back(wave.photons(), job.dead_time);
-                state.front().check(job.pixel_index[pixel]);
-            }
+            const WarmedUp state(job, wave, job.pixel_index[pixel]);
             for (int64_t r = begin; r < end; ++r) {
                 if (stop.load(std::memory_order_relaxed)) return;
-                walk(job, wave, state.empty() ? nullptr : state.data(),
-                     job.first_realization + static_cast<uint32_t>(r), job.pixel_index[pixel], stop,
-                     make(r * job.pixels + pixel));
+                walk(job, wave, Mode(job), state, job.first_realization + static_cast<uint32_t>(r),
+                     job.pixel_index[pixel], stop, make(r * job.pixels + pixel));
             }
         }
     });
+}
+
+template <class Make>
+void run_waveform(const BoundJob& job, int threads, const nb::object& progress, const Make& make) {
+    switch (job.mode) {
+        case DetectorMode::kNonparalyzable: return run_mode<FreeRunning>(job, threads, progress, make);
+        case DetectorMode::kParalyzable: return run_mode<ParalyzableMode>(job, threads, progress, make);
+        case DetectorMode::kSynchronous: return run_mode<SynchronousMode>(job, threads, progress, make);
+        case DetectorMode::kGated: return run_mode<GatedMode>(job, threads, progress, make);
+    }
 }
 
 int32_t bin_of(const Job& job, double phase) {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -72,7 +73,7 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
 
 
 def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
-    """Photons per period in each bin (bins,) that reach pixel (y, x), before dead time."""
+    """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
     background = np.full(system.bins, flux.background[y, x] / system.bins)
     if flux.waveform is not None:
         wave = flux.waveform[y, x]
@@ -90,18 +91,22 @@ def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.floa
 def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
     """Mean histogram (bins,) of pixel (y, x) over many exposures, by the exact finite-exposure statistics.
 
-    None where that takes too long for a picture, or does not converge. The engine "poisson" has no dead time:
-    its mean is the incident rate.
+    None where that takes too long for a picture, does not converge, or is not known: behind a gate that moves. The
+    engine "poisson" has no dead time: its mean is the incident rate, inside of the gate.
     """
     system, flux = cube.system, cube.flux
-    if cube.engine == "poisson":
-        return incident_rate(flux, system, y, x) * system.cycles
-    if system.cycles > _PREDICTED_CYCLES:
+    if system.detector.gate_moves:
         return None
-    from mars_lidar.statistics import ConvergenceError, exposure_moments
+    if cube.engine == "poisson" and system.detector.mode != "gated":
+        return incident_rate(flux, system, y, x) * system.cycles
+    if system.cycles > _PREDICTED_CYCLES and system.detector.mode in ("nonparalyzable", "gated"):
+        return None
+    if cube.engine == "poisson":
+        system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))
+    from mars_lidar.statistics import ConvergenceError, mean_histogram
 
     try:
-        return exposure_moments(system=system, **law_arguments(flux, system, y, x)).histogram
+        return mean_histogram(system=system, **law_arguments(flux, system, y, x))
     except ConvergenceError:
         return None
 

@@ -5,8 +5,10 @@ from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewa
 from mars_lidar.statistics.chain import PhaseChain, Stationary
 from mars_lidar.statistics.exposure import Exposure, exposure_moments
 from mars_lidar.statistics.grid import photons_per_bin
+from mars_lidar.statistics.histogram import mean_histogram
 from mars_lidar.statistics.joint import JointLaw, joint_law
 from mars_lidar.statistics.law import CountLaw, count_law, registration_pdf
+from mars_lidar.statistics.paralyzable import ParalyzableMoments, paralyzable_moments
 from mars_lidar.statistics.renewal import (
     HoldingTimes,
     MomentMatrices,
@@ -24,6 +26,7 @@ __all__ = [
     "HoldingTimes",
     "JointLaw",
     "MomentMatrices",
+    "ParalyzableMoments",
     "PhaseChain",
     "Stationary",
     "count_law",
@@ -32,7 +35,9 @@ __all__ = [
     "holding_times",
     "joint_law",
     "mars_moments",
+    "mean_histogram",
     "moment_matrices",
+    "paralyzable_moments",
     "photons_per_bin",
     "poisson_moments",
     "poisson_pmf",

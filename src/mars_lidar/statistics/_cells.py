@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar.detector import Mode
+from mars_lidar.statistics._gate import PLAIN, photons_before, require_mode
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
@@ -53,10 +55,16 @@ class Cells:
         *,
         delay_ns: ArrayLike | None = None,
         waveform: ArrayLike | None = None,
+        what: str = "this statistic",
+        modes: tuple[Mode, ...] = PLAIN,
     ) -> Cells:
-        """Check the arguments and broadcast them; `waveform` (..., T) broadcasts over its leading axes."""
+        """Check the arguments and broadcast them; `waveform` (..., T) broadcasts over its leading axes.
+
+        `what` is computed from the cells, and treats `modes` of the detector.
+        """
         if not isinstance(system, System):
             raise TypeError(f"system must be a System, got {type(system).__name__}")
+        require_mode(what, system, modes)
         back = _photons("background", background)
         if waveform is not None:
             if signal is not None or delay_ns is not None:
@@ -94,6 +102,22 @@ class Cells:
         """Number of cells."""
         return self.signal.size
 
+    @property
+    def native_flux(self) -> tuple[FloatArray, FloatArray]:
+        """Photons (cells,) of the shapes of `energies`, and of a flat background, as the native core adds them.
+
+        Behind a gate nothing is flat: all is in the shapes.
+        """
+        if self.system.detector.mode != "gated":
+            return self.signal, self.background
+        total = photons_before(self, np.ones(1))[:, 0]
+        return total, np.zeros_like(total)
+
+    @property
+    def total(self) -> FloatArray:
+        """Photons per period (cells,), inside of the gate if there is one."""
+        return np.asarray(sum(self.native_flux), dtype=np.float64)
+
     def part(self, index: IndexArray | slice) -> Cells:
         """Some of the cells, flat."""
         signal = self.signal[index]
@@ -120,6 +144,8 @@ class Cells:
             sharpness = probe * float(np.sum(energy**2))
         else:
             sharpness = self.waveform.shape[-1] * float(np.max(np.sum(self.waveform**2, -1)))
+        gate_width = self.system.detector.gate_periods(self.system.period_ns)[2]
+        sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / _MAX_FIRST_BINS))
         wanted = min(max(_MIN_BINS, _BINS_PER_WIDTH * sharpness), _MAX_FIRST_BINS)
         step = out_bins if out_bins % 2 == 0 else 2 * out_bins
         return step * math.ceil(wanted / step)
@@ -154,7 +180,7 @@ class Cells:
     def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:
         """Parts whose energies on the grid, and histograms, fit in a moderate amount of memory."""
         per_cell = 8 * (4 * bins + 2 * out_bins)
-        if self.waveform is None and np.unique(self.delay).size == 1:
+        if self.waveform is None and np.unique(self.delay).size == 1 and self.system.detector.mode != "gated":
             per_cell = 16 * out_bins + 128
         step = max(64, _CHUNK_BYTES // per_cell)
         for start in range(0, self.size, step):
@@ -175,6 +201,10 @@ class Cells:
         from mars_lidar import _core
 
         parts = bins * int(_core.EXPOSURE_PARTS)
+        if self.system.detector.mode == "gated":
+            before = photons_before(self, np.arange(parts + 1) / parts)
+            unit = np.diff(before) / np.maximum(before[:, -1:], np.finfo(float).tiny)
+            return np.ascontiguousarray(np.maximum(unit, 0.0)), np.arange(self.size, dtype=np.int32)
         if self.waveform is None:
             delays, rows = np.unique(self.delay, return_inverse=True)
             energy = self.system.pulse.bin_energy(

@@ -94,7 +94,7 @@ def _supports(
     dead = cells.system.dead_time_periods
     growth = np.maximum(
         _MAX_LOG_GROWTH / (1.0 + 1.0 / dead),
-        np.log1p(_MAX_LOG_GROWTH / np.maximum(cells.signal + cells.background, 1e-300)),
+        np.log1p(_MAX_LOG_GROWTH / np.maximum(cells.total, 1e-300)),
     )
     tilt = _TILTS / np.maximum(spread, 1e-300)[:, None]
     tilt = np.minimum(tilt, np.minimum(growth, _MAX_TILT)[:, None])
@@ -140,12 +140,13 @@ def _characteristic(
     from mars_lidar import _core
 
     energy, row = cells.energies(bins)
+    photons, flat = cells.native_flux
     re, im = np.empty(z_re.shape), np.empty(z_re.shape)
     settled = np.empty(z_re.shape, np.int64)
     _core.exposure_characteristic(
         grid=cells.grid(bins, 1),
-        signal=cells.signal,
-        background=cells.background,
+        signal=photons,
+        background=flat,
         shape=row,
         shapes=energy,
         tilted=z_im is None,

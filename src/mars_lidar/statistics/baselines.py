@@ -11,9 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar.detector import MODES
+from mars_lidar.statistics._gate import require_mode
 from mars_lidar.system import System
 
 FloatArray = NDArray[np.float64]
+
+_WITHOUT_GATE = MODES[:3]  # what is inside of a gate depends on the delay, which these do not know
 
 
 def poisson_moments(
@@ -24,6 +28,7 @@ def poisson_moments(
     `signal` and `background` are S and B in photons per period, scalars or arrays that broadcast; the results
     have the broadcast shape.
     """
+    require_mode("poisson_moments", system, _WITHOUT_GATE)
     mean = system.cycles * _total(signal, background)
     return mean, mean.copy()
 
@@ -32,6 +37,7 @@ def poisson_pmf(signal: ArrayLike, background: ArrayLike, system: System, suppor
     """Probability of each count in `support` (k,) without dead time: (..., k), leading axes those of S, B."""
     from scipy.special import gammaln, xlogy
 
+    require_mode("poisson_pmf", system, _WITHOUT_GATE)
     counts = _counts(support)
     mean = system.cycles * _total(signal, background)[..., None]
     return np.asarray(np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), dtype=np.float64)
@@ -56,6 +62,7 @@ def renewal_moments(
     tuple
         mean, variance: arrays of the broadcast shape.
     """
+    require_mode("renewal_moments", system)
     total = _total(signal, background)
     x = total * system.dead_time_periods
     mean = system.cycles * total / (1.0 + x)
@@ -83,6 +90,7 @@ def renewal_pmf(signal: ArrayLike, background: ArrayLike, system: System, suppor
     NDArray
         (..., k) probabilities; each to about 1e-13 absolute.
     """
+    require_mode("renewal_pmf", system)
     counts = _counts(support)
     rate = _total(signal, background)[..., None]
     below = _survival(counts, rate, system) - _survival(counts + 1.0, rate, system)

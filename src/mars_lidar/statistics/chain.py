@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar.statistics._feedback import ConvergenceError, Feedback, Solution, cyclic_recursion
+from mars_lidar.statistics._gate import require_mode
 from mars_lidar.statistics.grid import cell_name, photons_per_bin
 from mars_lidar.system import System
 
@@ -155,7 +156,8 @@ class PhaseChain:
         delay_ns: float | None = None,
         waveform: ArrayLike | None = None,
     ) -> PhaseChain:
-        """The chain of one pixel; arguments as `photons_per_bin`."""
+        """The chain of one pixel; arguments as `photons_per_bin`. For mode ``"nonparalyzable"`` only."""
+        require_mode("the chain of phases", system)
         photons = photons_per_bin(signal, background, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
         return cls(photons, system.dead_time_periods, rearm, cell_name(signal, background, system))
 

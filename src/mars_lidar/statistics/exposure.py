@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar.detector import Mode
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.system import System
 
 Progress = Callable[[int, int], object]
 
+_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")  # that the delay recursion treats
 _ORDERS = 4
 _MAX_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
 _UNSETTLED = -2  # the native core's code: gave up
@@ -107,11 +109,14 @@ def exposure_moments(
 
     Raises
     ------
-    ConvergenceError
-        Naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
+    ValueError, ConvergenceError
+        For a mode other than ``"nonparalyzable"`` and ``"gated"``; and
+        naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
         repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
     """
-    cells = Cells.of(signal, background, system, delay_ns=delay_ns, waveform=waveform)
+    cells = Cells.of(
+        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="exposure_moments", modes=_MODES
+    )
     return refined_moments(cells, system.bins, tolerance=tolerance, threads=threads, progress=progress)
 
 
@@ -211,10 +216,11 @@ def _run(cells: Cells, bins: int, out_bins: int, threads: int, progress: Progres
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
         energy, row = some.energies(bins)
+        photons, flat = some.native_flux
         _core.exposure_moments(
             grid=some.grid(bins, out_bins),
-            signal=some.signal,
-            background=some.background,
+            signal=photons,
+            background=flat,
             shape=row,
             shapes=energy,
             cumulants=result.cumulants[part],
@@ -244,10 +250,11 @@ def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatAr
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
         energy, row = some.energies(bins)
+        photons, flat = some.native_flux
         _core.exposure_stationary(
             grid=some.grid(bins, out_bins),
-            signal=some.signal,
-            background=some.background,
+            signal=photons,
+            background=flat,
             shape=row,
             shapes=energy,
             histogram=result[part],
@@ -306,8 +313,9 @@ def _poisson(cells: Cells, out_bins: int) -> Exposure:
         some = cells.part(part)
         energy, row = some.energies(step)
         energy = energy.reshape(energy.shape[0], out_bins, step // out_bins * parts).sum(-1)
-        result.histogram_rate[part] = some.signal[:, None] * energy[row] + some.background[:, None] / out_bins
-    result.cumulant_rates[:] = (cells.signal + cells.background)[:, None]
+        photons, flat = some.native_flux
+        result.histogram_rate[part] = photons[:, None] * energy[row] + flat[:, None] / out_bins
+    result.cumulant_rates[:] = cells.total[:, None]
     result.cumulants[:] = cells.system.cycles * result.cumulant_rates
     result.histogram[:] = cells.system.cycles * result.histogram_rate
     result.settled[:], result.bins[:] = 0, step

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
@@ -10,13 +11,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
+from mars_lidar.detector import MODES, Mode
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics._gate import PLAIN
 from mars_lidar.statistics._pmf import Window, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics.exposure import Exposure, refined_moments, stationary_histogram, thread_count
+from mars_lidar.statistics.histogram import mean_histograms
+from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 from mars_lidar.system import System
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
 _METHODS = ("exact", "mars", "renewal", "poisson")
+_LAW_MODES: dict[str, tuple[Mode, ...]] = {
+    "exact": ("nonparalyzable", "synchronous", "gated"),
+    "mars": PLAIN,
+    "renewal": PLAIN,
+    "poisson": MODES,
+}
 _SHAPES = ("exposure", "stationary", "chain")
 _REARMS = ("centre", "edge")
 
@@ -125,11 +136,12 @@ def count_law(
     system
         Laser, detector and histogram (whose bins do not matter here).
     method
-        - ``"exact"``: finite exposure, start and end included, any dead time (docs/theory_exposure.md),
+        - ``"exact"``: finite exposure, start and end included, any dead time (docs/theory_exposure.md); for
+          detectors of mode ``"nonparalyzable"``, ``"synchronous"`` and ``"gated"`` (docs/detectors.md),
         - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure,
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
-        - ``"poisson"``: no dead time.
+        - ``"poisson"``: no dead time, the law of the arrivals (inside of the gate) for every mode.
     delay_ns
         Delay of the return, ns; None: half the period. With ``"exact"`` an array may broadcast with S and B:
         an armed start makes the law depend on the delay.
@@ -150,14 +162,21 @@ def count_law(
     """
     _validate.choice("method", method, _METHODS)
     edge = _rearm(rearm, method == "mars", f"method {method!r}")
-    cells = Cells.of(signal, background, system, delay_ns=delay_ns, waveform=waveform)
+    cells = Cells.of(
+        signal, background, system, delay_ns=delay_ns, waveform=waveform,
+        what=f"count_law of method {method!r}", modes=_LAW_MODES[method],
+    )  # fmt: skip
     team = thread_count(threads)
+    if method == "exact" and system.detector.mode == "synchronous":
+        windows = synchronous_windows(cells)
+        found = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
+        return CountLaw(method, found, lambda: windows)
     if method == "exact":
         exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team)
         flat, bins = exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1)
         return CountLaw(method, exposure.cumulants, lambda: exact_windows(cells, flat, bins, team), exposure)
     if method == "poisson":
-        means = system.cycles * (cells.signal + cells.background)
+        means = system.cycles * cells.total
         cumulants = np.repeat(means[:, None], 4, axis=1).reshape(*cells.shape, 4)
         return CountLaw(method, cumulants, lambda: [poisson_window(float(m)) for m in means])
     mean, variance = _gaussian_moments(method, cells, edge)
@@ -191,7 +210,8 @@ def registration_pdf(
     method
         - ``"exposure"``: mean histogram of the finite exposure, which is what a measurement averages to,
         - ``"stationary"``: that of a pixel which has been running for long,
-        - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500).
+        - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500), for detectors
+          of mode ``"nonparalyzable"``; the others are for every mode (docs/detectors.md).
     rearm
         ``"centre"`` (default) or ``"edge"`` of the bin, for ``"chain"`` only.
 
@@ -203,14 +223,19 @@ def registration_pdf(
     """
     _validate.choice("method", method, _SHAPES)
     edge = _rearm(rearm, method == "chain", f"method {method!r}")
-    cells = Cells.of(signal, background, system, delay_ns=delay_ns, waveform=waveform)
-    if method == "exposure":
-        exposure = refined_moments(cells, system.bins, tolerance=tolerance, threads=threads)
-        shape = exposure.histogram.reshape(cells.size, system.bins)
-    elif method == "stationary":
-        shape = stationary_histogram(cells, system.bins, tolerance=tolerance, threads=threads)
-    else:
+    cells = Cells.of(
+        signal, background, system, delay_ns=delay_ns, waveform=waveform,
+        what=f"registration_pdf of method {method!r}", modes=PLAIN if method == "chain" else MODES,
+    )  # fmt: skip
+    if method == "chain":
         shape = _chain_shapes(cells, edge)
+    elif method == "exposure" or system.detector.mode == "synchronous":  # there the same at any time
+        shape = mean_histograms(cells, tolerance, threads)
+    elif system.detector.mode == "paralyzable":
+        warm = replace(cells, system=system.replace(start="stationary"))
+        shape = mean_histograms(warm, tolerance, threads)
+    else:
+        shape = stationary_histogram(cells, system.bins, tolerance=tolerance, threads=threads)
     total = shape.sum(-1, keepdims=True)
     dark = total == 0.0
     shape = np.where(dark, 1.0 / system.bins, shape / np.where(dark, 1.0, total))

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar.statistics._feedback import cyclic_recursion
+from mars_lidar.statistics._gate import require_mode
 from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
 from mars_lidar.statistics.grid import cell_name, default_bins, photons_per_bin
 from mars_lidar.system import System
@@ -223,6 +224,7 @@ def mars_moments(
     tuple
         mean, variance: arrays of the broadcast shape (0-d for scalars); 0, 0 where there is no flux.
     """
+    require_mode("mars_moments", system)
     _validate.choice("rearm", rearm, ("centre", "edge"))
     given = np.asarray(np.nan if signal is None else signal, dtype=np.float64)
     s, b = np.broadcast_arrays(given, np.asarray(background, dtype=np.float64))

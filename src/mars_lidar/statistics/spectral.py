@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar.statistics._gate import require_mode
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covariances, weighted_waits
 from mars_lidar.system import System
@@ -185,6 +186,7 @@ def holding_time_covariance(
     ConvergenceError
         Where a solution did not converge; the message names the cell.
     """
+    require_mode("holding_time_covariance", system)
     lags = _validate.integer("lags", lags, low=0, high=_MAX_LAGS)
     chain = PhaseChain.from_flux(
         signal, background, system, rearm=rearm, bins=bins, delay_ns=delay_ns, waveform=waveform

@@ -39,6 +39,12 @@ def _law(request: Request) -> list[Path]:
     return run(request)
 
 
+def _detectors(request: Request) -> list[Path]:
+    from mars_lidar.studies.detectors import run
+
+    return run(request)
+
+
 def _reference(request: Request) -> list[Path]:
     from mars_lidar.studies.reference import run
 
@@ -55,6 +61,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
     "joint": ("the histogram's covariance in closed form against simulation; --data adds reference cases", _joint),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
+    "detectors": ("what each mode of a detector does to the same flux, simulated and in closed form", _detectors),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
 }
 

@@ -1,0 +1,121 @@
+"""The detector pixel: dead time, when an arrival is registered, gate. Definitions: docs/detectors.md."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from mars_lidar import _validate
+
+Mode = Literal["nonparalyzable", "paralyzable", "synchronous", "gated"]
+MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "synchronous", "gated")
+
+_GATE = ("gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
+_MAX_GATE_CYCLES = 100_000_000
+_MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond it no digits are left
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detector:
+    """A single-photon detector pixel.
+
+    Parameters
+    ----------
+    dead_time_ns
+        After a registration the pixel is blind for this long, across period edges. 0, a fraction of the
+        laser period or many periods.
+    mode
+        - ``"nonparalyzable"``: free running; photons that arrive while the pixel is blind have no effect,
+        - ``"paralyzable"``: free running; every arrival, registered or not, begins the dead time anew, so that
+          an arrival is registered iff none came within the dead time before it,
+        - ``"synchronous"``: armed at the start of each laser period, registers the first photon and nothing
+          more until the next; a dead time that is not over at the start of a period costs that whole period,
+        - ``"gated"``: photons outside of the gate do not exist; inside, as ``"nonparalyzable"``. Where the gate
+          opens while the pixel is blind, the pixel is armed when its dead time is over.
+    gate_start_ns, gate_width_ns
+        The gate is open on [start, start + width) of each period; one that reaches beyond the end of the period
+        continues at its beginning. The start is taken modulo the period, the width is at most the period. Both
+        are needed by mode ``"gated"``; with the other modes all gate fields are None.
+    gate_step_ns
+        The start advances by this much (modulo the period, either sign) ...
+    gate_cycles
+        ... every so many periods, for a gate that is moved during the exposure. Default: 0 and 1, a gate that
+        stays.
+    """
+
+    dead_time_ns: float
+    mode: Mode = "nonparalyzable"
+    gate_start_ns: float | None = None
+    gate_width_ns: float | None = None
+    gate_step_ns: float | None = None
+    gate_cycles: int | None = None
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        set_field(self, "dead_time_ns", _validate.real("dead_time_ns", self.dead_time_ns, low=0.0))
+        _validate.choice("mode", self.mode, MODES)
+        if self.mode != "gated":
+            for name in _GATE:
+                if getattr(self, name) is not None:
+                    raise ValueError(
+                        f"{name} belongs to mode 'gated' and must be None with mode {self.mode!r}, "
+                        f"got {getattr(self, name)!r}"
+                    )
+            return
+        for name in ("gate_start_ns", "gate_width_ns"):
+            if getattr(self, name) is None:
+                raise ValueError(f"mode 'gated' needs {name}, in ns, got None")
+        set_field(
+            self,
+            "gate_start_ns",
+            _validate.real("gate_start_ns", self.gate_start_ns, low=-_MAX_GATE_NS, high=_MAX_GATE_NS),
+        )
+        set_field(
+            self, "gate_width_ns", _validate.real("gate_width_ns", self.gate_width_ns, low=0.0, strict_low=True)
+        )
+        step = 0.0 if self.gate_step_ns is None else self.gate_step_ns
+        set_field(
+            self, "gate_step_ns", _validate.real("gate_step_ns", step, low=-_MAX_GATE_NS, high=_MAX_GATE_NS)
+        )
+        cycles = 1 if self.gate_cycles is None else self.gate_cycles
+        set_field(self, "gate_cycles", _validate.integer("gate_cycles", cycles, low=1, high=_MAX_GATE_CYCLES))
+        if self.gate_cycles != 1 and self.gate_step_ns == 0.0:
+            raise ValueError(
+                "gate_cycles is the number of periods that a moving gate stays in place: give gate_step_ns too, "
+                f"got gate_cycles={self.gate_cycles} with gate_step_ns=0"
+            )
+
+    @property
+    def gate_moves(self) -> bool:
+        """Whether the gate is moved during the exposure."""
+        return bool(self.gate_step_ns)
+
+    def gate_periods(self, period_ns: float) -> tuple[float, float, float]:
+        """Start and step in [0, 1), and width in (0, 1], in laser periods; the whole period without a gate."""
+        if self.gate_start_ns is None or self.gate_width_ns is None or self.gate_step_ns is None:
+            return 0.0, 0.0, 1.0
+        start, step = self.gate_start_ns % period_ns / period_ns, self.gate_step_ns % period_ns / period_ns
+        return start % 1.0, step % 1.0, min(self.gate_width_ns / period_ns, 1.0)
+
+    def check(self, period_ns: float, start: str) -> None:
+        """Raise ValueError, naming the field, for what makes no sense at this laser period and start."""
+        if self.gate_width_ns is not None and self.gate_width_ns > period_ns * (1 + 1e-12):
+            raise ValueError(
+                f"gate_width_ns must be at most the laser period of {period_ns:g} ns, got {self.gate_width_ns:g}"
+            )
+        if self.gate_moves and start == "stationary":
+            raise ValueError(
+                "start must be 'armed' with a gate that moves, which has no stationary state, got 'stationary' "
+                f"with gate_step_ns={self.gate_step_ns:g}"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `Detector.from_dict` makes an equal detector; gate fields only where used."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Detector:
+        """The detector that `to_dict` described."""
+        names = tuple(field.name for field in dataclasses.fields(cls))
+        return cls(**_validate.known_keys("detector", data, names))

@@ -1,0 +1,229 @@
+// The exact engine's inner loop. Lanes work on different pixels; a lane whose exposure has ended takes the next
+// item of the block, so that dim and bright pixels do not wait for each other. The waits of the next registrations
+// are drawn ahead, because the chain from one registration to the next is what limits the speed. Compiled once for
+// each vector level, and for each mode of the detector, so that none pays for another.
+#pragma once
+#include <cstring>
+
+#include "detector_modes.h"
+#include "exact_kernel.h"
+#include "exact_writers.h"
+#include "pulse_view.h"
+
+#define MARS_JOIN2(a, b) a##b
+#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
+
+namespace mars {
+inline namespace MARS_LEVEL {
+namespace {
+
+constexpr int kMaxReturns = 16;
+constexpr int kAhead = 8;                    // registrations drawn ahead
+constexpr int kPollEvery = 512;              // rounds between looks at `stop`
+constexpr int32_t kIdleFrame = 100000001;    // every exposure has ended; + kAhead (kForever + t_d) fits 32 bits
+
+SystemView view(const Job& job, const PulseTable& pulse) {
+    SystemView system{};
+    system.pulse = pulse_view(pulse);
+    system.gate = gate_view(job.gate);
+    system.cycles = job.cycles;
+    system.bins = job.bins;
+    system.returns = static_cast<int32_t>(job.returns);
+    system.dead_whole = static_cast<int32_t>(job.dead_time);
+    system.dead_fraction = static_cast<float>(job.dead_time - system.dead_whole);
+    if (system.dead_fraction >= 1.0f) {
+        system.dead_whole += 1;
+        system.dead_fraction = 0.0f;
+    }
+    return system;
+}
+
+// Plain memory behind the lanes, for changing single lanes.
+struct RateArray {
+    float rate[kLanes], inverse[kLanes], never[kLanes];
+
+    void set(int lane, double photons) {
+        const float r = static_cast<float>(photons);
+        const bool dark = !(r >= 1e-30f);
+        rate[lane] = dark ? 0.0f : r;
+        inverse[lane] = dark ? 0.0f : 1.0f / r;
+        never[lane] = dark ? kForever : 0.0f;
+    }
+};
+
+MARS_INLINE Rate load_rate(const RateArray& from) {
+    return {load<Float>(from.rate), load<Float>(from.inverse), load<Float>(from.never)};
+}
+
+template <DetectorMode mode, bool gaussian, bool whole, Sink sink>
+class Runner {
+public:
+    explicit Runner(const ExactBlock& block)
+        : block_(block), job_(*block.job), system_(view(job_, *block.pulse)), writer_(block) {}
+
+    void run() {
+        for (int lane = 0; lane < kLanes; ++lane) take(lane);
+        load_items();
+        for (int round = 1; running_ > 0; ++round) {
+            for (int k = 0; k < kAhead; ++k)
+                ahead_[k] = draw(background_, returns_[0].flux, key0_, key1_, event_ + static_cast<uint32_t>(k));
+            for (int k = 0; k < kAhead; ++k) step(k);
+            event_ = event_ + static_cast<uint32_t>(kAhead);
+            rows_ += kAhead;
+            if (any(armed_.frame > system_.cycles)) exchange();
+            if (rows_ == kLog) flush();
+            if (round % kPollEvery == 0 && block_.stop->load(std::memory_order_relaxed)) return;
+        }
+    }
+
+private:
+    MARS_INLINE void step(int k) {
+        const Time hit = next_registration<gaussian, whole>(system_, returns_, armed_, ahead_[k], key0_, key1_,
+                                                            event_ + static_cast<uint32_t>(k), memory_);
+        if constexpr (mode == DetectorMode::kNonparalyzable) armed_ = rearm(system_, hit);
+        // from the frames of the first return to laser periods
+        const Float shifted = hit.phase + delay_;
+        const Int wrap = minus_if(one_if(shifted >= 1.0f), shifted < 0.0f);
+        const Int cycle = hit.frame + wrap;
+        const Float phase = shifted - to_float(wrap);
+        const Int bin = minimum(truncate(phase * static_cast<float>(system_.bins)), splat(system_.bins - 1));
+        // inside the exposure: 0 <= cycle < cycles, one unsigned comparison
+        Mask outside = as_uint(cycle) >= static_cast<uint32_t>(system_.cycles);
+        if constexpr (mode != DetectorMode::kNonparalyzable)
+            outside = outside | advance<mode>(system_, hit, cycle, phase, delay_, event_ + static_cast<uint32_t>(k),
+                                              armed_, memory_);
+        store(log_.bin[rows_ + k], select(outside, splat(-1), bin));
+        if constexpr (sink == Sink::kTimestamps) {
+            store(log_.cycle[rows_ + k], cycle);
+            store(log_.phase[rows_ + k], phase);
+        }
+    }
+
+    // Writes what a lane has logged for its present item, up to row `to`.
+    void flush(int lane, int to) {
+        if (slot_array_[lane] >= 0)
+            writer_.template write<1>(slot_array_ + lane, log_, lane, first_row_array_[lane], to);
+        first_row_array_[lane] = to;
+    }
+
+    // Empties the log.
+    MARS_NOINLINE void flush() {
+        constexpr int team = kLanes < 4 ? kLanes : 4;
+        for (int lane = 0; lane < kLanes; lane += team) {
+            int common = 0;
+            bool busy = true;
+            for (int i = lane; i < lane + team; ++i) {
+                if (first_row_array_[i] > common) common = first_row_array_[i];
+                busy = busy && slot_array_[i] >= 0;
+            }
+            if (!busy) common = rows_;
+            for (int i = lane; i < lane + team; ++i) flush(i, common);
+            if (busy) writer_.template write<team>(slot_array_ + lane, log_, lane, common, rows_);
+        }
+        memset(first_row_array_, 0, sizeof first_row_array_);
+        rows_ = 0;
+    }
+
+    // Gives the lanes whose exposure has ended another item.
+    MARS_NOINLINE void exchange() {
+        store(frame_array_, armed_.frame);
+        store(phase_array_, armed_.phase);
+        store(event_array_, event_);
+        for (int lane = 0; lane < kLanes; ++lane) {
+            if (frame_array_[lane] <= system_.cycles) continue;
+            flush(lane, rows_);
+            if (slot_array_[lane] >= 0) --running_;
+            take(lane);
+        }
+        load_items();
+        memory_.known = memory_.known & (event_ > 0u);
+    }
+
+    // Puts the next item of the block into a lane; a lane without work idles beyond the end of the exposure.
+    void take(int lane) {
+        const bool busy = taken_ < block_.items;
+        const int64_t item = block_.first_item + (busy ? taken_ : 0), pixel = job_.pixel(item);
+        event_array_[lane] = 0;
+        first_row_array_[lane] = rows_;
+        const float delay = wrapped(job_.delay[pixel] + block_.pulse->centre);
+        delay_array_[lane] = delay;
+        background_array_.set(lane, busy ? job_.background[pixel] : 0.0);
+        for (int32_t k = 0; k < system_.returns; ++k) {
+            signal_array_[k].set(lane, busy ? job_.signal[k * job_.pixels + pixel] : 0.0);
+            const float apart = wrapped(job_.delay[k * job_.pixels + pixel] - job_.delay[pixel]);
+            offset_array_[k][lane] = apart < 0.5f ? apart : apart - 1.0f;
+        }
+        // the start of the exposure in the frames of the first return
+        const bool warm = busy && block_.start_cycle;
+        const float start = (warm ? block_.start_phase[taken_] : 0.0f) - delay;
+        const int32_t wrap = (start >= 0.5f ? 1 : 0) - (start < -0.5f ? 1 : 0);
+        phase_array_[lane] = start - static_cast<float>(wrap);
+        frame_array_[lane] = busy ? (warm ? block_.start_cycle[taken_] : 0) + wrap : kIdleFrame;
+        slot_array_[lane] = busy ? taken_ : -1;
+        if (!busy) return;
+        const Pair<uint32_t> key = stream_key(job_.seed, job_.realization(item), job_.pixel_index[pixel]);
+        key0_array_[lane] = key.first;
+        key1_array_[lane] = key.second;
+        writer_.open(taken_);
+        ++taken_;
+        ++running_;
+    }
+
+    void load_items() {
+        background_ = load_rate(background_array_);
+        for (int32_t k = 0; k < system_.returns; ++k)
+            returns_[k] = {load_rate(signal_array_[k]), load<Float>(offset_array_[k])};
+        delay_ = load<Float>(delay_array_);
+        key0_ = load<UInt>(key0_array_);
+        key1_ = load<UInt>(key1_array_);
+        event_ = load<UInt>(event_array_);
+        armed_ = {load<Int>(frame_array_), load<Float>(phase_array_)};
+    }
+
+    // `periods` in [0, 1).
+    static float wrapped(double periods) {
+        const double whole_periods = static_cast<double>(static_cast<int64_t>(periods));
+        const float rest = static_cast<float>(periods - whole_periods + (periods < whole_periods ? 1.0 : 0.0));
+        return rest < 1.0f ? rest : 0.0f;
+    }
+
+    const ExactBlock& block_;
+    const Job& job_;
+    const SystemView system_;
+
+    // the lanes: flux of their pixels, state, draws ahead
+    Return returns_[kMaxReturns];
+    Rate background_;
+    Float delay_;  // of the first return's frame centre, in [0, 1)
+    UInt key0_, key1_, event_;
+    Time armed_;
+    Memory memory_ = {splat(1) < 0, splat(0), splat(0.0f)};
+    Draw ahead_[kAhead];
+
+    // the same as plain numbers, for changing single lanes
+    RateArray background_array_, signal_array_[kMaxReturns];
+    float delay_array_[kLanes], offset_array_[kMaxReturns][kLanes], phase_array_[kLanes];
+    int32_t frame_array_[kLanes];
+    uint32_t key0_array_[kLanes] = {}, key1_array_[kLanes] = {}, event_array_[kLanes];
+    int64_t slot_array_[kLanes];  // the item of a lane, or -1
+    int first_row_array_[kLanes];
+
+    int64_t taken_ = 0;
+    int running_ = 0, rows_ = 0;
+    Writer<sink> writer_;
+    Log<sink> log_;
+};
+
+template <DetectorMode mode, bool gaussian, bool whole>
+void run(const ExactBlock& block) {
+    switch (block.sink) {
+        case Sink::kCounts: return Runner<mode, gaussian, whole, Sink::kCounts>(block).run();
+        case Sink::kHistogram16: return Runner<mode, gaussian, whole, Sink::kHistogram16>(block).run();
+        case Sink::kHistogram32: return Runner<mode, gaussian, whole, Sink::kHistogram32>(block).run();
+        case Sink::kTimestamps: return Runner<mode, gaussian, whole, Sink::kTimestamps>(block).run();
+    }
+}
+
+}  // namespace
+}  // namespace MARS_LEVEL
+}  // namespace mars

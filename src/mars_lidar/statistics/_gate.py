@@ -1,0 +1,95 @@
+"""Which statistics treat which mode of the detector, and the flux behind a gate.
+
+A gate that repeats every period makes a gated pixel a free-running one that sees the flux inside of the gate, so that
+the exposure recursion holds for it with that flux: docs/detectors.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.detector import Mode
+from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar.statistics._cells import Cells
+
+FloatArray = NDArray[np.float64]
+
+PLAIN: tuple[Mode, ...] = ("nonparalyzable",)
+_INSTEAD = {
+    "nonparalyzable": "",
+    "paralyzable": "; paralyzable_moments, mean_histogram and registration_pdf have its exact statistics",
+    "synchronous": "; count_law, mean_histogram and registration_pdf have its exact statistics",
+    "gated": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
+}
+
+
+def require_mode(what: str, system: System, modes: tuple[Mode, ...] = PLAIN) -> None:
+    """Raise ValueError, naming the mode and what to use, where `what` does not treat the detector's mode."""
+    mode = system.detector.mode
+    if mode not in modes:
+        told = " and ".join(map(repr, modes))
+        raise ValueError(
+            f"{what} is for detectors of mode {told}, got {mode!r}{_INSTEAD[mode]}; any mode can be simulated"
+        )
+    if system.detector.gate_moves:
+        raise ValueError(
+            f"{what} needs a gate that repeats every period, got gate_step_ns={system.detector.gate_step_ns:g}; "
+            "a moving gate can be simulated"
+        )
+
+
+@dataclass(frozen=True)
+class GateIntervals:
+    """The open parts [low, high) of the period [0, 1), in periods and in order."""
+
+    parts: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def of(cls, system: System) -> GateIntervals:
+        """Of a system with a gate that does not move; the whole period without a gate."""
+        start, _, width = system.detector.gate_periods(system.period_ns)
+        end = start + width
+        if end <= 1.0:
+            return cls(((start, end),))
+        return cls(((0.0, end - 1.0), (start, 1.0)))
+
+    def open(self, edges: FloatArray) -> FloatArray:
+        """Share of each of the intervals between `edges` (n + 1,) that is open (n,)."""
+        covered = sum((np.clip(edges, low, high) for low, high in self.parts), np.zeros(edges.shape))
+        return np.asarray(np.diff(covered) / np.diff(edges), dtype=np.float64)
+
+
+def photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
+    """Photons that reach each cell between the start of the period and `edges` (n,) in [0, 1]: (cells, n).
+
+    What lies outside of the detector's gate is left out.
+    """
+    if cells.system.detector.mode != "gated":
+        return _photons_before(cells, edges)
+    total = np.zeros((cells.size, edges.size))
+    for low, high in GateIntervals.of(cells.system).parts:
+        bounded = np.concatenate([[low], np.clip(edges, low, high)])
+        inside = _photons_before(cells, bounded)
+        total += inside[:, 1:] - inside[:, :1]
+    return total
+
+
+def _photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
+    if cells.waveform is None:
+        period = cells.system.period_ns
+        at = np.concatenate([[0.0], edges])
+        energy = cells.system.pulse.wrapped_cumulative((at - cells.delay[:, None]) * period, period)
+        energy = energy[:, 1:] - energy[:, :1]
+    else:
+        knots = np.linspace(0.0, 1.0, cells.waveform.shape[-1] + 1)
+        rows, used = np.unique(cells.row, return_inverse=True)
+        below = [np.concatenate([[0.0], np.cumsum(cells.waveform[row])]) for row in rows]
+        energy = np.stack([np.interp(edges, knots, b) for b in below])[used.reshape(-1)]
+    total = cells.signal[:, None] * energy + cells.background[:, None] * edges
+    return np.asarray(np.maximum(total, 0.0), dtype=np.float64)

@@ -1,0 +1,47 @@
+"""The mean histogram of a finite exposure, for every mode of the detector."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar.detector import MODES
+from mars_lidar.statistics._cells import Cells, FloatArray
+from mars_lidar.statistics.exposure import refined_moments
+from mars_lidar.statistics.paralyzable import moments_of
+from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
+from mars_lidar.system import System
+
+
+def mean_histogram(
+    signal: ArrayLike | None,
+    background: ArrayLike,
+    system: System,
+    *,
+    delay_ns: ArrayLike | None = None,
+    waveform: ArrayLike | None = None,
+    tolerance: float = 1e-4,
+    threads: int | None = None,
+) -> FloatArray:
+    """Mean histogram (..., bins) of the finite exposure, exact for every mode of the detector.
+
+    Parameters and errors are those of `exposure_moments`; a gate must not move. It sums to the mean count.
+    """
+    cells = Cells.of(
+        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="mean_histogram", modes=MODES
+    )
+    return mean_histograms(cells, tolerance, threads).reshape(*cells.shape, system.bins)
+
+
+def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> FloatArray:
+    """`mean_histogram` of checked cells: (cells, bins)."""
+    mode, bins = cells.system.detector.mode, cells.system.bins
+    if mode == "synchronous":
+        armed = first_arrivals(cells)
+        seen = np.maximum(armed.sum(-1), np.finfo(float).tiny)
+        mean = np.array([cumulants_of(window)[0] for window in synchronous_windows(cells)])
+        return np.asarray(armed * (mean / seen)[:, None], dtype=np.float64)
+    if mode == "paralyzable":
+        return moments_of(cells, tolerance=tolerance).histogram.reshape(cells.size, bins)
+    exposure = refined_moments(cells, bins, tolerance=tolerance, threads=threads)
+    return exposure.histogram.reshape(cells.size, bins)

@@ -1,0 +1,210 @@
+"""Mean, variance and mean histogram of a paralyzable pixel, in closed form.
+
+An arrival is registered iff none came within the dead time before it, so that the rate of registrations follows from
+the integrated flux C, r(t) = lambda(t) exp(-(C(t) - C(t - t_d))), and registrations further apart than the dead time
+are independent. Equation numbers: docs/detectors.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar import _validate
+from mars_lidar.statistics._cells import Cells, FloatArray
+from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.statistics._gate import photons_before
+from mars_lidar.system import System
+
+_MAX_BINS = 2**20
+_MAX_WHOLE = 20_000  # whole periods of a dead time: each is a step of the variance's start-up
+
+
+@dataclass(frozen=True, eq=False)
+class ParalyzableMoments:
+    """Statistics of the count N and the histogram of one exposure, for cells of shape (...).
+
+    Attributes
+    ----------
+    mean, variance
+        (...) of N.
+    histogram
+        (..., bins) mean registrations per bin; sums to the mean.
+    bins
+        (...) bins per period of the grid that was needed, which is not the histogram's.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    histogram: FloatArray
+    bins: FloatArray
+
+
+def paralyzable_moments(
+    signal: ArrayLike | None,
+    background: ArrayLike,
+    system: System,
+    *,
+    delay_ns: ArrayLike | None = None,
+    waveform: ArrayLike | None = None,
+    tolerance: float = 1e-5,
+) -> ParalyzableMoments:
+    """Mean and variance of the count and mean histogram of a pixel of mode ``"paralyzable"``, both starts.
+
+    Parameters
+    ----------
+    signal, background, delay_ns, waveform
+        As `exposure_moments`: photons per period, scalars or arrays that broadcast to (...).
+    tolerance
+        The grid is refined until doubling it moves mean and variance by less than this, relative to
+        themselves, and the shape by less in total variation; in [1e-9, 0.1].
+
+    Returns
+    -------
+    ParalyzableMoments
+        For cells of shape (...).
+
+    Raises
+    ------
+    ValueError
+        For arguments out of range, another mode, or a dead time of more than 20,000 periods.
+    ConvergenceError
+        Naming the cell, where no grid up to 2^20 bins meets the tolerance.
+    """
+    cells = Cells.of(
+        signal, background, system, delay_ns=delay_ns, waveform=waveform,
+        what="paralyzable_moments", modes=("paralyzable",),
+    )  # fmt: skip
+    return moments_of(cells, tolerance=tolerance)
+
+
+def moments_of(cells: Cells, *, tolerance: float) -> ParalyzableMoments:
+    """`paralyzable_moments` of checked cells."""
+    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    system = cells.system
+    if system.dead_time_periods > _MAX_WHOLE:
+        raise ValueError(
+            f"dead_time_ns must be at most {_MAX_WHOLE} periods for the statistics of mode 'paralyzable', "
+            f"got {system.dead_time_periods:g} periods"
+        )
+    mean, variance, bins = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size)
+    histogram = np.empty((cells.size, system.bins))
+    for k in range(cells.size):
+        cell = cells.part(slice(k, k + 1))
+        n = cell.first_bins(system.bins)
+        coarse = _Grid(cell, n // 2)
+        while True:
+            fine = _Grid(cell, n)
+            if _moved(coarse, fine) <= tolerance:
+                break
+            coarse, n = fine, 2 * n
+            if n > max(_MAX_BINS, 4 * system.bins):
+                raise ConvergenceError(
+                    f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still move by "
+                    f"more than {tolerance:g}"
+                )
+        mean[k], variance[k], histogram[k], bins[k] = fine.mean, fine.variance, fine.histogram, n
+    shape = cells.shape
+    return ParalyzableMoments(
+        mean.reshape(shape), variance.reshape(shape), histogram.reshape(*shape, system.bins), bins.reshape(shape)
+    )
+
+
+class _Grid:
+    """One pixel on a grid of the period, with edges where the dead time of a start at 0 ends."""
+
+    def __init__(self, cell: Cells, bins: int) -> None:
+        system = cell.system
+        dead = system.dead_time_periods
+        self.cell, self.cycles, self.armed = cell, system.cycles, system.start == "armed"
+        self.whole = math.floor(dead)
+        self.rest = dead - self.whole
+        out = np.arange(system.bins + 1) / system.bins
+        self.edges = np.unique(np.concatenate([np.arange(bins + 1) / bins, out, [self.rest]]))
+        self.before = self._photons(self.edges)  # C(x)
+        self.total = float(self.before[-1])
+        photons = np.diff(self.before)
+        # photons within the dead time before each edge, t_d = K + f (1)
+        shifted = self.edges - self.rest
+        earlier = self._photons(np.where(shifted < 0.0, shifted + 1.0, shifted))
+        within = self.before - earlier + self.total * ((shifted < 0.0) + self.whole)
+        keep = np.exp(-within)
+        rise = np.diff(within)
+        # integral of exp(-within) over a bin where it is linear in the exponent: (1 - e^-d) / d
+        flat = np.abs(rise) < 1e-8
+        mean_keep = np.where(flat, 1.0, -np.expm1(-rise) / np.where(flat, 1.0, rise))
+        self.rate = photons * keep[:-1] * mean_keep  # registrations of each bin and period, warmed up
+        self.alone = np.exp(-self.before[:-1]) * -np.expm1(-photons)  # the first arrival is there, one period
+        self.below = np.concatenate([[0.0], np.cumsum(self.rate)])
+        place = np.minimum(np.searchsorted(out, self.edges[:-1], side="right") - 1, system.bins - 1)
+        self.histogram = np.bincount(place, self._exposure(), minlength=system.bins)
+        self.mean = float(self.histogram.sum())
+        self.variance = max(0.0, self.mean - 2.0 * self._pairs())
+
+    def _photons(self, at: FloatArray) -> FloatArray:
+        return np.asarray(photons_before(self.cell, at)[0], dtype=np.float64)
+
+    def _exposure(self) -> FloatArray:
+        """Registrations of each bin in the whole exposure (2)."""
+        if not self.armed:
+            return self.cycles * self.rate
+        start = min(self.whole, self.cycles)  # periods that lie within the dead time of a start at 0
+        empty = math.expm1(-start * self.total) / math.expm1(-self.total) if self.total > 0.0 else float(start)
+        total = empty * self.alone
+        if self.cycles > self.whole:
+            first = self.edges[:-1] < self.rest
+            total = total + np.where(first, math.exp(-self.whole * self.total) * self.alone, self.rate)
+            total += (self.cycles - self.whole - 1) * self.rate
+        return np.asarray(total, dtype=np.float64)
+
+    def _registered(self, period: int, phase: FloatArray) -> FloatArray:
+        """R(t): registrations expected in [0, t), t = period + phase, 0 before the exposure."""
+        mean = float(self.below[-1])
+        steady = period * mean + np.interp(phase, self.edges, self.below)
+        if not self.armed:
+            return np.asarray(steady if period >= 0 else np.zeros_like(steady), dtype=np.float64)
+        if period < 0:
+            return np.zeros_like(steady)
+        lit = period * self.total + np.interp(phase, self.edges, self.before)
+        reached = self.whole * self.total + float(np.interp(self.rest, self.edges, self.before))
+        at_end = self.whole * mean + float(np.interp(self.rest, self.edges, self.below))
+        early = (period < self.whole) | ((period == self.whole) & (phase <= self.rest))
+        return np.where(early, -np.expm1(-lit), -math.expm1(-reached) + steady - at_end)
+
+    def _pairs(self) -> float:
+        """Integral of r(t) [R(t) - R(t - t_d)]: pairs closer than the dead time, which do not exist (3)."""
+        total, first = 0.0, 0
+        if self.armed:  # up to t_d, where R(t - t_d) = 0, it is R^2 / 2
+            end = min(self.whole, self.cycles)
+            phase = np.array([self.rest if self.cycles > self.whole else 0.0])
+            total, first = 0.5 * float(self._registered(end, phase)[0]) ** 2, self.whole
+        step = 0.0
+        settled = 2 * self.whole + 2
+        for period in range(first, min(self.cycles, settled + 1)):
+            step = self._pairs_of(period, only_after=period == first and self.armed)
+            total += step
+        return total + max(0, self.cycles - settled - 1) * step
+
+    def _pairs_of(self, period: int, only_after: bool) -> float:
+        x = self.edges[self.edges >= self.rest] if only_after else self.edges
+        now = self._registered(period, x)
+        past = x - self.rest
+        before = np.where(
+            past < 0.0,
+            self._registered(period - self.whole - 1, past + 1.0),
+            self._registered(period - self.whole, np.maximum(past, 0.0)),
+        )
+        apart = now - before
+        return float(np.sum(0.5 * (apart[1:] + apart[:-1]) * np.diff(now)))
+
+
+def _moved(coarse: _Grid, fine: _Grid) -> float:
+    tiny = np.finfo(float).tiny
+    return max(
+        abs(fine.mean - coarse.mean) / max(fine.mean, tiny),
+        abs(fine.variance - coarse.variance) / max(fine.variance, tiny),
+        0.5 * float(np.abs(fine.histogram - coarse.histogram).sum()) / max(fine.mean, tiny),
+    )

@@ -1,0 +1,180 @@
+"""What each mode of a detector does to the same flux: simulated with the exact engine, and in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.detector import Detector
+from mars_lidar.flux import Flux
+from mars_lidar.pulse import GaussianPulse
+from mars_lidar.simulate import simulate_timestamps
+from mars_lidar.statistics import count_law, mean_histogram, paralyzable_moments
+from mars_lidar.studies import Request
+from mars_lidar.studies.report import configuration, save_csv, save_text, table
+from mars_lidar.system import System
+
+FloatArray = NDArray[np.float64]
+
+SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
+SEED = 20
+_REACH = 3.0  # periods of inter-registration times that are shown
+_BINS_OF_INTERVALS = 150
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A detector, its name in figures and tables, and the figure it belongs to."""
+
+    name: str
+    figure: str
+    detector: Detector
+
+
+SHOWN = (
+    Shown("non-paralyzable", "", Detector(dead_time_ns=DEAD_NS)),
+    Shown("paralyzable", "paralyzable", Detector(dead_time_ns=DEAD_NS, mode="paralyzable")),
+    Shown("synchronous, no dead time", "synchronous", Detector(dead_time_ns=0.0, mode="synchronous")),
+    Shown("synchronous", "synchronous", Detector(dead_time_ns=DEAD_NS, mode="synchronous")),
+    Shown(
+        "gated",
+        "gated",
+        Detector(dead_time_ns=DEAD_NS, mode="gated", gate_start_ns=20.0, gate_width_ns=40.0),
+    ),
+    Shown(
+        "moving gate",
+        "gated",
+        Detector(
+            dead_time_ns=DEAD_NS, mode="gated", gate_start_ns=0.0, gate_width_ns=30.0, gate_step_ns=1.0, gate_cycles=5
+        ),
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One detector: simulated, and predicted where there is a prediction.
+
+    `histogram` and `intervals` are means per exposure; `counts` (exposures,). `law` (n,) is P(N = n), or None.
+    """
+
+    shown: Shown
+    system: System
+    counts: NDArray[np.int64]
+    histogram: FloatArray
+    histogram_error: FloatArray
+    intervals: FloatArray
+    expected: FloatArray | None
+    moments: tuple[float, float] | None
+    law: FloatArray | None
+
+
+def run(request: Request) -> list[Path]:
+    """Write detectors.md, detectors.csv and a figure for each mode."""
+    from mars_lidar.studies.detector_figures import draw_all
+
+    exposures = 400 if request.quick else 40_000
+    outcomes = []
+    for shown in SHOWN:
+        request.tell(f"detectors: {shown.name}")
+        outcomes.append(outcome(shown, exposures))
+    figures = draw_all(request.out, outcomes)
+    rows = [row(each) for each in outcomes]
+    parts = [
+        "# Detector modes, compared",
+        "The same pixel seen by detectors of every mode (definitions and closed forms: "
+        "[detectors.md](../detectors.md)). Simulated with the exact engine; predicted by `mean_histogram`, `count_law` "
+        "and `paralyzable_moments`. `z mean` and `z variance` are differences in standard errors of the simulation, "
+        "`worst z of a bin` is the largest of the histogram.",
+        configuration(_settings(outcomes[0].system, exposures)),
+        table(rows),
+        "In the figures dots are simulated and lines predicted; the dashed count law is the Gaussian of the predicted "
+        "mean and variance. Inter-registration times are simulated.",
+        *(f"![{path.stem}]({path.name})" for path in figures),
+    ]
+    text = save_text(request.out / "detectors.md", parts)
+    return [text, save_csv(request.out / "detectors.csv", rows), *figures]
+
+
+def outcome(shown: Shown, exposures: int) -> Outcome:
+    """Simulate one detector, and predict what is known of it."""
+    system = System(
+        period_ns=100.0, cycles=500, bins=200, pulse=GaussianPulse(sigma_ns=1.0), detector=shown.detector
+    )
+    times = simulate_timestamps(Flux(np.full((1, exposures), SIGNAL), BACKGROUND, DELAY_NS), system, seed=SEED)
+    counts = times.counts[0]
+    each = np.bincount(times.bin, minlength=system.bins) / exposures
+    item = np.repeat(np.arange(exposures), counts)
+    second = _mean_square(item * system.bins + times.bin, exposures, system.bins)
+    apart = np.diff(times.times_ns)[item[1:] == item[:-1]] / system.period_ns
+    intervals = np.histogram(apart, _BINS_OF_INTERVALS, (0.0, _REACH))[0] / exposures
+    expected, moments, law = _predicted(system)
+    error = np.sqrt(np.maximum(second - each**2, 0.0) / exposures)
+    return Outcome(shown, system, counts, each, error, intervals, expected, moments, law)
+
+
+def _mean_square(place: NDArray[np.int64], exposures: int, bins: int) -> FloatArray:
+    """Mean of the squares of the counts in each bin, from the place (exposure, bin) of every registration."""
+    cell, number = np.unique(place, return_counts=True)
+    return np.bincount(cell % bins, number.astype(np.float64) ** 2, minlength=bins) / exposures
+
+
+def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] | None, FloatArray | None]:
+    if system.detector.gate_moves:
+        return None, None, None
+    expected = mean_histogram(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+    if system.detector.mode == "paralyzable":
+        found = paralyzable_moments(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+        return expected, (float(found.mean), float(found.variance)), None
+    law = count_law(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+    pmf = np.zeros(int(law.support[-1]) + 1)
+    pmf[law.support] = law.pmf
+    return expected, (float(law.mean), float(law.variance)), pmf
+
+
+def row(each: Outcome) -> dict[str, Any]:
+    """One line of the table."""
+    n = each.counts.size
+    mean, variance = float(each.counts.mean()), float(each.counts.var(ddof=1))
+    line: dict[str, Any] = {
+        "detector": each.shown.name,
+        "simulated mean": mean,
+        "simulated variance": variance,
+        "predicted mean": "-",
+        "predicted variance": "-",
+        "z mean": "-",
+        "z variance": "-",
+        "worst z of a bin": "-",
+    }
+    if each.moments is None or each.expected is None:
+        return line
+    fourth = float(np.mean((each.counts - mean) ** 4))
+    seen = each.histogram_error > 0
+    z = (each.histogram[seen] - each.expected[seen]) / each.histogram_error[seen]
+    return line | {
+        "predicted mean": each.moments[0],
+        "predicted variance": each.moments[1],
+        "z mean": (mean - each.moments[0]) / math.sqrt(each.moments[1] / n),
+        "z variance": (variance - each.moments[1]) / math.sqrt((fourth - variance**2) / n),
+        "worst z of a bin": float(np.abs(z).max()),
+    }
+
+
+def of_figure(outcomes: Sequence[Outcome], figure: str) -> list[Outcome]:
+    """The outcomes that a figure shows: the free-running pixel first."""
+    return [each for each in outcomes if each.shown.figure in ("", figure)]
+
+
+def _settings(system: System, exposures: int) -> dict[str, Any]:
+    told = {
+        field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"
+    }
+    flux = {"signal S": SIGNAL, "background B": BACKGROUND, "delay_ns": DELAY_NS}
+    return told | flux | {"dead_time_ns": DEAD_NS, "exposures": exposures, "engine": "exact", "seed": SEED}

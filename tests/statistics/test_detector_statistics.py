@@ -1,0 +1,285 @@
+"""Statistics of paralyzable, synchronous and gated pixels: closed forms, plain recursions, the exact engine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import mars_lidar as ml
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, first_arrival, flux_of, mean_vector, require, two_lobes
+from harness import waveform_flux as flux_of_waveform
+from mars_lidar.engines import ENGINES
+from mars_lidar.statistics import (
+    ConvergenceError,
+    PhaseChain,
+    exposure_moments,
+    mars_moments,
+    mean_histogram,
+    paralyzable_moments,
+    poisson_moments,
+    poisson_pmf,
+    renewal_moments,
+    renewal_pmf,
+)
+
+DEAD = [0.0, 0.4, 1.0, 1.7, 5.02, 60.0]
+GATES = {"gate": (0.303, 0.11), "wrapping gate": (0.9, 0.5), "narrow gate": (0.38, 0.002)}
+
+
+def view(mode: str, dead: float, start: str = "armed", cycles: int = 40, **changes: Any) -> ml.System:
+    extra = {}
+    if mode in GATES:
+        opens, width = GATES[mode]
+        mode, extra = "gated", {"gate_start_ns": opens * PERIOD_NS, "gate_width_ns": width * PERIOD_NS}
+    return ml.System(
+        period_ns=PERIOD_NS, cycles=cycles, bins=50, pulse=ml.GaussianPulse(sigma_ns=2.0),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode=mode, **extra), start=start,
+    ).replace(**changes)  # fmt: skip
+
+
+def law_of(case: Case, **pixel: Any) -> Law:
+    """What the statistics say about a case."""
+    histogram = mean_histogram(system=case.system, **pixel)
+    shape = ml.registration_pdf(system=case.system, **pixel)
+    assert shape == pytest.approx(histogram / histogram.sum(), abs=1e-12)
+    if case.system.detector.mode == "paralyzable":
+        moments = paralyzable_moments(system=case.system, **pixel)
+        assert moments.histogram.sum() == pytest.approx(float(moments.mean), rel=1e-12)
+        return Law(moments.histogram, None, (float(moments.mean), float(moments.variance)))
+    law = ml.count_law(system=case.system, **pixel)
+    assert law.mean == pytest.approx(histogram.sum(), rel=1e-3)
+    assert law.pmf @ law.support == pytest.approx(float(law.mean), rel=1e-6)
+    pmf = np.zeros(law.support[-1] + 1)
+    pmf[law.support] = law.pmf
+    return Law(histogram, pmf)
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize("dead", DEAD)
+@pytest.mark.parametrize("mode", ["paralyzable", "synchronous", *GATES])
+def test_statistics_are_those_of_the_exact_engine(mode: str, dead: float, start: str):
+    system = view(mode, dead, start)
+    signal, background = (1.5, 0.5) if dead < 2 else (0.05, 0.02)
+    case = Case(f"{mode}, t_d {dead:g}, {start}", flux_of(signal, background, 0.37), system, 6000)
+    law = law_of(case, signal=signal, background=background, delay_ns=37.0)
+    check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
+
+
+@pytest.mark.parametrize("mode", ["paralyzable", "synchronous", "wrapping gate"])
+def test_waveforms(mode: str):
+    wave = two_lobes() / 12
+    case = Case(f"{mode}, waveform", flux_of_waveform(wave, 0.3), view(mode, 0.7), 6000)
+    law = law_of(case, signal=None, background=0.3, waveform=wave)
+    check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
+
+
+@pytest.mark.parametrize("mode", ["paralyzable", "synchronous", "gate"])
+def test_cells_broadcast(mode: str):
+    system, signal, background = view(mode, 0.7), np.array([0.0, 0.3, 2.0]), np.array([[0.1], [0.0]])
+    delay = np.array([10.0, 33.0, 99.0])
+    together = mean_histogram(signal, background, system, delay_ns=delay)
+    assert together.shape == (2, 3, 50)
+    for i in range(2):
+        for k in range(3):
+            alone = mean_histogram(signal[k], background[i, 0], system, delay_ns=delay[k])
+            assert together[i, k] == pytest.approx(alone, rel=1e-3, abs=1e-7)
+    assert together[1, 0].sum() == 0.0
+    assert np.isfinite(ml.registration_pdf(signal, background, system, delay_ns=delay)).all()
+
+
+# Paralyzable
+
+
+@pytest.mark.parametrize(("rate", "dead", "cycles"), [(1.0, 0.6, 30), (4.0, 1.3, 20), (0.2, 7.0, 30), (0.2, 7.25, 5)])
+def test_paralyzable_constant_rate(rate: float, dead: float, cycles: int):
+    r, t = rate * np.exp(-rate * dead), float(cycles)
+    found = paralyzable_moments(0.0, rate, view("paralyzable", dead, "stationary", cycles))
+    near = min(dead, t)
+    assert float(found.mean) == pytest.approx(r * t, rel=1e-9)
+    assert float(found.variance) == pytest.approx(r * t - r**2 * (2 * t * near - near**2), rel=1e-5)
+    armed = paralyzable_moments(0.0, rate, view("paralyzable", dead, "armed", cycles))
+    # the first t_d sees the first arrival and nothing else
+    assert float(armed.mean) == pytest.approx(-np.expm1(-rate * near) + r * (t - near), rel=1e-9)
+
+
+def test_paralyzable_without_dead_time_is_poisson():
+    found = paralyzable_moments([0.0, 2.0], 0.5, view("paralyzable", 0.0))
+    assert found.mean == pytest.approx(40 * np.array([0.5, 2.5]), rel=1e-9)
+    assert found.variance == pytest.approx(found.mean, rel=1e-9)
+
+
+def test_paralyzable_long_exposures_grow_linearly():
+    """Mean and variance of 1e8 periods, and what one more period adds."""
+    for start in ("armed", "stationary"):
+        a, b, c = (
+            paralyzable_moments(1.0, 0.3, view("paralyzable", 2.4, start, n)) for n in (50, 51, 100_000_000)
+        )
+        for name in ("mean", "variance"):
+            x, y, z = (float(getattr(m, name)) for m in (a, b, c))
+            assert z == pytest.approx(x + (y - x) * (100_000_000 - 50), rel=1e-9)
+
+
+# Synchronous
+
+
+def by_recursion(system: ml.System, early: float, total: float) -> np.ndarray:
+    """P(N = n) (cycles + 1,): period after period, the chance of (armed here, n registrations before)."""
+    whole, cycles = int(system.dead_time_periods), system.cycles
+    soon, late = -np.expm1(-early), np.exp(-early) - np.exp(-total)
+    steps = ((1, 0, np.exp(-total)), (whole + 1, 1, soon), (whole + 2, 1, late))
+    armed = np.zeros((cycles + whole + 3, cycles + 2))
+    armed[0, 0] = 1.0
+    if system.start == "stationary":  # of the chain of periods left to wait
+        turn = np.eye(whole + 2, k=-1)
+        for step, _, chance in steps:
+            turn[0, step - 1] += chance
+        balance = np.vstack([turn.T - np.eye(whole + 2), np.ones(whole + 2)])
+        armed[: whole + 2, 0] = np.linalg.lstsq(balance, np.eye(whole + 3)[-1], rcond=None)[0]
+    done = np.zeros(cycles + 2)
+    for n in range(cycles):
+        for step, seen, chance in steps:
+            moved = np.roll(armed[n], seen) * chance
+            if n + step >= cycles:
+                done += moved
+            else:
+                armed[n + step] += moved
+    if system.start == "stationary":
+        done += armed[cycles:].sum(0)
+    return done[: cycles + 1]
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize("dead", [0.0, 0.4, 0.9, 1.0, 3.0, 3.7, 12.2, 70.5])
+@pytest.mark.parametrize("rate", [0.05, 0.8, 4.0])
+def test_synchronous_count_law(rate: float, dead: float, start: str):
+    system = view("synchronous", dead, start, 60)
+    law = ml.count_law(0.0, rate, system)
+    expected = by_recursion(system, rate * (1.0 - dead % 1.0), rate)
+    pmf = np.zeros_like(expected)
+    pmf[law.support] = law.pmf
+    mean = expected @ np.arange(expected.size)
+    assert expected.sum() == pytest.approx(1.0, abs=1e-9)
+    assert pmf == pytest.approx(expected, abs=1e-9)
+    assert law.mean == pytest.approx(mean, rel=1e-8)
+
+
+@pytest.mark.parametrize("cycles", [1, 1000, 1_000_000])
+def test_synchronous_is_binomial(cycles: int):
+    system = view("synchronous", 0.0, cycles=cycles)
+    law = ml.count_law([0.5, 0.0, 3.0], [0.1, 0.0, 1.0], system)
+    q = -np.expm1(-np.array([0.6, 0.0, 4.0]))
+    assert law.mean == pytest.approx(cycles * q, rel=1e-9)
+    assert law.variance == pytest.approx(cycles * q * (1 - q), rel=1e-6)
+    assert law.pmf[0] == pytest.approx(stats.binom.pmf(law.support[0], cycles, q[0]), abs=1e-11)
+
+
+def test_coates_inverts_the_synchronous_histogram():
+    """r_i = ln[(N_r - sum_{k<i} n_k) / (N_r - sum_{k<=i} n_k)] of the mean histogram is the flux (Coates 1968)."""
+    system = view("synchronous", 0.0, cycles=500)
+    n = mean_histogram(2.0, 0.7, system, delay_ns=40.0)
+    left = 500 - np.concatenate([[0.0], np.cumsum(n)])
+    photons = 2.0 * system.pulse.bin_energy(40.0, PERIOD_NS, 50) + 0.7 / 50
+    assert np.log(left[:-1] / left[1:]) == pytest.approx(photons, rel=1e-9)
+
+
+def test_coates_inverts_simulated_histograms():
+    system = view("synchronous", 0.0, cycles=5000)
+    cube = ml.simulate(ml.Flux(np.full((1, 500), 1.0), 0.7, 40.0), system, seed=3)[0, 0].astype(float)
+    left = 5000 - np.concatenate([np.zeros((500, 1)), np.cumsum(cube, -1)], axis=1)
+    photons = system.pulse.bin_energy(40.0, PERIOD_NS, 50) + 0.7 / 50
+    # the logarithm of a binomial share is biased by (1 / n_after - 1 / n_before) / 2
+    bias = 0.5 * (1 / left[:, 1:] - 1 / left[:, :-1])
+    require({"flux": mean_vector(np.log(left[:, :-1] / left[:, 1:]) - bias, photons)}, "Coates")
+
+
+# Gated
+
+
+def test_gate_that_is_always_open_has_the_free_law():
+    system = view("nonparalyzable", 0.6375)
+    always = ml.Detector(dead_time_ns=63.75, mode="gated", gate_start_ns=20.0, gate_width_ns=100.0)
+    for start in ("armed", "stationary"):
+        a, b = (
+            exposure_moments(1.5, 0.5, system.replace(detector=d, start=start), delay_ns=37.0)
+            for d in (system.detector, always)
+        )
+        assert b.cumulants == pytest.approx(a.cumulants, rel=1e-7, abs=1e-7)
+        assert b.histogram == pytest.approx(a.histogram, rel=1e-6, abs=1e-9)
+
+
+def test_gate_shorter_than_the_dead_time():
+    """One registration in each gate at most: Binomial, first arrivals behind the gate."""
+    system = view("gate", 0.6, bins=1000)
+    photons = 1.5 * system.pulse.bin_energy(37.0, PERIOD_NS, 1000) + 0.5 / 1000
+    photons[:303], photons[413:] = 0.0, 0.0
+    law = ml.count_law(1.5, 0.5, system, delay_ns=37.0)
+    q = -np.expm1(-photons.sum())
+    assert law.mean == pytest.approx(40 * q, rel=1e-5)
+    assert law.variance == pytest.approx(40 * q * (1 - q), rel=1e-4)
+    assert law.pmf == pytest.approx(stats.binom.pmf(law.support, 40, q), abs=1e-5)
+    assert mean_histogram(1.5, 0.5, system, delay_ns=37.0) == pytest.approx(40 * first_arrival(photons), abs=1e-4)
+
+
+# Refused
+
+
+@pytest.mark.parametrize("mode", ["paralyzable", "synchronous", "gate"])
+def test_what_does_not_treat_a_mode_says_so(mode: str):
+    system = view(mode, 0.7)
+    named = system.detector.mode
+    calls = {
+        "count_law of method 'mars'": lambda: ml.count_law(1.0, 1.0, system, "mars"),
+        "count_law of method 'renewal'": lambda: ml.count_law(1.0, 1.0, system, "renewal"),
+        "registration_pdf of method 'chain'": lambda: ml.registration_pdf(1.0, 1.0, system, "chain"),
+        "holding_time_covariance": lambda: ml.holding_time_covariance(1.0, 1.0, system),
+        "mars_moments": lambda: mars_moments(1.0, 1.0, system),
+        "the chain of phases": lambda: PhaseChain.from_flux(1.0, 1.0, system),
+        "renewal_moments": lambda: renewal_moments(1.0, 1.0, system),
+        "renewal_pmf": lambda: renewal_pmf(1.0, 1.0, system, [1]),
+    }
+    if mode == "paralyzable":
+        calls["count_law of method 'exact'"] = lambda: ml.count_law(1.0, 1.0, system)
+    if mode != "paralyzable":
+        calls["paralyzable_moments"] = lambda: paralyzable_moments(1.0, 1.0, system)
+    if mode != "gate":
+        calls["exposure_moments"] = lambda: exposure_moments(1.0, 1.0, system)
+    if mode == "gate":
+        calls["poisson_moments"] = lambda: poisson_moments(1.0, 1.0, system)
+        calls["poisson_pmf"] = lambda: poisson_pmf(1.0, 1.0, system, [1])
+    for what, call in calls.items():
+        with pytest.raises(ValueError) as error:
+            call()
+        told = str(error.value)
+        assert what in told
+        assert f"got {named!r}" in told
+        assert "mean_histogram" in told or "count_law" in told
+
+
+def test_moving_gates_are_refused():
+    system = view("gate", 0.7)
+    moving = ml.Detector(
+        dead_time_ns=5.0, mode="gated", gate_start_ns=3.0, gate_width_ns=9.0, gate_step_ns=1.0
+    )
+    for call in (ml.count_law, mean_histogram, ml.registration_pdf, exposure_moments):
+        with pytest.raises(ValueError, match=r"a gate that repeats every period, got gate_step_ns=1; .* simulated"):
+            call(1.0, 1.0, system.replace(detector=moving))
+
+
+def test_poisson_law_is_that_of_the_gated_arrivals():
+    system = view("wrapping gate", 3.0)
+    law = ml.count_law(1.5, 0.5, system, "poisson", delay_ns=37.0)
+    inside = 0.5 * 0.5 + 1.5 * (stats.norm.cdf(3.0 / 2.0) + stats.norm.sf((90 - 37) / 2.0))
+    assert law.mean == pytest.approx(40 * inside, rel=1e-9)
+
+
+def test_too_long_dead_times_and_sharp_tolerances_are_refused():
+    with pytest.raises(ValueError, match=r"dead_time_ns must be at most 20000 periods .*'paralyzable', got 30000"):
+        paralyzable_moments(1.0, 1.0, view("paralyzable", 3e4))
+    with pytest.raises(ValueError, match=r"tolerance must be"):
+        paralyzable_moments(1.0, 1.0, view("paralyzable", 1.0), tolerance=0.0)
+    narrow = view("paralyzable", 0.3, pulse=ml.GaussianPulse(sigma_ns=1e-4))
+    with pytest.raises(ConvergenceError, match=r"paralyzable statistics of S = 5.*more than 1e-09"):
+        paralyzable_moments(5.0, 1.0, narrow, tolerance=1e-9)

@@ -1,0 +1,270 @@
+"""Detector modes: same seed, same bits; what is refused, stored, and shown."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import mars_lidar as ml
+from mars_lidar import _core, io
+from mars_lidar.cli import app
+from mars_lidar.engines import ENGINES
+from mars_lidar.engines.base import Engine, Task
+from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.plot.data import predicted_counts
+from test_reproducibility import SHAPE, drawn, image
+
+GATE = {"mode": "gated", "gate_start_ns": 83.0, "gate_width_ns": 31.0}
+MOVING = GATE | {"gate_step_ns": -7.3, "gate_cycles": 3}
+DETECTORS: dict[str, dict[str, Any]] = {
+    "paralyzable": {"mode": "paralyzable"},
+    "synchronous": {"mode": "synchronous"},
+    "gated": GATE,
+    "moving": MOVING,
+}
+# Start of the SHA-256 of the cubes (2 realizations, seed 2**63 + 1), as little-endian uint32; see
+# test_reproducibility.py.
+GOLDEN = {
+    "paralyzable gaussian": "81ba71f608f6",
+    "paralyzable returns": "b3f0ed01997e",
+    "paralyzable sampled": "9e08554de809",
+    "paralyzable waveform": "f6f8399dc89a",
+    "paralyzable stationary": "f52ccf0c4da8",
+    "paralyzable stationary waveform": "4e8f9e452c3b",
+    "paralyzable whole periods": "cf866d618c14",
+    "paralyzable long dead time": "4e54bbb1bc1a",
+    "synchronous gaussian": "b87b9d6581cf",
+    "synchronous returns": "5b1dc23eec1e",
+    "synchronous sampled": "6bea0d141827",
+    "synchronous waveform": "ee1fcb64e233",
+    "synchronous stationary": "25ad1046e795",
+    "synchronous stationary waveform": "0046b3456d89",
+    "synchronous whole periods": "97dd3d32e5ae",
+    "synchronous long dead time": "d94fa31b3989",
+    "gated gaussian": "8d3b891be7d7",
+    "gated returns": "f81a5258fb17",
+    "gated sampled": "630dad5bc7be",
+    "gated waveform": "abc2a80584fd",
+    "gated stationary": "38b0fa8cfe88",
+    "gated stationary waveform": "890a8a12c901",
+    "gated whole periods": "082281f9b5d4",
+    "gated long dead time": "bb90526ab6b9",
+    "moving gaussian": "592e3aa16f37",
+    "moving returns": "aa010005e204",
+    "moving sampled": "2029437c22a4",
+    "moving waveform": "5779805a7127",
+    "moving whole periods": "3684c14ec58f",
+}
+KINDS = [
+    (mode, kind)
+    for mode in DETECTORS
+    for kind in ("gaussian", "returns", "sampled", "waveform", "stationary", "stationary waveform", "whole periods",
+                 "long dead time")
+    if not (mode == "moving" and kind in ("stationary", "stationary waveform", "long dead time"))
+]  # fmt: skip
+
+
+def scene(mode: str, kind: str) -> tuple[ml.Flux, ml.System]:
+    flux, system = image(kind)
+    dead = 23.75 if mode == "paralyzable" and kind != "whole periods" else system.detector.dead_time_ns
+    return flux, system.replace(detector=ml.Detector(dead_time_ns=dead, **DETECTORS[mode]))
+
+
+@pytest.mark.parametrize(("mode", "kind"), KINDS)
+def test_golden_bits_and_levels(mode: str, kind: str):
+    """The committed bits, from every vector level, in histograms and timestamps."""
+    flux, system = scene(mode, kind)
+    cube = ml.simulate(flux, system, realizations=2, seed=2**63 + 1)
+    told = hashlib.sha256(cube.astype("<u4").tobytes()).hexdigest()[:12]
+    index = np.arange(SHAPE[0] * SHAPE[1], dtype=np.uint32)
+    request = Task(flux, system, 2, 0, index, 2**63 + 1, 1, None)
+    expected = drawn(ExactEngine(level="scalar"), request)[1]
+    for level in _core.levels():
+        out, records = drawn(ExactEngine(level=level), request)
+        assert np.array_equal(out, cube.reshape(out.shape))
+        for name in ("times", "cycle", "bin"):
+            assert np.array_equal(getattr(records, name), getattr(expected, name))
+    assert told == GOLDEN[f"{mode} {kind}"]
+
+
+@pytest.mark.parametrize("engine", ["exact", "sequential"])
+@pytest.mark.parametrize(("mode", "kind"), KINDS)
+def test_threads_parts_and_timestamps(engine: str, mode: str, kind: str):
+    flux, system = scene(mode, kind)
+    if engine == "sequential":
+        system = system.replace(cycles=min(system.cycles, 40))
+    whole = ml.simulate(flux, system, engine=engine, realizations=2, seed=3, threads=1)
+    assert np.array_equal(whole, ml.simulate(flux, system, engine=engine, realizations=2, seed=3, threads=3))
+    index = np.arange(SHAPE[0] * SHAPE[1]).reshape(SHAPE)[1:4, 3:9]
+    part = ml.simulate(
+        flux[1:4, 3:9], system, engine=engine, first_realization=1, pixel_index=index, seed=3
+    )  # fmt: skip
+    assert np.array_equal(part[0], whole[1, 1:4, 3:9])
+    times = ml.simulate_timestamps(flux, system, engine=engine, realization=1, seed=3)
+    assert np.array_equal(times.histogram(), whole[1])
+    pixel = times.pixel(0, 2)
+    assert np.all(np.diff(pixel.times_ns) >= 0)
+
+
+@pytest.mark.parametrize(("mode", "kind"), KINDS)
+def test_rules_hold_for_every_registration(mode: str, kind: str):
+    """Never closer than the dead time; one a period; inside of the gate."""
+    flux, system = scene(mode, kind)
+    times = ml.simulate_timestamps(flux, system, seed=9)
+    period, slack = system.period_ns, 2e-4  # phases have 24 bits
+    if mode != "synchronous":
+        apart = np.diff(times.times_ns)
+        inside = np.ones(apart.size, bool)
+        inside[times.offsets[1:-1][times.offsets[1:-1] < len(times)] - 1] = False
+        assert np.all(apart[inside] >= system.detector.dead_time_ns - slack * 10)
+    for k in range(times.offsets.size - 1):
+        cycle = times.cycle[times.offsets[k] : times.offsets[k + 1]]
+        if mode == "synchronous":
+            assert np.all(np.diff(cycle) >= max(1, np.ceil(system.dead_time_periods)))
+    if system.detector.mode == "gated":
+        detector = system.detector
+        turns = times.cycle // detector.gate_cycles
+        opens = detector.gate_start_ns + detector.gate_step_ns * turns
+        since = (times.times_ns - opens + slack) % period
+        assert np.all(since < detector.gate_width_ns + 2 * slack)
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "fragments"),
+    [
+        ({"mode": "gate"}, ValueError, ["mode", "'paralyzable'", "'synchronous'", "'gated'", "got 'gate'"]),
+        ({"gate_start_ns": 5.0}, ValueError, ["gate_start_ns", "'gated'", "'nonparalyzable'", "got 5.0"]),
+        ({"mode": "paralyzable", "gate_width_ns": 5.0}, ValueError, ["gate_width_ns", "'gated'", "'paralyzable'"]),
+        ({"mode": "synchronous", "gate_step_ns": 0.0}, ValueError, ["gate_step_ns", "'gated'", "'synchronous'"]),
+        ({"mode": "synchronous", "gate_cycles": 1}, ValueError, ["gate_cycles", "'gated'", "'synchronous'"]),
+        ({"mode": "gated"}, ValueError, ["'gated'", "gate_start_ns"]),
+        ({"mode": "gated", "gate_start_ns": 1.0}, ValueError, ["'gated'", "gate_width_ns"]),
+        (GATE | {"gate_width_ns": 0.0}, ValueError, ["gate_width_ns", "(0, inf]", "got 0.0"]),
+        (GATE | {"gate_width_ns": "5"}, TypeError, ["gate_width_ns", "number", "got '5'"]),
+        (GATE | {"gate_start_ns": np.nan}, ValueError, ["gate_start_ns", "finite", "got nan"]),
+        (GATE | {"gate_step_ns": np.inf}, ValueError, ["gate_step_ns", "finite", "got inf"]),
+        (MOVING | {"gate_cycles": 0}, ValueError, ["gate_cycles", "[1, ", "got 0"]),
+        (MOVING | {"gate_cycles": 2.0}, TypeError, ["gate_cycles", "integer", "got 2.0"]),
+        (GATE | {"gate_cycles": 5}, ValueError, ["gate_cycles", "gate_step_ns", "gate_cycles=5"]),
+    ],
+)
+def test_bad_detectors(changes: dict[str, Any], kind: type[Exception], fragments: list[str]):
+    with pytest.raises(kind) as error:
+        ml.Detector(**{"dead_time_ns": 5.0} | changes)
+    assert all(fragment in str(error.value) for fragment in fragments), str(error.value)
+
+
+def test_bad_combinations(system: ml.System, flux: ml.Flux):
+    wide = ml.Detector(dead_time_ns=5.0, **GATE | {"gate_width_ns": 140.0})
+    with pytest.raises(ValueError, match=r"gate_width_ns must be at most the laser period of 133\.333 ns, got 140"):
+        system.replace(detector=wide)
+    moving = ml.Detector(dead_time_ns=5.0, **MOVING)
+    with pytest.raises(ValueError, match=r"start must be 'armed' with a gate that moves.*gate_step_ns=-7\.3"):
+        system.replace(detector=moving, start="stationary")
+    with pytest.raises(ValueError, match=r"'poisson' needs a gate that repeats.*use 'exact' or 'sequential'"):
+        ml.simulate(flux, system.replace(detector=moving), engine="poisson")
+    long = system.replace(detector=ml.Detector(dead_time_ns=1e6, mode="paralyzable"), cycles=10**8)
+    with pytest.raises(ValueError, match=r"2\.15e\+09 expected arrivals of mode 'paralyzable'"):
+        ml.simulate(ml.Flux(100.0, 0.0, 5.0), long)
+
+
+def test_engines_say_what_they_do(system: ml.System, flux: ml.Flux):
+    class Plain(Engine):
+        name, description = "plain", "for this test"
+
+        def histogram(self, task, out):
+            out[:] = 1
+
+    assert ml.simulate(flux, system, engine=Plain()).sum() > 0
+    gated = system.replace(detector=ml.Detector(dead_time_ns=5.0, **GATE))
+    with pytest.raises(ValueError, match=r"engine 'plain' does not do mode 'gated'.*use 'exact' or 'sequential'"):
+        ml.simulate(flux, gated, engine=Plain())
+    for mode in ("paralyzable", "synchronous", "gated"):
+        able = {name for name, engine in ENGINES.items() if mode in engine.modes}
+        assert able >= {"exact", "sequential", "poisson"}
+
+
+@pytest.mark.parametrize("mode", DETECTORS)
+def test_stored_and_read_back(tmp_path, system: ml.System, flux: ml.Flux, mode: str):
+    pixel = ml.Detector(dead_time_ns=1 / 3, **DETECTORS[mode])
+    view = system.replace(detector=pixel)
+    assert ml.Detector.from_dict(pixel.to_dict()) == pixel
+    assert ml.System.from_json(view.to_json()) == view
+    assert hash(ml.System.from_json(view.to_json())) == hash(view)
+    assert len({view, view.replace(detector=replace(pixel, dead_time_ns=1.0)), system}) == 3
+    view.save(tmp_path / "system.yaml")
+    assert ml.System.load(tmp_path / "system.yaml") == view
+    for suffix in ("zarr", "h5", "npz"):
+        path = tmp_path / f"cube.{suffix}"
+        io.simulate_to(path, flux, view, seed=5)
+        with io.load(path) as cube:
+            assert cube.system == view
+            assert io.verify(cube)
+            predicted = predicted_counts(cube, 0, 1)
+            assert (predicted is None) == (mode == "moving")
+            if predicted is not None:
+                assert predicted.shape == (view.bins,)
+
+
+def test_plain_detectors_are_written_as_before():
+    assert ml.Detector(dead_time_ns=5.0).to_dict() == {"dead_time_ns": 5.0, "mode": "nonparalyzable"}
+
+
+def test_starts_and_steps_wrap(system: ml.System):
+    """A gate one period later, or moved by a period more, is the same gate."""
+    flux = ml.Flux(np.ones((4, 4)), 0.5, 60.0)
+    one = ml.Detector(dead_time_ns=20.0, **GATE | {"gate_start_ns": 20.0, "gate_step_ns": 3.0})
+    period = system.period_ns
+    for start, step in ((20.0 + period, 3.0), (20.0 - 2 * period, 3.0), (20.0, 3.0 - period)):
+        other = replace(one, gate_start_ns=start, gate_step_ns=step)
+        a, b = (ml.simulate(flux, system.replace(detector=d), seed=1).astype(int) for d in (one, other))
+        # the last bit of a gate's edge may differ, and with it a photon in a million
+        assert np.abs(a - b).sum() <= 4
+
+
+@pytest.mark.parametrize(("dead", "cycles", "most"), [(0.0, 70, 70), (63.75, 70, 70), (100.0, 70, 70), (250.0, 70, 24)])
+def test_most_registrations_of_a_synchronous_bin(dead: float, cycles: int, most: int):
+    view = image("gaussian")[1].replace(
+        detector=ml.Detector(dead_time_ns=dead, mode="synchronous"), cycles=cycles, bins=1
+    )
+    assert view.max_bin_count == most
+    assert ml.simulate(ml.Flux(0.0, 1e5, 0.0), view).max() <= most
+    assert view.replace(cycles=65_535).histogram_dtype == np.uint16
+
+
+def test_command_line(tmp_path):
+    def run(*arguments: object):
+        return CliRunner().invoke(app, [str(a) for a in arguments])
+
+    small = ["simulate", "--scene", "room", "--size", 8, "--cycles", 20, "--bins", 32, "--no-picture"]
+    gate = ["--mode", "gated", "--gate-start-ns", 30, "--gate-width-ns", 20, "--gate-step-ns", 5, "--gate-cycles", 2]
+    done = run(*small, *gate, "-o", tmp_path / "a.zarr")
+    assert done.exit_code == 0, done.output
+    with io.load(tmp_path / "a.zarr") as cube:
+        detector = cube.system.detector
+        assert detector == ml.Detector(
+            dead_time_ns=75.0, mode="gated", gate_start_ns=30.0, gate_width_ns=20.0, gate_step_ns=5.0, gate_cycles=2
+        )
+        cube.system.save(tmp_path / "gated.yaml")
+    told = run("info", tmp_path / "a.zarr").output
+    assert "gated" in told
+    assert "20 ns from 30 ns of each period, moved by 5 ns every 2 periods" in told
+    # a file's gate: kept with its mode, replaced in part, dropped with another mode
+    file = ["--system", tmp_path / "gated.yaml"]
+    for given, expected in (
+        (["--gate-width-ns", 10], replace(detector, gate_width_ns=10.0)),
+        (["--dead-time-ns", 3], replace(detector, dead_time_ns=3.0)),
+        (["--mode", "synchronous"], ml.Detector(dead_time_ns=75.0, mode="synchronous")),
+    ):
+        done = run(*small, *file, *given, "-o", tmp_path / "b.zarr", "--overwrite")
+        assert done.exit_code == 0, done.output
+        with io.load(tmp_path / "b.zarr") as cube:
+            assert cube.system.detector == expected
+    done = run(*small, "--gate-start-ns", 3, "-o", tmp_path / "c.zarr")
+    assert done.exit_code == 2
+    assert "gate_start_ns belongs to mode 'gated'" in done.output

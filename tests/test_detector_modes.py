@@ -1,0 +1,262 @@
+"""Paralyzable, synchronous and gated pixels: both engines that do them, against each other and closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from harness import (
+    COUNTS,
+    INTERVALS,
+    JOINT,
+    PERIOD_NS,
+    SHAPE,
+    Case,
+    Law,
+    check,
+    draw,
+    first_arrival,
+    flux_of,
+    random_cases,
+    two_lobes,
+    waveform_flux,
+)
+from mars_lidar import Detector, GaussianPulse, SampledPulse, System
+from mars_lidar.detector import MODES
+from mars_lidar.engines import ENGINES
+from mars_lidar.statistics import count_law, exposure_moments
+
+EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
+BOTH = ["exact", "sequential"]
+
+
+def gate(start: float, width: float, dead: float, step: float = 0.0, cycles: int = 1) -> Detector:
+    """A gated detector, all in periods."""
+    return Detector(
+        dead_time_ns=dead * PERIOD_NS, mode="gated", gate_start_ns=start * PERIOD_NS,
+        gate_width_ns=width * PERIOD_NS, gate_step_ns=step * PERIOD_NS, gate_cycles=cycles,
+    )  # fmt: skip
+
+
+def detector(mode: str, dead: float) -> Detector:
+    return gate(0.3, 0.25, dead) if mode == "gated" else Detector(dead_time_ns=dead * PERIOD_NS, mode=mode)
+
+
+def pulsed(signal: float, background: float, pixel: Detector, *, items: int = 6000, **changes: object) -> Case:
+    system = System(
+        period_ns=PERIOD_NS, cycles=100, bins=64, pulse=GaussianPulse(sigma_ns=2.0), detector=pixel
+    ).replace(**changes)
+    name = f"{pixel.mode}, S {signal:g}, B {background:g}, t_d {system.dead_time_periods:g}, {system.start}"
+    return Case(name, flux_of(signal, background, 0.37), system, items)
+
+
+def open_share(system: System, parts: int) -> np.ndarray:
+    """Share of the exposure's periods for which each of fine parts of the period lies in the gate, by brute force."""
+    pixel, period = system.detector, system.period_ns
+    phase = (np.arange(parts) + 0.5) / parts
+    turns = np.arange(system.cycles) // pixel.gate_cycles
+    start = (pixel.gate_start_ns + pixel.gate_step_ns * turns) / period
+    return np.mean([(phase - s) % 1.0 < pixel.gate_width_ns / period for s in start], axis=0)
+
+
+def gated_photons(case: Case) -> np.ndarray:
+    """Photons per period and bin inside of the gate (bins,), on 640 parts of a bin: the gate's edges must fit them."""
+    flux, system, fine = case.flux, case.system, 640
+    parts = system.bins * fine
+    if flux.waveform is not None:
+        energy = np.repeat(flux.waveform[0, 0], parts // flux.waveform.shape[-1])
+        energy = energy * flux.waveform.shape[-1] / parts
+    else:
+        energy = sum(
+            s * system.pulse.bin_energy(tau, system.period_ns, parts)
+            for s, tau in zip(flux.returns_signal[:, 0, 0], flux.returns_delay_ns[:, 0, 0], strict=True)
+        )
+    energy = (energy + flux.background[0, 0] / parts) * open_share(system, parts)
+    return energy.reshape(system.bins, fine).sum(1)
+
+
+def modes_of(case: Case, k: int, random: np.random.Generator) -> Case:
+    """A random case with a detector of another mode; every other gate moves where it may."""
+    system = case.system
+    mode = ("paralyzable", "synchronous", "gated", "gated")[k % 4]
+    extra: dict[str, float] = {}
+    if mode == "gated":
+        width = (1.0, random.uniform(0, 1), 10 ** random.uniform(-3, -1))[int(random.integers(3))]
+        extra = {"gate_start_ns": random.uniform(0, system.period_ns), "gate_width_ns": width * system.period_ns}
+        if system.start == "armed" and k % 8 < 4:
+            extra["gate_step_ns"] = random.uniform(-0.3, 0.3) * system.period_ns * random.choice([1.0, 0.01])
+            extra["gate_cycles"] = int(random.choice([1, 7]))
+    pixel = Detector(dead_time_ns=system.detector.dead_time_ns, mode=mode, **extra)
+    told = f"{mode} {', moving' if 'gate_step_ns' in extra else ''}"
+    return replace(case, name=f"{told} {case.name}", system=system.replace(detector=pixel))
+
+
+_RANDOM = np.random.default_rng(7)
+RANDOM = [modes_of(case, k, _RANDOM) for k, case in enumerate(random_cases(32, seed=31, photons=8e5, least=1000))]
+
+
+@pytest.mark.parametrize("case", RANDOM, ids=lambda case: case.name)
+def test_random_system(case: Case):
+    check(ENGINES["exact"], case, ENGINES["sequential"], EVERYTHING)
+
+
+@pytest.mark.parametrize("mode", MODES[1:])
+@pytest.mark.parametrize(
+    ("signal", "dead", "cycles", "start"),
+    [
+        (10.0, 0.99, 100, "stationary"),  # locked to the laser
+        (3.0, 2.0, 150, "stationary"),
+        (8.0, 5.3, 60, "stationary"),
+        (1.0, 30.7, 200, "stationary"),
+        (1000.0, 0.6375, 4, "armed"),
+        (30.0, 1e-3, 15, "armed"),
+        (2.0, 40.2, 100, "armed"),
+    ],
+)
+def test_hard_system(mode: str, signal: float, dead: float, cycles: int, start: str):
+    """Bright, resonant, a dead time of many periods, many registrations in one pulse."""
+    warm_up = 0 if start == "armed" else 300 * (1 + dead)
+    items = int(min(4000, max(1000, 2e6 / (signal * (cycles + warm_up))))) // 4 * 4
+    case = pulsed(signal, 0.05, detector(mode, dead), cycles=cycles, start=start, items=items)
+    check(ENGINES["exact"], case, ENGINES["sequential"], EVERYTHING)
+
+
+# Paralyzable
+
+
+@pytest.mark.parametrize(("rate", "dead", "cycles"), [(1.0, 0.6375, 60), (6.0, 0.5, 40), (0.3, 7.3, 60)])
+@pytest.mark.parametrize("engine", BOTH)
+def test_paralyzable_at_a_constant_rate(engine: str, rate: float, dead: float, cycles: int):
+    """r = lambda e^(-lambda t_d); pairs within t_d of each other do not occur, all others are independent."""
+    case = pulsed(0.0, rate, detector("paralyzable", dead), cycles=cycles, start="stationary", bins=16, items=20_000)
+    r = rate * np.exp(-rate * dead)
+    law = Law(np.full(16, r * cycles / 16), None, (r * cycles, r * cycles - r**2 * (2 * cycles * dead - dead**2)))
+    check(ENGINES[engine], case, law, {COUNTS, SHAPE})
+
+
+@pytest.mark.parametrize("engine", BOTH)
+def test_paralyzable_under_blinding_light_goes_dark(engine: str):
+    """Armed at the start, it sees the first photon and, with lambda t_d = 40, nothing ever after."""
+    case = pulsed(0.0, 80.0, detector("paralyzable", 0.5), cycles=10, items=400)
+    assert np.all(draw(ENGINES[engine], case, 1).counts == 1)
+
+
+# Synchronous
+
+
+SYNCHRONOUS = {
+    "ideal": pulsed(1.5, 0.5, detector("synchronous", 0.0)),
+    "bright": pulsed(4.0, 2.0, detector("synchronous", 0.0)),
+    "stationary": pulsed(0.4, 0.2, detector("synchronous", 0.0), start="stationary"),
+    "lobes": pulsed(1.5, 0.5, detector("synchronous", 0.0), pulse=SampledPulse(two_lobes(), 0.3)),
+    "returns": replace(
+        pulsed(0, 0, detector("synchronous", 0.0)), flux=flux_of([1.0, 0.4, 0.1], 0.5, [0.2, 0.21, 0.9])
+    ),
+    # photons in the first 40 % of the period only, so that a dead time of 60 % never reaches the next
+    "dead time": replace(
+        pulsed(0, 0, detector("synchronous", 0.6)), flux=waveform_flux([0.5, 0.3, 0.0, 0.0, 0.0])
+    ),
+}
+
+
+def period_photons(case: Case) -> np.ndarray:
+    whole = replace(case, system=case.system.replace(detector=gate(0.0, 1.0, 0.0)))
+    return gated_photons(whole)
+
+
+@pytest.mark.parametrize("kind", SYNCHRONOUS)
+@pytest.mark.parametrize("engine", BOTH)
+def test_synchronous_is_binomial(engine: str, kind: str):
+    """Coates 1968: N ~ Binomial(N_r, 1 - e^-Lambda), histogram N_r e^-F_j (1 - e^-l_j)."""
+    case = SYNCHRONOUS[kind]
+    photons, cycles = period_photons(case), case.system.cycles
+    pmf = stats.binom.pmf(np.arange(cycles + 1), cycles, -np.expm1(-photons.sum()))
+    check(ENGINES[engine], case, Law(cycles * first_arrival(photons), pmf), {COUNTS, SHAPE})
+    assert draw(ENGINES[engine], case, 2).counts.max() <= cycles
+
+
+@pytest.mark.parametrize("engine", BOTH)
+@pytest.mark.parametrize("dead", [0.9, 1.0, 2.5])
+def test_synchronous_under_blinding_light(engine: str, dead: float):
+    """It registers at once in each armed period, and skips those in which its dead time ends."""
+    case = pulsed(0.0, 1e4, detector("synchronous", dead), cycles=12, items=8)
+    each = {0.9: 1, 1.0: 2, 2.5: 3}[dead]  # a photon at x > 0 is followed by ceil(x + t_d) periods
+    assert np.all(draw(ENGINES[engine], case, 1).counts == np.ceil(12 / each))
+
+
+# Gated
+
+
+GATED = {
+    "inside": gate(0.3, 0.25, 0.0),
+    "through the pulse": gate(0.37, 0.5, 0.0),
+    "round the end": gate(0.9, 0.5, 0.0),
+    "narrow": gate(0.375, 1 / 640, 0.0),
+    "always open": gate(0.7, 1.0, 0.0),
+}
+FLUXES = {
+    "gaussian": pulsed(1.5, 0.5, gate(0, 1, 0)),
+    "wide": pulsed(1.5, 0.5, gate(0, 1, 0), pulse=GaussianPulse(sigma_ns=30.0)),
+    "returns": replace(pulsed(0, 0, gate(0, 1, 0)), flux=flux_of([1.0, 0.4, 0.1], 0.5, [0.2, 0.41, 0.9])),
+    "waveform": replace(pulsed(0, 0, gate(0, 1, 0)), flux=waveform_flux(two_lobes()[::3] / 5, 0.1)),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "flux"),
+    [
+        ("inside", "gaussian"),
+        ("through the pulse", "gaussian"),
+        ("round the end", "wide"),
+        ("round the end", "returns"),
+        ("narrow", "wide"),
+        ("through the pulse", "waveform"),
+        ("round the end", "waveform"),
+        ("always open", "gaussian"),
+    ],
+)
+@pytest.mark.parametrize("engine", [*BOTH, "poisson"])
+def test_gate_without_dead_time_is_poisson(engine: str, kind: str, flux: str):
+    case = replace(FLUXES[flux], items=3000)
+    case = replace(case, system=case.system.replace(detector=GATED[kind]))
+    mean = case.system.cycles * gated_photons(case)
+    pmf = stats.poisson.pmf(np.arange(int(stats.poisson.isf(1e-12, mean.sum())) + 1), mean.sum())
+    check(ENGINES[engine], case, Law(mean, pmf, independent_poisson=True), {COUNTS, SHAPE, JOINT})
+
+
+@pytest.mark.parametrize(
+    ("step", "stay", "cycles"), [(0.05, 1, 37), (-0.11, 3, 40), (0.3, 7, 200), (1 / 640, 2, 300)]
+)
+@pytest.mark.parametrize("engine", BOTH)
+def test_moving_gate_without_dead_time_is_poisson(engine: str, step: float, stay: int, cycles: int):
+    case = pulsed(0.8, 0.5, gate(0.6, 0.2, 0.0, step, stay), cycles=cycles, items=4000)
+    mean = cycles * gated_photons(case)
+    check(ENGINES[engine], case, Law(mean, independent_poisson=True), {SHAPE, JOINT})
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize("engine", BOTH)
+def test_one_registration_in_each_gate(engine: str, start: str):
+    """t_d longer than the gate and over before the next one opens: Binomial, first arrivals behind the gate."""
+    case = pulsed(1.0, 2.0, gate(0.3, 0.25, 0.6), start=start)
+    photons, cycles = gated_photons(case), case.system.cycles
+    pmf = stats.binom.pmf(np.arange(cycles + 1), cycles, -np.expm1(-photons.sum()))
+    check(ENGINES[engine], case, Law(cycles * first_arrival(photons), pmf), {COUNTS, SHAPE})
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize("dead", [0.6375, 3.0, 12.4])
+@pytest.mark.parametrize("engine", BOTH)
+def test_a_gate_that_is_always_open_changes_nothing(engine: str, dead: float, start: str):
+    """The exact law of a free-running pixel, whose statistics know no gate."""
+    items = 1000 if engine == "sequential" and start == "stationary" else 4000
+    case = pulsed(1.5, 0.5, gate(0.4, 1.0, dead), start=start, items=items, cycles=104)
+    free = case.system.replace(detector=Detector(dead_time_ns=dead * PERIOD_NS))
+    law = count_law(1.5, 0.5, free, delay_ns=37.0)
+    pmf = np.zeros(law.support[-1] + 1)
+    pmf[law.support] = law.pmf
+    histogram = exposure_moments(1.5, 0.5, free, delay_ns=37.0).histogram
+    check(ENGINES[engine], case, Law(histogram, pmf), {COUNTS, SHAPE})

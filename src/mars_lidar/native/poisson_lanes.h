@@ -12,7 +12,7 @@ inline namespace MARS_LEVEL {
 
 constexpr float kExpansionFrom = 40.0f;
 constexpr float kLaneMeansBelow = 16777216.0f;  // 2^24: the integers of a float, and means beyond are rounded
-constexpr int kMostTerms = 128;
+constexpr int kFirstTerms = 5, kMostTerms = 128;
 
 struct Reciprocals {
     float value[kMostTerms];
@@ -27,14 +27,19 @@ MARS_INLINE Int poisson_by_terms(UInt word, Float mean) {
     const Float v = uniform(word);
     Float density = exp_minus(mean);
     Float above = one_minus_exp(mean, density);
-    Int count = splat(0);
+    Int count = one_if(v < above);
+    for (int k = 1; k < kFirstTerms; ++k) {  // as many as most bins need, without a look at where they all end
+        density = density * mean * kReciprocals.value[k];
+        above = above - density;
+        count = plus_if(count, v < above);
+    }
     Mask more = v < above;
-    for (int k = 1; any(more) && k < kMostTerms; ++k) {
-        count = plus_if(count, more);
+    for (int k = kFirstTerms; any(more) && k < kMostTerms; ++k) {
         density = density * mean * kReciprocals.value[k];
         above = above - density;
         // past the mode rounding may leave `above` positive for ever
         more = more & (v < above) & ((mean > splat(static_cast<float>(k))) | (density > 1e-10f));
+        count = plus_if(count, more);
     }
     return count;
 }

@@ -39,29 +39,29 @@ public:
     Sampler(ShapeBlock& block, Bump& memory)
         : block_(block), job_(*block.job), n_(block.job->bins), padded_(padded_bins(block.job->bins)) {
         counts_ = memory.take<uint32_t>(padded_);
-        segment_ = (n_ + kSegments - 1) / kSegments;
-        cumulative_ = memory.take<double>(segment_ * kSegments);
+        segment_ = padded_ / kSegments;
+        cumulative_ = memory.take<double>(padded_);
     }
 
     // The shape (padded) to draw from.
     void set(const float* shape) {
         shape_ = shape;
         double sums[kSegments] = {};
-        float highest = 0.0f;
-        const bool even = n_ == segment_ * kSegments;
         for (int64_t j = 0; j < segment_; ++j)
-            for (int s = 0; s < kSegments; ++s) {
-                const int64_t bin = s * segment_ + j;
-                cumulative_[bin] = sums[s] += even || bin < n_ ? static_cast<double>(shape[bin]) : 0.0;
-            }
-        for (int64_t j = 0; j < n_; ++j) highest = shape[j] > highest ? shape[j] : highest;
-        highest_ = highest;
+            for (int s = 0; s < kSegments; ++s)
+                cumulative_[s * segment_ + j] = sums[s] += static_cast<double>(shape[s * segment_ + j]);
+        Float highest = splat(0.0f);
+        for (int64_t j = 0; j < padded_; j += kLanes) highest = maximum(highest, load<Float>(shape + j));
+        alignas(64) float each[kLanes];
+        spill(each, highest);
+        highest_ = 0.0f;
+        for (int k = 0; k < kLanes; ++k) highest_ = each[k] > highest_ ? each[k] : highest_;
         start_[0] = 0.0;
         for (int s = 0; s < kSegments; ++s) start_[s + 1] = start_[s] + sums[s];
     }
 
-    // One exposure of `photons` registrations into row `item` of the output.
-    void draw(int64_t photons, Pair<uint32_t> key, int64_t item) {
+    // One exposure of `photons` registrations into row `row` of the output.
+    void draw(int64_t photons, Pair<uint32_t> key, int64_t row) {
         for (int64_t j = 0; j < padded_; ++j) counts_[j] = 0;
         if (photons > 0) {
             if (photons > 0xffffffffll || !(start_[kSegments] > 0.0)) {
@@ -71,9 +71,9 @@ public:
             scatter(photons, key);
         }
         if (block_.wide)
-            write(static_cast<uint32_t*>(block_.out) + item * n_);
+            write(static_cast<uint32_t*>(block_.out) + row * n_);
         else
-            write(static_cast<uint16_t*>(block_.out) + item * n_);
+            write(static_cast<uint16_t*>(block_.out) + row * n_);
     }
 
 private:
@@ -134,8 +134,11 @@ private:
         return static_cast<int64_t>(low) + (static_cast<int64_t>(high) << 16);
     }
 
+    // Photons one by one. The searches of several go side by side, because each waits for memory at every step.
     void place(int64_t photons, Pair<uint32_t> key) {
         alignas(64) uint32_t high[kLanes], low[kLanes];
+        double rest[kLanes];
+        const double* at[kLanes];
         for (int64_t k = 0; k < photons; k += kLanes) {
             const UInt event = load<UInt>(kLane.value) + static_cast<uint32_t>(k);
             const Pair<UInt> word =
@@ -143,29 +146,30 @@ private:
             spill(high, word.first);
             spill(low, word.second);
             const int here = photons - k < kLanes ? static_cast<int>(photons - k) : kLanes;
-            for (int lane = 0; lane < here; ++lane)
-                ++counts_[bin_of(uniform53(high[lane], low[lane]) * start_[kSegments])];
+            for (int lane = 0; lane < here; ++lane) {
+                const double energy = uniform53(high[lane], low[lane]) * start_[kSegments];
+                int64_t s = 0;
+                for (int edge = 1; edge < kSegments; ++edge) s += start_[edge] <= energy;
+                rest[lane] = energy - start_[s];
+                at[lane] = cumulative_ + s * segment_;
+            }
+            for (int64_t size = segment_; size > 1; size -= size / 2) {
+                const int64_t half = size / 2;
+                for (int lane = 0; lane < here; ++lane)
+                    at[lane] += half & -static_cast<int64_t>(at[lane][half - 1] <= rest[lane]);  // no branch
+            }
+            for (int lane = 0; lane < here; ++lane) ++counts_[lit(at[lane] - cumulative_)];
         }
+    }
+
+    // The bin found, or the one before it that rounding led past.
+    int64_t lit(int64_t bin) const {
+        while (bin > 0 && (bin >= n_ || shape_[bin] == 0.0f)) --bin;
+        return bin;
     }
 
     static double uniform53(uint32_t high, uint32_t low) {
         return static_cast<double>(static_cast<int64_t>(static_cast<uint64_t>(high) << 21 | low >> 11)) * 0x1p-53;
-    }
-
-    // The bin in which the cumulative shape passes `energy`.
-    int64_t bin_of(double energy) const {
-        int s = 0;
-        for (int k = 1; k < kSegments; ++k) s += start_[k] <= energy;
-        const double rest = energy - start_[s];
-        const double* at = cumulative_ + s * segment_;
-        for (int64_t size = segment_; size > 1;) {
-            const int64_t half = size / 2;
-            at += at[half - 1] <= rest ? half : 0;
-            size -= half;
-        }
-        int64_t bin = at - cumulative_;
-        while (bin > 0 && (bin >= n_ || shape_[bin] == 0.0f)) --bin;  // what rounding pushed behind the last
-        return bin;
     }
 
     // One of `total` photons, any with equal probability.
@@ -193,7 +197,7 @@ private:
     const int64_t n_, padded_;
     const float* shape_ = nullptr;
     uint32_t* counts_;
-    double* cumulative_;  // (segments, bins): inside each
+    double* cumulative_;  // (kSegments, segment_): inside each
     int64_t segment_;
     double start_[kSegments + 1];
     float highest_ = 0.0f;
@@ -211,9 +215,9 @@ MARS_NOINLINE void shape_block(ShapeBlock& block) {
         sampler.set(alignment.shape);
         for (int64_t r = block.realization; r < block.realization + block.realizations; ++r) {
             if (*block.stop || block.full) return;
-            const int64_t item = r * job.pixels + p;
             const uint32_t number = job.first_realization + static_cast<uint32_t>(r);
-            sampler.draw(job.counts[item], stream_key(job.seed ^ kShapeDomain, number, job.pixel_index[p]), item);
+            const Pair<uint32_t> key = stream_key(job.seed ^ kShapeDomain, number, job.pixel_index[p]);
+            sampler.draw(job.counts[r * job.pixels + p], key, r * job.image + job.place[p]);
         }
     }
 }

@@ -23,7 +23,9 @@ struct ShapeJob {
     uint64_t seed = 0;
     int32_t bins = 1;
     double dead_time = 0.0;                  // periods
-    const uint32_t* pixel_index = nullptr;   // (pixels)
+    const uint32_t* pixel_index = nullptr;   // (pixels): names the random streams
+    const int64_t* place = nullptr;          // (pixels): of the pixel in an image of the output
+    int64_t image = 0;                       // pixels of an image of the output
     const float* shapes = nullptr;           // (rows, bins), each summing to 1
     const int64_t* rows = nullptr;           // (pixels, 4)
     const double* weights = nullptr;         // (pixels, 4)
@@ -42,7 +44,7 @@ struct ShapeBlock {
     const ShapeJob* job;
     int64_t pixel, pixels, realization, realizations;
     bool wide;    // the output is uint32, not uint16
-    void* out;    // of the job: (realizations, pixels, bins)
+    void* out;    // (realizations, image, bins)
     void* memory; // `shape_memory` bytes, aligned to 64
     // Poisson number of a mean beyond those of the lanes
     int64_t (*large_poisson)(uint64_t key, uint32_t event, uint32_t step, double mean);

@@ -83,6 +83,8 @@ struct BoundShapeJob : ShapeJob {
 };
 
 void check(const BoundShapeJob& job, size_t rows) {
+    for (int64_t p = 0; p < job.pixels; ++p)
+        if (job.place[p] < 0 || job.place[p] >= job.image) throw nb::value_error("place must lie in the image");
     for (int64_t k = 0; k < 4 * job.pixels; ++k)
         if (job.rows[k] < 0 || job.rows[k] >= static_cast<int64_t>(rows))
             throw nb::value_error("rows must point into shapes");
@@ -94,9 +96,9 @@ void sample(const BoundShapeJob& job, Matrix<const int64_t> counts, Matrix<Count
     if (static_cast<int64_t>(counts.shape(0)) != job.realizations ||
         static_cast<int64_t>(counts.shape(1)) != job.pixels)
         throw nb::value_error("counts must be (realizations, pixels)");
-    if (static_cast<int64_t>(out.shape(0)) != job.realizations * job.pixels ||
+    if (static_cast<int64_t>(out.shape(0)) != job.realizations * job.image ||
         static_cast<int64_t>(out.shape(1)) != job.bins)
-        throw nb::value_error("out must be (realizations * pixels, bins)");
+        throw nb::value_error("out must be (realizations * image, bins)");
     const ShapeKernel kernel = kernel_of(level);
     ShapeJob full = job;
     full.counts = counts.data();
@@ -132,25 +134,28 @@ void bind_shape_sampler(nb::module_& module) {
         .def(
             "__init__",
             [](BoundShapeJob* self, Matrix<const float> shapes, Matrix<const int64_t> rows, Matrix<const double> weights,
-               Vector<const uint32_t> pixel_index, int64_t realizations, uint32_t first_realization, uint64_t seed) {
+               Vector<const uint32_t> pixel_index, Vector<const int64_t> place, int64_t image, int64_t realizations,
+               uint32_t first_realization, uint64_t seed) {
                 new (self) BoundShapeJob();
                 self->pixels = static_cast<int64_t>(pixel_index.shape(0));
                 self->realizations = realizations;
                 self->first_realization = first_realization;
                 self->seed = seed;
                 self->bins = static_cast<int32_t>(shapes.shape(1));
-                if (rows.shape(0) != pixel_index.shape(0) || weights.shape(0) != pixel_index.shape(0) ||
+                if (rows.shape(0) != pixel_index.shape(0) || place.shape(0) != pixel_index.shape(0) || weights.shape(0) != pixel_index.shape(0) ||
                     rows.shape(1) != 4 || weights.shape(1) != 4)
-                    throw nb::value_error("rows and weights must be (pixels, 4)");
+                    throw nb::value_error("rows and weights must be (pixels, 4), place (pixels)");
                 self->pixel_index = pixel_index.data();
+                self->place = place.data();
+                self->image = image;
                 self->shapes = shapes.data();
                 self->rows = rows.data();
                 self->weights = weights.data();
                 check(*self, shapes.shape(0));
-                self->arrays = nb::make_tuple(shapes, rows, weights, pixel_index);
+                self->arrays = nb::make_tuple(shapes, rows, weights, pixel_index, place);
             },
             nb::kw_only(), nb::arg("shapes"), nb::arg("rows"), nb::arg("weights"), nb::arg("pixel_index"),
-            nb::arg("realizations"), nb::arg("first_realization"), nb::arg("seed"))
+            nb::arg("place"), nb::arg("image"), nb::arg("realizations"), nb::arg("first_realization"), nb::arg("seed"))
         .def(
             "align",
             [](BoundShapeJob& self, Vector<const double> shift, Vector<const double> signal,
@@ -175,7 +180,7 @@ void bind_shape_sampler(nb::module_& module) {
             nb::kw_only(), nb::arg("shift"), nb::arg("signal"), nb::arg("background"), nb::arg("rate"),
             nb::arg("dead_time"), nb::arg("first"), nb::arg("cells"), nb::arg("energy"),
             "Move the rows by `shift`, in [0, 1), to the pixels' own delays.");
-    const char* about = "Histograms out (realizations * pixels, bins) of counts (realizations, pixels).";
+    const char* about = "Histograms out (realizations * image, bins) of counts (realizations, pixels).";
     module.def("shape_histogram", &sample<uint16_t>, nb::arg("job"), nb::arg("counts"), nb::arg("out").noconvert(),
                nb::arg("threads"), nb::arg("level"), nb::arg("progress").none(), about);
     module.def("shape_histogram", &sample<uint32_t>, nb::arg("job"), nb::arg("counts"), nb::arg("out").noconvert(),

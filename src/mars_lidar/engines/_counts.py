@@ -94,6 +94,28 @@ class Poisson(CountLaws):
 
 
 @dataclass(frozen=True, eq=False)
+class Matched(CountLaws):
+    """The discrete law with four given cumulants (pixels, 4): `mars_lidar.statistics.matched`."""
+
+    cumulants: FloatArray
+
+    def part(self, pixels: slice) -> Matched:
+        return Matched(self.cumulants[pixels])
+
+    def fill(self, streams: Streams, out: IndexArray) -> None:
+        from mars_lidar import _core
+
+        _core.matched_counts(
+            cumulants=np.ascontiguousarray(self.cumulants),
+            pixel_index=streams.pixel_index,
+            first_realization=streams.first,
+            seed=streams.seed,
+            out=out,
+            threads=streams.threads,
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Tabulated(CountLaws):
     """Exact laws: `law` (pixels,) points to one of some; the rest is made by `of`."""
 

@@ -38,9 +38,14 @@ class Group:
     cell: IndexArray
 
 
-def groups(flux: Flux, system: System, pixels: IndexArray) -> Iterator[Group]:
-    """The distinct ones among some pixels, in batches of moderate memory."""
-    keys = _keys(flux, system, pixels)
+def groups(flux: Flux, system: System, pixels: IndexArray, *, delays: bool = True) -> Iterator[Group]:
+    """The distinct ones among some pixels, in batches of moderate memory.
+
+    Without `delays` pixels of one return are distinct by (S, B) alone, and the cells have the canonical delay.
+    """
+    if pixels.size == 0:
+        return
+    keys = _keys(flux, system, pixels, delays)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(inverse, kind="stable")
     starts = np.searchsorted(inverse[order], np.arange(first.size + 1))
@@ -48,7 +53,7 @@ def groups(flux: Flux, system: System, pixels: IndexArray) -> Iterator[Group]:
     for low in range(0, first.size, step):
         high = min(low + step, first.size)
         members = order[starts[low] : starts[high]]
-        cells = _cells(flux, system, pixels[first[low:high]])
+        cells = _cells(flux, system, pixels[first[low:high]], delays)
         yield Group(pixels[members], cells, np.ascontiguousarray(inverse[members] - low))
 
 
@@ -70,7 +75,7 @@ def _parts(system: System) -> int:
     return system.bins * max(1, int(np.ceil(wanted / system.bins)))
 
 
-def _keys(flux: Flux, system: System, pixels: IndexArray) -> NDArray[np.void]:
+def _keys(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> NDArray[np.void]:
     """(P,) bytes that are equal where pixels are."""
     background = flux.background.reshape(-1)[pixels]
     if flux.waveform is not None:
@@ -82,19 +87,20 @@ def _keys(flux: Flux, system: System, pixels: IndexArray) -> NDArray[np.void]:
         return np.frombuffer(b"".join(digests), dtype="V16")
     signal = flux.returns_signal.reshape(len(flux.returns_signal), -1)[:, pixels]
     delay = flux.returns_delay_ns.reshape(len(flux.returns_signal), -1)[:, pixels] / system.period_ns
-    delay = np.where(signal > 0, delay - np.floor(delay), 0.0)
+    delay = np.where((signal > 0) & delays, delay - np.floor(delay), 0.0)
     table = np.ascontiguousarray(np.concatenate([signal, delay, background[None]]).T + 0.0)  # no -0.0
     return table.view(f"V{table.shape[1] * 8}").reshape(-1)
 
 
-def _cells(flux: Flux, system: System, pixels: IndexArray) -> Cells:
+def _cells(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> Cells:
     background = flux.background.reshape(-1)[pixels]
     if flux.waveform is not None:
         wave = flux.waveform.reshape(-1, flux.waveform.shape[-1])[pixels]
         return Cells.of(None, background, system, waveform=wave)
     single = single_return(flux)
     if single is not None:
-        return Cells.of(single[0][pixels], background, system, delay_ns=single[1][pixels])
+        own = single[1][pixels] if delays else None
+        return Cells.of(single[0][pixels], background, system, delay_ns=own)
     signal = flux.returns_signal.reshape(len(flux.returns_signal), -1)[:, pixels]
     delay = np.nan_to_num(flux.returns_delay_ns.reshape(len(flux.returns_signal), -1)[:, pixels])
     parts = _parts(system)

@@ -1,27 +1,115 @@
-"""What an engine asks of a lookup table: that it belongs to the system, and a record for the file of a cube."""
+"""What engines ask of a lookup table: that it fits the system, the entries of pixels, a record for a cube's file."""
 
 from __future__ import annotations
 
-from hashlib import blake2b
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mars_lidar import _validate
+from mars_lidar.engines._alignment import Alignment
+from mars_lidar.engines._counts import CountLaws
+from mars_lidar.engines._pixels import single_return
+from mars_lidar.engines._synthesis import Batch
+from mars_lidar.engines.base import Task
+from mars_lidar.flux import Flux
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
 
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
-def check_table(table: Table | None, system: System | None = None) -> Table | None:
-    """The table, if it is one, and of this system but for the number of cycles."""
-    if table is None:
-        return None
-    if not (callable(getattr(table, "lookup", None)) and callable(getattr(table, "shapes", None))):
-        raise TypeError(f"table must be a mars_lidar.Table, got {table!r}")
-    if system is not None:
-        ours, theirs = system.to_dict(), table.system.to_dict()
+PIXELS = 2**17  # looked up at a time: 14 MiB
+_INTERPOLATIONS = ("bilinear", "nearest")
+
+
+@dataclass(frozen=True, eq=False)
+class Entries:
+    """What a table says of some pixels (P,) of the image, in the order of its grid.
+
+    Neighbours on the grid follow each other, so that their rows are still in the processor's cache.
+    """
+
+    pixels: IndexArray
+    signal: FloatArray
+    background: FloatArray
+    cumulants: FloatArray
+    shapes: NDArray[np.float32]
+    rows: IndexArray
+    weights: FloatArray
+    alignment: Alignment
+
+    def batch(self, laws: CountLaws) -> Batch:
+        """With counts from `laws`."""
+        return Batch(self.pixels, self.shapes, self.rows, self.weights, laws, self.alignment)
+
+
+class TableReader:
+    """A table as an engine reads it: which, and how between its grid points."""
+
+    def __init__(self, table: Table, interpolation: str | None) -> None:
+        if not (callable(getattr(table, "lookup", None)) and callable(getattr(table, "shapes", None))):
+            raise TypeError(f"table must be a mars_lidar.Table, got {table!r}")
+        self.table = table
+        given = "bilinear" if interpolation is None else interpolation
+        self.interpolation = _validate.choice("interpolation", given, _INTERPOLATIONS)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a cube depends on: interpolation, and which table."""
+        return {"interpolation": self.interpolation, "table": table_record(self.table)}
+
+    def check(self, flux: Flux, system: System) -> None:
+        """The table is of this system but for the number of cycles, and every pixel has one return."""
+        ours, theirs = system.to_dict(), self.table.system.to_dict()
         for name in ours:
             if name != "cycles" and ours[name] != theirs[name]:
                 raise ValueError(f"table must be of this system: {name} is {ours[name]}, the table's {theirs[name]}")
-    return table
+        if single_return(flux) is None:
+            what = "a waveform" if flux.waveform is not None else "several returns in a pixel"
+            raise ValueError(f"flux must have one return a pixel with a table, got {what}; leave the table out")
+
+    def read(self, task: Task, pixels: IndexArray) -> tuple[Entries, IndexArray]:
+        """Entries of those of the pixels that lie on the grid; the others."""
+        single = single_return(task.flux)
+        assert single is not None  # see check
+        system = task.system
+        signal, delay = single[0][pixels], single[1][pixels]
+        background = np.ascontiguousarray(task.flux.background.reshape(-1)[pixels])
+        look = self.table.lookup(
+            signal,
+            background,
+            delay_ns=delay,
+            cycles=system.cycles,
+            interpolation=self.interpolation,
+            outside="exact",
+        )
+        order = np.flatnonzero(~look.outside)
+        order = order[np.argsort(look.rows[order, 0], kind="stable")]
+        signal, background, cumulants = signal[order], background[order], look.cumulants[order]
+        alignment = Alignment.of(system, signal, background, delay[order], cumulants[:, 0] / system.cycles)
+        entries = Entries(
+            pixels[order],
+            signal,
+            background,
+            cumulants,
+            self.table.shapes(system.cycles),
+            look.rows[order],
+            look.weights[order],
+            alignment,
+        )
+        return entries, pixels[look.outside]
+
+
+def table_record(table: Table) -> dict[str, Any]:
+    """Names a table in the file of a cube: hash of its content, method and grid."""
+    return {
+        "hash": table.content_hash,
+        "method": table.method,
+        "signal": [float(table.signal[0]), float(table.signal[-1]), table.signal.size],
+        "background": [float(table.background[0]), float(table.background[-1]), table.background.size],
+    }

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _validate
-from mars_lidar.engines._alignment import Alignment
 from mars_lidar.engines._counts import CountLaws, Matched, Poisson, RoundedGaussian, Tabulated
-from mars_lidar.engines._pixels import Group, groups, single_return
+from mars_lidar.engines._pixels import Group, groups
 from mars_lidar.engines._synthesis import Batch, Run
-from mars_lidar.engines._table import check_table, table_record
+from mars_lidar.engines._table import PIXELS, TableReader
 from mars_lidar.engines.base import Engine, Task
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
@@ -24,8 +23,6 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 _COUNTS = ("exact", "gaussian")
-_INTERPOLATIONS = ("bilinear", "nearest")
-_PIXELS = 2**17  # looked up at a time: 14 MiB
 
 
 class MarsEngine(Engine):
@@ -45,15 +42,21 @@ class MarsEngine(Engine):
     count
         ``"exact"``: the exact law without a table; with one the discrete law of the table's four cumulants.
         ``"gaussian"``: the paper's, a rounded normal number of the right mean and variance, at least 0. Rounding
-        adds up to 1/12 to the variance, which spoils pixels locked to the laser (variances down to 0.04).
+        adds 1/12 to the variance of a wide law and has no rule for a narrow one: it spoils pixels that are locked
+        to the laser, whose variances go down to 0.04.
     interpolation
-        ``"bilinear"`` in (log S, log B), or ``"nearest"`` grid point, which is the paper's.
+        For a table: ``"bilinear"`` in (log S, log B), the default, or ``"nearest"`` grid point, the paper's.
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
+
+    Notes
+    -----
+    Seconds of the stages go to the report: ``lookup_s``, ``evaluation_s``, ``counts_s``, ``sampling_s`` (alignment
+    included), and ``pixels_evaluated``, those that no table was used for.
     """
 
     name = "mars"
-    description = "count law x mean histogram, cost flat in the exposure; bins are not correlated as they should be"
+    description = "count law x mean histogram: cost flat in the exposure, bins not correlated as they should be"
     options: ClassVar[tuple[str, ...]] = ("table", "count", "interpolation")
 
     def __init__(
@@ -64,86 +67,40 @@ class MarsEngine(Engine):
         interpolation: Literal["bilinear", "nearest"] | None = None,
         level: str = "",
     ) -> None:
-        self.table = check_table(table)
         self.count = _validate.choice("count", count, _COUNTS)
-        if interpolation is not None and table is None:
-            raise ValueError(f"interpolation must be None without a table, got {interpolation!r}")
-        self.interpolation = _validate.choice(
-            "interpolation", "bilinear" if interpolation is None else interpolation, _INTERPOLATIONS
-        )
+        self.reader = table_reader(table, interpolation)
         self.level = level
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the cube depends on, for its file."""
-        if self.table is None:
-            return {"count": self.count}
-        return {"count": self.count, "interpolation": self.interpolation, "table": table_record(self.table)}
+        """Count law, and the table if there is one."""
+        return {"count": self.count} | (self.reader.settings if self.reader else {})
 
     def check(self, flux: Flux, system: System) -> None:
-        """A table must belong to the system, and knows one return a pixel."""
-        if self.table is not None:
-            check_table(self.table, system)
-            if single_return(flux) is None:
-                what = "a waveform" if flux.waveform is not None else "several returns in a pixel"
-                raise ValueError(f"flux must have one return a pixel for a table, got {what}; leave the table out")
+        """A table must be of the system, and knows one return a pixel."""
+        if self.reader:
+            self.reader.check(flux, system)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
-        """Batch by batch: look up, draw the counts, draw their places."""
+        """Look up or evaluate, draw the counts, draw their places: batch by batch."""
         run = Run(task, out, self.level)
         pixels = np.arange(task.pixel_index.size)
-        if self.table is None:
+        if self.reader is None:
             self._evaluate(run, pixels)
             return
-        left = [self._from_table(run, pixels[k : k + _PIXELS]) for k in range(0, pixels.size, _PIXELS)]
+        left = [self._look_up(run, self.reader, pixels[k : k + PIXELS]) for k in range(0, pixels.size, PIXELS)]
         self._evaluate(run, np.concatenate(left))
 
-    def _from_table(self, run: Run, pixels: IndexArray) -> IndexArray:
-        """Draws those that lie on the grid; returns the others."""
-        task, table = run.task, self.table
-        found = single_return(task.flux)
-        assert table is not None and found is not None
+    def _look_up(self, run: Run, reader: TableReader, pixels: IndexArray) -> IndexArray:
+        """Draws the pixels on the grid; returns the others."""
         with run.stage("lookup_s"):
-            system = task.system
-            signal, delay = found[0][pixels], found[1][pixels]
-            background = np.ascontiguousarray(task.flux.background.reshape(-1)[pixels])
-            look = table.lookup(
-                signal,
-                background,
-                delay_ns=delay,
-                cycles=system.cycles,
-                interpolation=self.interpolation,
-                outside="exact",
-            )
-            inside = ~look.outside
-            # neighbours on the grid follow each other, so that their rows are still in the processor's cache
-            order = np.flatnonzero(inside)
-            order = order[np.argsort(look.rows[order, 0], kind="stable")]
-            cumulants = look.cumulants[order]
-            rate = cumulants[:, 0] / system.cycles
-            batch = Batch(
-                pixels[order],
-                table.shapes(system.cycles),
-                look.rows[order],
-                look.weights[order],
-                self._laws(system, cumulants),
-                Alignment.of(system, signal[order], background[order], delay[order], rate),
-            )
-        run.draw(batch)
-        return np.asarray(pixels[~inside])
-
-    def _laws(self, system: System, cumulants: FloatArray) -> CountLaws:
-        if self.count == "gaussian":
-            return RoundedGaussian(cumulants[:, 0].copy(), cumulants[:, 1].copy())
-        if system.dead_time_periods == 0.0:
-            return Poisson(cumulants[:, 0].copy())
-        return Matched(cumulants)
+            entries, left = reader.read(run.task, pixels)
+        run.draw(entries.batch(self._laws(run.task.system, entries.cumulants)))
+        return left
 
     def _evaluate(self, run: Run, pixels: IndexArray) -> None:
         """The exact statistics of each distinct pixel, at its own delay."""
         run.count("pixels_evaluated", pixels.size)
-        if pixels.size == 0:
-            return
         for group in groups(run.task.flux, run.task.system, pixels):
             with run.stage("evaluation_s"):
                 batch = self._evaluated(run, group)
@@ -153,20 +110,32 @@ class MarsEngine(Engine):
         from mars_lidar.statistics._pmf import exact_windows
         from mars_lidar.statistics.exposure import refined_moments
 
-        system, cells = run.task.system, group.cells
+        task = run.task
         exposure = refined_moments(
-            cells, system.bins, tolerance=1e-4, threads=run.task.threads, progress=run.waiting
+            group.cells, task.system.bins, tolerance=1e-4, threads=task.threads, progress=run.waiting
         )
         cumulants = exposure.cumulants.reshape(-1, 4)
-        laws: CountLaws
-        if self.count == "gaussian":
-            laws = RoundedGaussian(cumulants[group.cell, 0], cumulants[group.cell, 1])
-        elif system.dead_time_periods == 0.0:
-            laws = Poisson(cumulants[group.cell, 0])
+        if self.count == "exact" and task.system.dead_time_periods > 0.0:
+            windows = exact_windows(group.cells, cumulants, exposure.bins.reshape(-1), task.threads)
+            laws: CountLaws = Tabulated.of(windows, group.cell)
         else:
-            windows = exact_windows(cells, cumulants, exposure.bins.reshape(-1), run.task.threads)
-            laws = Tabulated.of(windows, group.cell)
+            laws = self._laws(task.system, cumulants[group.cell])
         return Batch.unmixed(group.pixels, normalised(exposure.histogram), group.cell, laws)
+
+    def _laws(self, system: System, cumulants: FloatArray) -> CountLaws:
+        """Laws from cumulants (pixels, 4)."""
+        if self.count == "gaussian":
+            return RoundedGaussian(cumulants[:, 0], cumulants[:, 1])
+        return Poisson(cumulants[:, 0]) if system.dead_time_periods == 0.0 else Matched(cumulants)
+
+
+def table_reader(table: Table | None, interpolation: str | None) -> TableReader | None:
+    """A reader of the table, if there is one; without one there is nothing to interpolate."""
+    if table is not None:
+        return TableReader(table, interpolation)
+    if interpolation is not None:
+        raise ValueError(f"interpolation must be None without a table, got {interpolation!r}")
+    return None
 
 
 def normalised(histogram: FloatArray) -> NDArray[np.float32]:

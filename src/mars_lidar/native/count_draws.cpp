@@ -4,7 +4,8 @@
 #include <cstdint>
 
 #include "bindings.h"
-#include "normal_quantile.h"
+#include "elementary.h"
+#include "matched_law.h"
 #include "parallel.h"
 #include "poisson_sampler.h"
 
@@ -53,6 +54,12 @@ struct RoundedNormal {
     }
 };
 
+// The law with four given cumulants.
+struct Matched {
+    MatchedLaw law;
+    int64_t operator()(const EventStream& stream) const { return law.draw(open_uniform(stream.word(0, 0))); }
+};
+
 // A tabulated distribution function: the first count whose P(N <= n) exceeds the uniform number.
 struct Tabulated {
     const double *begin, *end;
@@ -75,6 +82,16 @@ void gaussian(Vector<const double> mean, Vector<const double> variance, Vector<c
     const double *m = mean.data(), *v = variance.data();
     draw({pixel_index, first_realization, seed, out}, threads,
          [=](int64_t p) { return RoundedNormal{m[p], std::sqrt(std::max(v[p], 0.0))}; });
+}
+
+void matched(Matrix<const double> cumulants, Vector<const uint32_t> pixel_index, uint32_t first_realization,
+             uint64_t seed, Matrix<int64_t> out, int threads) {
+    if (cumulants.shape(0) != out.shape(1) || cumulants.shape(1) != 4)
+        throw nb::value_error("cumulants must be (pixels, 4)");
+    const double* k = cumulants.data();
+    draw({pixel_index, first_realization, seed, out}, threads, [=](int64_t p) {
+        return Matched{MatchedLaw(Cumulants{k[4 * p], k[4 * p + 1], k[4 * p + 2], k[4 * p + 3]})};
+    });
 }
 
 void poisson(Vector<const double> mean, Vector<const uint32_t> pixel_index, uint32_t first_realization, uint64_t seed,
@@ -112,6 +129,9 @@ void bind_count_draws(nb::module_& module) {
     module.def("gaussian_counts", &gaussian, nb::kw_only(), nb::arg("mean"), nb::arg("variance"),
                nb::arg("pixel_index"), nb::arg("first_realization"), nb::arg("seed"), nb::arg("out").noconvert(),
                nb::arg("threads"), "Rounded normal numbers, at least 0: out (realizations, pixels).");
+    module.def("matched_counts", &matched, nb::kw_only(), nb::arg("cumulants"), nb::arg("pixel_index"),
+               nb::arg("first_realization"), nb::arg("seed"), nb::arg("out").noconvert(), nb::arg("threads"),
+               "Numbers of the laws with four given cumulants (pixels, 4): out (realizations, pixels).");
     module.def("poisson_counts", &poisson, nb::kw_only(), nb::arg("mean"), nb::arg("pixel_index"),
                nb::arg("first_realization"), nb::arg("seed"), nb::arg("out").noconvert(), nb::arg("threads"),
                "Poisson numbers: out (realizations, pixels).");

@@ -17,7 +17,7 @@ ENGINES: dict[str, Engine] = {
 
 
 def find_engine(engine: str | Engine, **options: Any) -> Engine:
-    """The engine of that name, with its default settings but for those options that are not None; or the engine itself."""
+    """The engine of that name, of default settings but for the options that are not None; or the engine itself."""
     given = {name: value for name, value in options.items() if value is not None}
     if isinstance(engine, Engine):
         found = engine

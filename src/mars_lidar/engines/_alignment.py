@@ -105,14 +105,13 @@ def _frame(pulse: Pulse, period_ns: float, bins: int, dead_fraction: float) -> F
 def _deviation(pulse: Pulse, period_ns: float) -> float:
     """Standard deviation, ns, of the Gaussian with the pulse's equivalent width 1 / integral of s^2."""
     low, high = pulse.support_ns()
-    edges = np.linspace(low, high, 4097)
-    squares = float(np.sum(np.diff(pulse.cumulative(edges)) ** 2)) / (edges[1] - edges[0])
+    squares = float(np.sum(np.diff(pulse.cumulative(np.linspace(low, high, 4097))) ** 2)) * 4096.0 / (high - low)
     return min(1.0 / squares / (2.0 * math.sqrt(math.pi)), period_ns)
 
 
 def _power_of_two(wanted: float, low: int, high: int) -> int:
     """The power of two next above `wanted`, kept in [low, high]."""
-    power = 2 ** max(0, math.ceil(math.log2(max(wanted, 1.0))))
+    power = 1 << math.ceil(math.log2(max(wanted, 1.0)))
     while power > high:
         power //= 2
     return max(power, low)

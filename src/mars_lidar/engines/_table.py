@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -106,10 +107,19 @@ class TableReader:
 
 
 def table_record(table: Table) -> dict[str, Any]:
-    """Names a table in the file of a cube: hash of its content, method and grid."""
+    """Names a table in the file of a cube: hash of its content, cycles, method and grid.
+
+    The hash is of what a cube depends on: axes, shapes, and cumulants at the nodes.
+    """
+    signal, background = (np.ascontiguousarray(axis, dtype=np.float64) for axis in (table.signal, table.background))
+    nodes = table.lookup(np.repeat(signal, background.size), np.tile(background, signal.size), interpolation="nearest")
+    digest = blake2b(digest_size=16)
+    for part in (signal, background, nodes.cumulants, table.shapes()):
+        digest.update(np.ascontiguousarray(part).data)
     return {
-        "hash": table.content_hash,
+        "hash": digest.hexdigest(),
         "method": table.method,
-        "signal": [float(table.signal[0]), float(table.signal[-1]), table.signal.size],
-        "background": [float(table.background[0]), float(table.background[-1]), table.background.size],
+        "cycles": table.system.cycles,
+        "signal": [float(signal[0]), float(signal[-1]), signal.size],
+        "background": [float(background[0]), float(background[-1]), background.size],
     }

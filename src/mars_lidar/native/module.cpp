@@ -59,4 +59,5 @@ NB_MODULE(_core, module) {
     mars::bind_shape_sampler(module);
     mars::bind_count_draws(module);
     mars::bind_matched(module);
+    mars::bind_table(module);
 }

@@ -68,11 +68,13 @@ def simulate(
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
     report
         A dictionary that takes what the engine has to tell beside the counts, numbers by name.
-    table, interpolation
-        For ``"mars"`` and ``"renewal"``: the lookup table, and how to read it between its grid points; see
+    table
+        For ``"mars"`` and ``"renewal"``: the lookup table (`mars_lidar.Table`); see
         `mars_lidar.engines.MarsEngine`.
     count
-        For ``"mars"``: the law of the count.
+        For ``"mars"``: the law of the count, ``"exact"`` (default) or ``"gaussian"`` (the paper's).
+    interpolation
+        For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
 
     Returns
     -------

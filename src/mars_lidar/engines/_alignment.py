@@ -14,7 +14,7 @@ from mars_lidar.system import System
 
 FloatArray = NDArray[np.float64]
 
-_OUTSIDE = 1e-8  # energy of the pulse before the frame, and behind it
+_OUTSIDE = 1e-6  # energy of the pulse before the frame, and behind it
 _STEPS_PER_WIDTH = 64  # energies per standard deviation of the pulse, linear between
 _CELLS_PER_WIDTH = 16  # and cells where registrations of the pulse re-arm inside the pulse
 _NARROW_BINS = 4.0  # standard deviations in bins from which a bin needs no cells

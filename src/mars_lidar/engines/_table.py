@@ -88,6 +88,7 @@ class TableReader:
             cycles=system.cycles,
             interpolation=self.interpolation,
             outside="exact",
+            threads=task.threads,
         )
         order = np.flatnonzero(~look.outside)
         order = order[np.argsort(look.rows[order, 0], kind="stable")]

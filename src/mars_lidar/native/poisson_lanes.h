@@ -12,7 +12,7 @@ inline namespace MARS_LEVEL {
 
 constexpr float kExpansionFrom = 40.0f;
 constexpr float kLaneMeansBelow = 16777216.0f;  // 2^24: the integers of a float, and means beyond are rounded
-constexpr int kFirstTerms = 5, kMostTerms = 128;
+constexpr int kFirstTerms = 4, kMostTerms = 128;
 
 struct Reciprocals {
     float value[kMostTerms];

@@ -53,9 +53,18 @@ struct ShapeBlock {
 };
 
 constexpr int64_t kShapeStep = 64;  // bins that are drawn together
-constexpr int kSegments = 8;        // of the cumulative shape
 
-inline constexpr int64_t padded_bins(int64_t bins) { return (bins + kShapeStep - 1) / kShapeStep * kShapeStep; }
+// Bins j, j + classes, j + 2 classes, ... are a class: photons find their class first, then their bin in it. About
+// as many classes as bins in each, in steps of 64.
+inline constexpr int64_t shape_classes(int64_t bins) {
+    int64_t classes = kShapeStep;
+    while (classes * classes < 4 * bins) classes *= 2;
+    return classes;
+}
+inline constexpr int64_t padded_bins(int64_t bins) {
+    const int64_t classes = shape_classes(bins);
+    return (bins + classes - 1) / classes * classes;
+}
 
 // Bins on either side of the frame that a dead time of `offset` bins, whole periods apart, reaches.
 inline int64_t frame_reach(double offset) { return static_cast<int64_t>(offset < 0 ? -offset : offset) + 2; }
@@ -75,7 +84,7 @@ void shape_kernel_avx2(ShapeBlock& block);
 void shape_kernel_avx512(ShapeBlock& block);
 #endif
 
-// Work area of one thread: bins of 4 + 4 + 4 + 8 bytes, and the frame.
+// Work area of one thread: four arrays of the bins, the classes, and the frame.
 int64_t shape_memory(const ShapeJob& job);
 
 }  // namespace mars

@@ -23,7 +23,7 @@ namespace mars {
 int64_t shape_memory(const ShapeJob& job) {
     const double offset = (job.dead_time - std::floor(job.dead_time + 0.5)) * job.bins;
     const int64_t cells = job.frame.cells > 1 ? (job.frame.size + 2 * frame_reach(offset)) * job.frame.cells : 0;
-    return padded_bins(job.bins) * 20 + job.frame.size * 16 + cells * 24 + 4096;
+    return padded_bins(job.bins) * 16 + shape_classes(job.bins) * 8 + job.frame.size * 16 + cells * 24 + 4096;
 }
 
 namespace {

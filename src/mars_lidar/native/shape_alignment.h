@@ -17,6 +17,7 @@ inline namespace MARS_LEVEL {
 namespace {
 
 constexpr double kLeastArmed = 1e-9;  // of a saturated pixel, where the difference leaves nothing but rounding
+constexpr double kBright = 2.0;       // photons per period from which the slope inside a bin shows
 constexpr int kSweeps = 12;           // of the fixed point where registrations re-arm inside the pulse
 
 struct Bump {  // hands out parts of a block of memory
@@ -32,7 +33,8 @@ struct Bump {  // hands out parts of a block of memory
 class Alignment {
 public:
     Alignment(const ShapeJob& job, Bump& memory) : job_(job), n_(job.bins) {
-        mixture_ = memory.take<float>(padded_bins(n_) + 16) + 16;  // room for the bin before the first
+        mixture_ = memory.take<float>(padded_bins(n_) + 32) + 16;  // room for the bins before and behind
+        past_ = memory.take<float>(padded_bins(n_) + 16) + 16;
         shape = memory.take<float>(padded_bins(n_));
         for (int64_t j = n_; j < padded_bins(n_); ++j) shape[j] = 0.0f;
         const PulseFrame& frame = job.frame;
@@ -68,16 +70,41 @@ public:
         }
         mix(pixel, mixture_);
         mixture_[-1] = mixture_[n_ - 1];
-        const float late = static_cast<float>(part), early = 1.0f - late;
-        slide(mixture_, shape + whole, n_ - whole, early, late);
-        slide(mixture_ + n_ - whole, shape, whole, early, late);
+        mixture_[n_] = mixture_[0];
+        const float late = static_cast<float>(part);
+        if (job_.signal[pixel] + job_.background[pixel] < kBright)
+            past_even(late);
+        else
+            past_sloped(late);
+        past_[-1] = past_[n_ - 1];
+        move(0, shape + whole, n_ - whole);
+        move(n_ - whole, shape, whole);
         if (part > 0.0 && job_.frame.size > 0 && job_.signal[pixel] > 0.0 && job_.rate[pixel] > 0.0)
             correct(pixel, whole, part);
     }
 
 private:
-    static void slide(const float* from, float* to, int64_t n, float early, float late) {
-        for (int64_t j = 0; j < n; ++j) to[j] = early * from[j] + late * from[j - 1];
+    // What leaves each bin for the next, if its registrations are spread evenly,
+    void past_even(float part) {
+        for (int64_t j = 0; j < n_; ++j) past_[j] = part * mixture_[j];
+    }
+
+    // or with the slope of the neighbours (van Leer's monotonised central one, J. Comput. Phys. 23, 1977): where
+    // many registrations re-arm at once, bright background registers with a step outside of the frame too.
+    void past_sloped(float part) {
+        const float half = 0.5f * part * (1.0f - part);
+        for (int64_t j = 0; j < n_; ++j) {
+            const float up = mixture_[j + 1] - mixture_[j], down = mixture_[j] - mixture_[j - 1];
+            const float central = 0.5f * (up + down), steep = up < 0.0f ? -up : up, gentle = down < 0.0f ? -down : down;
+            const float most = 2.0f * (steep < gentle ? steep : gentle);
+            const float limited = central > most ? most : central < -most ? -most : central;
+            past_[j] = part * mixture_[j] + half * (up * down > 0.0f ? limited : 0.0f);
+        }
+    }
+
+    void move(int64_t first, float* to, int64_t n) const {
+        const float *mixture = mixture_ + first, *past = past_ + first;
+        for (int64_t j = 0; j < n; ++j) to[j] = (mixture[j] - past[j]) + past[j - 1];
     }
 
     void mix(int64_t pixel, float* to) const {
@@ -133,14 +160,14 @@ private:
         else
             cut_bins(pixel, part);
         int64_t bin = frame.first, to = wrap(frame.first + whole);
-        double before = frame.size == n_ ? moved_[n_ - 1] : part * mixture_[frame.first - 1];
+        double before = frame.size == n_ ? moved_[n_ - 1] : past_[frame.first - 1];
         for (int32_t i = 0; i < frame.size; ++i) {
             shape[to] = static_cast<float>(mixture_[bin] - moved_[i] + before);
             before = moved_[i];
             if (++bin == n_) bin = 0;
             if (++to == n_) to = 0;
         }
-        if (frame.size < n_) shape[to] = static_cast<float>((1.0 - part) * mixture_[bin] + before);
+        if (frame.size < n_) shape[to] = static_cast<float>(mixture_[bin] - past_[bin] + before);
     }
 
     // Mean armed fraction at the frame's edges.
@@ -209,7 +236,8 @@ private:
                 double total = 0.0;
                 for (int64_t c = 0; c < k; ++c) {
                     const float* energy = frame.energy + c * step * frame.size + i;
-                    const double photons = signal * (energy[step * static_cast<int64_t>(frame.size)] - energy[0]) + dark;
+                    const float* next = energy + step * static_cast<int64_t>(frame.size);
+                    const double photons = signal * (next[0] - energy[0]) + dark;
                     total += mass[c] = (photons > 0.0 ? photons : 0.0) * between(armed[c], armed[c + 1]);
                 }
                 const double scale = total > 0.0 ? rate * mixture_[bin] / total : 0.0;
@@ -274,7 +302,7 @@ private:
 
     const ShapeJob& job_;
     const int64_t n_;
-    float* mixture_;
+    float *mixture_, *past_;  // (-1 .. bins]; what leaves each bin for the next
     double *armed_, *moved_;                                   // the frame: A at its edges; moved to the next bin
     double *mass_ = nullptr, *below_ = nullptr, *fine_ = nullptr;  // its cells, with `reach_` bins on either side
     double whole_, part_ = 0.0, nearest_ = 0.0, offset_ = 0.0;  // of the dead time: periods; bins

@@ -234,6 +234,10 @@ MARS_NOINLINE void shape_block(ShapeBlock& block) {
     Sampler sampler(block, memory);
     for (int64_t p = block.pixel; p < block.pixel + block.pixels; ++p) {
         alignment.set(p);
+        if (block.aligned) {
+            for (int64_t j = 0; j < job.bins; ++j) block.aligned[p * job.bins + j] = alignment.shape[j];
+            continue;
+        }
         sampler.set(alignment.shape);
         for (int64_t r = block.realization; r < block.realization + block.realizations; ++r) {
             if (*block.stop || block.full) return;

@@ -45,6 +45,7 @@ struct ShapeBlock {
     int64_t pixel, pixels, realization, realizations;
     bool wide;    // the output is uint32, not uint16
     void* out;    // (realizations, image, bins)
+    double* aligned;  // (pixels, bins): not histograms, but the shapes that they would be drawn from; or null
     void* memory; // `shape_memory` bytes, aligned to 64
     // Poisson number of a mean beyond those of the lanes
     int64_t (*large_poisson)(uint64_t key, uint32_t event, uint32_t step, double mean);
@@ -84,7 +85,7 @@ void shape_kernel_avx2(ShapeBlock& block);
 void shape_kernel_avx512(ShapeBlock& block);
 #endif
 
-// Work area of one thread: four arrays of the bins, the classes, and the frame.
+// Work area of one thread: five arrays of the bins, the classes, and the frame.
 int64_t shape_memory(const ShapeJob& job);
 
 }  // namespace mars

@@ -23,7 +23,7 @@ namespace mars {
 int64_t shape_memory(const ShapeJob& job) {
     const double offset = (job.dead_time - std::floor(job.dead_time + 0.5)) * job.bins;
     const int64_t cells = job.frame.cells > 1 ? (job.frame.size + 2 * frame_reach(offset)) * job.frame.cells : 0;
-    return padded_bins(job.bins) * 16 + shape_classes(job.bins) * 8 + job.frame.size * 16 + cells * 24 + 4096;
+    return padded_bins(job.bins) * 20 + shape_classes(job.bins) * 8 + job.frame.size * 16 + cells * 24 + 4096;
 }
 
 namespace {
@@ -127,15 +127,29 @@ void sample(const BoundShapeJob& job, Matrix<const int64_t> counts, Matrix<Count
     });
 }
 
+void aligned(const BoundShapeJob& job, Matrix<double> out, const std::string& level) {
+    if (static_cast<int64_t>(out.shape(0)) != job.pixels || static_cast<int64_t>(out.shape(1)) != job.bins)
+        throw nb::value_error("out must be (pixels, bins)");
+    const std::atomic<bool> stop{false};
+    const WorkArea area(shape_memory(job));
+    ShapeBlock block{};
+    block.job = &job;
+    block.pixels = job.pixels;
+    block.memory = area.get();
+    block.aligned = out.data();
+    block.stop = &stop;
+    kernel_of(level)(block);
+}
+
 }  // namespace
 
 void bind_shape_sampler(nb::module_& module) {
-    nb::class_<BoundShapeJob>(module, "ShapeJob", "Rows of shapes, how pixels mix and move them; times in periods.")
+    nb::class_<BoundShapeJob>(module, "ShapeJob", "Rows of shapes, and how pixels mix and move them.")
         .def(
             "__init__",
-            [](BoundShapeJob* self, Matrix<const float> shapes, Matrix<const int64_t> rows, Matrix<const double> weights,
-               Vector<const uint32_t> pixel_index, Vector<const int64_t> place, int64_t image, int64_t realizations,
-               uint32_t first_realization, uint64_t seed) {
+            [](BoundShapeJob* self, Matrix<const float> shapes, Matrix<const int64_t> rows,
+               Matrix<const double> weights, Vector<const uint32_t> pixel_index, Vector<const int64_t> place,
+               int64_t image, int64_t realizations, uint32_t first_realization, uint64_t seed) {
                 new (self) BoundShapeJob();
                 self->pixels = static_cast<int64_t>(pixel_index.shape(0));
                 self->realizations = realizations;
@@ -180,6 +194,8 @@ void bind_shape_sampler(nb::module_& module) {
             nb::kw_only(), nb::arg("shift"), nb::arg("signal"), nb::arg("background"), nb::arg("rate"),
             nb::arg("dead_time"), nb::arg("first"), nb::arg("cells"), nb::arg("energy"),
             "Move the rows by `shift`, in [0, 1), to the pixels' own delays.");
+    module.def("shape_aligned", &aligned, nb::arg("job"), nb::arg("out").noconvert(), nb::arg("level"),
+               "Shapes out (pixels, bins) from which a job's histograms are drawn: for its tests.");
     const char* about = "Histograms out (realizations * image, bins) of counts (realizations, pixels).";
     module.def("shape_histogram", &sample<uint16_t>, nb::arg("job"), nb::arg("counts"), nb::arg("out").noconvert(),
                nb::arg("threads"), nb::arg("level"), nb::arg("progress").none(), about);

@@ -14,6 +14,7 @@ from mars_lidar.statistics import (
     registration_pdf,
 )
 from mars_lidar.system import Detector, System
+from mars_lidar.table import Lookup, QuantisationError, Table
 from mars_lidar.timestamps import Timestamps
 
 __all__ = [
@@ -22,10 +23,13 @@ __all__ = [
     "Flux",
     "GaussianPulse",
     "JointLaw",
+    "Lookup",
     "Pulse",
+    "QuantisationError",
     "SampledPulse",
     "Scene",
     "System",
+    "Table",
     "Timestamps",
     "__version__",
     "count_law",

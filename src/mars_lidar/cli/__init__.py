@@ -12,6 +12,7 @@ import typer
 from mars_lidar.cli.init import init
 from mars_lidar.cli.inspect import info, view
 from mars_lidar.cli.simulate import EPILOG, simulate
+from mars_lidar.cli.table import app as table_app
 
 app = typer.Typer(
     name="mars-lidar",
@@ -25,6 +26,7 @@ app.command(no_args_is_help=True, epilog=EPILOG)(simulate)
 app.command(no_args_is_help=True)(info)
 app.command(no_args_is_help=True)(view)
 app.command()(init)
+app.add_typer(table_app, name="table")
 
 
 _EPILOG = "\n\n".join(

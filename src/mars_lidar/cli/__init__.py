@@ -13,6 +13,7 @@ from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.init import init
 from mars_lidar.cli.inspect import info, view
 from mars_lidar.cli.simulate import EPILOG, simulate
+from mars_lidar.cli.table import app as table_app
 
 app = typer.Typer(
     name="mars-lidar",
@@ -27,6 +28,7 @@ app.command(no_args_is_help=True, epilog=COMPARE_EPILOG)(compare)
 app.command(no_args_is_help=True)(info)
 app.command(no_args_is_help=True)(view)
 app.command()(init)
+app.add_typer(table_app, name="table")
 
 
 _EPILOG = "\n\n".join(

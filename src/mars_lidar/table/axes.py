@@ -15,6 +15,7 @@ Grid = tuple[float, float, int] | ArrayLike
 
 _MAX_PHOTONS = 1e6
 MAX_POINTS = 4096  # on one axis
+PAPER_GRID: dict[str, tuple[float, float, int]] = {"signal": (0.01, 10.0, 256), "background": (0.01, 10.0, 100)}
 
 
 def axis_values(name: str, grid: Grid) -> FloatArray:

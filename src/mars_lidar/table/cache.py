@@ -62,7 +62,14 @@ def request_key(
 
 
 def cached(system: System, signal: Grid, background: Grid, **options: Any) -> Table:
-    """The table from the cache, or built and put there.
+    """The table from the cache, or built and put there."""
+    from mars_lidar.table.table import Table
+
+    return Table.load(cached_path(system, signal, background, **options), system)
+
+
+def cached_path(system: System, signal: Grid, background: Grid, **options: Any) -> Path:
+    """File of the table in the cache; built and put there where it is not.
 
     A table made for another number of cycles is taken where every entry of it holds for those of `system`.
     """
@@ -71,9 +78,9 @@ def cached(system: System, signal: Grid, background: Grid, **options: Any) -> Ta
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     chosen = {"method": "exposure", "rearm": "centre", "refine": None, "tolerance": 1e-4} | options
-    unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "threads", "progress"}
+    unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "check_law", "threads", "progress"}
     if unknown:
-        raise TypeError(f"cached takes the options of Table.build, got {sorted(unknown)[0]!r}")
+        raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
     axes = axis_values("signal", signal), axis_values("background", background)
     key = request_key(
         system, axes, method=chosen["method"], rearm=chosen["rearm"], refine=chosen["refine"],
@@ -84,11 +91,13 @@ def cached(system: System, signal: Grid, background: Grid, **options: Any) -> Ta
     others = sorted(folder.glob(f"{key}-*{SUFFIX}")) if folder.is_dir() else []
     for path in [own, *(other for other in others if other != own)]:
         with contextlib.suppress(FileNotFoundError, ValueError):  # absent, damaged, or of too few cycles
-            return Table.load(path, system)
+            law = Table.load(path, system).provenance["law"]
+            if law is not None or not chosen.get("check_law", False):
+                return path
     table = Table.build(system, signal, background, **options)
     folder.mkdir(parents=True, exist_ok=True)
     table.save(own, overwrite=True)
-    return Table.load(own, system)
+    return own
 
 
 def files(folder: Path | None = None) -> list[Path]:

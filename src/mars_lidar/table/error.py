@@ -10,6 +10,7 @@ import numpy as np
 
 from mars_lidar import _validate
 from mars_lidar.statistics._cells import FloatArray
+from mars_lidar.statistics.exposure import exposure_moments, thread_count
 
 if TYPE_CHECKING:
     from mars_lidar.table.table import Interpolation, Table
@@ -76,18 +77,16 @@ def quantisation_error(
     table: Table, interpolation: Interpolation, samples: int, seed: int, cycles: int | None, threads: int | None
 ) -> QuantisationError:
     """See `Table.quantisation_error`."""
-    from mars_lidar.table.table import evaluate_entries
+    from mars_lidar.table.build import Recipe
 
     samples = _validate.integer("samples", samples, low=1, high=1_000_000)
     rng = np.random.default_rng(_validate.integer("seed", seed, low=0, high=2**64 - 1))
     periods = table.system.cycles if cycles is None else _validate.integer("cycles", cycles, low=1, high=10**8)
     system = table.system.replace(cycles=periods)
     below = interpolation == "bilinear"  # the nearest entry knows nothing between 0 and the lowest value
-    signal, background = (_between(rng, axis, samples, below) for axis in (table.signal, table.background))
-    exact = evaluate_entries(
-        signal, background, system, method=table.method, rearm=table.rearm, tolerance=table.tolerance,
-        threads=threads, progress=None,
-    )  # fmt: skip
+    signal, background = (random_pixels(rng, axis, samples, below) for axis in (table.signal, table.background))
+    recipe = Recipe(table.method, table.rearm, table.tolerance, thread_count(threads))
+    exact = recipe.entries(signal, background, system)
     found = table.lookup(signal, background, cycles=periods, interpolation=interpolation)
     shapes = table.shapes(periods)
     mixed = np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
@@ -120,7 +119,7 @@ def quantisation_error(
     )
 
 
-def _between(rng: np.random.Generator, axis: FloatArray, samples: int, below: bool) -> FloatArray:
+def random_pixels(rng: np.random.Generator, axis: FloatArray, samples: int, below: bool) -> FloatArray:
     """Random values of an axis: log-uniform, and if `below` one in eight in the cell that begins at 0."""
     positive = axis[axis > 0]
     if positive.size == 0:
@@ -144,8 +143,6 @@ def _delayed(
     threads: int | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Errors (P, 4) and (P,) of cumulants and shape at random delays, whole bins from the canonical one."""
-    from mars_lidar.statistics.exposure import exposure_moments
-
     system = table.system.replace(cycles=cycles)
     shift = rng.integers(0, system.bins, signal.size)
     delay = 0.5 * system.period_ns + shift * system.bin_ns

@@ -90,7 +90,8 @@ def start_phases(
     row, column = thinned(signal, _STEP), thinned(background, _STEP)
     index = (row[:, None] * background.size + column[None, :]).reshape(-1)
     cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system)
-    grids = bins[index]
+    own = bins[index]
+    grids = np.maximum(own, _phase_grid(cells, int(own.min())))
     spread = np.sqrt(np.maximum(cumulants[index, 1], 0.25))  # of small counts half a count is what matters
     scale = spread[:, None] ** np.arange(1, 5)
     some = np.zeros((row.size, column.size), dtype=bool)
@@ -103,7 +104,7 @@ def start_phases(
             progress(int(block[-1]), total)
     unsettled = np.flatnonzero(settled < 0)
     for place, k in enumerate(unsettled):
-        _replace_if_wrong(cells, int(k), int(grids[k]), phase, scale[k], correction[k], threads)
+        _replace_if_wrong(cells, int(k), int(own[k]), phase, scale[k], correction[k], threads)
         if progress is not None:
             progress(cells.size - unsettled.size + place, total)
     return StartPhases(
@@ -117,6 +118,13 @@ def start_phases(
 
 def _few(size: int) -> IndexArray:
     return np.unique(np.linspace(0, size - 1, _SAMPLE).round().astype(np.int64))
+
+
+def _phase_grid(cells: Cells, coarsest: int) -> int:
+    """Bins whose edges lie close enough for phases inside the pulse: an eighth of a sigma; a multiple of all grids."""
+    while coarsest < 4 * cells.first_bins(1):
+        coarsest *= 2
+    return coarsest
 
 
 def _blocks(grids: IndexArray) -> list[tuple[IndexArray, int]]:

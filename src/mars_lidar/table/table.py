@@ -7,7 +7,6 @@ is stored, and the errors, are described in docs/table.md.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,28 +15,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
-from mars_lidar._memory import check_memory
-from mars_lidar._version import __version__
 from mars_lidar.statistics._cells import FloatArray, _broadcast, _reals
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.exposure import thread_count
 from mars_lidar.system import System
-from mars_lidar.table.axes import Grid, axis_values, describe
-from mars_lidar.table.entries import Entries, Progress, exposure_entries
+from mars_lidar.table.axes import PAPER_GRID, Grid
+from mars_lidar.table.entries import Entries, Progress
 from mars_lidar.table.error import QuantisationError, quantisation_error
+from mars_lidar.table.law import LawError, law_error
 from mars_lidar.table.lookup import Lookup, evaluate
-from mars_lidar.table.refine import refined_axes
-from mars_lidar.table.renewal_entries import renewal_entries
-from mars_lidar.table.start_phase import StartPhases, start_phases
+from mars_lidar.table.start_phase import StartPhases
 
 Method = Literal["exposure", "mars"]
 Interpolation = Literal["bilinear", "nearest"]
-_METHODS, _INTERPOLATIONS, _OUTSIDE = ("exposure", "mars"), ("bilinear", "nearest"), ("error", "exact")
-_REARMS = ("centre", "edge")
-PAPER_GRID: dict[str, tuple[float, float, int]] = {"signal": (0.01, 10.0, 256), "background": (0.01, 10.0, 100)}
-
-_ERROR_SAMPLES = 128  # pixels on which a table is checked when it is built
-_ATTEMPTS = 4  # of refining, each with half the error of the one before
+_INTERPOLATIONS, _OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +72,7 @@ class Table:
         rearm: Rearm = "centre",
         refine: float | None = None,
         tolerance: float = 1e-4,
+        check_law: bool = False,
         threads: int | None = None,
         progress: Progress | None = None,
     ) -> Table:
@@ -103,6 +95,8 @@ class Table:
             nodes (`QuantisationError.largest`). None: the axes as they are.
         tolerance
             Of each entry, for ``"exposure"``: see `exposure_moments`.
+        check_law
+            Compare the counts drawn from the table with exact laws as well (`law_error`), and keep the result.
         threads
             Threads to run on; default: all processors that this process may use.
         progress
@@ -115,87 +109,12 @@ class Table:
         ConvergenceError
             Naming the cell that could not be evaluated.
         """
-        if not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
-        axes = axis_values("signal", signal), axis_values("background", background)
-        _validate.choice("method", method, _METHODS)
-        _validate.choice("rearm", rearm, _REARMS)
-        if rearm != "centre" and method != "mars":
-            raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
-        tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
-        goal = None if refine is None else _validate.real("refine", refine, low=1e-5, high=0.1)
-        team = thread_count(threads)
-        began = time.perf_counter()
-        from mars_lidar.table.cache import request_key
+        from mars_lidar.table.build import build
 
-        key = request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance)
-        built: dict[str, Any] = {
-            "method": method, "rearm": rearm, "tolerance": tolerance, "key": key, "threads": team, "progress": progress
-        }  # fmt: skip
-        if goal is None:
-            table = cls._evaluated(system, axes, **built)
-            error = table.quantisation_error(samples=_ERROR_SAMPLES, threads=team)
-        else:
-            table, error = cls._refined(system, axes, goal, built)
-        table.provenance["refine"] = goal
-        table.provenance["error"] = error.to_dict()
-        table.provenance["build_s"] = time.perf_counter() - began
-        return table
-
-    @classmethod
-    def _evaluated(
-        cls,
-        system: System,
-        axes: tuple[FloatArray, FloatArray],
-        *,
-        method: Method,
-        rearm: Rearm,
-        tolerance: float,
-        key: str,
-        threads: int,
-        progress: Progress | None,
-    ) -> Table:
-        signal, background = axes
-        check_memory(
-            2 * 4 * signal.size * background.size * system.bins,
-            f"tables of {signal.size} x {background.size} x {system.bins}",
-            "take fewer points or bins",
-        )
-        entries = evaluate_entries(
-            np.repeat(signal, background.size), np.tile(background, signal.size), system,
-            method=method, rearm=rearm, tolerance=tolerance, threads=threads, progress=progress,
+        return build(
+            system, signal, background, method=method, rearm=rearm, refine=refine, tolerance=tolerance,
+            check_law=check_law, threads=threads, progress=progress,
         )  # fmt: skip
-        phases = StartPhases.none()
-        if method == "exposure":
-            phases = start_phases(system, signal, background, entries.cumulants, entries.bins, threads=threads)
-        provenance = {
-            "version": __version__,
-            "key": key,
-            "signal": describe(signal),
-            "background": describe(background),
-        }
-        return cls(system, method, signal, background, rearm, tolerance, provenance, entries, phases)
-
-    @classmethod
-    def _refined(
-        cls, system: System, axes: tuple[FloatArray, FloatArray], goal: float, built: dict[str, Any]
-    ) -> tuple[Table, QuantisationError]:
-        def evaluated(signal: FloatArray, background: FloatArray) -> Entries:
-            chosen = {name: built[name] for name in ("method", "rearm", "tolerance", "threads")}
-            return evaluate_entries(signal, background, system, progress=None, **chosen)
-
-        inner = goal
-        for _ in range(_ATTEMPTS):
-            axes = refined_axes(*axes, evaluated, inner)
-            table = cls._evaluated(system, axes, **built)
-            error = table.quantisation_error(samples=4 * _ERROR_SAMPLES, threads=built["threads"])
-            if error.largest <= goal:
-                return table, error
-            inner *= 0.5
-        raise ValueError(
-            f"refine must be an error that can be met, got {goal:g}: reached {error.largest:.2g} with "
-            f"{axes[0].size} x {axes[1].size} points at S = {error.worst_signal:g}, B = {error.worst_background:g}"
-        )
 
     def lookup(
         self,
@@ -305,6 +224,15 @@ class Table:
         _validate.choice("interpolation", interpolation, _INTERPOLATIONS)
         return quantisation_error(self, interpolation, samples, seed, cycles, threads)
 
+    def law_error(
+        self, *, samples: int = 50, seed: int = 0, cycles: int | None = None, threads: int | None = None
+    ) -> LawError:
+        """Total variation, on random pixels, between the count law that the table leads to and the exact one.
+
+        Some 10 to 20 ms a pixel. Parameters as `quantisation_error`.
+        """
+        return law_error(self, samples, seed, cycles, threads)
+
     def serves(self, cycles: int) -> bool:
         """Whether every entry holds for exposures of `cycles` periods."""
         periods = self._cycles(cycles)
@@ -372,21 +300,3 @@ class Table:
             f"cycles must be {self.entries.cycles} at some of these pixels, got {cycles}: the table was made for "
             f"{self.entries.cycles} cycles, and {why}"
         )
-
-
-def evaluate_entries(
-    signal: FloatArray,
-    background: FloatArray,
-    system: System,
-    *,
-    method: Method,
-    rearm: Rearm,
-    tolerance: float,
-    threads: int | None,
-    progress: Progress | None,
-) -> Entries:
-    """Entries of cells (n,) by either method."""
-    team = thread_count(threads)
-    if method == "mars":
-        return renewal_entries(signal, background, system, rearm=rearm, threads=team, progress=progress)
-    return exposure_entries(signal, background, system, tolerance=tolerance, threads=team, progress=progress)

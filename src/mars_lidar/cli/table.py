@@ -1,0 +1,237 @@
+"""`mars-lidar table`: build the lookup table of a system, say what is in a file or in the cache, clear the cache."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mars_lidar.cli import options
+from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.system_options import build_system
+
+if TYPE_CHECKING:
+    from mars_lidar.system import System
+
+app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Lookup tables over (S, B).")
+
+_GRID = "Grid"
+_DEPTHS = 1024  # values of a delay axis, where there had to be one: the paper's 108 GB
+_PAPER_BYTES = "105 MB, 108 GB with delays"
+
+Signal = Annotated[
+    str,
+    typer.Option(
+        "--signal", metavar="LOW,HIGH,POINTS", rich_help_panel=_GRID, show_default=False,
+        help="Signal axis, photons per period, log-spaced; 0 is added. [dim]Default: 0.01,10,256.[/dim]",
+    ),
+]
+Background = Annotated[
+    str,
+    typer.Option(
+        "--background", metavar="LOW,HIGH,POINTS", rich_help_panel=_GRID, show_default=False,
+        help="Background axis, likewise. [dim]Default: 0.01,10,100.[/dim]",
+    ),
+]
+Method = Annotated[
+    str,
+    typer.Option(
+        "--method", rich_help_panel=_GRID, show_default=False,
+        help="exposure (exact, start-up included) or mars (the paper's). [dim]Default: exposure.[/dim]",
+    ),
+]
+Rearm = Annotated[
+    str,
+    typer.Option(
+        "--rearm", rich_help_panel=_GRID, show_default=False,
+        help="For mars: re-arming at the centre or the edge of a bin. [dim]Default: centre.[/dim]",
+    ),
+]
+Refine = Annotated[
+    float | None,
+    typer.Option(
+        "--refine", rich_help_panel=_GRID, show_default=False,
+        help="Insert points until the error between them, in total variation, is below this.",
+    ),
+]
+CheckLaw = Annotated[
+    bool,
+    typer.Option("--check-law", rich_help_panel=_GRID, help="Compare count laws with exact ones at the end."),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--out", show_default=False, help="The table: .h5 or .hdf5. [dim]Default: the cache.[/dim]"
+    ),
+]
+
+
+@app.command()
+def build(
+    *,
+    system: options.System = None,
+    period_ns: options.PeriodNs = None,
+    dead_time_ns: options.DeadTimeNs = None,
+    cycles: options.Cycles = None,
+    bins: options.Bins = None,
+    pulse_sigma_ns: options.PulseSigmaNs = None,
+    pulse_fwhm_ns: options.PulseFwhmNs = None,
+    pulse_file: options.PulseFile = None,
+    pulse_bin_ns: options.PulseBinNs = None,
+    pulse_origin: options.PulseOrigin = None,
+    start: options.Start = None,
+    signal: Signal = "0.01,10,256",
+    background: Background = "0.01,10,100",
+    method: Method = "exposure",
+    rearm: Rearm = "centre",
+    refine: Refine = None,
+    check_law: CheckLaw = False,
+    threads: options.Threads = None,
+    out: Out = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Build the table of a system and write it to a file, or to the cache, where it may be already."""
+    with reported():
+        began = time.perf_counter()
+        if out is not None and out.exists() and not overwrite:
+            raise FileExistsError(f"{out} exists already; give --overwrite or another --out")
+        instrument = build_system(
+            system,
+            period_ns=period_ns,
+            cycles=cycles,
+            bins=bins,
+            dead_time_ns=dead_time_ns,
+            start=start,
+            pulse_sigma_ns=pulse_sigma_ns,
+            pulse_fwhm_ns=pulse_fwhm_ns,
+            pulse_file=pulse_file,
+            pulse_bin_ns=pulse_bin_ns,
+            pulse_origin=pulse_origin,
+        )
+        axes = _grid("--signal", signal), _grid("--background", background)
+        from mars_lidar.table import Table, cache
+
+        chosen: dict[str, Any] = {
+            "method": method, "rearm": rearm, "refine": refine, "check_law": check_law, "threads": threads
+        }  # fmt: skip
+        with progress_bar("building") as progress:
+            if out is None:
+                path = cache.cached_path(instrument, *axes, progress=progress, **chosen)
+            else:
+                Table.build(instrument, *axes, progress=progress, **chosen).save(out, overwrite=overwrite)
+                path = out
+        table([*_rows(path), ("time", f"{time.perf_counter() - began:.3g} s in all")])
+
+
+@app.command()
+def info(
+    file: Annotated[
+        Path | None, typer.Argument(help="A table: .h5 or .hdf5. Without it: the cache.", show_default=False)
+    ] = None,
+) -> None:
+    """Say what is in a table, or which tables the cache holds."""
+    with reported():
+        if file is not None:
+            table(_rows(file))
+            return
+        from mars_lidar.table import cache
+
+        found = cache.files()
+        total = sum(path.stat().st_size for path in found)
+        rows = [("cache", f"{cache.directory()}: {len(found)} files, {total / 1e6:,.4g} MB")]
+        table(rows + [(f"{path.stat().st_size / 1e6:,.4g} MB", _line(path)) for path in found])
+
+
+@app.command()
+def clear(
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+) -> None:
+    """Remove the tables in the cache."""
+    with reported():
+        from mars_lidar.table import cache
+
+        found = cache.files()
+        if not found:
+            print(f"{cache.directory()} holds no tables")
+            return
+        total = sum(path.stat().st_size for path in found)
+        asked = f"remove {len(found)} files, {total / 1e6:,.4g} MB, from {cache.directory()}?"
+        if not yes and not typer.confirm(asked):
+            print("nothing was removed")
+            return
+        count, freed = cache.clear()
+        print(f"removed {count} files, {freed / 1e6:,.4g} MB")
+
+
+def _grid(name: str, text: str) -> tuple[float, float, int]:
+    try:
+        low, high, points = text.split(",")
+        return float(low), float(high), int(points)
+    except ValueError:
+        raise ValueError(f"{name} must be LOW,HIGH,POINTS, such as 0.01,10,256, got {text!r}") from None
+
+
+def _rows(path: Path) -> list[tuple[str, str]]:
+    from mars_lidar.table.storage import read_header
+
+    header = read_header(path)
+    system: System = header["system"]
+    told, made = header["provenance"], header["provenance"]["error"]
+    size, shapes = header["nbytes"], header["shape_bytes"]
+    never, later = int((header["enough"] < 0).sum()), int(header["enough"].max())
+    if never:
+        serves = f"{system.cycles:,}; {never} entries have not settled by then and serve no other number"
+    else:
+        serves = f"any number from {later:,} on (made for {system.cycles:,})"
+    method = header["method"] + (f", re-arming at the {header['rearm']}" if header["method"] == "mars" else "")
+    rows = [
+        ("table", f"{path} (mars-lidar {told['version']}, built in {told['build_s']:.3g} s)"),
+        ("method", method),
+        ("signal", told["signal"]),
+        ("background", told["background"]),
+        (
+            "size",
+            f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of {_DEPTHS} values "
+            f"{shapes * _DEPTHS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
+        ),
+        ("cycles", serves),
+        (
+            "system",
+            f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
+            f"{system.detector.dead_time_ns:.6g} ns, start {system.start}",
+        ),
+        ("start phases", f"{header['phases']}" if header["phases"] else "none: nothing depends on the delay"),
+        (
+            "error",
+            f"between entries, {made['samples']} random pixels: mean {made['mean_max']:.2g} and variance "
+            f"{made['variance_max']:.2g} at most (in standard deviations), shape {made['shape_max']:.2g} in total "
+            f"variation; at random delays {made['delayed_mean_max']:.2g}, {made['delayed_variance_max']:.2g}, "
+            f"{made['delayed_shape_max']:.2g}",
+        ),
+    ]
+    law = told.get("law")
+    if law is not None:
+        rows.append(
+            (
+                "count law",
+                f"{law['samples']} random pixels: total variation {law['mean']:.2g}, at most {law['largest']:.2g}; "
+                f"{100 * law['within']:.3g} % within 0.002",
+            )
+        )
+    return rows
+
+
+def _line(path: Path) -> str:
+    from mars_lidar.table.storage import read_header
+
+    try:
+        header = read_header(path)
+    except (OSError, ValueError, KeyError) as error:
+        return f"{path.name}: cannot be read ({error})"
+    system, told = header["system"], header["provenance"]
+    return (
+        f"{path.name}: {header['method']}, S {told['signal']}, B {told['background']}, {system.bins} bins, "
+        f"{system.cycles:,} cycles, dead time {system.detector.dead_time_ns:.6g} ns of {system.period_ns:.6g} ns"
+    )

@@ -1,0 +1,138 @@
+"""Building a table: entries, start-phase corrections, refinement of the axes, and the check at the end."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from mars_lidar import _validate
+from mars_lidar._memory import check_memory
+from mars_lidar._version import __version__
+from mars_lidar.statistics._cells import FloatArray
+from mars_lidar.statistics.chain import Rearm
+from mars_lidar.statistics.exposure import thread_count
+from mars_lidar.system import System
+from mars_lidar.table.axes import Grid, axis_values, describe
+from mars_lidar.table.cache import request_key
+from mars_lidar.table.entries import Entries, Progress, exposure_entries
+from mars_lidar.table.error import QuantisationError
+from mars_lidar.table.refine import refined_axes
+from mars_lidar.table.renewal_entries import renewal_entries
+from mars_lidar.table.start_phase import StartPhases, start_phases
+from mars_lidar.table.table import Method, Table
+
+_METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
+_ERROR_SAMPLES = 128  # pixels on which a table is checked when it is built
+_ATTEMPTS = 4  # of refining, each with half the error of the one before
+
+Axes = tuple[FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """How entries are evaluated."""
+
+    method: Method
+    rearm: Rearm
+    tolerance: float
+    threads: int
+
+    def entries(
+        self, signal: FloatArray, background: FloatArray, system: System, progress: Progress | None = None
+    ) -> Entries:
+        """Entries of cells (n,)."""
+        if self.method == "mars":
+            return renewal_entries(
+                signal, background, system, rearm=self.rearm, threads=self.threads, progress=progress
+            )
+        return exposure_entries(
+            signal, background, system, tolerance=self.tolerance, threads=self.threads, progress=progress
+        )
+
+
+def build(
+    system: System,
+    signal: Grid,
+    background: Grid,
+    *,
+    method: Method,
+    rearm: Rearm,
+    refine: float | None,
+    tolerance: float,
+    check_law: bool,
+    threads: int | None,
+    progress: Progress | None,
+) -> Table:
+    """See `Table.build`."""
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    axes = axis_values("signal", signal), axis_values("background", background)
+    _validate.choice("method", method, _METHODS)
+    _validate.choice("rearm", rearm, _REARMS)
+    if rearm != "centre" and method != "mars":
+        raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
+    goal = None if refine is None else _validate.real("refine", refine, low=1e-5, high=0.1)
+    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    if not isinstance(check_law, bool):
+        raise TypeError(f"check_law must be True or False, got {check_law!r}")
+    if progress is not None and not callable(progress):
+        raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
+    recipe = Recipe(method, rearm, tolerance, thread_count(threads))
+    began = time.perf_counter()
+    if goal is None:
+        table = _evaluated(system, axes, recipe, progress)
+        error = table.quantisation_error(samples=_ERROR_SAMPLES, threads=recipe.threads)
+    else:
+        table, error = _refined(system, axes, recipe, goal, progress)
+    law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
+    table.provenance.update(
+        key=request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
+        refine=goal,
+        error=error.to_dict(),
+        law=law,
+        build_s=time.perf_counter() - began,
+    )
+    return table
+
+
+def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:
+    signal, background = axes
+    check_memory(
+        2 * 4 * signal.size * background.size * system.bins,
+        f"tables of {signal.size} x {background.size} x {system.bins}",
+        "take fewer points or bins",
+    )
+    cells = signal.size * background.size
+    entries = recipe.entries(
+        np.repeat(signal, background.size), np.tile(background, signal.size), system, progress
+    )
+    phases = StartPhases.none()
+    if recipe.method == "exposure":
+        phases = start_phases(
+            system, signal, background, entries.cumulants, entries.bins, threads=recipe.threads, progress=progress
+        )
+    if progress is not None:
+        progress(cells, cells)
+    provenance = {"version": __version__, "signal": describe(signal), "background": describe(background)}
+    return Table(
+        system, recipe.method, signal, background, recipe.rearm, recipe.tolerance, provenance, entries, phases
+    )
+
+
+def _refined(
+    system: System, axes: Axes, recipe: Recipe, goal: float, progress: Progress | None
+) -> tuple[Table, QuantisationError]:
+    inner = goal
+    for _ in range(_ATTEMPTS):
+        axes = refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
+        table = _evaluated(system, axes, recipe, progress)
+        error = table.quantisation_error(samples=4 * _ERROR_SAMPLES, threads=recipe.threads)
+        if error.largest <= goal:
+            return table, error
+        inner *= 0.5
+    raise ValueError(
+        f"refine must be an error that can be met, got {goal:g}: reached {error.largest:.2g} with "
+        f"{axes[0].size} x {axes[1].size} points at S = {error.worst_signal:g}, B = {error.worst_background:g}"
+    )

@@ -1,0 +1,153 @@
+"""Table files, the cache, and the command `mars-lidar table`."""
+
+import h5py
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import mars_lidar as ml
+from mars_lidar.cli import app
+from mars_lidar.table import cache, storage
+from mars_lidar.table.axes import axis_values
+from table.cases import make_system, small_table
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("MARS_LIDAR_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+@pytest.mark.parametrize("method", ["exposure", "mars"])
+def test_a_file_says_what_the_table_said(tmp_path, method):
+    table = small_table(method=method)
+    table.save(tmp_path / "t.h5")
+    assert [p.name for p in tmp_path.iterdir()] == ["t.h5"]
+    read = ml.Table.load(tmp_path / "t.h5", table.system)
+    assert isinstance(read.entries.shape, np.memmap)
+    assert isinstance(read.shapes().base, np.memmap)
+    assert (read.system, read.method, read.provenance) == (table.system, method, table.provenance)
+    assert read.nbytes == table.nbytes
+    for cycles in (None, 1000):
+        assert np.array_equal(read.shapes(cycles), table.shapes(cycles))
+        a, b = (t.lookup([0.4, 3.0, 0.0], 1.3, delay_ns=[3.0, 70.0, 1.0], cycles=cycles) for t in (read, table))
+        for name in ("rows", "weights", "cumulants"):
+            assert np.array_equal(getattr(a, name), getattr(b, name))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"bins": 64}, "bins is 32 there and 64 here"),
+        ({"period_ns": 90.0}, "period_ns is 100.0 there and 90.0 here"),
+        ({"start": "stationary"}, "start is 'armed' there"),
+        ({"detector": ml.Detector(dead_time_ns=61.0)}, r"detector.dead_time_ns is 60.0 there and 61.0 here"),
+        ({"pulse": ml.GaussianPulse(sigma_ns=3.0)}, r"pulse.sigma_ns is 2.0 there and 3.0 here"),
+        ({"cycles": 2}, "cycles is 200 there and 2 here"),
+    ],
+)
+def test_another_system_is_refused(tmp_path, change, told):
+    table = small_table()
+    table.save(tmp_path / "t.h5")
+    with pytest.raises(ValueError, match=f"is a table of another system: {told}"):
+        ml.Table.load(tmp_path / "t.h5", table.system.replace(**change))
+    longer = ml.Table.load(tmp_path / "t.h5", table.system.replace(cycles=900))
+    assert np.array_equal(longer.lookup(1.0, 1.0).cumulants, table.lookup(1.0, 1.0, cycles=900).cumulants)
+    assert np.array_equal(longer.shapes(), table.shapes(900))
+
+
+def test_files_that_are_not_tables(tmp_path, monkeypatch):
+    table = small_table()
+    with pytest.raises(ValueError, match=r"path must end in .h5 or .hdf5"):
+        table.save(tmp_path / "t.npz")
+    table.save(tmp_path / "t.h5")
+    with pytest.raises(FileExistsError, match="exists already"):
+        table.save(tmp_path / "t.h5")
+    table.save(tmp_path / "t.h5", overwrite=True)
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        ml.Table.load(tmp_path / "no.h5", table.system)
+    (tmp_path / "text.h5").write_text("no")
+    with pytest.raises(ValueError, match="not an HDF5 file"):
+        ml.Table.load(tmp_path / "text.h5", table.system)
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file.attrs["kind"] = "something"
+    with pytest.raises(ValueError, match="not a table of mars-lidar"):
+        ml.Table.load(tmp_path / "other.h5", table.system)
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(storage, "_arrays", fail)
+    with pytest.raises(OSError, match="disk full"):
+        table.save(tmp_path / "half.h5")
+    assert not list(tmp_path.glob("half*"))
+
+
+def test_the_cache_builds_once(own_cache, monkeypatch):
+    system = make_system(cycles=300)
+    grids = {"signal": (0.1, 5.0, 6), "background": (0.1, 2.0, 5)}
+    first = ml.Table.cached(system, **grids, threads=1)
+    (file,) = own_cache.iterdir()
+    monkeypatch.setattr(ml.Table, "build", lambda *_, **__: pytest.fail("built again"))
+    again = ml.Table.cached(system, **grids)
+    longer = ml.Table.cached(system.replace(cycles=4000), **grids)
+    assert np.array_equal(first.shapes(), again.shapes())
+    assert longer.system.cycles == 4000
+    assert cache.files() == [file]
+    monkeypatch.undo()
+    for other in ({"tolerance": 1e-3}, {"method": "mars"}, {"background": (0.1, 2.0, 4)}):
+        key = cache.request_key(
+            system,
+            tuple(axis_values(name, (grids | other)[name]) for name in ("signal", "background")),
+            method=other.get("method", "exposure"), rearm="centre", refine=None,
+            tolerance=other.get("tolerance", 1e-4),
+        )  # fmt: skip
+        assert not file.name.startswith(key), other
+    with pytest.raises(TypeError, match="got 'grid'"):
+        ml.Table.cached(system, grid=3)
+
+
+def test_a_damaged_file_in_the_cache_is_replaced(own_cache):
+    system = make_system(cycles=300)
+    ml.Table.cached(system, [0.5, 1.0], [0.2, 0.4], threads=1)
+    (file,) = own_cache.iterdir()
+    file.write_bytes(file.read_bytes()[:3000])
+    table = ml.Table.cached(system, [0.5, 1.0], [0.2, 0.4], threads=1)
+    assert table.lookup(1.0, 0.4).cumulants[0, 0] > 0
+
+
+def test_where_the_cache_is(tmp_path, monkeypatch):
+    monkeypatch.delenv("MARS_LIDAR_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache.directory() == tmp_path / "mars-lidar"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path / "me"))
+    assert cache.directory() == tmp_path / "me" / ".cache" / "mars-lidar"
+
+
+def test_commands(tmp_path, own_cache):
+    small = ["--signal", "0.1,5,5", "--background", "0.1,2,4", "--bins", 32, "--pulse-sigma-ns", 4, "--threads", 1]
+    done = run("table", "build", *small, "-o", tmp_path / "t.h5", "--check-law")
+    assert done.exit_code == 0, done.output
+    told = run("table", "info", tmp_path / "t.h5")
+    for word in ("0 and 5 log-spaced values in [0.1, 5]", "105 MB", "108 GB", "count law", "start phases"):
+        assert word in told.output, word
+    assert run("table", "build", *small, "-o", tmp_path / "t.h5").exit_code == 2
+    assert run("table", "build", *small).exit_code == 0
+    assert run("table", "build", *small, "--method", "mars").exit_code == 0
+    assert len(list(own_cache.iterdir())) == 2
+    listed = run("table", "info").output
+    assert "2 files" in listed
+    assert "mars, S 0 and 5" in listed
+    for bad in (["--signal", "1,2"], ["--method", "no"], ["--refine", "7"]):
+        assert run("table", "build", *small, *bad).exit_code == 2
+    assert run("table", "info", tmp_path / "no.h5").exit_code == 2
+    (own_cache / "notes.txt").write_text("mine")
+    assert "nothing was removed" in CliRunner().invoke(app, ["table", "clear"], input="n\n").output
+    assert "removed 2 files" in run("table", "clear", "--yes").output
+    assert [p.name for p in own_cache.iterdir()] == ["notes.txt"]
+    assert "holds no tables" in run("table", "clear", "--yes").output

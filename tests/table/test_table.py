@@ -1,0 +1,262 @@
+"""The table: what it holds, what it says between its entries, what it refuses."""
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from mars_lidar.statistics import exposure_moments, mars_moments
+from mars_lidar.table.axes import axis_values, thinned
+from table.cases import make_system, small_table
+
+
+def off_grid(rng, number):
+    return 10 ** rng.uniform(-1.69, 1, number), 10 ** rng.uniform(-1.3, 0.69, number)
+
+
+def total_variation(a, b):
+    return 0.5 * np.abs(a - b).sum(-1)
+
+
+def mixed(table, found, cycles=None):
+    shapes = table.shapes(cycles)
+    return np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
+
+
+def test_entries_are_the_exact_statistics():
+    table = small_table()
+    shapes = table.shapes()
+    assert shapes.shape == (33 * 25, 32)
+    assert shapes.dtype == np.float32
+    assert not shapes.flags.writeable
+    for i, j in ((0, 0), (0, 7), (5, 0), (12, 20), (32, 24)):
+        exact = exposure_moments(table.signal[i], table.background[j], table.system, tolerance=1e-6)
+        found = table.lookup(table.signal[i], table.background[j])
+        assert found.cumulants[0] == pytest.approx(exact.cumulants, rel=1e-12)
+        row = found.rows[0, found.weights[0].argmax()]
+        assert row == i * 25 + j
+        own = exact.histogram / exact.mean if exact.mean > 0 else np.full(32, 1 / 32)
+        assert total_variation(shapes[row], own) < 1e-6
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize("cycles", [70, 200, 5000])
+def test_any_number_of_cycles(start, cycles):
+    table = small_table(start)
+    assert table.serves(cycles)
+    rng = np.random.default_rng(cycles)
+    i, j = rng.integers(0, table.signal.size, 30), rng.integers(0, table.background.size, 30)
+    exact = exposure_moments(
+        table.signal[i], table.background[j], table.system.replace(cycles=cycles), tolerance=1e-6
+    )
+    found = table.lookup(table.signal[i], table.background[j], cycles=cycles)
+    assert found.cumulants == pytest.approx(exact.cumulants, rel=1e-6, abs=1e-6)
+    shapes = table.shapes(cycles)[i * table.background.size + j]
+    lit = exact.mean > 0
+    own = exact.histogram[lit] / exact.mean[lit, None]
+    assert total_variation(shapes[lit], own).max() < 1e-5
+    if start == "armed" and cycles == 70:  # which the shape of 200 cycles is not
+        canonical = table.shapes()[i * table.background.size + j]
+        assert total_variation(canonical[lit], own).max() > 2e-4
+
+
+def test_between_entries():
+    table = small_table()
+    signal, background = off_grid(np.random.default_rng(0), 120)
+    exact = exposure_moments(signal, background, table.system, tolerance=1e-6)
+    spread = np.maximum(np.sqrt(exact.variance), 0.5)
+    own = exact.histogram / exact.mean[:, None]
+    found = table.lookup(signal, background)
+    near = table.lookup(signal, background, interpolation="nearest")
+    assert np.abs(found.weights.sum(-1) - 1).max() < 1e-12
+    assert found.weights.min() >= 0
+    assert set(np.unique(near.weights)) == {0.0, 1.0}
+    off = {n: np.abs(told.cumulants - exact.cumulants)[:, 0] / spread for n, told in (("b", found), ("n", near))}
+    assert off["b"].max() < 0.015
+    assert off["n"].max() > 20 * off["b"].max()
+    assert total_variation(mixed(table, found), own).max() < 3e-3
+    assert total_variation(mixed(table, near), own).max() > 3 * total_variation(mixed(table, found), own).max()
+
+
+def test_pixels_without_signal_background_or_both():
+    """Zero is a value of the axes: masked pixels and dark ones are answered, with linear continuation."""
+    table = small_table()
+    nothing = table.lookup(0.0, 0.0)
+    assert not nothing.cumulants.any()
+    assert mixed(table, nothing)[0] == pytest.approx(1 / 32)
+    # constant rate, armed: physics of one line
+    rate, dead, periods = table.background[9], 0.6, table.system.cycles
+    x = rate * dead
+    masked = table.lookup(0.0, rate, delay_ns=np.nan)
+    assert masked.cumulants[0, 0] == pytest.approx(rate * periods / (1 + x) + x**2 / 2 / (1 + x) ** 2, rel=1e-6)
+    signal, background = np.array([0.003, 0.012, 0.007, 1.0]), np.array([1.0, 0.02, 0.01, 0.021])
+    exact = exposure_moments(signal, background, table.system, tolerance=1e-6)
+    found = table.lookup(signal, background)
+    assert (np.abs(found.cumulants - exact.cumulants)[:, 0] / np.sqrt(exact.variance)).max() < 0.005
+    assert total_variation(mixed(table, found), exact.histogram / exact.mean[:, None]).max() < 5e-3
+
+
+def test_pixels_beyond_the_axes():
+    table = small_table()
+    with pytest.raises(ValueError, match=r"signal must lie in the table's \[0, 10\].*got 0.5 to 11 \(1 of 2 pixels"):
+        table.lookup([0.5, 11.0], 1.0)
+    with pytest.raises(ValueError, match="background must lie in"):
+        table.lookup(0.5, 6.0)
+    found = table.lookup([[0.5, 11.0], [2.0, 3.0]], 1.0, outside="exact")
+    assert found.outside.tolist() == [False, True, False, False]
+    assert np.isnan(found.cumulants[1]).all()
+    assert found.rows[1].tolist() == [0, 0, 0, 0]
+    assert found.weights[1].tolist() == [1, 0, 0, 0]
+    assert np.array_equal(found.cumulants[[0, 2, 3]], table.lookup([0.5, 2.0, 3.0], 1.0).cumulants)
+    assert not found.trusted()[1]
+
+
+def test_a_pixel_does_not_depend_on_the_others_or_on_threads():
+    table = small_table()
+    rng = np.random.default_rng(3)
+    signal, background = off_grid(rng, 3000)
+    delay = rng.uniform(0, 100, 3000)
+    whole = table.lookup(signal, background, delay_ns=delay)
+    again = table.lookup(signal, background, delay_ns=delay, threads=3)
+    part = table.lookup(signal[700:900], background[700:900], delay_ns=delay[700:900])
+    for name in ("rows", "weights", "cumulants"):
+        assert np.array_equal(getattr(whole, name), getattr(again, name))
+        assert np.array_equal(getattr(whole, name)[700:900], getattr(part, name))
+        assert getattr(whole, name).flags.c_contiguous
+
+
+def test_the_method_of_the_paper():
+    table = small_table(method="mars")
+    i, j = np.array([3, 20, 32]), np.array([2, 11, 24])
+    mean, variance = mars_moments(table.signal[i], table.background[j], table.system)
+    found = table.lookup(table.signal[i], table.background[j], delay_ns=12.0)
+    assert found.cumulants[:, 0] == pytest.approx(mean, rel=1e-12)
+    assert found.cumulants[:, 1] == pytest.approx(variance, rel=1e-12)
+    assert not found.cumulants[:, 2:].any()
+    chain = ml.registration_pdf(table.signal[i], table.background[j], table.system, "chain")
+    assert total_variation(table.shapes()[i * table.background.size + j], chain).max() < 1e-6
+    assert table.lookup(1.0, 1.0, cycles=2000).cumulants == pytest.approx(
+        10 * table.lookup(1.0, 1.0).cumulants, rel=1e-12
+    )
+    edge = ml.Table.build(table.system, [1.0], [0.5], method="mars", rearm="edge", threads=1)
+    expected = np.ravel(mars_moments(1.0, 0.5, table.system, rearm="edge"))
+    assert edge.lookup(1.0, 0.5).cumulants[0, :2] == pytest.approx(expected, rel=1e-12)
+
+
+def test_no_dead_time_is_poisson():
+    table = ml.Table.build(make_system(0.0), (0.1, 10, 12), (0.1, 10, 8), threads=1)
+    found = table.lookup(2.0, 0.3, delay_ns=17.0, cycles=3)
+    assert found.cumulants[0] == pytest.approx(3 * 2.3, rel=0.02)
+    assert np.ptp(found.cumulants[0]) < 1e-9
+
+
+def test_short_exposures_serve_no_others():
+    system = make_system(0.6, cycles=3)
+    table = ml.Table.build(system, [0.0, 1.0, 10.0], [0.0, 0.1, 1.0], threads=1)
+    assert not table.serves(4)
+    assert table.lookup(1.0, 0.1).cumulants[0] == pytest.approx(
+        exposure_moments(1.0, 0.1, system).cumulants, rel=1e-12
+    )
+    with pytest.raises(ValueError, match=r"cycles must be 3 at some of these pixels, got 4: .* at S = .*, B = "):
+        table.lookup(1.0, 0.1, cycles=4)
+    assert np.isnan(table.shapes(4)).any()
+    long = small_table()
+    with pytest.raises(ValueError, match=r"repeats only after \d+ periods"):
+        long.lookup(9.0, 4.0, cycles=2)
+
+
+def test_the_measured_error_is_the_error():
+    table = small_table()
+    error = table.quantisation_error(samples=150, seed=4, threads=2)
+    again = table.quantisation_error(samples=150, seed=4, threads=1)
+    assert error == again
+    assert error.mean_rms <= error.mean_max < 0.02
+    assert error.largest == max(error.law_max, error.shape_max)
+    near = table.quantisation_error(interpolation="nearest", samples=150, threads=2)
+    assert near.mean_max > 10 * error.mean_max
+    assert table.provenance["error"]["samples"] == 128
+    law = table.law_error(samples=25, threads=2)
+    assert law.mean < 0.003
+    paper = small_table(method="mars").law_error(samples=25, threads=2)
+    assert paper.mean > 3 * law.mean  # start-up, skewness: the exact law tells them apart
+
+
+def test_axes_refined_until_the_error_is_met():
+    system = make_system(0.6, bins=16, sigma=0.04)
+    coarse = ml.Table.build(system, (0.1, 5.0, 4), (0.1, 3.0, 4), threads=2)
+    fine = ml.Table.build(system, (0.1, 5.0, 4), (0.1, 3.0, 4), refine=5e-3, threads=2)
+    assert coarse.quantisation_error(samples=200, seed=9).largest > 2e-2
+    assert fine.quantisation_error(samples=200, seed=9).largest < 7e-3
+    assert fine.provenance["error"]["law_max"] <= 5e-3
+    assert fine.provenance["refine"] == 5e-3
+    assert set(coarse.signal) <= set(fine.signal)
+    assert coarse.signal.size < fine.signal.size < 60
+
+
+def test_axes():
+    grid = axis_values("signal", (0.01, 10, 256))
+    assert grid.size == 257
+    assert grid[[0, 1, -1]].tolist() == [0.0, 0.01, 10.0]
+    assert axis_values("signal", [1, 2.5]).tolist() == [1.0, 2.5]
+    some = grid[thinned(grid, 0.2)]
+    assert some[0] == 0.0
+    assert some[-1] == 10.0
+    assert np.diff(np.log(some[1:])).max() < 0.25
+    assert thinned(np.array([2.0]), 0.2).tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "told"),
+    [
+        ({"system": "laser"}, TypeError, "system must be a System"),
+        ({"signal": (0.1, 1.0)}, ValueError, r"signal must be \(low, high, points\)"),
+        ({"signal": (0.0, 1.0, 5)}, ValueError, r"signal\[0\] must be a finite number in \(0"),
+        ({"signal": (2.0, 1.0, 5)}, ValueError, "high > low"),
+        ({"signal": (0.1, 1.0, 1)}, ValueError, r"signal\[2\] must be an integer in \[2, 4096\]"),
+        ({"background": [1.0, 0.5]}, ValueError, "background must be strictly ascending"),
+        ({"background": [-1.0, 0.5]}, ValueError, "background must be strictly ascending"),
+        ({"background": ["a"]}, TypeError, "background must be .* real numbers"),
+        ({"background": [[1.0]]}, ValueError, r"background must have shape \(n,\)"),
+        ({"method": "exact"}, ValueError, "method must be one of"),
+        ({"rearm": "edge"}, ValueError, "rearm must be 'centre' for method 'exposure'"),
+        ({"refine": 0.5}, ValueError, "refine must be"),
+        ({"tolerance": 0.0}, ValueError, "tolerance must be"),
+        ({"check_law": 1}, TypeError, "check_law must be"),
+        ({"threads": 0}, ValueError, "threads must be"),
+        ({"progress": 3}, TypeError, "progress must be callable"),
+    ],
+)
+def test_bad_requests(change, error, told):
+    given = {"system": make_system(), "signal": [1.0], "background": [1.0]} | change
+    with pytest.raises(error, match=told):
+        ml.Table.build(given.pop("system"), **given)
+
+
+def test_bad_lookups():
+    table = small_table()
+    for given, error, told in (
+        ({"signal": -1.0}, ValueError, "signal must be photons per period >= 0"),
+        ({"signal": np.nan}, ValueError, "signal must be photons per period >= 0"),
+        ({"delay_ns": np.nan}, ValueError, "delay_ns must be finite"),
+        ({"delay_ns": [1.0, 2.0], "signal": [1.0, 2.0, 3.0]}, ValueError, "shapes must broadcast"),
+        ({"interpolation": "cubic"}, ValueError, "interpolation must be one of"),
+        ({"outside": "clip"}, ValueError, "outside must be one of"),
+        ({"cycles": 0}, ValueError, "cycles must be an integer"),
+    ):
+        with pytest.raises(error, match=told):
+            table.lookup(**({"signal": 1.0, "background": 1.0} | given))
+
+
+def test_progress_and_stopping():
+    seen = []
+    ml.Table.build(
+        make_system(cycles=50), [0.1, 1.0], [0.1, 1.0], threads=1, progress=lambda *at: seen.append(at)
+    )
+    assert seen[-1] == (4, 4)
+    assert all(0 <= done <= total for done, total in seen)
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    for method in ("exposure", "mars"):
+        with pytest.raises(KeyboardInterrupt):
+            ml.Table.build(make_system(), (0.1, 5, 8), (0.1, 5, 8), method=method, threads=1, progress=stop)

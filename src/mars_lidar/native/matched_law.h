@@ -1,5 +1,5 @@
 // A law on the integers n >= 0 with four given cumulants, to draw a count from: one uniform number, one
-// inversion, no rejection, no libm.
+// inversion, no rejection, no libm: the same bits on every machine.
 //
 // Three forms. *Smooth*: the Cornish-Fisher quantile with four cumulants, rounded; Sheppard's corrections
 // take out what rounding adds. *Atoms*: probabilities on up to 64 integers, matched_atoms.h. *Pair*: the two

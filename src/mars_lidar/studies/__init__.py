@@ -45,6 +45,12 @@ def _detectors(request: Request) -> list[Path]:
     return run(request)
 
 
+def _matched(request: Request) -> list[Path]:
+    from mars_lidar.studies.matched_report import run
+
+    return run(request)
+
+
 def _reference(request: Request) -> list[Path]:
     from mars_lidar.studies.reference import run
 
@@ -62,6 +68,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "joint": ("the histogram's covariance in closed form against simulation; --data adds reference cases", _joint),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "detectors": ("what each mode of a detector does to the same flux, simulated and in closed form", _detectors),
+    "matched": ("a law of the count from four cumulants: total variation to the exact law", _matched),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
 }
 

@@ -3,11 +3,12 @@
 from mars_lidar import _validate
 from mars_lidar.engines.base import Engine
 from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.sequential import SequentialEngine
 
 ENGINES: dict[str, Engine] = {
-    engine.name: engine for engine in (ExactEngine(), SequentialEngine(), PoissonEngine())
+    engine.name: engine for engine in (ExactEngine(), SequentialEngine(), PoissonEngine(), FeedbackEngine())
 }
 
 

@@ -55,11 +55,25 @@ def _count_law(request: Request) -> list[Path]:
     return run(request)
 
 
+def _joint_table(request: Request) -> list[Path]:
+    from mars_lidar.studies.joint_report import run
+
+    return run(request)
+
+
+def _runtime(request: Request) -> list[Path]:
+    from mars_lidar.studies.runtime_report import run
+
+    return run(request)
+
+
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
     "count-law": ("T1: every simulator's count law and shape against simulation", _count_law),
+    "joint-table": ("variance of signal window and bins, covariance of neighbours: every engine", _joint_table),
+    "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
 }
 
 __all__ = ["STUDIES", "Request", "Study", "Tell"]

@@ -26,6 +26,7 @@ FloatArray = NDArray[np.float64]
 
 PANELS = ((0.07, 0.07, 25.0), (0.5, 0.5, 50.0), (4.0, 0.5, 75.0), (10.0, 10.0, 100.0))  # nearest cells are drawn
 HISTOGRAM = (2.0, 1.0, 0.6375)  # S, B in photons per period, dead time in periods
+HISTOGRAM_CYCLES = 20_000
 _LINES = {
     "mars_exact": (INK, "-", 2.0),
     "mars_centre": (COLOURS[4], "-", 1.0),
@@ -33,12 +34,12 @@ _LINES = {
     "renewal": (COLOURS[2], "-", 1.0),
     "poisson": (COLOURS[0], "-", 1.0),
 }
-_SHORT = {
+_LEGEND = {
     "poisson": "Poisson",
     "renewal": "renewal",
-    "mars_centre": "centre",
-    "mars_edge": "edge",
-    "mars_exact": "ours",
+    "mars_centre": "MaRS, paper's, centre",
+    "mars_edge": "MaRS, paper's, edge",
+    "mars_exact": "MaRS, ours, exact",
 }
 _REACH = 30.0  # standard deviations beyond which a law is named at the panel's side instead of drawn
 
@@ -87,11 +88,13 @@ def _panel(ax: Axes, cell: Cell) -> None:
     low, high = cell.mean - 5.0 * spread, cell.mean + 5.0 * spread
     beyond = []
     for name, law in cell.laws.items():
-        centre = float((law.p * (law.first + np.arange(law.p.size))).sum())
+        at = law.first + np.arange(law.p.size)
+        centre = float((law.p * at).sum())
+        own = float((law.p * (at - centre) ** 2).sum()) ** 0.5
         if abs(centre - cell.mean) > _REACH * spread:
-            beyond.append(f"{_SHORT.get(name, name)}: mean {centre:.0f} \N{RIGHTWARDS ARROW}")
+            beyond.append(f"{_LEGEND.get(name, name)}: mean {centre:.0f} \N{RIGHTWARDS ARROW}")
             continue
-        low, high = min(low, centre - 3.0 * spread), max(high, centre + 3.0 * spread)
+        low, high = min(low, centre - 3.5 * own), max(high, centre + 3.5 * own)
     first, last = max(0, int(np.floor(low))), int(np.ceil(high))
     counts = np.arange(first, last + 1)
     ax.fill_between(
@@ -99,9 +102,10 @@ def _panel(ax: Axes, cell: Cell) -> None:
     )
     for name, law in cell.laws.items():
         colour, dash, width = _colour(name)
-        words = _LEGEND.get(name, name)
-        ax.plot(counts, law.on(first, last), ls=dash, lw=width, color=colour, label=words)
-    top = 1.15 * max(float(cell.truth.p.max()), float(cell.laws["mars_exact"].p.max()))
+        above = 1 if name == "mars_exact" else 2  # thin lines over the thick one
+        here = law.on(first, last)
+        ax.plot(counts, here, ls=dash, lw=width, color=colour, label=_LEGEND.get(name, name), zorder=above)
+    top = 1.15 * max(float(pmf.on(first, last).max()) for pmf in (cell.truth, *cell.laws.values()))
     # room at the right for the inset
     ax.set(xlim=(first, last + 0.55 * (last - first)), ylim=(0.0, top))
     ax.ticklabel_format(axis="x", useOffset=False)
@@ -109,15 +113,6 @@ def _panel(ax: Axes, cell: Cell) -> None:
     if beyond:
         ax.text(0.63, 0.08, "\n".join(beyond), transform=ax.transAxes, fontsize=6.0, color=MUTED)
     _inset(ax, cell)
-
-
-_LEGEND = {
-    "poisson": "Poisson",
-    "renewal": "renewal",
-    "mars_centre": "MaRS, paper's, centre",
-    "mars_edge": "MaRS, paper's, edge",
-    "mars_exact": "MaRS, ours, exact",
-}
 
 
 def _inset(ax: Axes, cell: Cell) -> None:
@@ -172,7 +167,7 @@ def _shape(path: Path, settings: Settings, cells: Sequence[Cell], sweep: dict[st
 def _dead_time(path: Path, settings: Settings, truth: str) -> Path:
     """One exposure of one pixel before and after dead time, with the expectations."""
     signal, background, dead = HISTOGRAM
-    system = settings.system(WIDE_PERIOD_NS, dead * WIDE_PERIOD_NS)
+    system = settings.system(WIDE_PERIOD_NS, dead * WIDE_PERIOD_NS).replace(cycles=HISTOGRAM_CYCLES)
     flux = Flux(signal, background, 0.5 * WIDE_PERIOD_NS)
     seed = settings.seed
     before = simulate(flux, system, engine="poisson", seed=seed)[0, 0, 0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from mars_lidar.studies import Request
 from mars_lidar.studies.count_law import FIGURES, FULL, QUICK, Cell, Settings, compute
-from mars_lidar.studies.count_law_figures import HISTOGRAM, draw_all
+from mars_lidar.studies.count_law_figures import HISTOGRAM, HISTOGRAM_CYCLES, draw_all
 from mars_lidar.studies.count_law_shape import shape_sweep
 from mars_lidar.studies.distance import KL_FLOOR
 from mars_lidar.studies.machine import machine
@@ -133,7 +133,7 @@ def _text(
         f"{len(settings.sweep_flux)} cells log-spaced on [{settings.sweep_flux[0]:g}, {settings.sweep_flux[-1]:g}], "
         "without noise. Marks: to the simulation, on the cells of *wide*.",
         "![A histogram before and after dead time](count_law_dead_time.png)",
-        f"S = {HISTOGRAM[0]:g}, B = {HISTOGRAM[1]:g}, {settings.cycles} cycles.",
+        f"S = {HISTOGRAM[0]:g}, B = {HISTOGRAM[1]:g}, one exposure of {HISTOGRAM_CYCLES} cycles.",
     ]  # fmt: skip
 
 

@@ -112,13 +112,15 @@ class Score:
     """One simulator in one cell: its distances, what sampling alone makes of them, and how its shape differs.
 
     `figures` (4,) in the order of `FIGURES`; `floors` (resamplings, 4) the same figures of samples of the exact
-    law; `shape` and `shape_floor` total variations of the mean histogram.
+    law; `shape` and `shape_floor` total variations of the mean histogram; `noise` the standard error of a difference
+    in units of the truth's own, above 1 for a simulator that is sampled itself.
     """
 
     figures: FloatArray
     floors: FloatArray
     shape: float
     shape_floor: float
+    noise: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +210,11 @@ def _scores(
                 exact.pmfs[k], size, one.sampled, settings.resamplings, random
             )
         shape = 0.5 * float(np.abs(sample.shape[k] - one.shape[k]).sum())
-        floor = float(sample.shape_floor[k])
-        if one.sampled:  # its own noise as well: as much for the same number of exposures
-            floor *= float(np.sqrt(1.0 + size / one.sampled))
+        # a sample has its own noise as well, as much as the truth's for the same number of exposures
+        own = float(np.sqrt(1.0 + size / one.sampled)) if one.sampled else 1.0
+        floor = own * float(sample.shape_floor[k])
         figures = law_figures(found, one.pmfs[k], float(one.mean[k]), float(one.variance[k]), size)
-        scores[name] = Score(figures, noise[one.sampled], shape, floor)
+        scores[name] = Score(figures, noise[one.sampled], shape, floor, own)
     return scores
 
 

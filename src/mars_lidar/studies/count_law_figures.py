@@ -169,7 +169,7 @@ def _dead_time(path: Path, settings: Settings, truth: str) -> Path:
     signal, background, dead = HISTOGRAM
     system = settings.system(WIDE_PERIOD_NS, dead * WIDE_PERIOD_NS).replace(cycles=HISTOGRAM_CYCLES)
     flux = Flux(signal, background, 0.5 * WIDE_PERIOD_NS)
-    seed = settings.seed
+    seed = settings.seed << 16
     before = simulate(flux, system, engine="poisson", seed=seed)[0, 0, 0]
     after = simulate(flux, system, engine=truth, seed=seed + 1)[0, 0, 0]
     arrivals = system.cycles * (signal + background) * arrival_shape(np.array([signal]), np.array([background]), system)
@@ -177,8 +177,8 @@ def _dead_time(path: Path, settings: Settings, truth: str) -> Path:
     time_ns = (np.arange(system.bins) + 0.5) * (WIDE_PERIOD_NS / system.bins)
     figure, axes = panels(2.6, 1, 2, sharex=True)
     for ax, counts, mean, words in (
-        (axes[0, 0], before, arrivals[0], "before dead time: arrivals"),
-        (axes[0, 1], after, registered, f"after dead time $t_d$ = {dead:g} $t_r$: registrations"),
+        (axes[0, 0], before, arrivals[0], "before: arrivals"),
+        (axes[0, 1], after, registered, f"after, $t_d$ = {dead:g} $t_r$: registrations"),
     ):
         ax.step(time_ns, counts, where="mid", color=MUTED, lw=0.5, label="one exposure")
         ax.plot(time_ns, mean, color=COLOURS[1], lw=0.8, label="expectation")

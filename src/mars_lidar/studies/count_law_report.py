@@ -64,10 +64,11 @@ def average(cells: Sequence[Cell], name: str) -> tuple[list[float], list[float],
 def right(cell: Cell, name: str) -> dict[str, bool]:
     """Whether a simulator has the cell's mean, variance and shape right, to the stated thresholds."""
     score = cell.scores[name]
+    errors = SCORES * score.noise
     mean, variance = (float(score.figures[FIGURES.index(key)]) for key in ("mean", "variance"))
     return {
-        "mean": mean <= max(RIGHT_MEAN * float(cell.exact[0]), SCORES * cell.mean_error),
-        "variance": variance <= max(RIGHT_VARIANCE * float(cell.exact[1]), SCORES * cell.variance_error),
+        "mean": mean <= max(RIGHT_MEAN * float(cell.exact[0]), errors * cell.mean_error),
+        "variance": variance <= max(RIGHT_VARIANCE * float(cell.exact[1]), errors * cell.variance_error),
         "shape": score.shape <= max(RIGHT_SHAPE, 2.0 * score.shape_floor),
     }
 

@@ -50,8 +50,9 @@ class Settings:
 
 
 def _decades(low: float, high: float, each: int) -> tuple[float, ...]:
-    number = round(np.log10(high / low) * each) + 1
-    return tuple(float(v) for v in np.geomspace(low, high, number))
+    """About `each` points a decade; whole numbers where the axis counts something."""
+    points = np.geomspace(low, high, round(np.log10(high / low) * each) + 1)
+    return tuple(float(v) for v in (np.unique(np.rint(points)) if low >= 1 else points))
 
 
 def _axes(pixels: int, most_pixels: int, high: float, each: int) -> tuple[Axis, ...]:
@@ -208,7 +209,7 @@ def crossover(points: Sequence[Point], axis: str, fast: str, other: str) -> tupl
 
 def _at(settings: Settings, axis: Axis, value: float) -> tuple[Flux, System, int]:
     """Flux, system and realizations of one value of an axis."""
-    number = max(1, round(value))
+    number = round(value)
     pixels = number if axis.name == "pixels" else axis.pixels
     cycles = number if axis.name == "cycles" else axis.cycles
     realizations = number if axis.name == "realizations" else axis.realizations

@@ -146,7 +146,7 @@ def _axis_rows(points: Sequence[Point], axis: str) -> list[Row]:
     rows: list[Row] = []
     for value in dict.fromkeys(p.value for p in here):
         at = [p for p in here if p.value == value]
-        row: dict[str, object] = {axis: f"{value:.4g}", "registrations per pixel": f"{at[0].registrations:.3g}"}
+        row: dict[str, object] = {axis: f"{value:.6g}", "registrations per pixel": f"{at[0].registrations:.3g}"}
         for p in sorted(at, key=lambda p: names.index(p.contender)):
             left_out = "outside" if p.why.startswith("flux") else "-"
             row[p.contender] = left_out if p.seconds is None else f"{p.seconds:.3g}"

@@ -27,5 +27,6 @@ void bind_sequential(nb::module_& module);
 void bind_poisson(nb::module_& module);
 void bind_chain(nb::module_& module);
 void bind_exposure(nb::module_& module);
+void bind_matched(nb::module_& module);
 
 }  // namespace mars

@@ -56,4 +56,5 @@ NB_MODULE(_core, module) {
     mars::bind_poisson(module);
     mars::bind_chain(module);
     mars::bind_exposure(module);
+    mars::bind_matched(module);
 }

@@ -1,0 +1,132 @@
+"""A law of the count with four given cumulants, for tables that hold no more of the exact law.
+
+The law is native/matched_law.h, which engines draw from: here its probabilities, and where it can be trusted.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar.statistics._cells import FloatArray, IndexArray
+from mars_lidar.statistics._pmf import Window
+
+_MAX_COUNTS = 2**24
+_MAX_MEAN = 1e15
+_OUTSIDE = 1.5e-15  # two normal tails beyond 8 standard deviations
+
+
+def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Window]:
+    """Probabilities of the laws on the integers n >= 0 that have four given cumulants.
+
+    Parameters
+    ----------
+    cumulants
+        (cells, 4) mean in [0, 1e15], variance >= 0, third and fourth cumulant. Cumulants that no count has
+        (a variance below what an integer of this mean can have, say) give a law nearby.
+    threads
+        Threads to run on; default: all processors that this process may use.
+
+    Returns
+    -------
+    list of Window
+        One for each cell.
+
+    Raises
+    ------
+    ValueError
+        For cumulants out of range, or a law too wide to be listed (a variance above 1e12).
+
+    Notes
+    -----
+    Three forms. A variance of 9 or more, or a smooth law: the quantile is that of E. A. Cornish and R. A.
+    Fisher (1938) to the fourth cumulant, rounded, with Sheppard's corrections. Few photons, mode locking,
+    saturation: an integer, plus a Panjer count, less a Poisson one (or the mirror image), times a polynomial.
+    The least variance that an integer can have: two integers. `trusted` tells where this is the exact law.
+    """
+    given, team = _checked(cumulants), _team(threads)
+    first, last, _ = _support(given, team)
+    size = last - first + 1
+    if (size > _MAX_COUNTS).any():
+        k = int(size.argmax())
+        raise ValueError(
+            f"cumulants[{k}] must have a variance for which {_MAX_COUNTS} counts suffice, got {given[k, 1]:g}"
+        )
+    start = np.concatenate([[0], np.cumsum(size)])
+    flat = np.empty(int(start[-1]))
+    from mars_lidar import _core
+
+    _core.matched_pmf(cumulants=given, first=first, start=start, out=flat, threads=team)
+    return [
+        Window(int(first[k]), flat[start[k] : start[k + 1]].copy(), _OUTSIDE) for k in range(first.size)
+    ]
+
+
+def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | None = None) -> IndexArray:
+    """Counts drawn by inversion from the laws of `matched_pmf`, bit for bit as the engines draw them.
+
+    Parameters
+    ----------
+    cumulants
+        (cells, 4), as `matched_pmf`.
+    uniform
+        (cells, draws) numbers in (0, 1).
+    threads
+        As `matched_pmf`.
+
+    Returns
+    -------
+    NDArray
+        (cells, draws) int64, not falling with `uniform`.
+    """
+    given, team = _checked(cumulants), _team(threads)
+    u = np.ascontiguousarray(uniform, dtype=np.float64)
+    if u.ndim != 2 or u.shape[0] != given.shape[0]:
+        raise ValueError(f"uniform must be of shape ({given.shape[0]}, draws), got {u.shape}")
+    if not ((u > 0.0) & (u < 1.0)).all():
+        raise ValueError(f"uniform must be in (0, 1), got {u[~((u > 0.0) & (u < 1.0))][0]:g}")
+    from mars_lidar import _core
+
+    out = np.empty(u.shape, np.int64)
+    _core.matched_draw(cumulants=given, uniform=u, out=out, threads=team)
+    return out
+
+
+def trusted(cumulants: ArrayLike, *, threads: int | None = None) -> NDArray[np.bool_]:
+    """Whether the law of `matched_pmf` is within a total variation of 0.002 of the exact one (cells,).
+
+    A criterion on the cumulants (cells, 4) alone; docs/studies/matched.md has how often it errs.
+    """
+    return _support(_checked(cumulants), _team(threads))[2]
+
+
+def _team(threads: int | None) -> int:
+    from mars_lidar.statistics.exposure import thread_count
+
+    return thread_count(threads)
+
+
+def _checked(cumulants: ArrayLike) -> FloatArray:
+    given: FloatArray = np.ascontiguousarray(cumulants, dtype=np.float64)
+    if given.ndim != 2 or given.shape[1] != 4:
+        raise ValueError(f"cumulants must be of shape (cells, 4), got {given.shape}")
+    bad = ~np.isfinite(given).all(-1) | (given[:, 0] < 0) | (given[:, 0] > _MAX_MEAN) | (given[:, 1] < 0)
+    if bad.any():
+        k = int(bad.argmax())
+        raise ValueError(
+            f"cumulants[{k}] must be finite with a mean in [0, {_MAX_MEAN:g}] and a variance >= 0, "
+            f"got {given[k].tolist()}"
+        )
+    return given
+
+
+def _support(given: FloatArray, team: int) -> tuple[IndexArray, IndexArray, NDArray[np.bool_]]:
+    from mars_lidar import _core
+
+    cells: tuple[Any] = (given.shape[0],)
+    first, last = np.empty(cells, np.int64), np.empty(cells, np.int64)
+    close = np.empty(cells, np.bool_)
+    _core.matched_support(cumulants=given, first=first, last=last, trusted=close, threads=team)
+    return first, last, close

@@ -112,7 +112,7 @@ def test_engine_without_a_law_is_sampled(monkeypatch):
 
     monkeypatch.setitem(ENGINES, "other", Other())
     names = [one.name for one in simulators.simulators(50, 1)]
-    assert names[:5] == ["poisson", "renewal", "mars_centre", "mars_edge", "mars_exact"]
+    assert names[:6] == ["poisson", "renewal", "mars_centre", "mars_edge", "mars_exact", "mars_matched"]
     other = next(one for one in simulators.simulators(50, 1) if one.name == "other")
     system = count_law.QUICK.system(100.0, 50.0)
     found = other.predict(np.array([0.1, 0.2]), np.array([0.1, 0.1]), system)

@@ -56,7 +56,7 @@ def _count_law(request: Request) -> list[Path]:
 
 
 def _joint_table(request: Request) -> list[Path]:
-    from mars_lidar.studies.joint_report import run
+    from mars_lidar.studies.joint_table_report import run
 
     return run(request)
 

@@ -29,6 +29,7 @@ HISTOGRAM = (2.0, 1.0, 0.6375)  # S, B in photons per period, dead time in perio
 HISTOGRAM_CYCLES = 20_000
 _LINES = {
     "mars_exact": (INK, "-", 2.0),
+    "mars_matched": (COLOURS[1], ":", 1.4),
     "mars_centre": (COLOURS[4], "-", 1.0),
     "mars_edge": (COLOURS[3], "--", 1.0),
     "renewal": (COLOURS[2], "-", 1.0),
@@ -40,6 +41,7 @@ _LEGEND = {
     "mars_centre": "MaRS, paper's, centre",
     "mars_edge": "MaRS, paper's, edge",
     "mars_exact": "MaRS, ours, exact",
+    "mars_matched": "MaRS, ours, four cumulants",
 }
 _REACH = 30.0  # standard deviations beyond which a law is named at the panel's side instead of drawn
 

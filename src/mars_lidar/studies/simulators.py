@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import CountLaw, count_law, photons_per_bin, registration_pdf
+from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.studies.distance import Pmf
 from mars_lidar.studies.sample import draw
 from mars_lidar.system import System
@@ -59,6 +60,7 @@ def simulators(sampled: int, seed: int) -> list[Simulator]:
         Simulator("mars_centre", "MaRS, paper's, centre", lambda s, b, system: _mars(s, b, system, "centre")),
         Simulator("mars_edge", "MaRS, paper's, edge", lambda s, b, system: _mars(s, b, system, "edge")),
         Simulator("mars_exact", "MaRS, ours, exact law", _exact),
+        Simulator("mars_matched", "MaRS, ours, four cumulants", _matched),
     ]
     others = [name for name in ENGINES if name not in _IN_CLOSED_FORM]
     return evaluated + [Simulator(name, f"{name} (sampled)", _sampler(name, sampled, seed)) for name in others]
@@ -96,6 +98,14 @@ def _mars(
 def _exact(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
     shape = registration_pdf(signal, background, system, "exposure")
     return of_law(count_law(signal, background, system, "exact"), shape)
+
+
+def _matched(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+    """What a table holds of the exact law, and an engine with a table draws: four cumulants."""
+    shape = registration_pdf(signal, background, system, "exposure")
+    cumulants = count_law(signal, background, system, "exact").cumulants
+    pmfs = [Pmf(window.first, window.pmf) for window in matched_pmf(cumulants)]
+    return Prediction(cumulants[:, 0], cumulants[:, 1], pmfs, shape)
 
 
 def _sampler(engine: str, realizations: int, seed: int) -> Predict:

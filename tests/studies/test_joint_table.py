@@ -8,7 +8,7 @@ from scipy import stats
 
 from harness.ledger import require
 from mars_lidar.engines import ENGINES
-from mars_lidar.studies import joint
+from mars_lidar.studies import joint_table as joint
 from mars_lidar.studies.__main__ import main
 
 POISSON = joint.Case("no dead time", 0.5, 0.5, 0.0, cycles=300)

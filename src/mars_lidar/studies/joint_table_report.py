@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mars_lidar.studies import Request
-from mars_lidar.studies.joint import (
+from mars_lidar.studies.joint_table import (
     AGAIN,
     COARSE,
     ENOUGH,

@@ -7,6 +7,7 @@ from mars_lidar.scene import Scene
 from mars_lidar.simulate import simulate, simulate_timestamps
 from mars_lidar.statistics import CountLaw, count_law, holding_time_covariance, registration_pdf
 from mars_lidar.system import Detector, System
+from mars_lidar.table import Lookup, QuantisationError, Table
 from mars_lidar.timestamps import Timestamps
 
 __all__ = [
@@ -14,10 +15,13 @@ __all__ = [
     "Detector",
     "Flux",
     "GaussianPulse",
+    "Lookup",
     "Pulse",
+    "QuantisationError",
     "SampledPulse",
     "Scene",
     "System",
+    "Table",
     "Timestamps",
     "__version__",
     "count_law",

@@ -28,5 +28,6 @@ void bind_poisson(nb::module_& module);
 void bind_chain(nb::module_& module);
 void bind_exposure(nb::module_& module);
 void bind_matched(nb::module_& module);
+void bind_table(nb::module_& module);
 
 }  // namespace mars

@@ -21,12 +21,14 @@ struct Level {
     const char* name;
     int lanes;
     void (*moments)(const MomentsBlock&);
+    void (*phases)(const PhasesBlock&);
     void (*stationary)(const StationaryBlock&);
     void (*characteristic)(const CharacteristicBlock&);
 };
 
 #define MARS_EXPOSURE_LEVEL(level, lanes) \
-    {#level, lanes, exposure_moments_##level, exposure_stationary_##level, exposure_characteristic_##level}
+    {#level, lanes, exposure_moments_##level, exposure_phases_##level, exposure_stationary_##level,  \
+     exposure_characteristic_##level}
 
 // Widest first.
 std::vector<Level> levels() {
@@ -106,6 +108,32 @@ void moments(const ExposureGrid& grid, Vector<const double> signal, Vector<const
     });
 }
 
+// Cumulants as `moments` gives them, and their change at the edges `phase` (ascending) of the grid.
+void phases(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
+            Vector<const int32_t> shape, Matrix<const double> shapes, Vector<const int32_t> phase,
+            Matrix<double> cumulants, Matrix<double> correction, Vector<int64_t> settled, int threads,
+            const std::string& level_name, const nb::object& progress) {
+    const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
+    const int64_t edges = static_cast<int64_t>(phase.shape(0));
+    expect("cumulants", cumulants, flux.entries, kExposureOrders);
+    expect("correction", correction, flux.entries, edges * kExposureOrders);
+    if (static_cast<int64_t>(settled.shape(0)) != flux.entries) throw nb::value_error("settled has the wrong shape");
+    for (int64_t p = 0; p < edges; ++p)
+        if (phase.data()[p] < (p ? phase.data()[p - 1] : 0) || phase.data()[p] > grid.bins)
+            throw nb::value_error("phase must be ascending edges of the grid");
+    const std::vector<double>::size_type cells = static_cast<size_t>(flux.entries);
+    std::vector<double> rates(cells * kExposureOrders), histogram(cells * grid.out_bins), rate(cells * grid.out_bins);
+    const Level level = level_for(level_name, 2 * bytes_per_lane(grid, kExposureOrders + 1));
+    const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
+    run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
+        const int64_t first = batch * level.lanes;
+        const MomentsBlock forward{&grid, &flux, first, std::min<int64_t>(level.lanes, flux.entries - first),
+                                   cumulants.data(), rates.data(), histogram.data(), rate.data(), settled.data(),
+                                   &stop, phase.data(), edges, correction.data()};
+        level.phases({forward, edges, correction.data()});
+    });
+}
+
 void stationary(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
                 Vector<const int32_t> shape, Matrix<const double> shapes, Matrix<double> histogram,
                 Vector<int64_t> settled, int threads, const std::string& level_name, const nb::object& progress) {
@@ -166,6 +194,9 @@ void bind_exposure(nb::module_& module) {
                nb::arg("shape"), nb::arg("shapes"), nb::arg("cumulants"), nb::arg("cumulant_rates"),
                nb::arg("histogram"), nb::arg("histogram_rate"), nb::arg("settled"), nb::arg("threads"),
                nb::arg("level"), nb::arg("progress").none());
+    module.def("exposure_phases", &phases, nb::kw_only(), nb::arg("grid"), nb::arg("signal"), nb::arg("background"),
+               nb::arg("shape"), nb::arg("shapes"), nb::arg("phase"), nb::arg("cumulants"), nb::arg("correction"),
+               nb::arg("settled"), nb::arg("threads"), nb::arg("level"), nb::arg("progress").none());
     module.def("exposure_stationary", &stationary, nb::kw_only(), nb::arg("grid"), nb::arg("signal"),
                nb::arg("background"), nb::arg("shape"), nb::arg("shapes"), nb::arg("histogram"), nb::arg("settled"),
                nb::arg("threads"), nb::arg("level"), nb::arg("progress").none());

@@ -1,6 +1,7 @@
 // The exposure recursion at one vector level: entry points.
 #include "exposure_kernel.h"
 
+#include "exposure_backward.h"
 #include "exposure_characteristic.h"
 #include "exposure_moments.h"
 
@@ -10,6 +11,19 @@
 namespace mars {
 
 void MARS_JOIN(exposure_moments_, MARS_LEVEL)(const MomentsBlock& block) { MomentsRun(block).run(); }
+
+void MARS_JOIN(exposure_phases_, MARS_LEVEL)(const PhasesBlock& block) {
+    const MomentsBlock& moments = block.moments;
+    MomentsRun(moments).run();
+    if (moments.stop->load(std::memory_order_relaxed)) return;
+    const auto response = responses(*moments.flux, moments.first, moments.count);
+    if (moments.grid->stationary) {
+        const Stationary start = stationary_state(*moments.grid, response, moments.count, *moments.stop);
+        BackwardRun(block, response, &start).run();
+    } else {
+        BackwardRun(block, response, nullptr).run();
+    }
+}
 
 void MARS_JOIN(exposure_characteristic_, MARS_LEVEL)(const CharacteristicBlock& block) {
     CharacteristicRun(block).run();

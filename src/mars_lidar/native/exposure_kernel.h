@@ -57,6 +57,16 @@ struct MomentsBlock {
     double* histogram_rate;  // (entries, out_bins) per period once settled, else NaN
     int64_t* settled;        // (entries)
     const std::atomic<bool>* stop;
+    const int32_t* phase = nullptr;  // (phases) edges of the grid, for PhasesBlock
+    int64_t phases = 0;
+    double* ends = nullptr;          // (entries, phases, 4) what ending at that phase adds to the cumulants, or null
+};
+
+// Change of the cumulants of entries where the exposure begins, and ends, at another phase (docs/table.md).
+struct PhasesBlock {
+    MomentsBlock moments;
+    int64_t phases;
+    double* correction;  // (entries, phases, 4)
 };
 
 // Stationary registrations per period and bin of entries [first, first + count).
@@ -86,6 +96,7 @@ struct CharacteristicBlock {
 
 #define MARS_DECLARE_EXPOSURE(level)                                 \
     void exposure_moments_##level(const MomentsBlock& block);        \
+    void exposure_phases_##level(const PhasesBlock& block);          \
     void exposure_stationary_##level(const StationaryBlock& block);  \
     void exposure_characteristic_##level(const CharacteristicBlock& block);
 

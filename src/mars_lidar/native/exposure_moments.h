@@ -20,7 +20,8 @@ class MomentsRun {
     void run() {
         Stationary start{};
         if (grid_.stationary) start = stationary_state(grid_, response_, block_.count, *block_.stop);
-        Recursion<Moments, Real> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr);
+        Recursion<Moments, Real> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr,
+                                          block_.ends != nullptr);
         recursion.armed.c[0] = grid_.stationary ? start.armed : splat(1.0);
         if (grid_.stationary) recursion.set_last({one(start.bins.back().mass), one(start.bins.back().moment)});
         std::vector<Real> histogram(grid_.bins), before(grid_.bins);
@@ -64,9 +65,10 @@ class MomentsRun {
                 if (!settled && !over && periods < grid_.max_periods) continue;
                 done[k] = true;
                 --left;
-                if (settled || over)
+                if (settled || over) {
                     put(k, step, periods, settled, histogram.data(), before.data());
-                else
+                    if (block_.ends) put_ends(k, recursion, q);
+                } else
                     block_.settled[block_.first + k] = kUnsettled;
             }
         }
@@ -147,6 +149,19 @@ class MomentsRun {
             if (settled) mean[b] += rest * mean_rate[b];
         }
         block_.settled[entry] = settled ? periods : kRanToEnd;
+    }
+
+    // What the count gains, in each cumulant, from the start of period q to the phases asked for (16).
+    void put_ends(int k, const Recursion<Moments, Real>& recursion, int64_t q) const {
+        constexpr double factorial[] = {1.0, 1.0, 2.0, 6.0, 24.0};
+        double* out = block_.ends + (block_.first + k) * block_.phases * kExposureOrders;
+        Moments total{};
+        int32_t j = 0;
+        for (int64_t p = 0; p < block_.phases; ++p) {
+            for (; j < block_.phase[p]; ++j) total = total + recursion.last_period(q, j).mass;
+            const Moments gain = growth(total);
+            for (int order = 1; order <= kExposureOrders; ++order) *out++ = factorial[order] * lane(gain.c[order], k);
+        }
     }
 
     const MomentsBlock& block_;

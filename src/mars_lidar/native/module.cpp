@@ -57,4 +57,5 @@ NB_MODULE(_core, module) {
     mars::bind_chain(module);
     mars::bind_exposure(module);
     mars::bind_matched(module);
+    mars::bind_table(module);
 }

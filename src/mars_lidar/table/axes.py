@@ -1,0 +1,86 @@
+"""Axes of a table: photons per period, ascending; how they are given, thinned and refined."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+
+FloatArray = NDArray[np.float64]
+Grid = tuple[float, float, int] | ArrayLike
+
+_MAX_PHOTONS = 1e6
+MAX_POINTS = 4096  # on one axis
+
+
+def axis_values(name: str, grid: Grid) -> FloatArray:
+    """Values of an axis.
+
+    Parameters
+    ----------
+    name
+        Of the argument, for errors.
+    grid
+        A tuple ``(low, high, points)``: 0, and `points` values from low to high, equally spaced in the logarithm.
+        Or an array of values, ascending, taken as it is.
+
+    Returns
+    -------
+    NDArray
+        (n,) photons per period.
+    """
+    if isinstance(grid, tuple):
+        if len(grid) != 3:
+            raise ValueError(f"{name} must be (low, high, points) or an array of values, got {grid!r}")
+        low = _validate.real(f"{name}[0]", grid[0], low=0.0, high=_MAX_PHOTONS, strict_low=True)
+        high = _validate.real(f"{name}[1]", grid[1], low=0.0, high=_MAX_PHOTONS, strict_low=True)
+        points = _validate.integer(f"{name}[2]", grid[2], low=2, high=MAX_POINTS)
+        if not high > low:
+            raise ValueError(f"{name} must be (low, high, points) with high > low, got {grid!r}")
+        return np.concatenate([[0.0], np.geomspace(low, high, points)])
+    values = np.array(grid)
+    if values.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must be (low, high, points) or real numbers, got dtype {values.dtype}")
+    if values.ndim != 1 or not 1 <= values.size <= MAX_POINTS:
+        raise ValueError(f"{name} must have shape (n,) with n from 1 to {MAX_POINTS}, got {values.shape}")
+    values = values.astype(np.float64)
+    if not ((values >= 0) & (values <= _MAX_PHOTONS)).all() or not (np.diff(values) > 0).all():
+        raise ValueError(
+            f"{name} must be strictly ascending photons per period in [0, {_MAX_PHOTONS:g}], got {values}"
+        )
+    return values
+
+
+def thinned(values: FloatArray, step: float) -> NDArray[np.int64]:
+    """Indices of some values of an axis, its ends included, at most `step` apart in the logarithm where they can."""
+    start = 1 if values[0] == 0.0 and values.size > 1 else 0
+    logs = np.log(np.maximum(values[start:], np.finfo(float).tiny))
+    intervals = max(1, math.ceil((logs[-1] - logs[0]) / step))
+    wanted = np.linspace(logs[0], logs[-1], intervals + 1)
+    nearest = start + np.abs(wanted[:, None] - logs[None, :]).argmin(1)
+    return np.unique(np.concatenate([[0], nearest])).astype(np.int64)
+
+
+def midpoints(values: FloatArray) -> FloatArray:
+    """(n - 1,) points between those of an axis: geometric means, and half of the lowest where it is after 0."""
+    low, high = values[:-1], values[1:]
+    return np.where(low > 0, np.sqrt(low * high), 0.5 * high)
+
+
+def inserted(values: FloatArray, more: Sequence[float] | FloatArray) -> FloatArray:
+    """The axis with `more` points."""
+    return np.unique(np.concatenate([values, np.asarray(more, dtype=np.float64)]))
+
+
+def describe(values: FloatArray) -> str:
+    """An axis in words."""
+    positive = values[values > 0]
+    zero = "0 and " if values[0] == 0.0 and positive.size else ""
+    if positive.size < 2:
+        return f"{zero}{positive[0]:g}" if positive.size else "0"
+    even = np.ptp(np.diff(np.log(positive))) < 1e-9
+    return f"{zero}{positive.size} {'log-spaced ' if even else ''}values in [{positive[0]:g}, {positive[-1]:g}]"

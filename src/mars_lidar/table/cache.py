@@ -1,0 +1,114 @@
+"""Tables that were built before, kept in the user's cache directory under the hash of their request.
+
+``MARS_LIDAR_CACHE``, or ``mars-lidar`` in ``XDG_CACHE_HOME``, or in ``~/.cache``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mars_lidar._version import __version__
+from mars_lidar.statistics._cells import FloatArray
+from mars_lidar.system import System
+from mars_lidar.table.axes import Grid, axis_values
+
+if TYPE_CHECKING:
+    from mars_lidar.table.table import Table
+
+FORMAT = 1
+SUFFIX = ".h5"
+_KEY_LENGTH = 24
+
+
+def directory() -> Path:
+    """Where tables are kept; it need not exist yet."""
+    given = os.environ.get("MARS_LIDAR_CACHE")
+    if given:
+        return Path(given)
+    base = os.environ.get("XDG_CACHE_HOME")
+    root = Path(base) if base and Path(base).is_absolute() else Path.home() / ".cache"
+    return root / "mars-lidar"
+
+
+def request_key(
+    system: System,
+    axes: tuple[FloatArray, FloatArray],
+    *,
+    method: str,
+    rearm: str,
+    refine: float | None,
+    tolerance: float,
+) -> str:
+    """Hash of all that decides a table but its cycles, which many tables do not depend on."""
+    instrument = system.to_dict()
+    del instrument["cycles"]
+    request = {
+        "format": FORMAT,
+        "version": __version__,
+        "system": instrument,
+        "axes": [[value.hex() for value in axis.tolist()] for axis in axes],
+        "method": method,
+        "rearm": rearm,
+        "refine": refine,
+        "tolerance": tolerance,
+    }
+    text = json.dumps(request, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
+
+
+def cached(system: System, signal: Grid, background: Grid, **options: Any) -> Table:
+    """The table from the cache, or built and put there.
+
+    A table made for another number of cycles is taken where every entry of it holds for those of `system`.
+    """
+    from mars_lidar.table.table import Table
+
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    chosen = {"method": "exposure", "rearm": "centre", "refine": None, "tolerance": 1e-4} | options
+    unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "threads", "progress"}
+    if unknown:
+        raise TypeError(f"cached takes the options of Table.build, got {sorted(unknown)[0]!r}")
+    axes = axis_values("signal", signal), axis_values("background", background)
+    key = request_key(
+        system, axes, method=chosen["method"], rearm=chosen["rearm"], refine=chosen["refine"],
+        tolerance=chosen["tolerance"],
+    )  # fmt: skip
+    folder = directory()
+    own = folder / f"{key}-{system.cycles}{SUFFIX}"
+    others = sorted(folder.glob(f"{key}-*{SUFFIX}")) if folder.is_dir() else []
+    for path in [own, *(other for other in others if other != own)]:
+        with contextlib.suppress(FileNotFoundError, ValueError):  # absent, damaged, or of too few cycles
+            return Table.load(path, system)
+    table = Table.build(system, signal, background, **options)
+    folder.mkdir(parents=True, exist_ok=True)
+    table.save(own, overwrite=True)
+    return Table.load(own, system)
+
+
+def files(folder: Path | None = None) -> list[Path]:
+    """Tables in the cache, and what unfinished writing left there."""
+    where = directory() if folder is None else folder
+    if not where.is_dir():
+        return []
+    return sorted(p for p in where.iterdir() if p.is_file() and _is_ours(p.name))
+
+
+def clear(folder: Path | None = None) -> tuple[int, int]:
+    """Remove them; the number of files and bytes that are gone."""
+    count = freed = 0
+    for path in files(folder):
+        size = path.stat().st_size
+        path.unlink()
+        count, freed = count + 1, freed + size
+    return count, freed
+
+
+def _is_ours(name: str) -> bool:
+    key, _, rest = name.partition("-")
+    return len(key) == _KEY_LENGTH and all(c in "0123456789abcdef" for c in key) and SUFFIX in rest

@@ -1,0 +1,160 @@
+"""How well a table answers between its nodes: measured on random pixels against the exact law of each."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mars_lidar import _validate
+from mars_lidar.statistics._cells import FloatArray
+
+if TYPE_CHECKING:
+    from mars_lidar.table.table import Interpolation, Table
+
+# total variation between normal laws that differ a little: 0.399 per standard deviation of the mean, 0.242 per
+# relative change of the variance
+_TV_MEAN, _TV_VARIANCE = 1.0 / np.sqrt(2.0 * np.pi), 1.0 / np.sqrt(2.0 * np.pi * np.e)
+_LEAST_SPREAD = 0.5  # below it a count is a lottery between two integers, and errors matter in counts
+
+
+@dataclass(frozen=True)
+class QuantisationError:
+    """Errors of a table on random pixels between its nodes.
+
+    Errors of the cumulants are in units of powers of the standard deviation, at least 1/2 count. Those called
+    `delayed` are at random delays, where an armed start gives another law; the others at the canonical t_r / 2.
+
+    Attributes
+    ----------
+    interpolation, samples, cycles
+        What was measured, on how many pixels, for exposures of how many periods.
+    mean_rms, mean_max, variance_rms, variance_max, third_max, fourth_max
+        Of the cumulants.
+    shape_mean, shape_max
+        Total variation between the mixture of shapes and the pixel's own.
+    delayed_mean_max, delayed_variance_max, delayed_shape_max
+        The same at random delays. The shape is shifted by whole bins, so that nothing but the table errs.
+    law_max
+        Largest of 0.399 |error of the mean| + 0.242 |error of the variance|: the total variation between two
+        normal laws, to first order; delays included.
+    worst_signal, worst_background
+        The pixel of `law_max` or `shape_max`, whichever is larger.
+    """
+
+    interpolation: str
+    samples: int
+    cycles: int
+    mean_rms: float
+    mean_max: float
+    variance_rms: float
+    variance_max: float
+    third_max: float
+    fourth_max: float
+    shape_mean: float
+    shape_max: float
+    delayed_mean_max: float
+    delayed_variance_max: float
+    delayed_shape_max: float
+    law_max: float
+    worst_signal: float
+    worst_background: float
+
+    @property
+    def largest(self) -> float:
+        """Total variation that the table may be off by: the larger of `law_max` and `shape_max`."""
+        return max(self.law_max, self.shape_max)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return dataclasses.asdict(self)
+
+
+def quantisation_error(
+    table: Table, interpolation: Interpolation, samples: int, seed: int, cycles: int | None, threads: int | None
+) -> QuantisationError:
+    """See `Table.quantisation_error`."""
+    from mars_lidar.table.table import evaluate_entries
+
+    samples = _validate.integer("samples", samples, low=1, high=1_000_000)
+    rng = np.random.default_rng(_validate.integer("seed", seed, low=0, high=2**64 - 1))
+    periods = table.system.cycles if cycles is None else _validate.integer("cycles", cycles, low=1, high=10**8)
+    system = table.system.replace(cycles=periods)
+    below = interpolation == "bilinear"  # the nearest entry knows nothing between 0 and the lowest value
+    signal, background = (_between(rng, axis, samples, below) for axis in (table.signal, table.background))
+    exact = evaluate_entries(
+        signal, background, system, method=table.method, rearm=table.rearm, tolerance=table.tolerance,
+        threads=threads, progress=None,
+    )  # fmt: skip
+    found = table.lookup(signal, background, cycles=periods, interpolation=interpolation)
+    shapes = table.shapes(periods)
+    mixed = np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
+    scale = np.maximum(np.sqrt(exact.cumulants[:, 1]), _LEAST_SPREAD)[:, None] ** np.arange(1, 5)
+    error = np.abs(found.cumulants - exact.cumulants) / scale
+    shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
+    delayed, delayed_shape = error, shape
+    if table.method == "exposure":
+        delayed, delayed_shape = _delayed(table, interpolation, rng, signal, background, mixed, periods, threads)
+    law = np.maximum(*((e[:, 0] * _TV_MEAN + e[:, 1] * _TV_VARIANCE) for e in (error, delayed)))
+    worst = int(np.argmax(np.maximum(law, shape)))
+    return QuantisationError(
+        interpolation=interpolation,
+        samples=samples,
+        cycles=periods,
+        mean_rms=float(np.sqrt(np.mean(error[:, 0] ** 2))),
+        mean_max=float(error[:, 0].max()),
+        variance_rms=float(np.sqrt(np.mean(error[:, 1] ** 2))),
+        variance_max=float(error[:, 1].max()),
+        third_max=float(error[:, 2].max()),
+        fourth_max=float(error[:, 3].max()),
+        shape_mean=float(shape.mean()),
+        shape_max=float(shape.max()),
+        delayed_mean_max=float(delayed[:, 0].max()),
+        delayed_variance_max=float(delayed[:, 1].max()),
+        delayed_shape_max=float(delayed_shape.max()),
+        law_max=float(law.max()),
+        worst_signal=float(signal[worst]),
+        worst_background=float(background[worst]),
+    )
+
+
+def _between(rng: np.random.Generator, axis: FloatArray, samples: int, below: bool) -> FloatArray:
+    """Random values of an axis: log-uniform, and if `below` one in eight in the cell that begins at 0."""
+    positive = axis[axis > 0]
+    if positive.size == 0:
+        return np.zeros(samples)
+    values = np.exp(rng.uniform(np.log(positive[0]), np.log(positive[-1]), samples))
+    values = np.clip(values, positive[0], positive[-1])
+    if below and axis[0] == 0.0:
+        low = rng.random(samples) < 0.125
+        values[low] = positive[0] * rng.random(int(low.sum()))
+    return values
+
+
+def _delayed(
+    table: Table,
+    interpolation: Interpolation,
+    rng: np.random.Generator,
+    signal: FloatArray,
+    background: FloatArray,
+    mixed: FloatArray,
+    cycles: int,
+    threads: int | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Errors (P, 4) and (P,) of cumulants and shape at random delays, whole bins from the canonical one."""
+    from mars_lidar.statistics.exposure import exposure_moments
+
+    system = table.system.replace(cycles=cycles)
+    shift = rng.integers(0, system.bins, signal.size)
+    delay = 0.5 * system.period_ns + shift * system.bin_ns
+    exact = exposure_moments(
+        signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads
+    )
+    found = table.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
+    scale = np.maximum(np.sqrt(exact.variance), _LEAST_SPREAD)[:, None] ** np.arange(1, 5)
+    total = exact.histogram.sum(-1, keepdims=True)
+    own = np.where(total > 0, exact.histogram / np.where(total > 0, total, 1.0), 1.0 / system.bins)
+    turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
+    return np.abs(found.cumulants - exact.cumulants) / scale, 0.5 * np.abs(turned - own).sum(-1)

@@ -1,0 +1,69 @@
+"""What a table says of pixels: rows and weights of its shapes, cumulants of their counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.statistics._cells import FloatArray, IndexArray
+from mars_lidar.table.start_phase import StartPhases
+
+
+@dataclass(frozen=True, eq=False)
+class Lookup:
+    """Entries of a table for P pixels; all arrays C-contiguous.
+
+    Attributes
+    ----------
+    rows, weights
+        (P, 4) rows of `Table.shapes` and their weights, >= 0 with sum 1: the pixel's shape at the canonical delay
+        is their mixture. A pixel `outside` has row 0 with weight 1.
+    cumulants
+        (P, 4) mean, variance, third and fourth cumulant of the pixel's count, at its own delay and the exposure
+        asked for; NaN for a pixel `outside`.
+    outside
+        (P,) pixels that the table does not reach, to be evaluated by the caller.
+    """
+
+    rows: IndexArray
+    weights: FloatArray
+    cumulants: FloatArray
+    outside: NDArray[np.bool_]
+
+
+def evaluate(
+    axes: tuple[FloatArray, FloatArray],
+    cumulants: FloatArray,
+    phases: StartPhases,
+    own_cycles: bool,
+    signal: FloatArray,
+    background: FloatArray,
+    phase: FloatArray,
+    nearest: bool,
+    threads: int,
+) -> tuple[IndexArray, FloatArray, FloatArray]:
+    """Rows, weights and cumulants (P, 4) each of pixels (P,) inside the axes; `phase` in [0, 1) periods."""
+    from mars_lidar import _core
+
+    rows = np.empty((signal.size, 4), np.int64)
+    weights, out = np.empty((signal.size, 4)), np.empty((signal.size, 4))
+    _core.table_lookup(
+        signal_axis=axes[0],
+        background_axis=axes[1],
+        entries=cumulants,
+        sub_signal=phases.signal,
+        sub_background=phases.background,
+        phase=phases.phase,
+        correction=phases.correction_at(own_cycles),
+        signal=signal,
+        background=background,
+        at=phase,
+        nearest=nearest,
+        rows=rows,
+        weights=weights,
+        cumulants=out,
+        threads=threads,
+    )
+    return rows, weights, out

@@ -1,0 +1,177 @@
+"""Tables in HDF5 files: contiguous and uncompressed, so that the shapes can be mapped into memory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.io.store import TemporarySibling, check_target
+from mars_lidar.system import System
+from mars_lidar.table.cache import FORMAT
+from mars_lidar.table.entries import Entries
+from mars_lidar.table.start_phase import StartPhases
+
+if TYPE_CHECKING:
+    from mars_lidar.table.table import Table
+
+_KIND = "mars-lidar table"
+_SUFFIXES = (".h5", ".hdf5")
+_MAPPED = ("shape", "startup")
+
+
+def save(table: Table, path: Path, *, overwrite: bool) -> None:
+    """Write all of a table; the file gets its name when it is complete."""
+    import h5py
+
+    if path.suffix not in _SUFFIXES:
+        raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
+    check_target(path, folder=False, overwrite=overwrite)
+    sibling = TemporarySibling(path)
+    try:
+        with h5py.File(sibling.path, "w", libver=("earliest", "v110")) as file:
+            for name, value in _header(table).items():
+                file.attrs[name] = value
+            for name, array in _arrays(table).items():
+                file.create_dataset(name, data=array)
+        sibling.publish()
+    except BaseException:
+        sibling.discard()
+        raise
+
+
+def load(path: Path, system: System) -> Table:
+    """See `Table.load`."""
+    from mars_lidar.table.table import Table
+
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    header, arrays = _read(path)
+    made_for = System.from_json(header["system"])
+    _compare(path, made_for, system)
+    entries = Entries(
+        cycles=made_for.cycles,
+        **{name: arrays[name] for name in ("cumulants", "rates", "enough", "bins", "shape")},
+        startup=arrays.get("startup"),
+    )
+    phases = StartPhases(
+        **{n: arrays["phase_" + n] for n in ("signal", "background", "phase", "correction", "settled")}
+    )
+    table = Table(
+        system, header["method"], arrays["signal"], arrays["background"], header["rearm"], float(header["tolerance"]),
+        json.loads(header["provenance"]), entries, phases,
+    )  # fmt: skip
+    if not table.serves(system.cycles):
+        raise ValueError(
+            f"{path} is a table of another system: cycles is {made_for.cycles} there and {system.cycles} here, "
+            "and not every entry holds for other cycles"
+        )
+    return table
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """What a file says about its table: system, axes, method, provenance; no shapes are read."""
+    header, arrays = _read(path)
+    return {
+        "system": System.from_json(header["system"]),
+        "method": header["method"],
+        "rearm": header["rearm"],
+        "tolerance": float(header["tolerance"]),
+        "provenance": json.loads(header["provenance"]),
+        "signal": arrays["signal"],
+        "background": arrays["background"],
+        "phases": arrays["phase_phase"].size,
+        "enough": arrays["enough"],
+        "nbytes": path.stat().st_size,
+        "shape_bytes": arrays["shape"].nbytes,
+    }
+
+
+def _header(table: Table) -> dict[str, Any]:
+    made_for = table.system.replace(cycles=table.entries.cycles)
+    return {
+        "kind": _KIND,
+        "format": FORMAT,
+        "system": made_for.to_json(),
+        "method": table.method,
+        "rearm": table.rearm,
+        "tolerance": table.tolerance,
+        "provenance": json.dumps(table.provenance),
+    }
+
+
+def _arrays(table: Table) -> dict[str, NDArray[Any]]:
+    entries, phases = table.entries, table.start_phases
+    arrays: dict[str, NDArray[Any]] = {
+        "signal": table.signal,
+        "background": table.background,
+        "cumulants": entries.cumulants,
+        "rates": entries.rates,
+        "enough": entries.enough,
+        "bins": entries.bins,
+        "phase_signal": phases.signal,
+        "phase_background": phases.background,
+        "phase_phase": phases.phase,
+        "phase_correction": phases.correction,
+        "phase_settled": phases.settled.astype(np.uint8),
+        "shape": entries.shape,
+    }
+    if entries.startup is not None:
+        arrays["startup"] = entries.startup
+    return arrays
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Attributes and arrays; the large ones are mapped, the others read."""
+    import h5py
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist")
+    try:
+        with h5py.File(path, "r") as file:
+            header = dict(file.attrs.items())
+            if header.get("kind") != _KIND:
+                raise ValueError(f"{path} is not a table of mars-lidar")
+            if int(header["format"]) != FORMAT:
+                raise ValueError(f"{path} is a table of format {header['format']}; this version reads {FORMAT}")
+            arrays = {
+                name: _mapped(path, data) if name in _MAPPED else _own(data[()]) for name, data in file.items()
+            }
+    except OSError as error:
+        raise ValueError(f"{path} is not an HDF5 file that can be read: {error}") from error
+    arrays["phase_settled"] = arrays["phase_settled"].astype(bool)
+    return header, arrays
+
+
+def _own(array: Any) -> NDArray[Any]:
+    values = np.ascontiguousarray(array)
+    values.flags.writeable = False
+    return values
+
+
+def _mapped(path: Path, data: Any) -> NDArray[Any]:
+    offset = data.id.get_offset()
+    if offset is None:
+        raise ValueError(f"{path} has no contiguous {data.name}: it was not written by mars-lidar")
+    return np.memmap(path, dtype=data.dtype, mode="r", offset=offset, shape=data.shape)
+
+
+def _compare(path: Path, made_for: System, system: System) -> None:
+    """Refuse another system, naming the field that differs."""
+    theirs, ours = made_for.to_dict(), system.to_dict()
+    for name in ours:
+        if name == "cycles" or theirs[name] == ours[name]:
+            continue
+        inner = [k for k in ours[name] if theirs[name].get(k) != ours[name][k]] if isinstance(ours[name], dict) else []
+        at, there, here = name, theirs[name], ours[name]
+        if inner and inner[0] in there:
+            at, there, here = f"{name}.{inner[0]}", there[inner[0]], here[inner[0]]
+        raise ValueError(f"{path} is a table of another system: {at} is {_short(there)} there and {_short(here)} here")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

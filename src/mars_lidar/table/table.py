@@ -1,0 +1,392 @@
+"""The lookup table over (S, B) at a canonical delay: built once for a system, it answers for any pixel.
+
+The paper's table (arXiv 2512.04924): 256 x 100 entries on [0.01, 10]^2; delay invariance replaces a third axis. Here
+with the exact law of the finite exposure, its dependence on the delay, any number of cycles, and interpolation. What
+is stored, and the errors, are described in docs/table.md.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar._memory import check_memory
+from mars_lidar._version import __version__
+from mars_lidar.statistics._cells import FloatArray, _broadcast, _reals
+from mars_lidar.statistics.chain import Rearm
+from mars_lidar.statistics.exposure import thread_count
+from mars_lidar.system import System
+from mars_lidar.table.axes import Grid, axis_values, describe
+from mars_lidar.table.entries import Entries, Progress, exposure_entries
+from mars_lidar.table.error import QuantisationError, quantisation_error
+from mars_lidar.table.lookup import Lookup, evaluate
+from mars_lidar.table.refine import refined_axes
+from mars_lidar.table.renewal_entries import renewal_entries
+from mars_lidar.table.start_phase import StartPhases, start_phases
+
+Method = Literal["exposure", "mars"]
+Interpolation = Literal["bilinear", "nearest"]
+_METHODS, _INTERPOLATIONS, _OUTSIDE = ("exposure", "mars"), ("bilinear", "nearest"), ("error", "exact")
+_REARMS = ("centre", "edge")
+PAPER_GRID: dict[str, tuple[float, float, int]] = {"signal": (0.01, 10.0, 256), "background": (0.01, 10.0, 100)}
+
+_ERROR_SAMPLES = 128  # pixels on which a table is checked when it is built
+_ATTEMPTS = 4  # of refining, each with half the error of the one before
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Count law and histogram shape over a grid of (S, B); made by `build`, `load` or `cached`.
+
+    Attributes
+    ----------
+    system
+        Laser, detector and histogram; its `cycles` are those of ``cycles=None``.
+    method
+        ``"exposure"`` or ``"mars"``.
+    signal, background
+        (nS,), (nB,) axes, photons per period, ascending. The first may be 0: pixels without a return.
+    rearm
+        Of the chain, for ``"mars"``.
+    tolerance
+        Of the exposure statistics.
+    provenance
+        How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
+    """
+
+    system: System
+    method: Method
+    signal: FloatArray
+    background: FloatArray
+    rearm: Rearm
+    tolerance: float
+    provenance: dict[str, Any]
+    entries: Entries = field(repr=False)
+    start_phases: StartPhases = field(repr=False)
+
+    @classmethod
+    def build(
+        cls,
+        system: System,
+        signal: Grid = PAPER_GRID["signal"],
+        background: Grid = PAPER_GRID["background"],
+        *,
+        method: Method = "exposure",
+        rearm: Rearm = "centre",
+        refine: float | None = None,
+        tolerance: float = 1e-4,
+        threads: int | None = None,
+        progress: Progress | None = None,
+    ) -> Table:
+        """Evaluate every entry.
+
+        Parameters
+        ----------
+        system
+            Laser, detector and histogram.
+        signal, background
+            Axes, photons per period: ``(low, high, points)`` for 0 and `points` log-spaced values, or an array
+            of values taken as it is. Between 0 and the next value everything is interpolated linearly.
+        method
+            ``"exposure"``: exact statistics of the finite exposure. ``"mars"``: the paper's, Markov chain and
+            Gaussian of the Markov-renewal law, asymptotic in the exposure.
+        rearm
+            ``"centre"`` or ``"edge"`` of the bin, for ``"mars"``.
+        refine
+            Error in total variation, in [1e-5, 0.1]: points are inserted until the table meets it between its
+            nodes (`QuantisationError.largest`). None: the axes as they are.
+        tolerance
+            Of each entry, for ``"exposure"``: see `exposure_moments`.
+        threads
+            Threads to run on; default: all processors that this process may use.
+        progress
+            Called as ``progress(done, total)``; an exception from it stops the build.
+
+        Raises
+        ------
+        ValueError, TypeError
+            Naming the argument, before any work; or where `refine` cannot be met.
+        ConvergenceError
+            Naming the cell that could not be evaluated.
+        """
+        if not isinstance(system, System):
+            raise TypeError(f"system must be a System, got {type(system).__name__}")
+        axes = axis_values("signal", signal), axis_values("background", background)
+        _validate.choice("method", method, _METHODS)
+        _validate.choice("rearm", rearm, _REARMS)
+        if rearm != "centre" and method != "mars":
+            raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
+        tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+        goal = None if refine is None else _validate.real("refine", refine, low=1e-5, high=0.1)
+        team = thread_count(threads)
+        began = time.perf_counter()
+        from mars_lidar.table.cache import request_key
+
+        key = request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance)
+        built: dict[str, Any] = {
+            "method": method, "rearm": rearm, "tolerance": tolerance, "key": key, "threads": team, "progress": progress
+        }  # fmt: skip
+        if goal is None:
+            table = cls._evaluated(system, axes, **built)
+            error = table.quantisation_error(samples=_ERROR_SAMPLES, threads=team)
+        else:
+            table, error = cls._refined(system, axes, goal, built)
+        table.provenance["refine"] = goal
+        table.provenance["error"] = error.to_dict()
+        table.provenance["build_s"] = time.perf_counter() - began
+        return table
+
+    @classmethod
+    def _evaluated(
+        cls,
+        system: System,
+        axes: tuple[FloatArray, FloatArray],
+        *,
+        method: Method,
+        rearm: Rearm,
+        tolerance: float,
+        key: str,
+        threads: int,
+        progress: Progress | None,
+    ) -> Table:
+        signal, background = axes
+        check_memory(
+            2 * 4 * signal.size * background.size * system.bins,
+            f"tables of {signal.size} x {background.size} x {system.bins}",
+            "take fewer points or bins",
+        )
+        entries = evaluate_entries(
+            np.repeat(signal, background.size), np.tile(background, signal.size), system,
+            method=method, rearm=rearm, tolerance=tolerance, threads=threads, progress=progress,
+        )  # fmt: skip
+        phases = StartPhases.none()
+        if method == "exposure":
+            phases = start_phases(system, signal, background, entries.cumulants, entries.bins, threads=threads)
+        provenance = {
+            "version": __version__,
+            "key": key,
+            "signal": describe(signal),
+            "background": describe(background),
+        }
+        return cls(system, method, signal, background, rearm, tolerance, provenance, entries, phases)
+
+    @classmethod
+    def _refined(
+        cls, system: System, axes: tuple[FloatArray, FloatArray], goal: float, built: dict[str, Any]
+    ) -> tuple[Table, QuantisationError]:
+        def evaluated(signal: FloatArray, background: FloatArray) -> Entries:
+            chosen = {name: built[name] for name in ("method", "rearm", "tolerance", "threads")}
+            return evaluate_entries(signal, background, system, progress=None, **chosen)
+
+        inner = goal
+        for _ in range(_ATTEMPTS):
+            axes = refined_axes(*axes, evaluated, inner)
+            table = cls._evaluated(system, axes, **built)
+            error = table.quantisation_error(samples=4 * _ERROR_SAMPLES, threads=built["threads"])
+            if error.largest <= goal:
+                return table, error
+            inner *= 0.5
+        raise ValueError(
+            f"refine must be an error that can be met, got {goal:g}: reached {error.largest:.2g} with "
+            f"{axes[0].size} x {axes[1].size} points at S = {error.worst_signal:g}, B = {error.worst_background:g}"
+        )
+
+    def lookup(
+        self,
+        signal: ArrayLike,
+        background: ArrayLike,
+        *,
+        delay_ns: ArrayLike | None = None,
+        cycles: int | None = None,
+        interpolation: Interpolation = "bilinear",
+        outside: Literal["error", "exact"] = "error",
+        threads: int | None = 1,
+    ) -> Lookup:
+        """Entries for pixels.
+
+        Parameters
+        ----------
+        signal, background, delay_ns
+            S and B, photons per period, and delay of the return, ns: scalars or arrays that broadcast; P is the
+            number of their elements in C order. The delay is of no account where S is 0, and may be NaN there;
+            None: the canonical t_r / 2 everywhere.
+        cycles
+            Laser periods of the exposure; None: the system's.
+        interpolation
+            ``"bilinear"``: the mean histogram is a mixture of four, linear in S and in B; cumulants are bicubic in
+            their logarithms. ``"nearest"``: the nearest entry, as in the paper.
+        outside
+            ``"error"``, or ``"exact"``: pixels beyond the axes are left to the caller, marked in `Lookup.outside`.
+        threads
+            Threads to run on; the result does not depend on it.
+
+        Raises
+        ------
+        ValueError
+            Naming the range that lies outside of the table; or the entry that does not hold for `cycles`.
+        """
+        _validate.choice("interpolation", interpolation, _INTERPOLATIONS)
+        _validate.choice("outside", outside, _OUTSIDE)
+        periods = self._cycles(cycles)
+        team = thread_count(threads)
+        canonical = 0.5 * self.system.period_ns
+        given = _reals("delay_ns", canonical if delay_ns is None else delay_ns)
+        parts = _broadcast(
+            ("signal", "background", "delay_ns"), _reals("signal", signal), _reals("background", background), given
+        )
+        s, b, delay = (np.ascontiguousarray(part.reshape(-1), dtype=np.float64) for part in parts)
+        bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (s == 0))
+        if bad.any():
+            raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad][0]}")
+        beyond = np.zeros(s.size, dtype=bool)
+        for name, values, axis in (("signal", s, self.signal), ("background", b, self.background)):
+            if not (values >= 0).all():
+                raise ValueError(f"{name} must be photons per period >= 0, got {values[~(values >= 0)][0]}")
+            out = (values < axis[0]) | (values > axis[-1])
+            if out.any() and outside == "error":
+                raise ValueError(
+                    f"{name} must lie in the table's [{axis[0]:g}, {axis[-1]:g}] photons per period, got "
+                    f"{values.min():g} to {values.max():g} ({int(out.sum())} of {values.size} pixels outside); build "
+                    "the table over that range, or leave them to the exact engine with outside='exact'"
+                )
+            beyond |= out
+        phase = (canonical - np.where(np.isnan(delay), canonical, delay)) / self.system.period_ns
+        phase -= np.floor(phase)
+        inside = np.flatnonzero(~beyond)
+        rows, weights = np.zeros((s.size, 4), np.int64), np.zeros((s.size, 4))
+        weights[:, 0] = 1.0
+        cumulants = np.full((s.size, 4), np.nan)
+        everything = inside.size == s.size
+        pick: NDArray[np.int64] | slice = slice(None) if everything else inside
+        rows[pick], weights[pick], cumulants[pick] = evaluate(
+            (self.signal, self.background), self.entries.cumulants_at(periods), self.start_phases,
+            periods == self.entries.cycles, s[pick], b[pick], phase[pick], interpolation == "nearest", team,
+        )  # fmt: skip
+        if np.isnan(cumulants[inside]).any():
+            self._refuse(periods)
+        return Lookup(rows, weights, cumulants, beyond)
+
+    def shapes(self, cycles: int | None = None) -> NDArray[np.float32]:
+        """Normalised mean histograms at the canonical delay t_r / 2 (nS * nB, bins), float32, read-only.
+
+        Row iS * nB + iB belongs to ``signal[iS], background[iB]``. Mapped from the file where it holds what is
+        asked for; computed at each call for other cycles than those that the table was made for. Rows that do not
+        hold for `cycles` are NaN; `lookup` refuses to name them.
+        """
+        shapes = self.entries.shapes_at(self._cycles(cycles)).view()
+        shapes.flags.writeable = False
+        return shapes
+
+    def quantisation_error(
+        self,
+        *,
+        interpolation: Interpolation = "bilinear",
+        samples: int = 200,
+        seed: int = 0,
+        cycles: int | None = None,
+        threads: int | None = None,
+    ) -> QuantisationError:
+        """Errors on random pixels between the nodes, against the law of each evaluated directly.
+
+        Parameters
+        ----------
+        interpolation, cycles
+            As `lookup`.
+        samples, seed
+            Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
+            and the lowest value, where the axis has a 0.
+        """
+        _validate.choice("interpolation", interpolation, _INTERPOLATIONS)
+        return quantisation_error(self, interpolation, samples, seed, cycles, threads)
+
+    def serves(self, cycles: int) -> bool:
+        """Whether every entry holds for exposures of `cycles` periods."""
+        periods = self._cycles(cycles)
+        own = periods == self.entries.cycles
+        return own or bool(self.entries.serves(periods).all() and self.start_phases.settled.all())
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
+        from mars_lidar.table.storage import save
+
+        save(self, Path(path), overwrite=overwrite)
+
+    @classmethod
+    def load(cls, path: str | Path, system: System) -> Table:
+        """The table of a file, for `system`; shapes stay in the file, mapped into memory.
+
+        Raises
+        ------
+        ValueError
+            Where the table is of another system, naming the field that differs. Another number of cycles is no
+            difference where every entry holds for it.
+        """
+        from mars_lidar.table.storage import load
+
+        return load(Path(path), system)
+
+    @classmethod
+    def cached(
+        cls,
+        system: System,
+        signal: Grid = PAPER_GRID["signal"],
+        background: Grid = PAPER_GRID["background"],
+        **options: Any,
+    ) -> Table:
+        """`build`, or the same table from the user's cache (docs/table.md, 6), which keeps what is built."""
+        from mars_lidar.table.cache import cached
+
+        return cached(system, signal, background, **options)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of its arrays."""
+        phases, entries = self.start_phases, self.entries
+        startup = 0 if entries.startup is None else entries.startup.nbytes
+        return int(
+            entries.shape.nbytes + startup + entries.cumulants.nbytes + entries.rates.nbytes + entries.enough.nbytes
+            + entries.bins.nbytes + phases.correction.nbytes + phases.settled.nbytes
+        )  # fmt: skip
+
+    def _cycles(self, cycles: int | None) -> int:
+        return self.system.cycles if cycles is None else _validate.integer("cycles", cycles, low=1, high=10**8)
+
+    def _refuse(self, cycles: int) -> None:
+        """Raise, naming the entry that holds for the fewest numbers of cycles."""
+        enough = self.entries.enough
+        worst = int(np.argmin(enough)) if (enough < 0).any() else int(np.argmax(enough))
+        s, b = self.signal[worst // self.background.size], self.background[worst % self.background.size]
+        if enough[worst] < 0:
+            why = f"the state of a pixel at S = {s:g}, B = {b:g} does not repeat from period to period by then"
+        elif enough[worst] > cycles:
+            why = f"the state of a pixel at S = {s:g}, B = {b:g} repeats only after {enough[worst]} periods"
+        else:
+            why = "the effect of the delay has not settled by then"
+        raise ValueError(
+            f"cycles must be {self.entries.cycles} at some of these pixels, got {cycles}: the table was made for "
+            f"{self.entries.cycles} cycles, and {why}"
+        )
+
+
+def evaluate_entries(
+    signal: FloatArray,
+    background: FloatArray,
+    system: System,
+    *,
+    method: Method,
+    rearm: Rearm,
+    tolerance: float,
+    threads: int | None,
+    progress: Progress | None,
+) -> Entries:
+    """Entries of cells (n,) by either method."""
+    team = thread_count(threads)
+    if method == "mars":
+        return renewal_entries(signal, background, system, rearm=rearm, threads=team, progress=progress)
+    return exposure_entries(signal, background, system, tolerance=tolerance, threads=team, progress=progress)

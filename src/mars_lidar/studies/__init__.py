@@ -67,12 +67,19 @@ def _runtime(request: Request) -> list[Path]:
     return run(request)
 
 
+def _quantisation(request: Request) -> list[Path]:
+    from mars_lidar.studies.quantisation_report import run
+
+    return run(request)
+
+
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
     "count-law": ("T1: every simulator's count law and shape against simulation", _count_law),
     "joint-table": ("variance of signal window and bins, covariance of neighbours: every engine", _joint_table),
+    "quantisation": ("what a table's lookup costs, nearest and interpolated, over its size", _quantisation),
     "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
 }
 

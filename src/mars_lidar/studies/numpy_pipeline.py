@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.flux import Flux
-from mars_lidar.statistics import exposure_moments
 from mars_lidar.system import System
+from mars_lidar.table import Table
 
 FloatArray = NDArray[np.float64]
 
@@ -59,16 +59,21 @@ class NumpyTable:
         signal: tuple[float, float, int] = (0.01, 10.0, 256),
         background: tuple[float, float, int] = (0.01, 10.0, 100),
     ) -> NumpyTable:
-        """Entries from the exact moments at delay t_r / 2; axes as (low, high, points), at least 2 points."""
-        axes = [np.geomspace(*axis) for axis in (signal, background)]
-        shape = (axes[0].size, axes[1].size)
-        mean, variance = np.empty(shape), np.empty(shape)
-        shapes = np.empty((*shape, system.bins), np.float32)
-        for k, level in enumerate(axes[0]):  # row by row: memory for the double precision of one row only
-            found = exposure_moments(np.full(axes[1].size, level), axes[1], system)
-            mean[k], variance[k] = found.mean, found.variance
-            shapes[k] = found.histogram / found.mean[:, None]
-        return cls.of(system, axes[0], axes[1], mean.ravel(), variance.ravel(), shapes.reshape(-1, system.bins))
+        """A new `Table` of axes (low, high, points), at least 2 points, in the form of this pipeline."""
+        return cls.of_table(Table.build(system, signal, background))
+
+    @classmethod
+    def of_table(cls, table: Table, system: System | None = None) -> NumpyTable:
+        """The entries of a `Table`, for `system` if that has another number of cycles; those of no flux left out."""
+        seen = table.system if system is None else system
+        signal, background = (axis[axis > 0] for axis in (table.signal, table.background))
+        skipped = table.signal.size - signal.size, table.background.size - background.size
+        rows = np.arange(table.signal.size * table.background.size).reshape(table.signal.size, -1)
+        inner = rows[skipped[0] :, skipped[1] :].ravel()
+        nodes = np.repeat(signal, background.size), np.tile(background, signal.size)
+        moments = table.lookup(*nodes, cycles=seen.cycles, interpolation="nearest").cumulants
+        shapes = table.shapes(seen.cycles)[inner]
+        return cls.of(seen, signal, background, moments[:, 0], moments[:, 1], shapes)
 
     @classmethod
     def of(

@@ -29,6 +29,7 @@ def test_files(tmp_path):
     text = (tmp_path / "runtime.md").read_text()
     assert "| 105.1 MB | 105 MB |" in text
     assert "40.83" in text
+    assert "`Table` of this run, 5 x 4 entries" in text  # flux 0 is a node of either axis
     assert {path.name for path in tmp_path.glob("*.png")} == {"runtime_axes.png", "runtime_teaser.png"}
 
 
@@ -116,7 +117,7 @@ def test_points_that_would_take_too_long_are_left_out(monkeypatch):
         return run
 
     monkeypatch.setattr(
-        runtime, "contenders", lambda points: [contenders.Contender("slow", "slow", prepare)]
+        runtime, "contenders", lambda tables: [contenders.Contender("slow", "slow", prepare)]
     )
     axis = runtime.Axis("cycles", "cycles", (10.0, 100.0, 1000.0, 10_000.0), 2)
     found = runtime.along(runtime.QUICK, axis, str)
@@ -125,8 +126,26 @@ def test_points_that_would_take_too_long_are_left_out(monkeypatch):
 
 
 def test_flux_beyond_the_table_is_left_out():
-    one = next(c for c in contenders.contenders((4, 3)) if c.name == contenders.NUMPY)
+    one = next(c for c in contenders.contenders(contenders.Tables((4, 3))) if c.name == contenders.NUMPY)
     assert one.takes(ml.Flux(0.01, 10.0, 1.0))
     assert not one.takes(ml.Flux(0.009, 1.0, 1.0))
     assert not one.takes(ml.Flux(0.1, 10.1, 1.0))
+
+
+def test_tables_are_shared_between_exposures(system):
+    tables = contenders.Tables((4, 3))
+    first = tables.get(system)
+    longer = system.replace(cycles=5 * system.cycles)
+    assert first.serves(longer.cycles)
+    assert tables.get(longer) is first
+    assert tables.numpy(longer).system == longer
+    assert tables.numpy(longer) is tables.numpy(longer)
+    assert tables.get(system.replace(bins=32)).system.bins == 32
+    direct = ml.statistics.exposure_moments(0.1, 10.0, longer)
+    row = tables.numpy(longer).rows(np.array([0.1]), np.array([10.0]))[0]
+    assert tables.numpy(longer).mean[row] == pytest.approx(float(direct.mean), rel=1e-6)
+    assert tables.numpy(longer).spread[row] == pytest.approx(float(direct.variance) ** 0.5, rel=1e-5)
+
+
+def test_stages_of_a_report():
     assert contenders.stages_of({"lookup_s": 0.5, "pixels_exact": 3.0}) == {"lookup": 0.5}

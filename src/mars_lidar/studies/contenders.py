@@ -62,9 +62,8 @@ class Tables:
         return self._numpy
 
 
-def contenders(points: tuple[int, int]) -> list[Contender]:
-    """All of them; tables of so many points in S and B."""
-    tables = Tables(points)
+def contenders(tables: Tables) -> list[Contender]:
+    """All of them; those that need a table share it."""
     found = [Contender(name, _words(name), _engine(name)) for name in ENGINES]
     if "mars" in ENGINES:
         found.append(Contender(TABLED, "mars, table", _tabled(tables), tabled=True))

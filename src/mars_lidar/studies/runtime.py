@@ -14,8 +14,9 @@ from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate
 from mars_lidar.studies import Tell
-from mars_lidar.studies.contenders import Contender, Run, contenders
+from mars_lidar.studies.contenders import Contender, Run, Tables, contenders
 from mars_lidar.system import Detector, System
+from mars_lidar.table import Table
 
 PERIOD_NS, DEAD_TIME_NS, SIGMA_NS = 1e3 / 7.5, 85.0, 0.5
 FLUX = (0.05, 1.0)  # S and B uniform on this, photons per period
@@ -129,25 +130,26 @@ def system(settings: Settings, cycles: int) -> System:
     )
 
 
-def cube_stages(settings: Settings, tell: Tell) -> list[Cube]:
-    """Every contender on one cube of side x side pixels."""
+def cube_stages(settings: Settings, tell: Tell) -> tuple[list[Cube], Table]:
+    """Every contender on one cube of side x side pixels, and the table that some of them used."""
     flux, seen = image(settings.side**2, settings.seed), system(settings, 1000)
     out = _memory(flux, seen, 1)
     found = []
-    for one in contenders(settings.cube_table):
+    tables = Tables(settings.cube_table)
+    for one in contenders(tables):
         began = time.perf_counter()
         run = one.prepare(flux, seen, 1)
         prepared = time.perf_counter() - began
         seconds, stages = _least({one.name: run}, out, settings)[one.name]
         found.append(Cube(one.name, one.words, seconds, stages, prepared))
         tell(f"runtime: cube, {one.words}: {seconds:.3g} s")
-    return found
+    return found, tables.get(seen)
 
 
 def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
     """Every contender along one axis; each is stopped where its next point would take too long."""
     points: list[Point] = []
-    entrants = contenders(settings.axis_table)
+    entrants = contenders(Tables(settings.axis_table))
     for value in axis.values:
         flux, seen, realizations = _at(settings, axis, value)
         hits = registrations(flux, seen, settings.seed)
@@ -169,7 +171,7 @@ def teaser(settings: Settings, tell: Tell) -> list[Point]:
     """Many exposures of one pixel, S = B = 1."""
     cycles, realizations = settings.teaser
     flux, seen = Flux(1.0, 1.0, 0.5 * PERIOD_NS), system(settings, cycles)
-    runs = {one.name: one.prepare(flux, seen, realizations) for one in contenders(settings.axis_table)}
+    runs = {one.name: one.prepare(flux, seen, realizations) for one in contenders(Tables(settings.axis_table))}
     timed = _least(runs, _memory(flux, seen, realizations), settings)
     tell("runtime: teaser")
     return [Point("teaser", float(realizations), name, seconds) for name, (seconds, _) in timed.items()]

@@ -26,6 +26,7 @@ from mars_lidar.studies.runtime import (
     teaser,
 )
 from mars_lidar.studies.runtime_figures import draw_all
+from mars_lidar.table import Table
 
 # T2 and T3 of arXiv 2512.04924; NumPy on a Ryzen 7 9700X
 PAPER_STAGES = {"lookup": 0.020, "alignment": 0.144, "sampling": 0.849}
@@ -40,7 +41,7 @@ def run(request: Request) -> list[Path]:
     settings = QUICK if request.quick else FULL
     began = time.monotonic()
     busy = [load()]
-    cubes = cube_stages(settings, request.tell)
+    cubes, held = cube_stages(settings, request.tell)
     single = teaser(settings, request.tell)
     points = [point for axis in settings.axes for point in along(settings, axis, request.tell)]
     busy.append(load())
@@ -49,7 +50,7 @@ def run(request: Request) -> list[Path]:
     for line in rules:
         request.tell(line)
     spent = time.monotonic() - began
-    text = _text(settings, cubes, single, points, rules, request.quick, busy, spent)
+    text = _text(settings, cubes, held, single, points, rules, request.quick, busy, spent)
     rows = [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]]
     return [
         save_text(request.out / "runtime.md", text), *figures, save_csv(request.out / "runtime.csv", rows),
@@ -57,7 +58,7 @@ def run(request: Request) -> list[Path]:
 
 
 def _text(
-    settings: Settings, cubes: Sequence[Cube], single: Sequence[Point], points: Sequence[Point],
+    settings: Settings, cubes: Sequence[Cube], held: Table, single: Sequence[Point], points: Sequence[Point],
     rules: Sequence[str], quick: bool, busy: Sequence[str], spent: float,
 ) -> list[str]:  # fmt: skip
     side, bins = settings.side, settings.bins
@@ -96,7 +97,7 @@ def _text(
         table([{"simulator": p.contender, "seconds": f"{p.seconds:.3g}"} for p in single]),
         "Paper, another workload: Poisson 0.2 s, MaRS 0.3 s, sequential 16.1 s.",
         "## Size of the table (T3)",
-        table(_sizes()),
+        table(_sizes(held)),
     ]  # fmt: skip
 
 
@@ -154,7 +155,7 @@ def _axis_rows(points: Sequence[Point], axis: str) -> list[Row]:
     return rows
 
 
-def _sizes() -> list[Row]:
+def _sizes(held: Table) -> list[Row]:
     signal, background, bins = PAPER_GRID
     without = signal * background * (bins + 2) * _BYTES
     grid = f"{signal} x {background} entries of {bins} bins and 2 moments, float32"
@@ -164,5 +165,10 @@ def _sizes() -> list[Row]:
             "table": f"the same at each of {bins} delays",
             "computed": f"{without * bins / 1e9:.1f} GB",
             "paper": f"{PAPER_DELAYS_GB} GB",
+        },
+        {
+            "table": f"`Table` of this run, {held.signal.size} x {held.background.size} entries of any exposure",
+            "computed": f"{held.nbytes / 1e6:.1f} MB",
+            "paper": "-",
         },
     ]

@@ -41,11 +41,13 @@ from mars_lidar.engines import ENGINES
 CLAIMS = {
     "exact": {COUNTS, SHAPE, JOINT, INTERVALS},
     "sequential": {COUNTS, SHAPE, JOINT, INTERVALS},
+    "mars": {COUNTS, SHAPE},  # its bins are multinomial given the count: the joint law is known to be wrong
     "poisson": {COUNTS, SHAPE, JOINT},
+    "renewal": set(),  # a baseline whose count law is wrong on purpose: tests/engines/test_renewal.py
 }
 WITHOUT_DEAD_TIME = {"poisson"}  # the law of the arrivals, whatever the detector
 TRUTH = "sequential"
-WITH_DEAD_TIME = sorted(set(CLAIMS) - WITHOUT_DEAD_TIME)
+WITH_DEAD_TIME = sorted(engine for engine in set(CLAIMS) - WITHOUT_DEAD_TIME if CLAIMS[engine])
 RANDOM = random_cases(40, seed=2024, photons=2.5e6)
 
 

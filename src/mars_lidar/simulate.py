@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,9 @@ from mars_lidar.engines.base import Progress, Records, Task
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
 from mars_lidar.timestamps import Timestamps
+
+if TYPE_CHECKING:
+    from mars_lidar.table import Table
 
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
@@ -33,6 +36,9 @@ def simulate(
     out: NDArray[Any] | None = None,
     progress: Progress | None = None,
     report: dict[str, float] | None = None,
+    table: Table | None = None,
+    count: Literal["exact", "gaussian"] | None = None,
+    interpolation: Literal["bilinear", "nearest"] | None = None,
 ) -> NDArray[Any]:
     """Histogram cubes of an image.
 
@@ -43,8 +49,8 @@ def simulate(
     system
         Laser, detector and histogram.
     engine
-        ``"exact"`` (default), ``"sequential"`` (slow, independent gold standard) or ``"poisson"`` (no dead
-        time), or an `Engine` of your own settings.
+        ``"exact"`` (default), ``"sequential"`` (slow, independent gold standard), ``"mars"`` (count law x
+        shape), ``"renewal"`` and ``"poisson"`` (baselines), or an `Engine` of your own settings.
     realizations
         Independent exposures of the whole image.
     first_realization
@@ -62,14 +68,20 @@ def simulate(
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
     report
         A dictionary that takes what the engine has to tell beside the counts, numbers by name.
+    table, interpolation
+        For ``"mars"`` and ``"renewal"``: the lookup table, and how to read it between its grid points; see
+        `mars_lidar.engines.MarsEngine`.
+    count
+        For ``"mars"``: the law of the count.
 
     Returns
     -------
     NDArray
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given).
     """
-    task, drawn_by = _task(
-        flux, system, engine, realizations, first_realization, pixel_index, seed, threads, progress
+    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation)
+    task = _task(
+        flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress
     )
     shape = (task.realizations, *flux.shape, system.bins)
     if out is None:
@@ -104,8 +116,9 @@ def simulate_timestamps(
     Timestamps
         Packed times (ns), cycles and bins of all pixels.
     """
-    task, drawn_by = _task(
-        flux, system, engine, 1, realization, pixel_index, seed, threads, progress, first_name="realization"
+    drawn_by = find_engine(engine)
+    task = _task(
+        flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization"
     )
     counts = drawn_by.counts(task)
     _check_memory((int(counts.sum()),), 16, "timestamps")
@@ -121,7 +134,7 @@ def simulate_timestamps(
 def _task(
     flux: Flux,
     system: System,
-    engine: str | Engine,
+    drawn_by: Engine,
     realizations: int,
     first_realization: int,
     pixel_index: ArrayLike | None,
@@ -129,12 +142,11 @@ def _task(
     threads: int | None,
     progress: Progress | None,
     first_name: str = "first_realization",
-) -> tuple[Task, Engine]:
+) -> Task:
     if not isinstance(flux, Flux):
         raise TypeError(f"flux must be a Flux, got {type(flux).__name__}")
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
-    drawn_by = find_engine(engine)
     first = _validate.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = _validate.integer("realizations", realizations, low=1, high=2**32 - first)
     _validate.integer("seed", seed, low=0, high=2**64 - 1)
@@ -146,7 +158,7 @@ def _task(
     _check_registrations(flux, system)
     drawn_by.check(flux, system)
     index = _pixel_index(pixel_index, flux.shape)
-    return Task(flux, system, number, first, index, seed, team, progress), drawn_by
+    return Task(flux, system, number, first, index, seed, team, progress)
 
 
 def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArray[np.uint32]:

@@ -125,8 +125,9 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
     first = recipe.first_realization
     numbers = f"{first}" if count == 1 else f"{first} to {first + count - 1}"
     dead = system.detector.dead_time_ns
+    made = "".join(f", {name} {_short(value)}" for name, value in cube.settings.items() if name != "table")
     rows += [
-        ("engine", f"{cube.engine}, seed {cube.seed}, realization {numbers}"),
+        ("engine", f"{cube.engine}{made}, seed {cube.seed}, realization {numbers}"),
         (
             "laser",
             f"period {system.period_ns:.6g} ns ({1e3 / system.period_ns:.4g} MHz, unambiguous to "
@@ -141,6 +142,8 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
         ("bins", f"{1e3 * system.bin_ns:.5g} ps, {system.depth_m(system.bin_ns):.3g} m of depth each"),
         ("flux", photons),
     ]
+    if "table" in cube.settings:
+        rows.append(("table", ", ".join(f"{name} {value}" for name, value in cube.settings["table"].items())))
     made_of = [f"{k} {_short(v)}" for k, v in flux.info.items() if not k.endswith("_definition")]
     if made_of:
         rows.append(("flux made of", ", ".join(made_of)))

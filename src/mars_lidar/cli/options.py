@@ -149,8 +149,28 @@ Engine = Annotated[
     str,
     _option(
         "--engine", panel=_RUN, default="exact",
-        help="exact; sequential (slow, independent gold standard); poisson (no dead time).",
+        help="exact; sequential (slow, independent gold standard); mars (count law x mean histogram); renewal, "
+        "poisson (baselines).",
     ),
+]
+Table = Annotated[
+    Path | None,
+    _option(
+        "--table", panel=_RUN,
+        help="For --engine mars and renewal: a table of this system (mars-lidar table build).",
+        default="every distinct pixel is evaluated by itself, which is slow",
+    ),
+]
+Count = Annotated[
+    str | None,
+    _option(
+        "--count", panel=_RUN, default="exact",
+        help="For --engine mars: the law of the count, exact or gaussian (the paper's).",
+    ),
+]
+Interpolation = Annotated[
+    str | None,
+    _option("--interpolation", panel=_RUN, default="bilinear", help="Of --table: bilinear or nearest."),
 ]
 Realizations = Annotated[
     int,

@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mars_lidar.cli import options
-from mars_lidar.cli.console import progress_bar, reported, say, table
+from mars_lidar.cli.console import progress_bar, reported, say
+from mars_lidar.cli.console import table as print_table
 from mars_lidar.cli.system_options import build_system
 
 if TYPE_CHECKING:
     from mars_lidar.io import Written
     from mars_lidar.scene import Scene
+    from mars_lidar.system import System
+    from mars_lidar.table import Table
 
 EPILOG = "\n\n".join(
     (
@@ -22,6 +25,7 @@ EPILOG = "\n\n".join(
         "mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr",
         "mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr",
         "mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5",
+        "mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr",
         "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
         "S and B are expected detectable photons per laser period, after detection efficiency. Dead time "
         "bends histograms where S + B is not small.",
@@ -55,6 +59,9 @@ def simulate(
     ambient: options.Ambient = None,
     dark_counts: options.DarkCounts = 0.0,
     engine: options.Engine = "exact",
+    table: options.Table = None,
+    count: options.Count = None,
+    interpolation: options.Interpolation = None,
     realizations: options.Realizations = 1,
     seed: options.Seed = 0,
     threads: options.Threads = None,
@@ -112,6 +119,9 @@ def simulate(
                 source=source,
                 overwrite=overwrite,
                 progress=progress,
+                table=_table(table, instrument),
+                count=count,  # type: ignore[arg-type]  # checked there
+                interpolation=interpolation,  # type: ignore[arg-type]
             )
         if picture:
             _draw(out, png)
@@ -140,6 +150,14 @@ def _scene(
         return Scene.example(name or "", size=size, seed=seed), f"example {name}, size {size}, seed {seed}"
     source = f"depth {depth}" + ("" if image is None else f", image {image}")
     return Scene.from_rgbd(depth, image, size=size, depth_unit_m=unit, focal_px=focal), source
+
+
+def _table(file: Path | None, system: System) -> Table | None:
+    if file is None:
+        return None
+    from mars_lidar.table import Table
+
+    return Table.load(file, system)
 
 
 def _draw(cube: Path, png: Path) -> None:
@@ -177,6 +195,16 @@ def _summary(written: Written, png: Path | None, began: float) -> None:
             ),
             ("cube", str(written.path)),
         ]
+        if written.report:
+            rows.insert(2, ("engine", _told(written.report)))
     if png is not None:
         rows.append(("picture", str(png)))
-    table(rows)
+    print_table(rows)
+
+
+def _told(report: dict[str, float]) -> str:
+    """An engine's report in words: seconds by stage, numbers of pixels."""
+    return ", ".join(
+        f"{name[:-2]} {value:.3g} s" if name.endswith("_s") else f"{name.replace('_', ' ')} {value:,.0f}"
+        for name, value in report.items()
+    )

@@ -1,20 +1,36 @@
 """Engines: one file each, under the names that `simulate` takes."""
 
+from typing import Any
+
 from mars_lidar import _validate
 from mars_lidar.engines.base import Engine
 from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.mars import MarsEngine
 from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.engines.renewal import RenewalEngine
 from mars_lidar.engines.sequential import SequentialEngine
 
 ENGINES: dict[str, Engine] = {
-    engine.name: engine for engine in (ExactEngine(), SequentialEngine(), PoissonEngine())
+    engine.name: engine
+    for engine in (ExactEngine(), SequentialEngine(), MarsEngine(), RenewalEngine(), PoissonEngine())
 }
 
 
+def find_engine(engine: str | Engine, **options: Any) -> Engine:
+    """The engine of that name, of default settings but for the options that are not None; or the engine itself."""
+    given = {name: value for name, value in options.items() if value is not None}
+    if isinstance(engine, Engine):
+        found = engine
+        if given:
+            name = next(iter(given))
+            raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {given[name]!r}")
+        return found
+    found = ENGINES[_validate.choice("engine", engine, tuple(ENGINES))]
+    for name in given:
+        if name not in found.options:
+            takes = ", ".join(found.options) if found.options else "none"
+            raise TypeError(f"{name} must be None for engine {engine!r} (its options: {takes}), got {given[name]!r}")
+    return type(found)(**given) if given else found
 
-def find_engine(engine: str | Engine) -> Engine:
-    """The engine of that name with its default settings, or the engine itself."""
-    return engine if isinstance(engine, Engine) else ENGINES[_validate.choice("engine", engine, tuple(ENGINES))]
 
-
-__all__ = ["ENGINES", "Engine", "find_engine"]
+__all__ = ["ENGINES", "Engine", "MarsEngine", "RenewalEngine", "find_engine"]

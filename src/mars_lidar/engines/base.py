@@ -102,6 +102,12 @@ class Engine(ABC):
 
     name: ClassVar[str]
     description: ClassVar[str]
+    options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a cube depends on beside system, flux and seed: plain data for the file of a cube."""
+        return {}
 
     def check(self, flux: Flux, system: System) -> None:  # noqa: B027  (most engines take everything)
         """Raise ValueError, naming the field, for what this engine cannot do."""

@@ -74,6 +74,11 @@ class Cube:
         return self.recipe.engine
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of the engine that the counts depend on; empty for most engines."""
+        return self.recipe.settings
+
+    @property
     def seed(self) -> int:
         """Seed of the random streams."""
         return self.recipe.seed

@@ -18,7 +18,8 @@ waveform            y, x, waveform_time          photons per period and part, wh
 pixel_index         y, x                         where the cube is a part of a larger image
 ==================  ===========================  =====================================================
 
-Attributes: ``format``, ``format_version``, ``complete``, ``system`` (JSON), ``engine``, ``seed``,
+Attributes: ``format``, ``format_version``, ``complete``, ``system`` (JSON), ``engine``, ``engine_settings``
+(JSON: what the counts depend on beside, such as the hash and grid of a table), ``seed``,
 ``first_realization``, ``flux`` (JSON: what made the flux), ``source``, ``version`` (of this package) and,
 once complete, ``registrations``.
 """
@@ -109,6 +110,7 @@ def attributes(recipe: Recipe) -> dict[str, str | int]:
         "format_version": FORMAT_VERSION,
         "system": recipe.system.to_json(),
         "engine": recipe.engine,
+        "engine_settings": json.dumps(recipe.settings),
         "seed": recipe.seed,
         "first_realization": recipe.first_realization,
         "flux": json.dumps(recipe.flux.info, default=_plain),
@@ -146,6 +148,7 @@ def recipe_from(
         depth_m=read("depth"),
         reflectivity=read("reflectivity") if "reflectivity" in names else None,
         source=str(attrs["source"]),
+        settings=json.loads(attrs.get("engine_settings", "{}")),
     )
 
 

@@ -33,6 +33,11 @@ class Recipe:
         (H, W) or None where no scene is behind the flux.
     source
         Free text: where the scene came from.
+    options
+        Arguments of `mars_lidar.simulate` that the engine takes beside: table, count, interpolation.
+    settings
+        What the cube depends on beside system, flux and seed, as plain data: `Engine.settings`. It is what a file
+        keeps of the options.
     """
 
     system: System
@@ -45,6 +50,8 @@ class Recipe:
     depth_m: NDArray[np.float64] = None  # type: ignore[assignment]  # filled below, never None afterwards
     reflectivity: NDArray[np.float64] | None = None
     source: str = ""
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    settings: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, System):
@@ -142,6 +149,7 @@ class Recipe:
             "first_realization": self.first_realization + realizations.start,
             "pixel_index": np.arange(first, last) if index is None else index[first:last],
             "seed": self.seed,
+            **self.options,
         }
 
     def replace(self, **changes: Any) -> Recipe:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,9 @@ from mars_lidar.flux import Flux
 from mars_lidar.io.cube import Cube, check_output, create
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar.table import Table
 
 Progress = Callable[[int, int], None]
 
@@ -32,12 +35,15 @@ class Written:
         Total counts of the cube.
     simulate_s, write_s
         Seconds spent in the engine and on the file.
+    report
+        What the engine had to tell beside the counts, numbers by name, added up.
     """
 
     path: Path
     registrations: int
     simulate_s: float
     write_s: float
+    report: dict[str, float] = field(default_factory=dict)
 
     @property
     def ns_per_registration(self) -> float:
@@ -69,6 +75,9 @@ def simulate_to(
     source: str = "",
     overwrite: bool = False,
     progress: Progress | None = None,
+    table: Table | None = None,
+    count: Literal["exact", "gaussian"] | None = None,
+    interpolation: Literal["bilinear", "nearest"] | None = None,
 ) -> Written:
     """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
 
@@ -79,8 +88,8 @@ def simulate_to(
     ----------
     path
         The file; its suffix chooses the format.
-    flux, system, engine, realizations, first_realization, pixel_index, seed, threads
-        As for `mars_lidar.simulate`.
+    flux, system, engine, realizations, first_realization, pixel_index, seed, threads, table, count, interpolation
+        As for `mars_lidar.simulate`; the file keeps the name of the engine, its settings, and a hash of the table.
     depth_m, reflectivity
         Maps (H, W) of the scene to store beside the counts; depth is c tau / 2 by default.
     source
@@ -101,6 +110,7 @@ def simulate_to(
     WriteError, Interrupted
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
+    options = _given(table=table, count=count, interpolation=interpolation)
     recipe = Recipe(
         system=system,
         flux=flux,
@@ -112,6 +122,8 @@ def simulate_to(
         depth_m=system.depth_m(flux.delay_ns) if depth_m is None else np.asarray(depth_m),
         reflectivity=None if reflectivity is None else np.asarray(reflectivity),
         source=source,
+        options=options,
+        settings=_settings(engine, options),
     )
     target = Path(path)
     check_output(target, recipe, overwrite=overwrite)
@@ -122,15 +134,19 @@ def simulate_to(
         raise WriteError(error.errno, f"{error.strerror or error}; nothing was left at {target}") from error
     registrations = 0
     simulate_s = write_s = 0.0
+    report: dict[str, float] = {}
     try:
         for images, rows in recipe.blocks(writer.chunks):
             began = time.perf_counter()
-            block = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))
+            told: dict[str, float] = {}
+            block = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows), told)
             ended = time.perf_counter()
             writer.write(images, rows, block)
             registrations += int(block.sum(dtype=np.uint64))
             simulate_s += ended - began
             write_s += time.perf_counter() - ended
+            for name, value in told.items():
+                report[name] = report.get(name, 0.0) + value
         writer.finish(registrations)
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; {writer.abandon()}") from None
@@ -139,7 +155,7 @@ def simulate_to(
     except BaseException:
         writer.abandon()
         raise
-    return Written(target, registrations, simulate_s, write_s)
+    return Written(target, registrations, simulate_s, write_s, report)
 
 
 def regenerate(
@@ -148,6 +164,7 @@ def regenerate(
     realizations: slice = slice(None),
     rows: slice = slice(None),
     threads: int | None = None,
+    table: Table | None = None,
 ) -> NDArray[Any]:
     """Simulate a cube, or a part of it, again from its recipe.
 
@@ -159,13 +176,15 @@ def regenerate(
         Part to make: slices of step 1 that count from the start of the cube.
     threads
         As for `mars_lidar.simulate`.
+    table
+        The table that the cube was made with, if there was one; another one is refused.
 
     Returns
     -------
     NDArray
         (realizations, rows, W, bins): the bits of the cube, with the same engine on the same version.
     """
-    recipe = cube.recipe if isinstance(cube, Cube) else cube
+    recipe = _repeatable(cube.recipe if isinstance(cube, Cube) else cube, table)
     parts = []
     count, height = recipe.shape[:2]
     for name, part, size in (("realizations", realizations, count), ("rows", rows, height)):
@@ -176,9 +195,14 @@ def regenerate(
     return _simulate(recipe, parts[0], parts[1], threads, None)
 
 
-def verify(cube: Cube, *, threads: int | None = None, progress: Progress | None = None) -> bool:
-    """Whether simulating again gives the stored counts, bit for bit; one block in memory at a time."""
-    recipe = cube.recipe
+def verify(
+    cube: Cube, *, threads: int | None = None, progress: Progress | None = None, table: Table | None = None
+) -> bool:
+    """Whether simulating again gives the stored counts, bit for bit; one block in memory at a time.
+
+    A cube that was made with a table needs that `table`; another one is refused.
+    """
+    recipe = _repeatable(cube.recipe, table)
     for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
         again = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))
         if not np.array_equal(again, np.asarray(cube.histogram[images, rows])):
@@ -187,12 +211,50 @@ def verify(cube: Cube, *, threads: int | None = None, progress: Progress | None 
 
 
 def _simulate(
-    recipe: Recipe, images: slice, rows: slice, threads: int | None, progress: Progress | None
+    recipe: Recipe,
+    images: slice,
+    rows: slice,
+    threads: int | None,
+    progress: Progress | None,
+    report: dict[str, float] | None = None,
 ) -> NDArray[Any]:
     from mars_lidar import simulate
 
-    counts: NDArray[Any] = simulate(**recipe.part(images, rows), threads=threads, progress=progress)
+    part = recipe.part(images, rows)
+    counts: NDArray[Any] = simulate(**part, threads=threads, progress=progress, report=report)
     return counts
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _settings(engine: str, options: dict[str, Any]) -> dict[str, Any]:
+    """What a cube of this engine depends on, as plain data; checks the options on the way."""
+    from mars_lidar.engines import find_engine
+
+    return find_engine(engine, **options).settings if isinstance(engine, str) else {}
+
+
+def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
+    """The recipe with the options that its settings ask for, of which only the table is not in a file."""
+    recorded = recipe.settings
+    table = recipe.options.get("table") if table is None else table
+    if table is None and "table" in recorded:
+        raise ValueError(f"table must be the one that the cube was made with, got None: {_grid(recorded['table'])}")
+    options = _given(
+        table=table, count=recorded.get("count"), interpolation=recorded.get("interpolation")
+    )
+    settings = _settings(recipe.engine, options)
+    if table is not None and settings.get("table") != recorded.get("table"):
+        was = _grid(recorded["table"]) if "table" in recorded else "none"
+        raise ValueError(f"table must be the one that the cube was made with ({was}), got {_grid(settings['table'])}")
+    return recipe.replace(options=options)
+
+
+def _grid(record: dict[str, Any]) -> str:
+    axes = ", ".join("{} {:g} to {:g} in {}".format(name, *record[name]) for name in ("signal", "background"))
+    return f"method {record['method']!r}, {axes}, hash {record['hash']}"
 
 
 def _try_brightest_pixel(recipe: Recipe, threads: int | None) -> None:

@@ -27,6 +27,8 @@ void bind_sequential(nb::module_& module);
 void bind_poisson(nb::module_& module);
 void bind_chain(nb::module_& module);
 void bind_exposure(nb::module_& module);
+void bind_shape_sampler(nb::module_& module);
+void bind_count_draws(nb::module_& module);
 void bind_matched(nb::module_& module);
 void bind_table(nb::module_& module);
 

@@ -56,6 +56,8 @@ NB_MODULE(_core, module) {
     mars::bind_poisson(module);
     mars::bind_chain(module);
     mars::bind_exposure(module);
+    mars::bind_shape_sampler(module);
+    mars::bind_count_draws(module);
     mars::bind_matched(module);
     mars::bind_table(module);
 }

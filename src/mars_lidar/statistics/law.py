@@ -237,7 +237,7 @@ def _gaussian_moments(
 
     mean, variance = np.empty(cells.size), np.empty(cells.size)
     for k in range(cells.size):
-        signal, waveform, delay = _pixel(cells, k)
+        signal, waveform, delay = pixel_of(cells, k)
         mean[k], variance[k] = mars_moments(
             signal, cells.background[k], cells.system, rearm=edge, delay_ns=delay, waveform=waveform
         )
@@ -253,7 +253,7 @@ def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
     for k in range(cells.size):
         if cells.signal[k] + cells.background[k] == 0.0:
             continue
-        signal, waveform, delay = _pixel(cells, k)
+        signal, waveform, delay = pixel_of(cells, k)
         chain = PhaseChain.from_flux(
             signal, float(cells.background[k]), cells.system, rearm=edge, delay_ns=delay, waveform=waveform
         )
@@ -261,7 +261,7 @@ def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
     return out
 
 
-def _pixel(cells: Cells, k: int) -> tuple[float | None, FloatArray | None, float | None]:
+def pixel_of(cells: Cells, k: int) -> tuple[float | None, FloatArray | None, float | None]:
     """Signal, waveform and delay of one cell as the chain takes them."""
     if cells.waveform is not None:
         return None, cells.signal[k] * cells.waveform[cells.row[k]], None

@@ -1,0 +1,155 @@
+"""Laws of the number of registrations, one a pixel, as the engines that draw it by itself need them.
+
+One word of the pixel's own random stream makes one count, whatever the law.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.statistics._pmf import Window
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Streams:
+    """Whose counts are drawn: pixels (P,) of `realizations` realizations from number `first` on."""
+
+    pixel_index: NDArray[np.uint32]
+    realizations: int
+    first: int
+    seed: int
+    threads: int
+
+
+class CountLaws(ABC):
+    """A law of the count for each of some pixels."""
+
+    @abstractmethod
+    def part(self, pixels: slice) -> CountLaws:
+        """Those of some of the pixels."""
+
+    @abstractmethod
+    def fill(self, streams: Streams, out: IndexArray) -> None:
+        """Draw counts into `out` (realizations, pixels)."""
+
+    def draw(self, streams: Streams) -> IndexArray:
+        """Counts (realizations, pixels)."""
+        out = np.empty((streams.realizations, streams.pixel_index.size), np.int64)
+        self.fill(streams, out)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class RoundedGaussian(CountLaws):
+    """The count law of the MaRS paper: a normal number of given mean and variance (pixels,), rounded, at least 0."""
+
+    mean: FloatArray
+    variance: FloatArray
+
+    def part(self, pixels: slice) -> RoundedGaussian:
+        return RoundedGaussian(self.mean[pixels], self.variance[pixels])
+
+    def fill(self, streams: Streams, out: IndexArray) -> None:
+        from mars_lidar import _core
+
+        _core.gaussian_counts(
+            mean=np.ascontiguousarray(self.mean),
+            variance=np.ascontiguousarray(self.variance),
+            pixel_index=streams.pixel_index,
+            first_realization=streams.first,
+            seed=streams.seed,
+            out=out,
+            threads=streams.threads,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Poisson(CountLaws):
+    """No dead time: Poisson of a given mean (pixels,)."""
+
+    mean: FloatArray
+
+    def part(self, pixels: slice) -> Poisson:
+        return Poisson(self.mean[pixels])
+
+    def fill(self, streams: Streams, out: IndexArray) -> None:
+        from mars_lidar import _core
+
+        _core.poisson_counts(
+            mean=np.ascontiguousarray(self.mean),
+            pixel_index=streams.pixel_index,
+            first_realization=streams.first,
+            seed=streams.seed,
+            out=out,
+            threads=streams.threads,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Matched(CountLaws):
+    """The discrete law with four given cumulants (pixels, 4): `mars_lidar.statistics.matched`."""
+
+    cumulants: FloatArray
+
+    def part(self, pixels: slice) -> Matched:
+        return Matched(self.cumulants[pixels])
+
+    def fill(self, streams: Streams, out: IndexArray) -> None:
+        from mars_lidar import _core
+
+        _core.matched_counts(
+            cumulants=np.ascontiguousarray(self.cumulants),
+            pixel_index=streams.pixel_index,
+            first_realization=streams.first,
+            seed=streams.seed,
+            out=out,
+            threads=streams.threads,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Tabulated(CountLaws):
+    """Exact laws: `law` (pixels,) points to one of some; the rest is made by `of`."""
+
+    first: IndexArray
+    offsets: IndexArray
+    cumulative: FloatArray
+    law: IndexArray
+
+    @classmethod
+    def of(cls, windows: Sequence[Window], law: IndexArray) -> Tabulated:
+        """From the probabilities of each law."""
+        sizes = [window.pmf.size for window in windows]
+        sums = [np.cumsum(window.pmf) for window in windows]
+        return cls(
+            np.array([window.first for window in windows], np.int64),
+            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+            np.concatenate([s / s[-1] for s in sums]),
+            law,
+        )
+
+    def part(self, pixels: slice) -> Tabulated:
+        return Tabulated(self.first, self.offsets, self.cumulative, self.law[pixels])
+
+    def fill(self, streams: Streams, out: IndexArray) -> None:
+        from mars_lidar import _core
+
+        _core.tabulated_counts(
+            first=self.first,
+            offsets=self.offsets,
+            cumulative=self.cumulative,
+            law=np.ascontiguousarray(self.law),
+            pixel_index=streams.pixel_index,
+            first_realization=streams.first,
+            seed=streams.seed,
+            out=out,
+            threads=streams.threads,
+        )

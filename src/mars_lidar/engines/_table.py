@@ -1,0 +1,125 @@
+"""What engines ask of a lookup table: that it fits the system, the entries of pixels, a record for a cube's file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import _validate
+from mars_lidar.engines._alignment import Alignment
+from mars_lidar.engines._counts import CountLaws
+from mars_lidar.engines._pixels import single_return
+from mars_lidar.engines._synthesis import Batch
+from mars_lidar.engines.base import Task
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar.table import Table
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+PIXELS = 2**17  # looked up at a time: 14 MiB
+_INTERPOLATIONS = ("bilinear", "nearest")
+
+
+@dataclass(frozen=True, eq=False)
+class Entries:
+    """What a table says of some pixels (P,) of the image, in the order of its grid.
+
+    Neighbours on the grid follow each other, so that their rows are still in the processor's cache.
+    """
+
+    pixels: IndexArray
+    signal: FloatArray
+    background: FloatArray
+    cumulants: FloatArray
+    shapes: NDArray[np.float32]
+    rows: IndexArray
+    weights: FloatArray
+    alignment: Alignment
+
+    def batch(self, laws: CountLaws) -> Batch:
+        """With counts from `laws`."""
+        return Batch(self.pixels, self.shapes, self.rows, self.weights, laws, self.alignment)
+
+
+class TableReader:
+    """A table as an engine reads it: which, and how between its grid points."""
+
+    def __init__(self, table: Table, interpolation: str | None) -> None:
+        if not (callable(getattr(table, "lookup", None)) and callable(getattr(table, "shapes", None))):
+            raise TypeError(f"table must be a mars_lidar.Table, got {table!r}")
+        self.table = table
+        given = "bilinear" if interpolation is None else interpolation
+        self.interpolation = _validate.choice("interpolation", given, _INTERPOLATIONS)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a cube depends on: interpolation, and which table."""
+        return {"interpolation": self.interpolation, "table": table_record(self.table)}
+
+    def check(self, flux: Flux, system: System) -> None:
+        """The table is of this system but for the number of cycles, and every pixel has one return."""
+        ours, theirs = system.to_dict(), self.table.system.to_dict()
+        for name in ours:
+            if name != "cycles" and ours[name] != theirs[name]:
+                raise ValueError(f"table must be of this system: {name} is {ours[name]}, the table's {theirs[name]}")
+        if single_return(flux) is None:
+            what = "a waveform" if flux.waveform is not None else "several returns in a pixel"
+            raise ValueError(f"flux must have one return a pixel with a table, got {what}; leave the table out")
+
+    def read(self, task: Task, pixels: IndexArray) -> tuple[Entries, IndexArray]:
+        """Entries of those of the pixels that lie on the grid; the others."""
+        single = single_return(task.flux)
+        assert single is not None  # see check
+        system = task.system
+        signal, delay = single[0][pixels], single[1][pixels]
+        background = np.ascontiguousarray(task.flux.background.reshape(-1)[pixels])
+        look = self.table.lookup(
+            signal,
+            background,
+            delay_ns=delay,
+            cycles=system.cycles,
+            interpolation=self.interpolation,
+            outside="exact",
+        )
+        order = np.flatnonzero(~look.outside)
+        order = order[np.argsort(look.rows[order, 0], kind="stable")]
+        signal, background, cumulants = signal[order], background[order], look.cumulants[order]
+        alignment = Alignment.of(system, signal, background, delay[order], cumulants[:, 0] / system.cycles)
+        entries = Entries(
+            pixels[order],
+            signal,
+            background,
+            cumulants,
+            self.table.shapes(system.cycles),
+            look.rows[order],
+            look.weights[order],
+            alignment,
+        )
+        return entries, pixels[look.outside]
+
+
+def table_record(table: Table) -> dict[str, Any]:
+    """Names a table in the file of a cube: hash of its content, cycles, method and grid.
+
+    The hash is of what a cube depends on: axes, shapes, and cumulants at the nodes.
+    """
+    signal, background = (np.ascontiguousarray(axis, dtype=np.float64) for axis in (table.signal, table.background))
+    nodes = table.lookup(np.repeat(signal, background.size), np.tile(background, signal.size), interpolation="nearest")
+    digest = blake2b(digest_size=16)
+    for part in (signal, background, nodes.cumulants, table.shapes()):
+        digest.update(np.ascontiguousarray(part).data)
+    return {
+        "hash": digest.hexdigest(),
+        "method": table.method,
+        "cycles": table.system.cycles,
+        "signal": [float(signal[0]), float(signal[-1]), signal.size],
+        "background": [float(background[0]), float(background[-1]), background.size],
+    }

@@ -1,0 +1,128 @@
+"""The renewal baseline of the MaRS paper: the chain's shape, and the count law of light spread over the period."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.engines._alignment import Alignment
+from mars_lidar.engines._counts import CountLaws, RoundedGaussian
+from mars_lidar.engines._pixels import Group, groups, single_return
+from mars_lidar.engines._synthesis import Batch, Run
+from mars_lidar.engines._table import PIXELS, TableReader
+from mars_lidar.engines.base import Engine, Task
+from mars_lidar.engines.mars import normalised, table_reader
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar.table import Table
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+class RenewalEngine(Engine):
+    """N from the Gaussian law of a constant-rate renewal process of equal energy, Multinomial(N, pi) from the chain.
+
+    The baseline "Renewal" of the MaRS paper (arXiv 2512.04924): mean t lambda / (1 + lambda t_d) and variance
+    t lambda / (1 + lambda t_d)^3 with lambda = (S + B) / t_r, rounded to integers and at least 0; pi the stationary
+    distribution of the Markov chain of phases (arXiv 2509.20500). Mean and variance are wrong where a pulse
+    matters; the shape is right for an exposure that is long, or starts warmed up.
+
+    Parameters
+    ----------
+    table
+        `mars_lidar.Table` of this system: its shapes (of either method) in place of the chain's, and see
+        `MarsEngine`. None: the chain is solved for every distinct (S, B), some milliseconds each.
+    interpolation
+        As for `MarsEngine`.
+    level
+        Forces one of ``_core.levels()`` (vector widths); it changes speed only.
+    """
+
+    name = "renewal"
+    description = "constant-rate renewal count law x the chain's shape: a baseline"
+    options: ClassVar[tuple[str, ...]] = ("table", "interpolation")
+
+    def __init__(
+        self,
+        table: Table | None = None,
+        *,
+        interpolation: Literal["bilinear", "nearest"] | None = None,
+        level: str = "",
+    ) -> None:
+        self.reader = table_reader(table, interpolation)
+        self.level = level
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The table, if there is one."""
+        return self.reader.settings if self.reader else {}
+
+    def check(self, flux: Flux, system: System) -> None:
+        """A table must be of the system, and knows one return a pixel."""
+        if self.reader:
+            self.reader.check(flux, system)
+
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        """Look up or solve, draw the counts, draw their places: batch by batch."""
+        run = Run(task, out, self.level)
+        pixels = np.arange(task.pixel_index.size)
+        if self.reader is None:
+            self._solve(run, pixels)
+            return
+        left = [self._look_up(run, self.reader, pixels[k : k + PIXELS]) for k in range(0, pixels.size, PIXELS)]
+        self._solve(run, np.concatenate(left))
+
+    def _look_up(self, run: Run, reader: TableReader, pixels: IndexArray) -> IndexArray:
+        """Draws the pixels on the grid; returns the others."""
+        with run.stage("lookup_s"):
+            entries, left = reader.read(run.task, pixels)
+        run.draw(entries.batch(_laws(run.task.system, entries.signal, entries.background)))
+        return left
+
+    def _solve(self, run: Run, pixels: IndexArray) -> None:
+        """The chain of each distinct pixel; one return is solved at the canonical delay and moved."""
+        run.count("pixels_evaluated", pixels.size)
+        task = run.task
+        single = single_return(task.flux)
+        for group in groups(task.flux, task.system, pixels, delays=single is None):
+            with run.stage("evaluation_s"):
+                shapes, rates = _chains(run, group)
+                alignment = None
+                signal, background = group.cells.signal[group.cell], group.cells.background[group.cell]
+                if single is not None:
+                    delay, rate = single[1][group.pixels], rates[group.cell]
+                    alignment = Alignment.of(task.system, signal, background, delay, rate)
+                laws = _laws(task.system, signal, background)
+                batch = Batch.unmixed(group.pixels, shapes, group.cell, laws, alignment)
+            run.draw(batch)
+
+
+def _laws(system: System, signal: FloatArray, background: FloatArray) -> CountLaws:
+    from mars_lidar.statistics.baselines import renewal_moments
+
+    return RoundedGaussian(*renewal_moments(signal, background, system))
+
+
+def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:
+    """Shapes (cells, bins) and registrations per period (cells,)."""
+    from mars_lidar.statistics.chain import PhaseChain
+    from mars_lidar.statistics.law import pixel_of
+
+    cells, system = group.cells, run.task.system
+    shapes, rates = np.zeros((cells.size, system.bins)), np.zeros(cells.size)
+    for k in range(cells.size):
+        if run.waiting is not None:
+            run.waiting(k, cells.size)
+        background = float(cells.background[k])
+        signal, waveform, delay = pixel_of(cells, k)
+        if cells.signal[k] + background == 0.0:
+            continue
+        chain = PhaseChain.from_flux(signal, background, system, delay_ns=delay, waveform=waveform)
+        stationary = chain.stationary()
+        shapes[k], rates[k] = stationary.pdf.reshape(system.bins, -1).sum(-1), stationary.rate
+    return normalised(shapes), rates

@@ -1,0 +1,81 @@
+// Histograms from a count and a shape, one function per vector level (shape_kernel.cpp is compiled once for each).
+//
+// The registrations of an exposure are N draws from the shape: Multinomial(N, pi), with N given. The shape of a
+// pixel is a mixture of rows of a table, moved by the pixel's delay to a fraction of a bin (shape_alignment.h).
+#pragma once
+#include <atomic>
+#include <cstdint>
+
+namespace mars {
+
+// Flux of the pulse at the table's own delay, in the bins that it reaches: the frame.
+struct PulseFrame {
+    int32_t first = 0;               // bin, of the period
+    int32_t size = 0;                // bins; at most all of them
+    int32_t parts = 1;               // of a bin
+    int32_t cells = 1;               // of a bin, a divisor of `parts`: where registrations re-arm in the pulse
+    const float* energy = nullptr;   // (parts + 1, size): of the pulse, from a bin's start to part p of it
+};
+
+struct ShapeJob {
+    int64_t pixels = 0, realizations = 1;
+    uint32_t first_realization = 0;
+    uint64_t seed = 0;
+    int32_t bins = 1;
+    double dead_time = 0.0;                  // periods
+    const uint32_t* pixel_index = nullptr;   // (pixels): names the random streams
+    const int64_t* place = nullptr;          // (pixels): of the pixel in an image of the output
+    int64_t image = 0;                       // pixels of an image of the output
+    const float* shapes = nullptr;           // (rows, bins), each summing to 1
+    const int64_t* rows = nullptr;           // (pixels, 4)
+    const double* weights = nullptr;         // (pixels, 4)
+    const double* shift = nullptr;           // (pixels) periods, [0, 1); null: rows are at the pixels' own delays
+    const double* signal = nullptr;          // (pixels) photons per period; with `shift` only; likewise below
+    const double* background = nullptr;
+    const double* rate = nullptr;            // (pixels) mean registrations per period
+    PulseFrame frame;
+    const int64_t* counts = nullptr;         // (realizations, pixels)
+};
+
+constexpr uint64_t kShapeDomain = 0x5368617065730000u;  // "Shapes": not another engine's numbers at one seed
+
+// Consecutive pixels in consecutive realizations.
+struct ShapeBlock {
+    const ShapeJob* job;
+    int64_t pixel, pixels, realization, realizations;
+    bool wide;    // the output is uint32, not uint16
+    void* out;    // (realizations, image, bins)
+    void* memory; // `shape_memory` bytes, aligned to 64
+    // Poisson number of a mean beyond those of the lanes
+    int64_t (*large_poisson)(uint64_t key, uint32_t event, uint32_t step, double mean);
+    const std::atomic<bool>* stop;
+    bool full;    // result: a bin would have exceeded the output's type
+};
+
+constexpr int64_t kShapeStep = 64;  // bins that are drawn together
+constexpr int kSegments = 8;        // of the cumulative shape
+
+inline constexpr int64_t padded_bins(int64_t bins) { return (bins + kShapeStep - 1) / kShapeStep * kShapeStep; }
+
+// Bins on either side of the frame that a dead time of `offset` bins, whole periods apart, reaches.
+inline int64_t frame_reach(double offset) { return static_cast<int64_t>(offset < 0 ? -offset : offset) + 2; }
+
+using ShapeKernel = void (*)(ShapeBlock&);
+
+#ifdef MARS_HAS_scalar
+void shape_kernel_scalar(ShapeBlock& block);
+#endif
+#ifdef MARS_HAS_vector128
+void shape_kernel_vector128(ShapeBlock& block);
+#endif
+#ifdef MARS_HAS_avx2
+void shape_kernel_avx2(ShapeBlock& block);
+#endif
+#ifdef MARS_HAS_avx512
+void shape_kernel_avx512(ShapeBlock& block);
+#endif
+
+// Work area of one thread: bins of 4 + 4 + 4 + 8 bytes, and the frame.
+int64_t shape_memory(const ShapeJob& job);
+
+}  // namespace mars

@@ -1,0 +1,190 @@
+// Multinomial histograms from counts and shapes: chunks of pixels on threads, each through the widest kernel that
+// the processor runs.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <new>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+
+#include "bindings.h"
+#include "histogram_output.h"
+#include "parallel.h"
+#include "poisson_sampler.h"
+#include "shape_kernel.h"
+
+namespace mars {
+
+int64_t shape_memory(const ShapeJob& job) {
+    const double offset = (job.dead_time - std::floor(job.dead_time + 0.5)) * job.bins;
+    const int64_t cells = job.frame.cells > 1 ? (job.frame.size + 2 * frame_reach(offset)) * job.frame.cells : 0;
+    return padded_bins(job.bins) * 20 + job.frame.size * 16 + cells * 24 + 4096;
+}
+
+namespace {
+
+constexpr int64_t kChunkBins = 1 << 19;  // a millisecond of work
+
+struct Level {
+    const char* name;
+    ShapeKernel kernel;
+};
+
+// Widest first.
+std::vector<Level> levels() {
+    std::vector<Level> found;
+#if defined(MARS_HAS_avx512)
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+        found.push_back({"avx512", shape_kernel_avx512});
+#endif
+#if defined(MARS_HAS_avx2)
+    if (__builtin_cpu_supports("avx2")) found.push_back({"avx2", shape_kernel_avx2});
+#endif
+#if defined(MARS_HAS_vector128)
+    found.push_back({"vector128", shape_kernel_vector128});
+#endif
+    found.push_back({"scalar", shape_kernel_scalar});
+    return found;
+}
+
+ShapeKernel kernel_of(const std::string& name) {
+    for (const Level& level : levels())
+        if (name.empty() || name == level.name) return level.kernel;
+    throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
+}
+
+int64_t large_poisson(uint64_t key, uint32_t event, uint32_t step, double mean) {
+    const EventStream stream(key, 0, step, 0x4c61726765u & 0xffffffffu);
+    return PoissonSampler(mean)(stream, event);
+}
+
+// Memory of one thread, aligned to a cache line.
+class WorkArea {
+public:
+    explicit WorkArea(int64_t bytes) : memory_(::operator new(static_cast<size_t>(bytes), std::align_val_t(64))) {}
+    ~WorkArea() { ::operator delete(memory_, std::align_val_t(64)); }
+    WorkArea(const WorkArea&) = delete;
+    WorkArea& operator=(const WorkArea&) = delete;
+    void* get() const { return memory_; }
+
+private:
+    void* memory_;
+};
+
+// A shape job together with the arrays that it points into.
+struct BoundShapeJob : ShapeJob {
+    nb::object arrays;
+};
+
+void check(const BoundShapeJob& job, size_t rows) {
+    for (int64_t p = 0; p < job.pixels; ++p)
+        if (job.place[p] < 0 || job.place[p] >= job.image) throw nb::value_error("place must lie in the image");
+    for (int64_t k = 0; k < 4 * job.pixels; ++k)
+        if (job.rows[k] < 0 || job.rows[k] >= static_cast<int64_t>(rows))
+            throw nb::value_error("rows must point into shapes");
+}
+
+template <class Count>
+void sample(const BoundShapeJob& job, Matrix<const int64_t> counts, Matrix<Count> out, int threads,
+            const std::string& level, const nb::object& progress) {
+    if (static_cast<int64_t>(counts.shape(0)) != job.realizations ||
+        static_cast<int64_t>(counts.shape(1)) != job.pixels)
+        throw nb::value_error("counts must be (realizations, pixels)");
+    if (static_cast<int64_t>(out.shape(0)) != job.realizations * job.image ||
+        static_cast<int64_t>(out.shape(1)) != job.bins)
+        throw nb::value_error("out must be (realizations * image, bins)");
+    const ShapeKernel kernel = kernel_of(level);
+    ShapeJob full = job;
+    full.counts = counts.data();
+    const int64_t memory = shape_memory(job);
+    // Runs of pixels, all realizations of each, so that a pixel's shape is made once; with few pixels, runs of
+    // realizations.
+    const int64_t size = std::max<int64_t>(1, kChunkBins / job.bins);
+    const int64_t deep = std::min(job.realizations, size), wide = std::max<int64_t>(1, size / deep);
+    const int64_t layers = (job.realizations + deep - 1) / deep, strips = (job.pixels + wide - 1) / wide;
+    run_chunks(layers * strips, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+        const WorkArea area(memory);
+        const int64_t strip = chunk % strips, layer = chunk / strips;
+        ShapeBlock block{};
+        block.job = &full;
+        block.pixel = strip * wide;
+        block.pixels = std::min(wide, job.pixels - block.pixel);
+        block.realization = layer * deep;
+        block.realizations = std::min(deep, job.realizations - block.realization);
+        block.wide = sizeof(Count) == 4;
+        block.out = out.data();
+        block.memory = area.get();
+        block.large_poisson = large_poisson;
+        block.stop = &stop;
+        kernel(block);
+        if (block.full) throw_full<Count>();
+    });
+}
+
+}  // namespace
+
+void bind_shape_sampler(nb::module_& module) {
+    nb::class_<BoundShapeJob>(module, "ShapeJob", "Rows of shapes, how pixels mix and move them; times in periods.")
+        .def(
+            "__init__",
+            [](BoundShapeJob* self, Matrix<const float> shapes, Matrix<const int64_t> rows, Matrix<const double> weights,
+               Vector<const uint32_t> pixel_index, Vector<const int64_t> place, int64_t image, int64_t realizations,
+               uint32_t first_realization, uint64_t seed) {
+                new (self) BoundShapeJob();
+                self->pixels = static_cast<int64_t>(pixel_index.shape(0));
+                self->realizations = realizations;
+                self->first_realization = first_realization;
+                self->seed = seed;
+                self->bins = static_cast<int32_t>(shapes.shape(1));
+                if (rows.shape(0) != pixel_index.shape(0) || place.shape(0) != pixel_index.shape(0) || weights.shape(0) != pixel_index.shape(0) ||
+                    rows.shape(1) != 4 || weights.shape(1) != 4)
+                    throw nb::value_error("rows and weights must be (pixels, 4), place (pixels)");
+                self->pixel_index = pixel_index.data();
+                self->place = place.data();
+                self->image = image;
+                self->shapes = shapes.data();
+                self->rows = rows.data();
+                self->weights = weights.data();
+                check(*self, shapes.shape(0));
+                self->arrays = nb::make_tuple(shapes, rows, weights, pixel_index, place);
+            },
+            nb::kw_only(), nb::arg("shapes"), nb::arg("rows"), nb::arg("weights"), nb::arg("pixel_index"),
+            nb::arg("place"), nb::arg("image"), nb::arg("realizations"), nb::arg("first_realization"), nb::arg("seed"))
+        .def(
+            "align",
+            [](BoundShapeJob& self, Vector<const double> shift, Vector<const double> signal,
+               Vector<const double> background, Vector<const double> rate, double dead_time, int32_t first,
+               int32_t cells, Matrix<const float> energy) {
+                const size_t pixels = static_cast<size_t>(self.pixels);
+                if (shift.shape(0) != pixels || signal.shape(0) != pixels || background.shape(0) != pixels ||
+                    rate.shape(0) != pixels)
+                    throw nb::value_error("shift, signal, background and rate must be (pixels)");
+                const int32_t parts = static_cast<int32_t>(energy.shape(0)) - 1;
+                const int32_t size = static_cast<int32_t>(energy.shape(1));
+                if (parts < 1 || cells < 1 || parts % cells != 0 || size > self.bins || first < 0 || first >= self.bins)
+                    throw nb::value_error("the pulse's frame must lie in the period, its cells divide its parts");
+                self.shift = shift.data();
+                self.signal = signal.data();
+                self.background = background.data();
+                self.rate = rate.data();
+                self.dead_time = dead_time;
+                self.frame = {first, size, parts, cells, energy.data()};
+                self.arrays = nb::make_tuple(self.arrays, shift, signal, background, rate, energy);
+            },
+            nb::kw_only(), nb::arg("shift"), nb::arg("signal"), nb::arg("background"), nb::arg("rate"),
+            nb::arg("dead_time"), nb::arg("first"), nb::arg("cells"), nb::arg("energy"),
+            "Move the rows by `shift`, in [0, 1), to the pixels' own delays.");
+    const char* about = "Histograms out (realizations * image, bins) of counts (realizations, pixels).";
+    module.def("shape_histogram", &sample<uint16_t>, nb::arg("job"), nb::arg("counts"), nb::arg("out").noconvert(),
+               nb::arg("threads"), nb::arg("level"), nb::arg("progress").none(), about);
+    module.def("shape_histogram", &sample<uint32_t>, nb::arg("job"), nb::arg("counts"), nb::arg("out").noconvert(),
+               nb::arg("threads"), nb::arg("level"), nb::arg("progress").none(), about);
+}
+
+}  // namespace mars

@@ -5,6 +5,7 @@ from typing import Any
 from mars_lidar import _validate
 from mars_lidar.engines.base import Engine
 from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
 from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.renewal import RenewalEngine
@@ -12,7 +13,9 @@ from mars_lidar.engines.sequential import SequentialEngine
 
 ENGINES: dict[str, Engine] = {
     engine.name: engine
-    for engine in (ExactEngine(), SequentialEngine(), MarsEngine(), RenewalEngine(), PoissonEngine())
+    for engine in (
+        ExactEngine(), SequentialEngine(), MarsEngine(), FeedbackEngine(), RenewalEngine(), PoissonEngine()
+    )
 }
 
 

@@ -31,5 +31,6 @@ void bind_shape_sampler(nb::module_& module);
 void bind_count_draws(nb::module_& module);
 void bind_matched(nb::module_& module);
 void bind_table(nb::module_& module);
+void bind_feedback(nb::module_& module);
 
 }  // namespace mars

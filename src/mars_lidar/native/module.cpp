@@ -60,4 +60,5 @@ NB_MODULE(_core, module) {
     mars::bind_count_draws(module);
     mars::bind_matched(module);
     mars::bind_table(module);
+    mars::bind_feedback(module);
 }

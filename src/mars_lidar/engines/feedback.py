@@ -1,0 +1,102 @@
+"""The feedback engine: the whole integer histogram at once, at a cost that does not grow with the exposure."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import _core
+from mars_lidar.engines.base import Engine, Task
+from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.parts import draw_pixels, stage
+from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.flux import Flux
+from mars_lidar.pulse import GaussianPulse
+from mars_lidar.system import System
+
+FEWEST_PERIODS = 100  # exposures below so many dead times (rounded up to periods) are drawn exactly
+MOST_BINS = 2**16  # internal bins; beyond, the memory of a batch leaves every cache
+
+
+class FeedbackEngine(Engine):
+    """Cyclic feedback: an integer histogram that agrees with itself round the laser period.
+
+    The pixel is armed iff nothing was registered within the last dead time. Folded over the exposure, the counts
+    of a bin are binomial given those of the preceding dead time; this engine finds the histogram that satisfies
+    all these laws at once for one uniform number per bin. Its mean and covariance are those of
+    ``H = lambda (N_r + e - G H) + M``; the law is right bin by bin and jointly (derivation: docs/theory.md).
+    The cost is that of some sweeps over the bins, whatever the number of cycles.
+
+    Pixels that it cannot do are given to the exact engine, by a rule on the pixel and the system alone: exposures
+    below 100 dead times, sweeps that contract too slowly (about eight or more background photons per dead time),
+    count laws of a few counts under several blind periods, bins too fine or too many. Without dead time the bins
+    are independent Poisson numbers.
+
+    The same seed gives the same bits whatever the threads, chunks, parts of the image and vector width. `level`
+    forces one of ``_core.levels()``.
+
+    Reports ``pixels given to exact``.
+    """
+
+    name = "feedback"
+    description = "whole histograms with their joint law, at a cost independent of the exposure"
+
+    def __init__(self, level: str = "") -> None:
+        self.level = level
+
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        """Poisson numbers, feedback, or the exact engine, pixel by pixel."""
+        rest = self.sample(task, out, np.arange(task.pixel_index.size))
+        draw_pixels(ExactEngine(self.level), task, out, rest)
+        task.report["pixels given to exact"] = float(rest.size)
+
+    def sample(self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Fill the rows of `pixels` (n,) and return those that this engine cannot do, whose rows are not filled."""
+        if task.system.dead_time_periods == 0.0:
+            draw_pixels(PoissonEngine(), task, out, pixels)
+            return pixels[:0]
+        merge = internal_bins(task.flux, task.system) // task.system.bins
+        few = task.system.cycles < FEWEST_PERIODS * math.ceil(task.system.dead_time_periods)
+        merge = np.where(few | (merge * task.system.bins > MOST_BINS), 0, merge).reshape(-1)[pixels]
+        refused = [pixels[merge == 0]]
+        # lanes go through their sweeps together: neighbours in background need about as many
+        order = np.lexsort((task.flux.background.reshape(-1)[pixels], merge))
+        groups = [factor for factor in np.unique(merge) if factor > 0]
+        for k, factor in enumerate(groups):
+            group = np.ascontiguousarray(pixels[order][merge[order] == factor])
+            status = np.zeros(group.size, np.uint8)
+            _core.feedback_histogram(
+                task.job, task.pulse, out, group, status, int(factor), task.threads, self.level,
+                stage(task.progress, k, len(groups)),
+            )  # fmt: skip
+            refused.append(group[status != 0])
+        return np.sort(np.concatenate(refused))
+
+
+def internal_bins(flux: Flux, system: System) -> NDArray[np.int64]:
+    """Bins (H, W) of the period on which the sweeps run: those of the histogram, cut into equal parts.
+
+    Bins are at most a quarter of the pulse's standard deviation wide, an eighth above 5 signal photons, and no
+    wider than the dead time.
+    """
+    finest = np.full(flux.shape, min(1.0, system.dead_time_periods))
+    if flux.waveform is not None:
+        finest = np.minimum(finest, 1.0 / flux.waveform.shape[-1])
+    else:
+        width = _pulse_sigma(system) / system.period_ns
+        finest = np.where(flux.signal > 0, np.minimum(finest, np.where(flux.signal > 5, width / 8, width / 4)), finest)
+    parts = np.ceil(1.0 / (finest * system.bins) - 1e-9)
+    return np.asarray(np.maximum(parts, 1.0) * system.bins, dtype=np.int64)
+
+
+def _pulse_sigma(system: System) -> float:
+    """Width of the pulse, as the standard deviation of the Gaussian of the same energy concentration, ns."""
+    if isinstance(system.pulse, GaussianPulse):
+        return system.pulse.sigma_ns
+    low, high = system.pulse.support_ns()
+    edges = np.linspace(low, high, 4097)
+    energy = np.diff(system.pulse.cumulative(edges))
+    return float((edges[1] - edges[0]) / np.sum(energy**2) / (2.0 * math.sqrt(math.pi)))

@@ -1,0 +1,62 @@
+"""Pixels of one task drawn by several engines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.engines.base import Engine, Progress, Task
+from mars_lidar.flux import Flux
+
+_BUFFER_BYTES = 64 << 20  # of histograms drawn aside before they are put in place
+
+
+def stage(progress: Progress | None, number: int, of: int) -> Progress | None:
+    """A progress callback for one of several calls, so that the whole runs from 0 to its end once."""
+    if progress is None or of == 1:
+        return progress
+    return lambda done, total: progress(number * total + done, of * total)
+
+
+def part_of(flux: Flux, pixels: NDArray[np.int64]) -> Flux:
+    """The flux of some pixels (n,), as an image of one row."""
+    n = pixels.size
+    background = flux.background.reshape(-1)[pixels].reshape(1, n)
+    if flux.waveform is not None:
+        return Flux(waveform=flux.waveform.reshape(-1, flux.waveform.shape[-1])[pixels][None], background=background)
+    number = len(flux.returns_signal)
+    signal = flux.returns_signal.reshape(number, -1)[:, pixels]
+    delay = flux.returns_delay_ns.reshape(number, -1)[:, pixels]
+    if number == 1:
+        return Flux(signal, background, delay)
+    dark = np.zeros_like(background)
+    every = enumerate(zip(signal, delay, strict=True))
+    return Flux.multi(*(Flux(s[None], dark if k else background, tau[None]) for k, (s, tau) in every))
+
+
+def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[np.int64]) -> None:
+    """Fill the rows of `pixels` (n,) in `out` (items, bins) with `engine`'s histograms, the bits of the whole."""
+    if pixels.size == 0:
+        return
+    every = task.pixel_index.size
+    if pixels.size == every:
+        engine.histogram(task, out)
+        return
+    cube = out.reshape(task.realizations, every, task.system.bins)
+    row = task.system.bins * out.itemsize
+    wide = max(1, min(pixels.size, _BUFFER_BYTES // row))
+    deep = max(1, min(task.realizations, _BUFFER_BYTES // (row * wide)))
+    steps = [(p, r) for p in range(0, pixels.size, wide) for r in range(0, task.realizations, deep)]
+    for k, (first_pixel, first) in enumerate(steps):
+        some = pixels[first_pixel : first_pixel + wide]
+        number = min(deep, task.realizations - first)
+        part = replace(
+            task, flux=part_of(task.flux, some), realizations=number, first_realization=task.first_realization + first,
+            pixel_index=task.pixel_index[some], progress=stage(task.progress, k, len(steps)), report={},
+        )  # fmt: skip
+        rows = np.empty((part.items, task.system.bins), out.dtype)
+        engine.histogram(part, rows)
+        cube[first : first + number, some] = rows.reshape(number, some.size, task.system.bins)

@@ -1,0 +1,137 @@
+// The feedback engine: expected photons of every pixel, and batches of exposures on threads.
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include <nanobind/stl/string.h>
+
+#include "bindings.h"
+#include "feedback_kernel.h"
+#include "feedback_photons.h"
+#include "histogram_output.h"
+#include "parallel.h"
+#include "pulse_table.h"
+
+namespace mars {
+
+namespace {
+
+using Kernel = bool (*)(const FeedbackBatch&);
+
+Kernel kernel_of(const std::string& name) {
+    auto asked = [&name](const char* level) { return name.empty() || name == level; };
+#if defined(MARS_HAS_avx512)
+    if (asked("avx512") && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+        return feedback_kernel_avx512;
+#endif
+#if defined(MARS_HAS_avx2)
+    if (asked("avx2") && __builtin_cpu_supports("avx2")) return feedback_kernel_avx2;
+#endif
+#if defined(MARS_HAS_vector128)
+    if (asked("vector128")) return feedback_kernel_vector128;
+#endif
+    if (asked("scalar")) return feedback_kernel_scalar;
+    throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
+}
+
+FeedbackGrid make_grid(const Job& job, int32_t merge) {
+    FeedbackGrid grid;
+    grid.bins = job.bins * merge;
+    grid.merge = merge;
+    grid.dead_time = job.dead_time;
+    grid.cycles = job.cycles;
+    grid.stationary = job.stationary;
+    grid.whole = static_cast<int32_t>(job.dead_time);
+    const double rest = (job.dead_time - grid.whole) * grid.bins;
+    grid.shift = static_cast<int32_t>(rest + 1e-9);
+    grid.fraction = std::max(0.0, rest - grid.shift);
+    if (grid.fraction < 1e-9) grid.fraction = 0.0;
+    if (grid.shift == 0 && grid.whole > 0) {  // re-armed in the bin of the registration: count a period in bins
+        grid.whole -= 1;
+        grid.shift = grid.bins;
+    }
+    if (grid.shift < 1) throw nb::value_error("merge must make the bins shorter than the dead time");
+    return grid;
+}
+
+template <class Count>
+void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, Vector<const int64_t> pixels,
+               Vector<uint8_t> status, int32_t merge, int threads, const std::string& level,
+               const nb::object& progress) {
+    check_histogram(job, out);
+    if (status.shape(0) != pixels.shape(0)) throw nb::value_error("status must be as long as pixels");
+    const int64_t number = static_cast<int64_t>(pixels.shape(0));
+    for (int64_t k = 0; k < number; ++k)
+        if (pixels.data()[k] < 0 || pixels.data()[k] >= job.pixels) throw nb::value_error("pixels must be of the job");
+    if (number == 0) return;
+    const Kernel kernel = kernel_of(level);
+    const FeedbackGrid grid = make_grid(job, merge);
+    const PulseEnergy energy(pulse.shape);
+    Count* const cube = out.data();
+
+    // A stream is every `splits`-th realization of one pixel; a batch is kTeam streams.
+    const int64_t wanted = int64_t{kTeam} * 4 * threads;
+    const int64_t splits = std::min(job.realizations, (wanted + number - 1) / number), streams = number * splits;
+    std::vector<uint8_t> refused(static_cast<size_t>(streams), 0);
+    run_chunks((streams + kTeam - 1) / kTeam, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+        thread_local std::vector<unsigned char> memory;
+        int64_t lane_pixel[kTeam];
+        int32_t draws[kTeam];
+        uint32_t index[kTeam], realization[kTeam];
+        void* rows[kTeam];
+        FeedbackStatus lane_status[kTeam] = {};
+        for (int i = 0; i < kTeam; ++i) {
+            const int64_t stream = std::min(chunk * kTeam + i, streams - 1), pixel = pixels.data()[stream / splits];
+            const int64_t part = stream % splits;
+            lane_pixel[i] = pixel;
+            draws[i] = chunk * kTeam + i < streams
+                           ? static_cast<int32_t>((job.realizations - part + splits - 1) / splits) : 0;
+            index[i] = job.pixel_index[pixel];
+            realization[i] = job.first_realization + static_cast<uint32_t>(part);
+            rows[i] = cube + (part * job.pixels + pixel) * job.bins;
+        }
+        const LanePhotons photons(job, energy, grid, lane_pixel);
+        FeedbackBatch batch{};
+        batch.grid = &grid;
+        batch.first_bin = photons.first_bin;
+        batch.dark_photons = photons.dark;
+        batch.lit_begin = photons.lit_begin;
+        batch.lit_end = photons.lit_end;
+        batch.lit_photons = photons.lit.data();
+        batch.pixel_index = index;
+        batch.realization = realization;
+        batch.realization_step = static_cast<uint32_t>(splits);
+        batch.draws = draws;
+        batch.seed = job.seed;
+        batch.rows = rows;
+        batch.row_step = splits * job.pixels * job.bins;
+        batch.wide = sizeof(Count) == 4;
+        batch.status = lane_status;
+        batch.memory = &memory;
+        batch.stop = &stop;
+        if (!kernel(batch)) throw_full<Count>();
+        for (int i = 0; i < kTeam && chunk * kTeam + i < streams; ++i)
+            refused[static_cast<size_t>(chunk * kTeam + i)] = static_cast<uint8_t>(lane_status[i]);
+    });
+    for (int64_t stream = 0; stream < streams; ++stream)
+        status.data()[stream / splits] = refused[static_cast<size_t>(stream)];
+}
+
+}  // namespace
+
+void bind_feedback(nb::module_& module) {
+    const char* about =
+        "Histograms out (realizations * pixels, bins) of some pixels by cyclic feedback on bins * merge internal bins; "
+        "status (pixels) tells which were refused (not 0: their rows are not written).";
+    module.def("feedback_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
+               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("threads"),
+               nb::arg("level") = "", nb::arg("progress").none() = nb::none(), about);
+    module.def("feedback_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
+               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("threads"),
+               nb::arg("level") = "", nb::arg("progress").none() = nb::none(), about);
+}
+
+}  // namespace mars

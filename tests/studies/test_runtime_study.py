@@ -94,11 +94,15 @@ def test_crossover():
     flat = points("cycles", "other", [3e-2] * 4, hits)
     at, rule = runtime.crossover([*exact, *flat], "cycles", "exact", "other")
     assert at == pytest.approx(300.0)
-    assert rule == "exact is the faster below 300 registrations per pixel, other above"
+    assert rule == "exact is faster than other below 300 registrations per pixel, slower above"
     slow = points("cycles", "slow", [9.0] * 4, hits)
     at, rule = runtime.crossover([*exact, *slow], "cycles", "exact", "slow")
     assert at is None
-    assert rule.startswith("exact is the faster from 10 to 1e+04")
+    assert rule.startswith("exact is faster than slow from 10 to 1e+04")
+    late = points("cycles", "late", [9.0, 9.0, 1e-2, 9.0], hits)
+    at, rule = runtime.crossover([*exact, *late], "cycles", "exact", "late")
+    assert at is None
+    assert rule == "exact is faster than late at 1e+04 registrations per pixel, not everywhere below"
     at, rule = runtime.crossover(exact, "cycles", "exact", "other")
     assert at is None
     assert "not timed together" in rule

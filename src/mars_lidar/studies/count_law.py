@@ -91,7 +91,7 @@ FULL = Settings(
     grids=(_wide(8, (25.0, 50.0, 75.0, 100.0)), _near(8, (25.0, 50.0, 75.0))),
     realizations=100_000,
     resamplings=200,
-    sampled=20_000,
+    sampled=4_000,
     dead_sweep=_points(np.linspace(0.05, 2.0, 40)),
     sweep_flux=_points(np.geomspace(0.01, 10.0, 8)),
 )
@@ -99,7 +99,7 @@ QUICK = Settings(
     grids=(_wide(2, (25.0, 75.0)), _near(2, (50.0,))),
     realizations=400,
     resamplings=50,
-    sampled=200,
+    sampled=40,
     dead_sweep=(0.1875, 0.6375, 1.3),
     sweep_flux=(0.1, 5.0),
     cycles=100,

@@ -198,15 +198,16 @@ def crossover(points: Sequence[Point], axis: str, fast: str, other: str) -> tupl
     ratio = [float(found[other][v].seconds or 0.0) / float(found[fast][v].seconds or 1.0) for v in shared]
     ahead = np.array(ratio) > 1.0
     if ahead.all() or not ahead.any():
-        first = fast if ahead.all() else other
-        return None, f"{first} is the faster from {min(hits):.3g} to {max(hits):.3g} registrations per pixel"
+        first, second = (fast, other) if ahead.all() else (other, fast)
+        span = f"at {hits[0]:.3g}" if len(hits) == 1 else f"from {min(hits):.3g} to {max(hits):.3g}"
+        return None, f"{first} is faster than {second} {span} registrations per pixel, wherever both were timed"
     last = int(np.flatnonzero(ahead)[-1])  # from the next point on, `other` is faster to the end
     if last == len(shared) - 1:
-        return None, f"{fast} and {other} are within the noise of each other along {axis}"
+        return None, f"{fast} is faster than {other} at {hits[-1]:.3g} registrations per pixel, not everywhere below"
     a, b = np.log(ratio[last]), np.log(ratio[last + 1])
     place = np.log(hits[last]) + a / (a - b) * np.log(hits[last + 1] / hits[last])
     least = float(np.exp(place))
-    return least, f"{fast} is the faster below {least:.3g} registrations per pixel, {other} above"
+    return least, f"{fast} is faster than {other} below {least:.3g} registrations per pixel, slower above"
 
 
 def _at(settings: Settings, axis: Axis, value: float) -> tuple[Flux, System, int]:

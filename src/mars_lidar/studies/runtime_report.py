@@ -130,7 +130,7 @@ def _speed(cubes: Sequence[Cube]) -> str:
 def _rules(points: Sequence[Point], settings: Settings) -> list[str]:
     """Who is the faster from how many registrations on, along exposure and flux."""
     names = list(dict.fromkeys(p.contender for p in points))
-    others = [name for name in names if name not in ("exact", "poisson")]
+    others = [name for name in names if name not in ("exact", "sequential", "poisson")]
     cycles = next(axis for axis in settings.axes if axis.name == "cycles")
     lines = []
     for other in others:

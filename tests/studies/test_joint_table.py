@@ -62,3 +62,19 @@ def test_dead_time_is_seen():
     score = joint.score("", "poisson", joint.moments(settings, joint.REFERENCE[0], "poisson", 2), truth)
     assert score.count[0] > 5
     assert score.bins == joint.COARSE
+
+
+def test_bins_without_neighbours():
+    """Neighbours are compared only where both bins have counts; a lone pulse has none."""
+    case = joint.Case("pulse alone", 1.0, 0.0, 0.1, delay=0.5 + 0.5 / joint.COARSE, sigma=0.0005, cycles=100)
+    settings = joint.Settings((case,), realizations=400)
+    found = joint.moments(settings, case, "exact", 1)
+    score = joint.score("", "sequential", joint.moments(settings, case, "sequential", 2), found)
+    assert score.bins == 1
+    assert np.isnan(score.neighbour).all()
+    assert score.bin[0] == pytest.approx(1.0, abs=6 * score.bin[1])
+    near = joint.Case("on an edge", 1.0, 0.0, 0.1, delay=0.5, sigma=0.0005, cycles=100)
+    both = joint.moments(settings, near, "exact", 3)
+    again = joint.score("", "exact", joint.moments(settings, near, "exact", 4), both)
+    assert again.bins == 2
+    assert np.isfinite(again.neighbour).all()

@@ -109,8 +109,8 @@ class Score:
     """One engine in one case, against the exact engine: values with their standard errors.
 
     `window` and `count` ratios of variances; `bin` the mean over bins of the ratio of variances; `neighbour` the
-    mean over bins of the difference of the correlation with the next bin; `window_mean` the difference of the
-    window's mean in standard deviations of the window's count.
+    mean over bins of the difference of the correlation with the next bin, NaN where no two neighbours have counts;
+    `window_mean` the difference of the window's mean in standard deviations of the window's count.
     """
 
     case: str
@@ -172,17 +172,18 @@ def score(case: str, engine: str, found: Moments, truth: Moments) -> Score:
     """Ratios and differences, with errors from the scatter between blocks of both samples."""
     enough = (truth.mean.mean(0) >= ENOUGH) & (truth.variance.mean(0) > 0)
     here, there = (m.variance[:, enough] for m in (found, truth))
-    known = there.mean(0)
-    scale = np.sqrt(known * np.roll(truth.variance.mean(0), -1)[enough])
-    correlations = [m.next[:, enough] / np.maximum(scale, np.finfo(float).tiny) for m in (found, truth)]
+    known = truth.variance.mean(0)
+    pairs = enough & np.roll(enough, -1)  # both of them
+    scale = np.sqrt(known * np.roll(known, -1))[pairs]
+    correlations = [(m.next[:, pairs] / scale).mean(1) for m in (found, truth)] if pairs.any() else None
     spread = float(np.sqrt(truth.window[:, 1].mean()))
     return Score(
         case, engine,
         window=_ratio(found.window[:, 1], truth.window[:, 1]),
         window_mean=_difference(found.window[:, 0] / spread, truth.window[:, 0] / spread),
         count=_ratio(found.count[:, 1], truth.count[:, 1]),
-        bin=_ratio((here / known).mean(1), (there / known).mean(1)),
-        neighbour=_difference(*(c.mean(1) for c in correlations)),
+        bin=_ratio((here / known[enough]).mean(1), (there / known[enough]).mean(1)),
+        neighbour=_difference(*correlations) if correlations else (np.nan, np.nan),
         bins=int(enough.sum()),
     )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -110,7 +111,8 @@ def _rows(scores: Sequence[Score], key: str) -> list[Row]:
         for s in scores:
             if s.case == case:
                 value, error = _pair(s, key)
-                row[s.engine] = f"{value:.3f} ({error:.3f}){'*' if beyond(s, key) else ''}"
+                told = f"{value:.3f} ({error:.3f}){'*' if beyond(s, key) else ''}"
+                row[s.engine] = "-" if math.isnan(value) else told
         rows.append(row)
     return rows
 

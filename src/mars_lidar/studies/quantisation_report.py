@@ -129,6 +129,7 @@ def _panel(ax: Axes, settings: Settings, costs: Sequence[Cost], key: str) -> Non
             ax.plot(entries, [c.errors[key].mean() for c in here], dash, color=COLOURS[k], lw=1.2, label=words)
             ax.plot(entries, [np.quantile(c.errors[key], 0.95) for c in here], dash, color=COLOURS[k], lw=0.5)
     ax.set(xscale="log", yscale="log", xlabel="entries")
+    ax.tick_params(axis="x", which="minor", labelbottom=False)
     ax.set_title(_WORDS[key], loc="left", fontsize=7.0)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from mars_lidar.system import Detector, System
 from mars_lidar.table import Table
 
 PERIOD_NS, DEAD_TIME_NS, SIGMA_NS = 1e3 / 7.5, 85.0, 0.5
+_CUBE_PART = 64  # of the cube's pixels, one in so many foretells its time
 FLUX = (0.05, 1.0)  # S and B uniform on this, photons per period
 
 
@@ -44,6 +45,7 @@ class Settings:
     teaser: tuple[int, int]  # cycles, realizations of the single pixel
     repeats: int
     limit_s: float  # a point predicted to take longer is left out
+    cube_limit_s: float  # the same of the cube, predicted from a part of it
     enough_s: float  # repeats end once a contender has had so much
     cube_table: tuple[int, int]  # points in S and B
     axis_table: tuple[int, int]
@@ -68,10 +70,11 @@ def _axes(pixels: int, most_pixels: int, high: float, each: int) -> tuple[Axis, 
 FULL = Settings(
     side=128,
     bins=1024,
-    axes=_axes(1024, 262_144, 1e5, 2),
+    axes=_axes(256, 262_144, 1e5, 2),
     teaser=(1000, 10_000),
     repeats=5,
     limit_s=8.0,
+    cube_limit_s=30.0,
     enough_s=0.5,
     cube_table=(256, 100),
     axis_table=(32, 24),
@@ -83,6 +86,7 @@ QUICK = Settings(
     teaser=(100, 50),
     repeats=1,
     limit_s=0.5,
+    cube_limit_s=1.0,
     enough_s=0.05,
     cube_table=(4, 3),
     axis_table=(4, 3),
@@ -103,11 +107,15 @@ class Point:
 
 @dataclass(frozen=True)
 class Cube:
-    """One contender on the cube of the stages: least seconds, and the stages of that run."""
+    """One contender on the cube of the stages: least seconds, and the stages of that run.
+
+    `predicted` where it would have taken too long: seconds and stages are those of a part of the pixels, scaled.
+    """
 
     contender: str
     words: str
     seconds: float
+    predicted: bool
     stages: dict[str, float]
     prepared: float  # seconds spent before, on a table or nothing
 
@@ -133,16 +141,23 @@ def system(settings: Settings, cycles: int) -> System:
 def cube_stages(settings: Settings, tell: Tell) -> tuple[list[Cube], Table]:
     """Every contender on one cube of side x side pixels, and the table that some of them used."""
     flux, seen = image(settings.side**2, settings.seed), system(settings, 1000)
-    out = _memory(flux, seen, 1)
+    out, part = _memory(flux, seen, 1), max(1, settings.side**2 // _CUBE_PART)
     found = []
     tables = Tables(settings.cube_table)
     for one in contenders(tables):
         began = time.perf_counter()
         run = one.prepare(flux, seen, 1)
         prepared = time.perf_counter() - began
-        seconds, stages = _least({one.name: run}, out, settings)[one.name]
-        found.append(Cube(one.name, one.words, seconds, stages, prepared))
-        tell(f"runtime: cube, {one.words}: {seconds:.3g} s")
+        small = one.prepare(flux[:, :part], seen, 1)
+        seconds, stages = _least({one.name: small}, out[:, :, :part], replace(settings, repeats=1))[one.name]
+        scale = settings.side**2 / part
+        predicted = scale * seconds > settings.cube_limit_s
+        if predicted:
+            seconds, stages = scale * seconds, {name: scale * spent for name, spent in stages.items()}
+        else:
+            seconds, stages = _least({one.name: run}, out, settings)[one.name]
+        found.append(Cube(one.name, one.words, seconds, predicted, stages, prepared))
+        tell(f"runtime: cube, {one.words}: {seconds:.3g} s{' (predicted)' if predicted else ''}")
     return found, tables.get(seen)
 
 

@@ -84,7 +84,8 @@ def _text(
         f"## One cube of {side} x {side} x {bins}, 1000 cycles",
         table([_cube_row(cube) for cube in cubes] + _paper_rows()),
         "Stages in seconds, as each simulator reports them. *before*: preparing a table "
-        f"({settings.cube_table[0]} x {settings.cube_table[1]} entries) or nothing.",
+        f"({settings.cube_table[0]} x {settings.cube_table[1]} entries) or nothing. *predicted*: "
+        f"over {settings.cube_limit_s:g} s by a part of the pixels, scaled, and not run.",
         _speed(cubes),
         "## Rules",
         "\n".join(rules),
@@ -105,7 +106,7 @@ def _cube_row(cube: Cube) -> Row:
     stages = ", ".join(f"{name} {seconds:.3f}" for name, seconds in cube.stages.items())
     return {
         "simulator": cube.words,
-        "seconds": f"{cube.seconds:.4f}",
+        "seconds": f"{cube.seconds:.3g} (predicted)" if cube.predicted else f"{cube.seconds:.4f}",
         "stages": stages or "-",
         "before, s": f"{cube.prepared:.2f}",
     }

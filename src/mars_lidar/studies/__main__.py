@@ -38,7 +38,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--truth", choices=("sequential", "exact"), default="sequential",
         help="engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is "
-        "some ten times faster (default: %(default)s)",
+        "several times faster (default: %(default)s)",
     )  # fmt: skip
     return parser
 

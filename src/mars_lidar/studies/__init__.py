@@ -1,8 +1,8 @@
 """Studies: each reproduces or extends a published result, and writes a report, figures and a table.
 
 Run ``python -m mars_lidar.studies --help`` for the list. A study computes what it states: every sentence with
-a figure in it is made from the run. Reports hold the configuration and the seed; nothing in them depends on
-the machine.
+a figure in it is made from the run. Reports hold the configuration and the seed; only those that time
+something depend on the machine, and they name it.
 """
 
 from __future__ import annotations
@@ -16,12 +16,16 @@ Tell = Callable[[str], object]
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a study: output folder, quick or full, reference data, who hears of progress."""
+    """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
+
+    `truth` is the engine whose simulation the study "count-law" takes for true.
+    """
 
     out: Path
     quick: bool = False
     data: Path | None = None
     tell: Tell = str
+    truth: str = "sequential"
 
 
 Study = Callable[[Request], list[Path]]
@@ -63,6 +67,30 @@ def _joint(request: Request) -> list[Path]:
     return run(request)
 
 
+def _count_law(request: Request) -> list[Path]:
+    from mars_lidar.studies.count_law_report import run
+
+    return run(request)
+
+
+def _joint_table(request: Request) -> list[Path]:
+    from mars_lidar.studies.joint_table_report import run
+
+    return run(request)
+
+
+def _runtime(request: Request) -> list[Path]:
+    from mars_lidar.studies.runtime_report import run
+
+    return run(request)
+
+
+def _quantisation(request: Request) -> list[Path]:
+    from mars_lidar.studies.quantisation_report import run
+
+    return run(request)
+
+
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
     "joint": ("the histogram's covariance in closed form against simulation; --data adds reference cases", _joint),
@@ -70,6 +98,10 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "detectors": ("what each mode of a detector does to the same flux, simulated and in closed form", _detectors),
     "matched": ("a law of the count from four cumulants: total variation to the exact law", _matched),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
+    "count-law": ("T1: every simulator's count law and shape against simulation", _count_law),
+    "joint-table": ("variance of signal window and bins, covariance of neighbours: every engine", _joint_table),
+    "quantisation": ("what a table's lookup costs, nearest and interpolated, over its size", _quantisation),
+    "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
 }
 
 __all__ = ["STUDIES", "Request", "Study", "Tell"]

@@ -35,6 +35,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help="folder of the reference cases, *.json (studies 'reference', 'joint')"
     )
+    parser.add_argument(
+        "--truth", choices=("sequential", "exact"), default="sequential",
+        help="engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is "
+        "several times faster (default: %(default)s)",
+    )  # fmt: skip
     return parser
 
 
@@ -51,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         parser.error(f"--out must be a folder that can be made, got {str(given.out)!r}: {error.strerror}")
     tell = partial(print, file=sys.stderr, flush=True)
-    request = Request(given.out, given.quick, given.data, tell)
+    request = Request(given.out, given.quick, given.data, tell, given.truth)
     try:
         for name in dict.fromkeys(given.studies):
             began = time.monotonic()

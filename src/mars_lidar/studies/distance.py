@@ -15,6 +15,7 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 _POOLED = 5.0  # expected counts below which cells of a G-test are pooled
+KL_FLOOR = 1e-12  # of a law's probabilities in a Kullback-Leibler divergence, which is infinite without
 _NEGLIGIBLE = 1e-10  # probability left out of the bootstrap's classes, in one class of its own
 
 
@@ -113,3 +114,15 @@ def variance_score(cumulants: FloatArray, sample: Pmf, size: int, variance: floa
     spread = float(cumulants[3] + 2.0 * cumulants[1] ** 2)
     error = square - (float(cumulants[1]) if variance is None else variance)
     return error / math.sqrt(spread / size) if spread > 0 else (0.0 if error == 0 else math.inf)
+
+
+def wasserstein(sample: FloatArray, law: FloatArray) -> FloatArray:
+    """First Wasserstein distance (...) of pmfs (..., w) to one of (w,), on the same consecutive counts."""
+    return np.asarray(np.abs(np.cumsum(sample - law, axis=-1)).sum(-1), dtype=np.float64)
+
+
+def kl_divergence(sample: FloatArray, law: FloatArray) -> FloatArray:
+    """KL(sample || law) (...) in nats, pmfs (..., w) and (w,) on the same counts; `law` floored at `KL_FLOOR`."""
+    log_law = np.log(np.maximum(law, KL_FLOOR))
+    log_sample = np.log(np.where(sample > 0, sample, 1.0))
+    return np.asarray((sample * (log_sample - log_law)).sum(-1), dtype=np.float64)

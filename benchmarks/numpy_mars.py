@@ -1,0 +1,56 @@
+"""The MaRS paper's whole pipeline in NumPy, stage by stage, in turn with the engines that do the same.
+
+The pipeline is `mars_lidar.studies.numpy_pipeline`; its table holds the exact moments, 256 x 100 at full size.
+"""
+
+from __future__ import annotations
+
+import time
+
+from benchmarks.config import Config
+from benchmarks.engines import PAPER_MARS_S
+from benchmarks.floor import Bandwidth
+from benchmarks.report import Goal, Section
+from benchmarks.rows import engine_row, timing_row
+from benchmarks.timing import in_turn
+from benchmarks.workload import EngineRun, canonical
+from mars_lidar import _core
+from mars_lidar.engines import ENGINES
+from mars_lidar.studies.numpy_pipeline import NumpyTable, Stages, synthesize
+
+_AXIS = (0.01, 10.0)
+_NAME = "NumPy, lookup + alignment + multinomial"
+
+
+def pipeline(config: Config, bandwidth: Bandwidth) -> Section:
+    """One cube by the paper's pipeline, exact, and every other engine that needs no arrival."""
+    workload = canonical(config)
+    points = (256, 100) if config.mode == "full" else (32, 24)
+    began = time.perf_counter()
+    table = NumpyTable.build(workload.system, (*_AXIS, points[0]), (*_AXIS, points[1]))
+    built = time.perf_counter() - began
+    stages, out = Stages(), workload.warm()
+    level, every = _core.levels()[0], config.threads
+    runs = {
+        "exact, all threads": EngineRun(workload, level=level, threads=every, out=out),
+        "exact, 1 thread": EngineRun(workload, level=level, out=out),
+    }
+    for engine in ENGINES:
+        if engine not in ("exact", "sequential", "mars", "renewal"):  # those need a table of their own, or arrivals
+            runs[f"{engine}, all threads"] = EngineRun(workload, engine=engine, threads=every, out=out)
+    cube = out.reshape(1, *workload.flux.shape, workload.system.bins)
+    times = in_turn({**runs, _NAME: lambda: synthesize(table, workload.flux, stages=stages, out=cube)}, config)
+    reference = times["exact, all threads"]
+    note = (
+        f"Table of {points[0]} x {points[1]} entries, built in {built:.1f} s. Of the pipeline's time: "
+        + ", ".join(f"{name} {100 * s / stages.total:.0f} %" for name, s in stages.seconds.items())
+        + f". The paper reports {PAPER_MARS_S:g} s for all three on a Ryzen 7 9700X."
+    )
+    section = Section("The paper's pipeline in NumPy", notes=[note])
+    section.rows = [engine_row(name, run, times[name], bandwidth, reference) for name, run in runs.items()]
+    section.rows.append(
+        timing_row(_NAME, workload, times[_NAME], bandwidth, engine="numpy", reference=reference)
+    )
+    what = "exact, all threads: times faster than the paper's pipeline in NumPy"
+    section.goals.append(Goal(what, times[_NAME].ratio(reference), 1.0, "", at_least=True))
+    return section

@@ -1,0 +1,144 @@
+"""The study of count laws: its distances, its floors, what it calls right, and its quick form."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from harness.ledger import require
+from mars_lidar.engines import ENGINES
+from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.studies import count_law, count_law_report, simulators
+from mars_lidar.studies.__main__ import main
+from mars_lidar.studies.count_law_shape import shape_sweep
+from mars_lidar.studies.distance import KL_FLOOR, Pmf, kl_divergence, wasserstein
+from mars_lidar.studies.report import MAX_FIGURE_BYTES
+from mars_lidar.studies.sample import draw
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    out = tmp_path_factory.mktemp("count_law")
+    assert main(["count-law", "--quick", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def cells():
+    return count_law.compute(count_law.QUICK, "sequential", str)
+
+
+def test_files(quick):
+    text = (quick / "count_law.md").read_text()
+    figures = [path for path in quick.iterdir() if path.suffix == ".png"]
+    assert len(figures) == 3
+    for path in figures:
+        assert 5_000 < path.stat().st_size <= MAX_FIGURE_BYTES
+        assert text.count(f"({path.name})") == 1
+    with (quick / "count_law.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == sum(grid.size for grid in count_law.QUICK.grids)
+    assert "engine `sequential`" in text
+
+
+def test_exact_law_passes_and_poisson_fails(cells):
+    outcomes = {}
+    for cell in cells:
+        size = cell.realizations
+        z = (cell.mean - cell.exact[0]) / cell.mean_error
+        outcomes[f"{cell.name()}: mean"] = 2 * stats.norm.sf(abs(z))
+        score = cell.scores["mars_exact"]
+        assert score.figures.shape == (4,)
+        assert score.floors.shape == (count_law.QUICK.resamplings, 4)
+        assert cell.truth.p.sum() == pytest.approx(1.0)
+        assert np.rint(cell.truth.p * size).sum() == size
+    require(outcomes, "count-law study")
+    figures, floor, limit = count_law_report.average(cells, "mars_exact")
+    assert all(value <= 2 * bound for value, bound in zip(figures, limit, strict=True))
+    assert all(low < high for low, high in zip(floor, limit, strict=True))
+    assert count_law_report.average(cells, "poisson")[0][0] > 100 * floor[0]
+    bright = max(cells, key=lambda cell: cell.signal + cell.background)
+    assert count_law_report.right(bright, "mars_exact") == {"mean": True, "variance": True, "shape": True}
+    assert count_law_report.right(bright, "renewal") == {"mean": False, "variance": False, "shape": True}
+    assert not any(count_law_report.right(bright, "poisson")[key] for key in ("mean", "variance"))
+
+
+def test_distances():
+    normal = stats.norm.pdf(np.arange(60), 30.0, 3.0)
+    later = np.roll(normal, 4)
+    assert wasserstein(normal, later) == pytest.approx(4.0, rel=1e-6)
+    assert kl_divergence(normal, later) == pytest.approx(0.5 * (4.0 / 3.0) ** 2, rel=1e-3)
+    assert kl_divergence(normal, normal) == pytest.approx(0.0, abs=1e-9)
+    certain, elsewhere = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    assert kl_divergence(certain, elsewhere) == pytest.approx(-np.log(KL_FLOOR))
+    both = np.stack([normal, later])
+    np.testing.assert_allclose(wasserstein(both, normal), [0.0, 4.0], atol=1e-6)
+
+
+def test_floors_are_those_of_samples():
+    """Of a Poisson law: differences of moments are half-normal, the mean of KL is a sum over binomials."""
+    law = Pmf(0, stats.poisson.pmf(np.arange(80), 20.0))
+    size = 10_000
+    random = np.random.default_rng(3)
+    found = count_law.resampled_figures(law, size, 0, 2000, random)
+    assert found[:, 2].mean() == pytest.approx(np.sqrt(2 / np.pi * 20.0 / size), rel=0.06)
+    assert found[:, 3].mean() == pytest.approx(np.sqrt(2 / np.pi * (20.0 + 2 * 20.0**2) / size), rel=0.06)
+    times = np.arange(1, size + 1)
+    rates = np.log(times[:, None] / (size * law.p)) * times[:, None] / size
+    expected = (stats.binom.pmf(times[:, None], size, law.p) * rates).sum()
+    assert found[:, 1].mean() == pytest.approx(expected, rel=0.05)
+    twice = count_law.resampled_figures(law, size, size, 500, random)
+    assert twice[:, 2].mean() == pytest.approx(np.sqrt(2) * found[:, 2].mean(), rel=0.12)
+
+
+def test_sample_noise_of_the_shape():
+    """The floor of the shape is the distance that a sample really has; of a Poisson pixel that is known."""
+    system = count_law.QUICK.system(100.0, 0.0).replace(bins=64)
+    signal, background = np.array([0.0]), np.array([1.0])
+    found = [draw("poisson", signal, background, system, realizations=200, seed=k) for k in range(30)]
+    floor = np.mean([one.shape_floor[0] for one in found])
+    apart = np.mean([0.5 * np.abs(one.shape[0] - 1 / 64).sum() for one in found])
+    assert floor == pytest.approx(apart, rel=0.1)
+    assert floor == pytest.approx(0.5 * np.sqrt(2 / np.pi * 63 / (200 * system.cycles)), rel=0.1)
+    assert found[0].counts.shape == (200, 1)
+    assert abs(found[0].counts.mean() - system.cycles) < 6 * np.sqrt(system.cycles / 200)
+
+
+def test_engine_without_a_law_is_sampled(monkeypatch):
+    class Other(PoissonEngine):
+        name = "other"
+
+    monkeypatch.setitem(ENGINES, "other", Other())
+    names = [one.name for one in simulators.simulators(50, 1)]
+    assert names[:6] == ["poisson", "renewal", "mars_centre", "mars_edge", "mars_exact", "mars_matched"]
+    other = next(one for one in simulators.simulators(50, 1) if one.name == "other")
+    system = count_law.QUICK.system(100.0, 50.0)
+    found = other.predict(np.array([0.1, 0.2]), np.array([0.1, 0.1]), system)
+    assert found.sampled == 50
+    np.testing.assert_allclose(found.mean, [20.0, 30.0], atol=6 * np.sqrt(30.0 / 50))
+    settings = replace(count_law.QUICK, grids=count_law.QUICK.grids[1:], realizations=100, sampled=50)
+    scores = count_law.compute(settings, "exact", str)[0].scores["other"]
+    assert scores.shape_floor > 1.5 * count_law.compute(settings, "exact", str)[0].scores["poisson"].shape_floor
+
+
+def test_shapes_over_dead_time():
+    """A dead time of a whole period does not distort the shape; the chain is close everywhere else."""
+    settings = replace(count_law.QUICK, dead_sweep=(0.5, 1.0), cycles=1000)
+    found = shape_sweep(settings, str)
+    assert found["poisson"].shape == (2, 4)
+    assert found["poisson"][0].max() > 0.1
+    assert found["poisson"][1].max() < 0.02
+    assert found["renewal"][0].max() < 0.02
+
+
+def test_truth_by_the_exact_engine(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["count-law", "--truth", "poisson", "--out", str(tmp_path)])
+    assert stop.value.code == 2
+    assert "invalid choice: 'poisson'" in capsys.readouterr().err
+    settings = replace(count_law.QUICK, grids=count_law.QUICK.grids[1:])
+    pairs = zip(*(count_law.compute(settings, truth, str) for truth in ("exact", "sequential")), strict=True)
+    z = [(one.mean - other.mean) / np.hypot(one.mean_error, other.mean_error) for one, other in pairs]
+    require({f"cell {k}: mean": 2 * stats.norm.sf(abs(v)) for k, v in enumerate(z)}, "truths agree")

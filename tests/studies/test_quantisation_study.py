@@ -1,0 +1,42 @@
+"""The study of quantisation: errors vanish on the nodes, shrink with the grid, and less for the nearest entry."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from mars_lidar.statistics import exposure_moments
+from mars_lidar.studies import quantisation
+from mars_lidar.studies.__main__ import main
+from mars_lidar.table import Table
+
+
+def test_files(tmp_path):
+    assert main(["quantisation", "--quick", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "quantisation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    settings = quantisation.QUICK
+    assert len(rows) == len(settings.sizes) * len(settings.dead_ns) * len(quantisation.INTERPOLATIONS)
+    for key in quantisation.ERRORS:
+        error = {(row["signal_points"], row["lookup"]): float(row[f"{key}_mean"]) for row in rows}
+        assert error["16", "bilinear"] < error["16", "nearest"] < error["4", "nearest"]
+        assert error["16", "bilinear"] < error["4", "bilinear"]
+    text = (tmp_path / "quantisation.md").read_text()
+    assert "quantisation.png" in text
+    assert (tmp_path / "quantisation.png").stat().st_size > 5_000
+
+
+@pytest.mark.parametrize("interpolation", quantisation.INTERPOLATIONS)
+def test_no_error_on_the_nodes(interpolation):
+    system = quantisation.QUICK.system(75.0)
+    table = Table.build(system, signal=(0.1, 10.0, 3), background=(0.1, 10.0, 3))
+    signal, background = np.array([0.1, 1.0, 10.0]), np.array([1.0, 10.0, 0.1])
+    truth = exposure_moments(signal, background, system)
+    found = table.lookup(signal, background, interpolation=interpolation)
+    errors = quantisation._errors(found.rows, found.weights, found.cumulants, table.shapes(), truth)
+    assert all(errors[key].max() < 1e-5 for key in quantisation.ERRORS)
+    shifted = quantisation._errors(
+        found.rows[[1, 1, 1]], found.weights, found.cumulants[[1, 1, 1]], table.shapes(), truth
+    )
+    assert shifted["law"][0] > 0.5
+    assert shifted["shape"][0] > 0.05

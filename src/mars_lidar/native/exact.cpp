@@ -89,12 +89,12 @@ double photons_between(const Job& job, const PulseShape& shape, int64_t pixel, d
 class WarmedUp {
 public:
     WarmedUp(const Job& job, const PulseShape& shape, int64_t pixel) : job_(job) {
-        const double dead = job.dead_time, total = photons_between(job, shape, pixel, 0.0, 1.0);
+        const double dead = job.dead_time;
         if (job.mode == DetectorMode::kParalyzable) {
-            start_ = -paralyzable_warm_up(dead, total);
+            start_ = -paralyzable_warm_up(dead, photons_between(job, shape, pixel, 0.0, 1.0));
         } else if (job.mode == DetectorMode::kSynchronous) {
             const double early = photons_between(job, shape, pixel, 0.0, 1.0 - (dead - std::floor(dead)));
-            synchronous_.emplace_back(dead, total, early);
+            synchronous_.emplace_back(dead, photons_between(job, shape, pixel, 0.0, 1.0), early);
         } else {
             std::vector<double> photons = photons_on_grid(job, shape, pixel);
             if (job.mode == DetectorMode::kGated)

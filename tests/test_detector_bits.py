@@ -161,8 +161,10 @@ def test_bad_detectors(changes: dict[str, Any], kind: type[Exception], fragments
 
 def test_bad_combinations(system: ml.System, flux: ml.Flux):
     wide = ml.Detector(dead_time_ns=5.0, **GATE | {"gate_width_ns": 140.0})
-    with pytest.raises(ValueError, match=r"gate_width_ns must be at most the laser period of 133\.333 ns, got 140"):
-        system.replace(detector=wide)
+    thin = ml.Detector(dead_time_ns=5.0, **GATE | {"gate_width_ns": 1e-3})
+    for gate, got in ((wide, "140"), (thin, r"0\.001")):
+        with pytest.raises(ValueError, match=rf"gate_width_ns must lie in \[0\.00133333, 133\.333\] ns .* got {got}"):
+            system.replace(detector=gate)
     moving = ml.Detector(dead_time_ns=5.0, **MOVING)
     with pytest.raises(ValueError, match=r"start must be 'armed' with a gate that moves.*gate_step_ns=-7\.3"):
         system.replace(detector=moving, start="stationary")

@@ -13,6 +13,7 @@ MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "synchronous", "gate
 
 _GATE = ("gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
 _MAX_GATE_CYCLES = 100_000_000
+_MIN_GATE_PERIODS = 1e-5  # phases have 24 bits: at 1e-6 periods the counts behind a gate were 4 % off
 _MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond it no digits are left
 
 
@@ -100,9 +101,11 @@ class Detector:
 
     def check(self, period_ns: float, start: str) -> None:
         """Raise ValueError, naming the field, for what makes no sense at this laser period and start."""
-        if self.gate_width_ns is not None and self.gate_width_ns > period_ns * (1 + 1e-12):
+        least, most = _MIN_GATE_PERIODS * period_ns, period_ns * (1 + 1e-12)
+        if self.gate_width_ns is not None and not least <= self.gate_width_ns <= most:
             raise ValueError(
-                f"gate_width_ns must be at most the laser period of {period_ns:g} ns, got {self.gate_width_ns:g}"
+                f"gate_width_ns must lie in [{least:g}, {period_ns:g}] ns (1e-5 to 1 period), "
+                f"got {self.gate_width_ns:g}"
             )
         if self.gate_moves and start == "stationary":
             raise ValueError(

@@ -180,9 +180,15 @@ def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArr
 
 def _check_registrations(flux: Flux, system: System) -> None:
     photons, dead = float(flux.total.max()), system.dead_time_periods
-    most, what = photons * system.cycles / (1.0 + photons * dead), "registrations"
-    if system.detector.mode == "paralyzable":  # each arrival is an event, seen or not
+    mode, what = system.detector.mode, "registrations"
+    if mode == "gated":  # what arrives outside of the gate costs one draw a period
+        shut = 1.0 - system.detector.gate_periods(system.period_ns)[2]
+        photons = float((flux.total - shut * flux.background).max())
+    most = photons * system.cycles / (1.0 + photons * dead)
+    if mode == "paralyzable":  # each arrival is drawn, seen or not
         most, what = photons * (system.cycles + dead), "arrivals of mode 'paralyzable'"
+    elif mode == "synchronous":
+        most = min(most, float(system.cycles))
     if most > 0.5 * _MAX_REGISTRATIONS:
         raise ValueError(
             f"a pixel must have at most {0.5 * _MAX_REGISTRATIONS:.3g} expected {what}, "

@@ -278,6 +278,9 @@ def test_poisson_law_is_that_of_the_gated_arrivals():
 def test_too_long_dead_times_and_sharp_tolerances_are_refused():
     with pytest.raises(ValueError, match=r"dead_time_ns must be at most 20000 periods .*'paralyzable', got 30000"):
         paralyzable_moments(1.0, 1.0, view("paralyzable", 3e4))
+    assert mean_histogram(1.0, 1.0, view("paralyzable", 3e4)).sum() == pytest.approx(1.0)
+    with pytest.raises(ConvergenceError, match=r"count law of S = 1.*'synchronous'.*use fewer cycles"):
+        ml.count_law(1.0, 1.0, view("synchronous", 1.5, cycles=10**8))
     with pytest.raises(ValueError, match=r"tolerance must be"):
         paralyzable_moments(1.0, 1.0, view("paralyzable", 1.0), tolerance=0.0)
     narrow = view("paralyzable", 0.3, pulse=ml.GaussianPulse(sigma_ns=1e-4))

@@ -19,6 +19,7 @@ from mars_lidar.flux import Flux
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
+    from mars_lidar.table.table import Interpolation
     from mars_lidar.table import Table
 
 FloatArray = NDArray[np.float64]
@@ -57,7 +58,8 @@ class TableReader:
             raise TypeError(f"table must be a mars_lidar.Table, got {table!r}")
         self.table = table
         given = "bilinear" if interpolation is None else interpolation
-        self.interpolation = _validate.choice("interpolation", given, _INTERPOLATIONS)
+        _validate.choice("interpolation", given, _INTERPOLATIONS)
+        self.interpolation: Interpolation = "nearest" if given == "nearest" else "bilinear"
 
     @property
     def settings(self) -> dict[str, Any]:

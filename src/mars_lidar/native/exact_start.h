@@ -95,12 +95,12 @@ class WarmedUp {
 public:
     WarmedUp(const Job& job, const PulseTable& pulse, int64_t pixel) : job_(job), photons_(job, pulse, pixel) {
         const PulseShape& shape = pulse.shape;
-        const double dead = job.dead_time, total = photons_between(job, shape, pixel, 0.0, 1.0);
+        const double dead = job.dead_time;
         if (job.mode == DetectorMode::kParalyzable) {
-            start_ = -paralyzable_warm_up(dead, total);
+            start_ = -paralyzable_warm_up(dead, photons_.total());
         } else if (job.mode == DetectorMode::kSynchronous) {
             const double early = photons_between(job, shape, pixel, 0.0, 1.0 - (dead - std::floor(dead)));
-            synchronous_.emplace_back(dead, total, early);
+            synchronous_.emplace_back(dead, photons_.total(), early);
         } else if (job.mode == DetectorMode::kNonparalyzable &&
                    gaps_are_near(photons_.total(), photons_.least(dead, shape), dead)) {
             gaps_ = true;

@@ -99,7 +99,7 @@ def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
         return None
     if cube.engine == "poisson" and system.detector.mode != "gated":
         return incident_rate(flux, system, y, x) * system.cycles
-    if system.cycles > _PREDICTED_CYCLES and system.detector.mode in ("nonparalyzable", "gated"):
+    if system.cycles > _PREDICTED_CYCLES and system.detector.mode != "paralyzable":  # whose mean has a closed form
         return None
     if cube.engine == "poisson":
         system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))

@@ -86,6 +86,8 @@ def exposure_moments(
 ) -> Exposure:
     """Exact cumulants of the count and mean histogram of an exposure of `System.cycles` periods.
 
+    For detectors of mode nonparalyzable, and gated with a gate that stays.
+
     Parameters
     ----------
     signal, background
@@ -109,9 +111,8 @@ def exposure_moments(
 
     Raises
     ------
-    ValueError, ConvergenceError
-        For a mode other than ``"nonparalyzable"`` and ``"gated"``; and
-        naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
+    ConvergenceError
+        Naming the cell, where no grid up to 2^20 bins meets the tolerance, or where the state has not
         repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
     """
     cells = Cells.of(
@@ -216,11 +217,10 @@ def _run(cells: Cells, bins: int, out_bins: int, threads: int, progress: Progres
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
         energy, row = some.energies(bins)
-        photons, flat = some.native_flux
         _core.exposure_moments(
             grid=some.grid(bins, out_bins),
-            signal=photons,
-            background=flat,
+            signal=some.native_flux[0],
+            background=some.native_flux[1],
             shape=row,
             shapes=energy,
             cumulants=result.cumulants[part],
@@ -250,11 +250,10 @@ def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatAr
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
         energy, row = some.energies(bins)
-        photons, flat = some.native_flux
         _core.exposure_stationary(
             grid=some.grid(bins, out_bins),
-            signal=photons,
-            background=flat,
+            signal=some.native_flux[0],
+            background=some.native_flux[1],
             shape=row,
             shapes=energy,
             histogram=result[part],

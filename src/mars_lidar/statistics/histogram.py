@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from mars_lidar.detector import MODES
 from mars_lidar.statistics._cells import Cells, FloatArray
 from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.statistics.paralyzable import moments_of
+from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
 from mars_lidar.system import System
 
@@ -42,6 +42,6 @@ def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> Floa
         mean = np.array([cumulants_of(window)[0] for window in synchronous_windows(cells)])
         return np.asarray(armed * (mean / seen)[:, None], dtype=np.float64)
     if mode == "paralyzable":
-        return moments_of(cells, tolerance=tolerance).histogram.reshape(cells.size, bins)
+        return paralyzable_histograms(cells, tolerance)
     exposure = refined_moments(cells, bins, tolerance=tolerance, threads=threads)
     return exposure.histogram.reshape(cells.size, bins)

@@ -78,26 +78,30 @@ def paralyzable_moments(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
         what="paralyzable_moments", modes=("paralyzable",),
     )  # fmt: skip
-    return moments_of(cells, tolerance=tolerance)
-
-
-def moments_of(cells: Cells, *, tolerance: float) -> ParalyzableMoments:
-    """`paralyzable_moments` of checked cells."""
-    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
-    system = cells.system
     if system.dead_time_periods > _MAX_WHOLE:
         raise ValueError(
-            f"dead_time_ns must be at most {_MAX_WHOLE} periods for the statistics of mode 'paralyzable', "
+            f"dead_time_ns must be at most {_MAX_WHOLE} periods for the variance of mode 'paralyzable', "
             f"got {system.dead_time_periods:g} periods"
         )
+    return _refined(cells, tolerance, with_variance=True)
+
+
+def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
+    """Mean histograms (cells, bins) of checked cells, any dead time."""
+    return _refined(cells, tolerance, with_variance=False).histogram.reshape(cells.size, -1)
+
+
+def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> ParalyzableMoments:
+    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    system = cells.system
     mean, variance, bins = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size)
     histogram = np.empty((cells.size, system.bins))
     for k in range(cells.size):
         cell = cells.part(slice(k, k + 1))
         n = cell.first_bins(system.bins)
-        coarse = _Grid(cell, n // 2)
+        coarse = _Grid(cell, n // 2, with_variance)
         while True:
-            fine = _Grid(cell, n)
+            fine = _Grid(cell, n, with_variance)
             if _moved(coarse, fine) <= tolerance:
                 break
             coarse, n = fine, 2 * n
@@ -116,7 +120,7 @@ def moments_of(cells: Cells, *, tolerance: float) -> ParalyzableMoments:
 class _Grid:
     """One pixel on a grid of the period, with edges where the dead time of a start at 0 ends."""
 
-    def __init__(self, cell: Cells, bins: int) -> None:
+    def __init__(self, cell: Cells, bins: int, with_variance: bool) -> None:
         system = cell.system
         dead = system.dead_time_periods
         self.cell, self.cycles, self.armed = cell, system.cycles, system.start == "armed"
@@ -142,7 +146,7 @@ class _Grid:
         place = np.minimum(np.searchsorted(out, self.edges[:-1], side="right") - 1, system.bins - 1)
         self.histogram = np.bincount(place, self._exposure(), minlength=system.bins)
         self.mean = float(self.histogram.sum())
-        self.variance = max(0.0, self.mean - 2.0 * self._pairs())
+        self.variance = max(0.0, self.mean - 2.0 * self._pairs()) if with_variance else self.mean
 
     def _photons(self, at: FloatArray) -> FloatArray:
         return np.asarray(photons_before(self.cell, at)[0], dtype=np.float64)

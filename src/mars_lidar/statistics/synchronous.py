@@ -12,12 +12,14 @@ import math
 import numpy as np
 
 from mars_lidar.statistics._cells import Cells, FloatArray
+from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._gate import photons_before
 from mars_lidar.statistics._pmf import Window
 
 _TAIL = 1e-13  # probability left out at either end of the support
 _SPREAD = 9.0  # standard deviations of the number of late registrations that are summed over
-_CHUNK = 1 << 20
+_CHUNK = 1 << 20  # terms of (6) at a time
+_MAX_TERMS = 1 << 28  # of one cell: half a minute
 
 
 def first_arrivals(cells: Cells) -> FloatArray:
@@ -32,7 +34,10 @@ def synchronous_windows(cells: Cells) -> list[Window]:
     dead = cells.system.dead_time_periods
     whole = math.floor(dead)
     reach = photons_before(cells, np.array([1.0 - (dead - whole), 1.0]))
-    return [_Count(cells, whole, float(early), float(total)).window() for early, total in reach]
+    return [
+        _Count(cells, cells.name(k), whole, float(early), float(total)).window()
+        for k, (early, total) in enumerate(reach)
+    ]
 
 
 def cumulants_of(window: Window) -> FloatArray:
@@ -46,8 +51,8 @@ def cumulants_of(window: Window) -> FloatArray:
 class _Count:
     """The count of one pixel: `early` of its `total` photons a period come before 1 - f."""
 
-    def __init__(self, cells: Cells, whole: int, early: float, total: float) -> None:
-        self.cycles, self.whole = cells.system.cycles, whole
+    def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
+        self.name, self.cycles, self.whole = name, cells.system.cycles, whole
         self.seen = -math.expm1(-total)  # q
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
         self.late = min(after / self.seen, 1.0) if self.seen > 0.0 else 0.0
@@ -65,14 +70,16 @@ class _Count:
 
     def at_least(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) (6)."""
-        rows = max(1, int(_CHUNK / (self.first.size * self._spread(float(counts.max())))))
-        parts = [self._at_least(counts[k : k + rows]) for k in range(0, counts.size, rows)]
+        spread = self._spread(float(counts.max()))
+        rows = max(1, int(_CHUNK / (self.first.size * spread)))
+        parts = [self._at_least(counts[k : k + rows], spread) for k in range(0, counts.size, rows)]
         return np.concatenate(parts)
 
     def _spread(self, most: float) -> float:
-        return 2.0 * (_SPREAD * math.sqrt(most * self.late * (1.0 - self.late)) + 20.0)
+        """Numbers of late registrations that matter."""
+        return 1.0 if self.late == 0.0 else 2.0 * (_SPREAD * math.sqrt(most * self.late * (1.0 - self.late)) + 20.0)
 
-    def _at_least(self, counts: FloatArray) -> FloatArray:
+    def _at_least(self, counts: FloatArray, spread: float) -> FloatArray:
         from scipy.special import betainc
         from scipy.stats import binom
 
@@ -80,26 +87,37 @@ class _Count:
         late: FloatArray = np.zeros((k.size, 1))
         weight: FloatArray = np.ones((k.size, 1))
         if self.late > 0.0:
-            width = self._spread(float(k.max()))
-            low = np.maximum(np.floor((k - 1.0) * self.late - 0.5 * width), 0.0)
-            late = low[:, None] + np.arange(math.ceil(width) + 1)
+            low = np.maximum(np.floor((k - 1.0) * self.late - 0.5 * spread), 0.0)
+            late = low[:, None] + np.arange(math.ceil(spread) + 1)
             weight = np.asarray(binom.pmf(late, (k - 1.0)[:, None], self.late), dtype=np.float64)
         empty = self.cycles - 1.0 - (k[:, None] - 1.0) * (self.whole + 1.0) - late  # periods that may be empty
-        empty = empty[..., None] - np.arange(self.first.size)
-        waited = betainc(k[:, None, None], np.maximum(empty, 0.0) + 1.0, self.seen)
-        chance: FloatArray = np.where(empty >= 0.0, waited, 0.0)
-        found = np.minimum(((chance @ self.first) * weight).sum(-1), 1.0)
-        return np.asarray(np.where(counts <= 0.0, 1.0, found), dtype=np.float64)
+        found, step = np.zeros(k.size), max(1, int(_CHUNK / (k.size * spread)))
+        for r in range(0, self.first.size, step):
+            some = self.first[r : r + step]
+            left = empty[..., None] - (r + np.arange(some.size))
+            waited = betainc(k[:, None, None], np.maximum(left, 0.0) + 1.0, self.seen)
+            found += ((np.where(left >= 0.0, waited, 0.0) @ some) * weight).sum(-1)
+        return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(found, 1.0)), dtype=np.float64)
 
     def window(self) -> Window:
         most = math.ceil(self.cycles / (self.whole + 1))
         if self.seen == 0.0:
             return Window(0, np.ones(1), 0.0)
+        self._check(math.log2(most + 1.0) + 1.0, most)
         low, high = self._last(1.0 - _TAIL, most), self._last(_TAIL, most)
+        self._check(high + 2.0 - low, high)
         survival = self.at_least(np.arange(low, high + 2, dtype=np.float64))
         survival[0] = 1.0
         pmf = survival - np.append(survival[1:], 0.0)
         return Window(low, np.maximum(pmf[:-1], 0.0), _TAIL * ((low > 0) + (high < most)))
+
+    def _check(self, counts: float, most: int) -> None:
+        terms = counts * self.first.size * self._spread(float(most))
+        if terms > _MAX_TERMS:
+            raise ConvergenceError(
+                f"count law of {self.name}: {terms:.2g} terms are too many for mode 'synchronous' with a dead time "
+                f"that reaches over period starts (at most {_MAX_TERMS:.2g}); use fewer cycles"
+            )
 
     def _last(self, chance: float, most: int) -> int:
         """The largest count that is reached with at least this probability."""

@@ -11,6 +11,7 @@ from mars_lidar import _validate
 from mars_lidar._memory import check_memory
 from mars_lidar._version import __version__
 from mars_lidar.statistics._cells import FloatArray
+from mars_lidar.statistics._gate import require_mode
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.exposure import thread_count
 from mars_lidar.system import System
@@ -68,6 +69,7 @@ def build(
     """See `Table.build`."""
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
+    require_mode("a table", system)
     axes = axis_values("signal", signal), axis_values("background", background)
     _validate.choice("method", method, _METHODS)
     _validate.choice("rearm", rearm, _REARMS)

@@ -19,8 +19,8 @@ from mars_lidar.flux import Flux
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
-    from mars_lidar.table.table import Interpolation
     from mars_lidar.table import Table
+    from mars_lidar.table.table import Interpolation
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]

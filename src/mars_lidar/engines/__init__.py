@@ -3,6 +3,7 @@
 from typing import Any
 
 from mars_lidar import _validate
+from mars_lidar.engines.auto import AutoEngine
 from mars_lidar.engines.base import Engine
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
@@ -14,7 +15,8 @@ from mars_lidar.engines.sequential import SequentialEngine
 ENGINES: dict[str, Engine] = {
     engine.name: engine
     for engine in (
-        ExactEngine(), FeedbackEngine(), SequentialEngine(), MarsEngine(), RenewalEngine(), PoissonEngine()
+        ExactEngine(), FeedbackEngine(), AutoEngine(), SequentialEngine(), MarsEngine(), RenewalEngine(),
+        PoissonEngine(),
     )
 }
 

@@ -18,6 +18,8 @@ from mars_lidar.pulse import GaussianPulse
 from mars_lidar.system import System
 
 FEWEST_PERIODS = 100  # exposures below so many dead times (rounded up to periods) are drawn exactly
+_GRID_ERROR, _GRID_GOAL = 1.1e-3, 0.05  # see internal_bins
+_ECHO_SIGMAS = 5.0
 MOST_BINS = 2**16  # internal bins; beyond, the memory of a batch leaves every cache
 
 
@@ -79,15 +81,21 @@ class FeedbackEngine(Engine):
 def internal_bins(flux: Flux, system: System) -> NDArray[np.int64]:
     """Bins (H, W) of the period on which the sweeps run: those of the histogram, cut into equal parts.
 
-    Bins are at most a quarter of the pulse's standard deviation wide, an eighth above 5 signal photons, and no
-    wider than the dead time.
+    The grid's error of a bin's mean is about c (width / sigma)^2 of its standard deviation for one period, and
+    grows as the root of the number of periods. c = 1.1e-3 S up to S = 4 (measured against n = 16384), twenty times
+    that where the pulse meets its own echo after whole periods. Bins are narrow enough for 1/20 of a standard
+    deviation, at most 0.3 sigma wide, 0.15 above 5 signal photons, and no wider than the dead time.
     """
     finest = np.full(flux.shape, min(1.0, system.dead_time_periods))
     if flux.waveform is not None:
         finest = np.minimum(finest, 1.0 / flux.waveform.shape[-1])
     else:
-        width = _pulse_sigma(system) / system.period_ns
-        finest = np.where(flux.signal > 0, np.minimum(finest, np.where(flux.signal > 5, width / 8, width / 4)), finest)
+        sigma = _pulse_sigma(system) / system.period_ns
+        apart = abs(system.dead_time_periods - round(system.dead_time_periods))
+        near = 20.0 if apart < _ECHO_SIGMAS * sigma else 1.0
+        error = _GRID_ERROR * near * np.clip(flux.signal, 1e-3, 4.0) * math.sqrt(system.cycles)
+        width = np.minimum(np.where(flux.signal > 5, 0.15, 0.3), np.sqrt(_GRID_GOAL / error))
+        finest = np.where(flux.signal > 0, np.minimum(finest, width * sigma), finest)
     parts = np.ceil(1.0 / (finest * system.bins) - 1e-9)
     return np.asarray(np.maximum(parts, 1.0) * system.bins, dtype=np.int64)
 

@@ -19,13 +19,13 @@ constexpr uint32_t kEndEvent = 0xffffffffu;        // the counter, not a bin, of
 constexpr int kMeanSweeps = 40, kLinearSweeps = 60, kIntegerSweeps = 40;
 constexpr float kSlowest = 0.85f;      // contraction of a sweep beyond which a pixel is refused
 constexpr float kLinearFrom = 0.1f;    // and from which the linear response is worth its sweeps
+constexpr double kLeastVariance = 12.0;  // of the count, for each whole period of dead time: 0.2 to 0.5 are added
 constexpr double kFewArmed = 32.0, kFewCounts = 0.03;  // quantiles are taken anew below this many exposures armed
 
 double floor_of(double x) {
     const double whole = static_cast<double>(static_cast<int64_t>(x));
     return whole > x ? whole - 1.0 : whole;
 }
-int64_t nearest(double x) { return static_cast<int64_t>(floor_of(x + 0.5)); }
 
 template <class Real>
 class Batch {
@@ -62,6 +62,7 @@ public:
     bool run() {
         solve_mean();
         linearise();
+        if (grid_.whole > 0) refuse_locked();
         int32_t most = 0;
         for (int i = 0; i < kTeam; ++i) most = batch_.draws[i] > most ? batch_.draws[i] : most;
         for (int32_t draw = 0; draw < most; ++draw) {
@@ -200,6 +201,40 @@ private:
         }
     }
 
+    // Where whole periods of the dead time are blind, the total is found by a fixed point, to half a count. Pixels
+    // whose count varies by little more than that are refused: Var N = sum y^2 v / (1 + K sum w)^2, y the adjoint of 1.
+    void refuse_locked() {
+        Real *sums = spare_sums_, *fresh = real_sums_[2], *values = real_sums_[3];
+        alignas(64) Real moved[kTeam];
+        for (int64_t k = 0; k < row(n_); ++k) values[k] = 1;
+        for (int i = 0; i < kTeam; ++i) sums[row(n_) + i] = 0;
+        for (int32_t j = n_ - 1; j >= 0; --j)
+            for (int i = 0; i < kTeam; ++i) sums[row(j) + i] = sums[row(j + 1) + i] + rates_.fire(j)[i];
+        double variance[kTeam] = {};
+        int32_t done[kTeam] = {};
+        for (int sweep = 0; sweep < kMeanSweeps; ++sweep) {
+            adjoint_sweep<Real>(grid_, rates_, sums, fresh, values, moved);
+            std::swap(sums, fresh);
+            bool some = false;
+            for (int i = 0; i < kTeam; ++i) {
+                if (done[i]) continue;
+                if (moved[i] > Real(1e-3) && sweep + 1 < kMeanSweeps) {
+                    some = true;
+                    continue;
+                }
+                done[i] = 1;
+                for (int32_t j = 0; j < n_; ++j) {
+                    const double y = static_cast<double>(values[row(j) + i]);
+                    variance[i] += y * y * static_cast<double>(variance_[row(j) + i]);
+                }
+            }
+            if (!some) break;
+        }
+        for (int i = 0; i < kTeam; ++i)
+            if (variance[i] * share_[i] * share_[i] < kLeastVariance * grid_.whole)
+                batch_.status[i] = FeedbackStatus::kLocked;
+    }
+
     // Everything random of one draw: the quantiles of all bins, and the state at the ends of the exposure.
     void draw_numbers(int32_t draw) {
         alignas(64) uint32_t words[kTeam], other[kTeam];
@@ -219,7 +254,7 @@ private:
         }
         for (int i = 0; i < kTeam; ++i) {
             exposure_.place[i] = batch_.first_bin[i];
-            exposure_.active[i] = drawing_[i] ? 1 : 0;
+            exposure_.active[i] = drawing_[i] ? -1 : 0;
             const int32_t whole = blind_bins(i, 1u, exposure_.end[i]);
             int32_t before = exposure_.start[i] = 0;
             if (grid_.stationary) before = blind_bins(i, 2u, exposure_.start[i]);
@@ -298,9 +333,15 @@ private:
             for (int i = 0; i < kTeam; ++i)
                 history[row(j) + i] = static_cast<int32_t>(static_cast<uint32_t>(
                     static_cast<int64_t>(static_cast<double>(sums[row(j) + i]) * static_cast<double>(scale[i]) + 0.5)));
+        set_blind();
+    }
+
+    // K N is a real number here: rounded to an integer, the total would jump by sum w where K N steps by one.
+    void set_blind() {
         for (int i = 0; i < kTeam; ++i) {
-            blind_[i] = nearest(grid_.whole * number_[i]);
-            exposure_.armed[i] = static_cast<int32_t>(grid_.cycles - blind_[i]) + spare_[i];
+            const double blind = grid_.whole * number_[i], whole = floor_of(blind);
+            exposure_.armed[i] = grid_.cycles - static_cast<int32_t>(whole) + spare_[i];
+            exposure_.part[i] = static_cast<float>(blind - whole);
         }
     }
 
@@ -317,22 +358,21 @@ private:
             bool some = false;
             for (int i = 0; i < kTeam; ++i) {
                 if (!exposure_.active[i]) continue;
-                int64_t turn = 0;
+                double turn = 0.0;  // what the next sweep's total will move by
                 if (grid_.whole > 0) {
-                    const double number = static_cast<double>(blind_[i]) / grid_.whole;
                     const double seen = static_cast<double>(static_cast<uint32_t>(sums_[0][row(n_) + i]));
-                    const int64_t next = nearest(grid_.whole * (number + (seen - number) * share_[i]));
-                    turn = next > blind_[i] ? next - blind_[i] : blind_[i] - next;
-                    exposure_.armed[i] -= static_cast<int32_t>(next - blind_[i]);
-                    blind_[i] = next;
+                    const double step = (seen - number_[i]) * share_[i];
+                    turn = grid_.whole * total_[i] * (step < 0.0 ? -step : step);
+                    number_[i] += step;
                 }
                 const float moved = static_cast<float>(change[i]);
                 const bool settled = moved <= 1.0f || (sweep > 1 && moved * moved <= 0.25f * last[i]);
                 last[i] = moved;
-                exposure_.active[i] = settled && turn <= 1 && sweep >= least_[i] ? 0 : 1;
+                exposure_.active[i] = settled && turn <= 0.5 && sweep >= least_[i] ? 0 : -1;
                 some = some || exposure_.active[i];
             }
             if (!some) break;
+            if (grid_.whole > 0) set_blind();
         }
         return true;
     }
@@ -391,7 +431,6 @@ private:
     double total_[kTeam];    // sum w
     double share_[kTeam];    // 1 / (1 + K sum w)
     double number_[kTeam];   // N, real
-    int64_t blind_[kTeam];   // K N, an integer
 };
 
 // Cycles up to which float32 carries counts to a small part of their standard deviation.

@@ -98,6 +98,42 @@ MARS_NOINLINE void real_sweep(const FeedbackGrid& grid, const Rates<Real>& rates
     }
 }
 
+// Sweep of the adjoint, backwards: y_j = 1 - sum of G_ij p_i y_i + sum of Shift_ij q_i y_i, for the variance of the
+// count. `old`, `fresh`: suffix sums of p y (n + 1 rows); `values`: y, replaced in place.
+// `moved`: the largest change of y.
+template <class Real>
+MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const Rates<Real>& rates,
+                                 const Real* __restrict__ old, Real* __restrict__ fresh,
+                                 Real* __restrict__ values, Real* __restrict__ moved) {
+    const int32_t n = grid.bins, d = grid.shift;
+    const Real f = static_cast<Real>(grid.fraction), g = Real(1) - f;
+    alignas(64) Real total[kTeam], sum[kTeam], nothing[kTeam];
+    for (int i = 0; i < kTeam; ++i) {
+        total[i] = old[i];
+        sum[i] = nothing[i] = moved[i] = 0;
+        fresh[static_cast<int64_t>(n) * kTeam + i] = 0;
+    }
+    auto row = [](auto* rows, int32_t j) { return rows + static_cast<int64_t>(j) * kTeam; };
+    for (int32_t j = n - 1; j >= 0; --j) {
+        const int32_t near = (j + d) % n, far = (j + d + 1) % n, to_near = j + 1 + d, to_far = j + 2 + d;
+        const Real *q_near = rates.refire(near), *q_far = rates.refire(far), *p = rates.fire(j);
+        const Real *y_near = row(values, near), *y_far = row(values, far);
+        const Real* s_near = to_near <= n ? row(fresh, to_near) : row(old, to_near - n);
+        const Real* s_far = to_far <= n ? row(fresh, to_far) : row(old, to_far <= 2 * n ? to_far - n : n);
+        const Real *less_near = to_near > n ? total : nothing, *less_far = to_far > n ? total : nothing;
+        Real *value = row(values, j), *after = row(fresh, j);
+        for (int i = 0; i < kTeam; ++i) {
+            const Real window = sum[i] - g * (s_near[i] - less_near[i]) - f * (s_far[i] - less_far[i]);
+            const Real y = Real(1) - window + g * q_near[i] * y_near[i] + f * q_far[i] * y_far[i];
+            const Real step = y > value[i] ? y - value[i] : value[i] - y;
+            moved[i] = step > moved[i] ? step : moved[i];
+            value[i] = y;
+            sum[i] += p[i] * y;
+            after[i] = sum[i];
+        }
+    }
+}
+
 MARS_INLINE int32_t plus(int32_t a, int32_t b) {  // prefix sums may pass 2^31: only differences count
     return static_cast<int32_t>(static_cast<uint32_t>(a) + static_cast<uint32_t>(b));
 }
@@ -107,11 +143,12 @@ MARS_INLINE int32_t minus(int32_t a, int32_t b) {
 
 // What the lanes of an integer sweep know beside the prefix sums.
 struct Exposure {
-    alignas(64) int32_t armed[kTeam];   // N_r - K N + whole periods still blind at the end - those at the start
+    alignas(64) int32_t armed[kTeam];   // N_r - floor(K N) + whole periods still blind at the end - those at the start
+    alignas(64) float part[kTeam];      // K N - floor(K N), one exposure less armed in that share of the bins
     alignas(64) int32_t end[kTeam];     // bins of the period that are blind once more at the end ...
     alignas(64) int32_t start[kTeam];   // ... and at the start
     alignas(64) int32_t place[kTeam];   // of bin 0 in the period
-    alignas(64) int32_t active[kTeam];
+    alignas(64) int32_t active[kTeam];  // -1, or 0: the lane keeps its sums
 };
 
 // The quantiles of a sweep, for all bins and lanes. `exact`: a bit per lane whose quantile is not followed but taken
@@ -181,6 +218,8 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates<Real>& ra
         const int32_t* before = old + row + kTeam;
         int32_t* after = fresh + row + kTeam;
         const uint32_t exact = quantiles.exact[j];
+        const double golden = 0.61803398874989485 * j;  // evenly over the bins and over [0, 1)
+        const float turn = static_cast<float>(golden - static_cast<double>(static_cast<int64_t>(golden)));
         if (exact) {
             alignas(64) int32_t armed[kTeam], rearmed[kTeam], count[kTeam];
             for (int i = 0; i < kTeam; ++i) {
@@ -188,7 +227,8 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates<Real>& ra
                 const Real part = f * static_cast<Real>(inside) + static_cast<Real>(next_dither[i]) * Real(0x1p-16);
                 const int32_t next = minus(at, static_cast<int32_t>(part));
                 const int32_t blind = minus(c[i], re[i]);
-                const int32_t extra = (phase[i] < exposure.end[i] ? 1 : 0) - (phase[i] < exposure.start[i] ? 1 : 0);
+                const int32_t extra = (phase[i] < exposure.end[i] ? 1 : 0) - (phase[i] < exposure.start[i] ? 1 : 0) -
+                                      (exposure.part[i] > turn ? 1 : 0);
                 const int32_t e = exposure.armed[i] + extra - blind, in = minus(next, re[i]);
                 armed[i] = e > 0 ? e : 0;
                 rearmed[i] = in > 0 ? in : 0;
@@ -204,7 +244,8 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates<Real>& ra
             take_exactly(quantiles, j, exact, p, q, armed, rearmed, count);
             for (int i = 0; i < kTeam; ++i) {
                 const int32_t there = armed[i] + rearmed[i];
-                c[i] = exposure.active[i] ? plus(c[i], count[i] < there ? count[i] : there) : before[i];
+                const int32_t moved = plus(c[i], count[i] < there ? count[i] : there), kept = before[i];
+                c[i] = kept ^ ((moved ^ kept) & exposure.active[i]);
                 after[i] = c[i];
             }
         } else {
@@ -213,20 +254,21 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates<Real>& ra
                 const Real part = f * static_cast<Real>(inside) + static_cast<Real>(next_dither[i]) * Real(0x1p-16);
                 const int32_t next = minus(at, static_cast<int32_t>(part));
                 const int32_t blind = minus(c[i], re[i]);
-                const int32_t extra = (phase[i] < exposure.end[i] ? 1 : 0) - (phase[i] < exposure.start[i] ? 1 : 0);
-                int32_t e = exposure.armed[i] + extra - blind, in = minus(next, re[i]);
-                e = e > 0 ? e : 0;
-                in = in > 0 ? in : 0;
+                const int32_t extra = (phase[i] < exposure.end[i] ? 1 : 0) - (phase[i] < exposure.start[i] ? 1 : 0) -
+                                      (exposure.part[i] > turn ? 1 : 0);
+                const int32_t left = exposure.armed[i] + extra - blind, in = minus(next, re[i]);
+                const int32_t e = left > 0 ? left : 0, back = in > 0 ? in : 0;
                 re[i] = next;
                 const int32_t turned = phase[i] + 1;
                 phase[i] = turned == n ? 0 : turned;
-                const Real mean = p[i] * static_cast<Real>(e) + q[i] * static_cast<Real>(in);
+                const Real mean = p[i] * static_cast<Real>(e) + q[i] * static_cast<Real>(back);
                 const Real x = alpha[i] * mean + beta[i];
                 const int32_t down = static_cast<int32_t>(x);
-                int32_t k = down + (x > static_cast<Real>(down) ? 1 : 0);
-                k = k > 0 ? k : 0;
-                k = k < e + in ? k : e + in;
-                c[i] = exposure.active[i] ? plus(c[i], k) : before[i];
+                const int32_t up = down + (x > static_cast<Real>(down) ? 1 : 0);
+                const int32_t some = up > 0 ? up : 0, there = e + back;
+                const int32_t k = some < there ? some : there;
+                const int32_t moved = plus(c[i], k), kept = before[i];
+                c[i] = kept ^ ((moved ^ kept) & exposure.active[i]);
                 after[i] = c[i];
             }
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,8 @@ class TableReader:
             raise TypeError(f"table must be a mars_lidar.Table, got {table!r}")
         self.table = table
         given = "bilinear" if interpolation is None else interpolation
-        self.interpolation = _validate.choice("interpolation", given, _INTERPOLATIONS)
+        nearest = _validate.choice("interpolation", given, _INTERPOLATIONS) == "nearest"
+        self.interpolation: Literal["bilinear", "nearest"] = "nearest" if nearest else "bilinear"
 
     @property
     def settings(self) -> dict[str, Any]:

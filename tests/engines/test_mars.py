@@ -55,6 +55,12 @@ def test_a_table_serves_other_numbers_of_cycles():
     system = SYSTEM.replace(cycles=1500)
     case = Case("1500 cycles", ml.Flux(np.full((1, 4), 0.8), 0.6, 71.3), system, 4000)
     check(MarsEngine(table()), case, exact_law(0.8, 0.6, 71.3, system), {COUNTS, SHAPE})
+    again = [
+        ml.simulate(case.flux, SYSTEM.replace(cycles=cycles), engine="mars", table=table())
+        for cycles in (1500, 300, 700, 1500, 700)
+    ]
+    assert np.array_equal(again[0], again[3])
+    assert np.array_equal(again[2], again[4])
 
 
 def test_the_gaussian_count_is_the_paper_s():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,12 +101,24 @@ class TableReader:
             signal,
             background,
             cumulants,
-            self.table.shapes(system.cycles),
+            _shapes(self.table, system.cycles),
             look.rows[order],
             look.weights[order],
             alignment,
         )
         return entries, pixels[look.outside]
+
+
+# A table computes its shapes for other cycles than it was built for at each call, at a cost beyond that of a cube: those of the
+# last cycles asked for stay as long as the table lives.
+_last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32]]] = WeakKeyDictionary()
+
+
+def _shapes(table: Table, cycles: int) -> NDArray[np.float32]:
+    kept = _last_shapes.get(table)
+    if kept is None or kept[0] != cycles:
+        kept = _last_shapes[table] = cycles, table.shapes(cycles)
+    return kept[1]
 
 
 def table_record(table: Table) -> dict[str, Any]:

@@ -109,8 +109,8 @@ class TableReader:
         return entries, pixels[look.outside]
 
 
-# A table computes its shapes for other cycles than it was built for at each call, at a cost beyond that of a cube: those of the
-# last cycles asked for stay as long as the table lives.
+# A table computes its shapes for other cycles than it was built for at each call, which takes longer than a cube: those
+# of the last cycles asked for stay as long as the table lives.
 _last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32]]] = WeakKeyDictionary()
 
 

@@ -39,7 +39,7 @@ def sample(shape: np.ndarray, counts: np.ndarray, *, seed: int = 1, level: str =
 def test_multinomial_by_either_way(photons: int):
     """Photon by photon below 154 (0.15 x 1024), Poisson rounds above: means, variances, totals, covariances."""
     shape = peaked(BINS)
-    draws = 4000
+    draws = 8000
     cube = sample(shape, np.full((draws // 8, 8), photons)).reshape(-1, BINS)
     assert (cube.sum(-1, dtype=np.int64) == photons).all()
     assert not cube[:, shape == 0].any()

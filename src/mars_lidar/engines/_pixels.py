@@ -64,7 +64,8 @@ def _doubles(flux: Flux, system: System) -> int:
         parts = 4 * flux.waveform.shape[-1]
     elif single_return(flux) is None:
         parts = 4 * _parts(system)
-    return 12 * system.bins + parts
+    law = 40.0 * float(np.sqrt(system.cycles * flux.total.max()))  # a count is no wider than without dead time
+    return 12 * system.bins + parts + int(law)
 
 
 def _parts(system: System) -> int:

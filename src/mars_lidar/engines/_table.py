@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,6 @@ from mars_lidar.system import System
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
-    from mars_lidar.table.table import Interpolation
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -58,8 +58,8 @@ class TableReader:
             raise TypeError(f"table must be a mars_lidar.Table, got {table!r}")
         self.table = table
         given = "bilinear" if interpolation is None else interpolation
-        _validate.choice("interpolation", given, _INTERPOLATIONS)
-        self.interpolation: Interpolation = "nearest" if given == "nearest" else "bilinear"
+        nearest = _validate.choice("interpolation", given, _INTERPOLATIONS) == "nearest"
+        self.interpolation: Literal["bilinear", "nearest"] = "nearest" if nearest else "bilinear"
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -101,12 +101,24 @@ class TableReader:
             signal,
             background,
             cumulants,
-            self.table.shapes(system.cycles),
+            _shapes(self.table, system.cycles),
             look.rows[order],
             look.weights[order],
             alignment,
         )
         return entries, pixels[look.outside]
+
+
+# A table computes its shapes for other cycles than it was built for at each call, which takes longer than a cube: those
+# of the last cycles asked for stay as long as the table lives.
+_last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32]]] = WeakKeyDictionary()
+
+
+def _shapes(table: Table, cycles: int) -> NDArray[np.float32]:
+    kept = _last_shapes.get(table)
+    if kept is None or kept[0] != cycles:
+        kept = _last_shapes[table] = cycles, table.shapes(cycles)
+    return kept[1]
 
 
 def table_record(table: Table) -> dict[str, Any]:

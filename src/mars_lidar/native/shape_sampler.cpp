@@ -156,7 +156,8 @@ void bind_shape_sampler(nb::module_& module) {
                 self->first_realization = first_realization;
                 self->seed = seed;
                 self->bins = static_cast<int32_t>(shapes.shape(1));
-                if (rows.shape(0) != pixel_index.shape(0) || place.shape(0) != pixel_index.shape(0) || weights.shape(0) != pixel_index.shape(0) ||
+                const size_t pixels = pixel_index.shape(0);
+                if (rows.shape(0) != pixels || place.shape(0) != pixels || weights.shape(0) != pixels ||
                     rows.shape(1) != 4 || weights.shape(1) != 4)
                     throw nb::value_error("rows and weights must be (pixels, 4), place (pixels)");
                 self->pixel_index = pixel_index.data();

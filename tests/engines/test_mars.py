@@ -1,0 +1,215 @@
+"""The engine "mars": tables, count laws, settings; its statistics without a table are in tests/test_engines.py."""
+
+from __future__ import annotations
+
+import tracemalloc
+from functools import cache
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from harness import Law, check, counts_against_law, require
+from harness.cases import Case
+from harness.check import COUNTS, SHAPE
+from mars_lidar.engines import MarsEngine
+from mars_lidar.statistics import exposure_moments
+from mars_lidar.table import Table
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=300, bins=128, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    detector=ml.Detector(dead_time_ns=63.75),
+)  # fmt: skip
+
+
+@cache
+def table() -> Table:
+    return Table.build(SYSTEM, (0.05, 3.0, 40), (0.05, 3.0, 40))
+
+
+def image(height: int = 5, width: int = 7, seed: int = 1) -> ml.Flux:
+    rng = np.random.default_rng(seed)
+    shape = (height, width)
+    return ml.Flux(rng.uniform(0.1, 2.5, shape), rng.uniform(0.1, 2.5, shape), rng.uniform(-50.0, 250.0, shape))
+
+
+def exact_law(signal: float, background: float, delay_ns: float, system: ml.System = SYSTEM) -> Law:
+    law = ml.count_law(signal, background, system, delay_ns=delay_ns)
+    histogram = exposure_moments(signal, background, system, delay_ns=delay_ns).histogram
+    pmf = np.zeros(int(law.support[-1]) + 1)
+    pmf[law.support] = law.pmf
+    return Law(histogram, pmf)
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "delay"), [(0.31, 0.47, 17.3), (1.7, 0.11, 63.1), (2.9, 2.3, 2.2), (0.0, 1.3, 0.0)]
+)
+def test_table_gives_the_exact_law(signal: float, background: float, delay: float):
+    """Between the nodes, at any delay, with a return or without."""
+    flux = ml.Flux(np.full((1, 4), signal), background, delay)
+    case = Case(f"S {signal:g}, B {background:g}", flux, SYSTEM, 6000)
+    check(MarsEngine(table()), case, exact_law(signal, background, delay), {COUNTS, SHAPE})
+
+
+def test_a_table_serves_other_numbers_of_cycles():
+    system = SYSTEM.replace(cycles=1500)
+    case = Case("1500 cycles", ml.Flux(np.full((1, 4), 0.8), 0.6, 71.3), system, 4000)
+    check(MarsEngine(table()), case, exact_law(0.8, 0.6, 71.3, system), {COUNTS, SHAPE})
+    again = [
+        ml.simulate(case.flux, SYSTEM.replace(cycles=cycles), engine="mars", table=table())
+        for cycles in (1500, 300, 700, 1500, 700)
+    ]
+    assert np.array_equal(again[0], again[3])
+    assert np.array_equal(again[2], again[4])
+
+
+def test_the_gaussian_count_is_the_paper_s():
+    flux = ml.Flux(np.full((1, 8), 0.9), 0.4, 40.0)
+    for given in (None, table()):
+        cube = ml.simulate(flux, SYSTEM, engine="mars", table=given, count="gaussian", realizations=3000)
+        exact = ml.count_law(0.9, 0.4, SYSTEM, delay_ns=40.0)
+        n = np.arange(int(exact.mean + 12 * np.sqrt(exact.variance)))
+        from scipy.stats import norm
+
+        below = norm.cdf((n + 0.5 - exact.mean) / np.sqrt(exact.variance))
+        pmf = np.diff(below, prepend=0.0)
+        outcome = counts_against_law(cube.sum(-1).ravel(), pmf)
+        require({"count law": outcome}, f"gaussian count, {'table' if given else 'no table'}")
+
+
+def test_a_locked_pixel_needs_the_exact_count():
+    """Variance far below 1: the default law is right, the rounded Gaussian is not."""
+    system = SYSTEM.replace(detector=ml.Detector(dead_time_ns=97.0), cycles=200)
+    flux = ml.Flux(np.full((1, 8), 40.0), 0.02, 50.0)
+    law = exact_law(40.0, 0.02, 50.0, system)
+    n = np.arange(law.count_pmf.size)
+    mean = law.count_pmf @ n
+    variance = law.count_pmf @ (n - mean) ** 2
+    assert variance < 0.2
+    counts = ml.simulate(flux, system, engine="mars", realizations=2000).sum(-1).ravel()
+    require({"count law": counts_against_law(counts, law.count_pmf)}, "locked pixel")
+
+
+@pytest.mark.parametrize("with_table", [True, False])
+def test_any_part_alone_on_any_threads(with_table: bool):
+    flux, given = image(), table() if with_table else None
+    whole = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=2)
+    one = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=1)
+    assert np.array_equal(whole, one)
+    index = np.arange(35).reshape(5, 7)[1:4]
+    part = ml.simulate(
+        flux[1:4], SYSTEM, engine="mars", table=given, first_realization=1, pixel_index=index, seed=5
+    )
+    assert np.array_equal(part[0], whole[1, 1:4])
+    assert not np.array_equal(
+        whole, ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=6)
+    )
+
+
+def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):
+    from mars_lidar.engines import _synthesis, mars
+
+    whole = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5)
+    monkeypatch.setattr(_synthesis, "_BATCH", 4)
+    monkeypatch.setattr(mars, "PIXELS", 11)
+    assert np.array_equal(whole, ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5))
+
+
+def test_pixels_beyond_the_table_are_evaluated_and_counted():
+    bright = np.full((2, 3), 1.0)
+    bright[0, 1], bright[1, 2] = 20.0, 5.0
+    flux = ml.Flux(bright, 0.5, 30.0)
+    report: dict[str, float] = {}
+    cube = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=4, report=report)
+    assert report["pixels_evaluated"] == 2
+    assert {"lookup_s", "evaluation_s", "counts_s", "sampling_s"} <= set(report)
+    assert min(report.values()) >= 0.0
+    direct = ml.simulate(flux, SYSTEM, engine="mars", realizations=4, report=report)
+    assert report["pixels_evaluated"] == 6
+    assert np.array_equal(cube[:, bright > 3], direct[:, bright > 3])
+
+
+def test_nearest_and_bilinear():
+    cubes = {
+        how: ml.simulate(image(), SYSTEM, engine="mars", table=table(), interpolation=how, realizations=2)
+        for how in ("nearest", "bilinear")
+    }
+    assert not np.array_equal(cubes["nearest"], cubes["bilinear"])
+    plain = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=2)
+    assert np.array_equal(plain, cubes["bilinear"])
+    own = MarsEngine(table(), interpolation="nearest")
+    assert np.array_equal(ml.simulate(image(), SYSTEM, engine=own, realizations=2), cubes["nearest"])
+
+
+def test_a_masked_image_works():
+    signal, delay = np.full((3, 4), 0.7), np.full((3, 4), 20.0)
+    signal[1], delay[1] = 0.0, np.nan
+    background = np.full((3, 4), 0.3)
+    background[2] = 0.0
+    signal[2, 0] = 0.0
+    flux = ml.Flux(signal, background, delay)
+    cube = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=20)
+    assert cube[:, :2].sum(-1).min() > 0
+    assert not cube[:, 2, 0].any()
+
+
+def test_memory_is_the_output_and_a_bounded_work_area():
+    """2^17 pixels, all different: what is held beside the cube and the table stays far below 256 MiB."""
+    system = SYSTEM.replace(bins=16)
+    small = Table.build(system, (0.1, 2.0, 4), (0.1, 2.0, 4))
+    rng = np.random.default_rng(0)
+    shape = (256, 512)
+    flux = ml.Flux(rng.uniform(0.2, 1.5, shape), rng.uniform(0.2, 1.5, shape), rng.uniform(0, 100, shape))
+    out = np.empty((1, 256, 512, 16), system.histogram_dtype)
+    tracemalloc.start()
+    ml.simulate(flux, system, engine="mars", table=small, out=out)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 128 * 2**20
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "fragments"),
+    [
+        (lambda f: ml.simulate(f, SYSTEM, engine="mars", count="normal"), ValueError, ["count", "'normal'"]),
+        (
+            lambda f: ml.simulate(f, SYSTEM, engine="mars", table=table(), interpolation="cubic"),
+            ValueError,
+            ["interpolation", "'cubic'"],
+        ),
+        (
+            lambda f: ml.simulate(f, SYSTEM, engine="mars", interpolation="nearest"),
+            ValueError,
+            ["interpolation", "without a table"],
+        ),
+        (lambda f: ml.simulate(f, SYSTEM, engine="exact", table=table()), TypeError, ["table", "'exact'"]),
+        (lambda f: ml.simulate(f, SYSTEM, engine="renewal", count="exact"), TypeError, ["count", "'renewal'"]),
+        (
+            lambda f: ml.simulate(f, SYSTEM, engine=MarsEngine(), count="exact"),
+            TypeError,
+            ["count", "engine is an Engine"],
+        ),
+        (lambda f: ml.simulate(f, SYSTEM, engine="mars", table="room.h5"), TypeError, ["table", "room.h5"]),
+        (
+            lambda f: ml.simulate(f, SYSTEM.replace(bins=64), engine="mars", table=table()),
+            ValueError,
+            ["table", "bins", "64", "128"],
+        ),
+        (
+            lambda f: ml.simulate(ml.Flux.multi(f, f), SYSTEM, engine="mars", table=table()),
+            ValueError,
+            ["one return", "several returns"],
+        ),
+        (
+            lambda f: ml.simulate(ml.Flux(waveform=np.ones(8)), SYSTEM, engine="mars", table=table()),
+            ValueError,
+            ["one return", "a waveform"],
+        ),
+        (lambda f: ml.simulate_timestamps(f, SYSTEM, engine="mars"), ValueError, ["'mars'", "histograms only"]),
+    ],
+)
+def test_bad_input(call, kind, fragments):
+    with pytest.raises(kind) as error:
+        call(image())
+    for fragment in fragments:
+        assert fragment in str(error.value)

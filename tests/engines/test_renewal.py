@@ -1,0 +1,58 @@
+"""The renewal baseline: its own count law, the chain's shape at the pixel's delay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import mars_lidar as ml
+from harness import counts_against_law, require
+from harness.pvalues import goodness
+from mars_lidar.statistics import exposure_moments, renewal_moments
+from mars_lidar.table import Table
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=400, bins=128, pulse=ml.GaussianPulse(sigma_ns=1.5),
+    detector=ml.Detector(dead_time_ns=63.75), start="stationary",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("with_table", [True, False])
+def test_count_and_shape(with_table: bool):
+    signal, background, delay = 1.3, 0.4, 31.234
+    table = Table.build(SYSTEM, np.array([1.2, 1.3]), np.array([0.4, 0.5])) if with_table else None
+    flux = ml.Flux(np.full((2, 4), signal), background, delay)
+    cube = ml.simulate(flux, SYSTEM, engine="renewal", table=table, realizations=1000).reshape(-1, SYSTEM.bins)
+    mean, variance = (float(x) for x in renewal_moments(signal, background, SYSTEM))
+    n = np.arange(int(mean + 12 * np.sqrt(variance)))
+    pmf = np.diff(stats.norm.cdf((n + 0.5 - mean) / np.sqrt(variance)), prepend=0.0)
+    exact = exposure_moments(signal, background, SYSTEM, delay_ns=delay).histogram
+    seen = cube.sum(0, dtype=np.int64)
+    require(
+        {
+            "count law": counts_against_law(cube.sum(1, dtype=np.int64), pmf),
+            "shape": goodness(seen, exact / exact.sum() * seen.sum()),
+        },
+        f"renewal, table {with_table}",
+    )
+
+
+def test_waveforms_and_returns_are_solved_at_their_own_delays():
+    one = ml.Flux(np.full((1, 4), 0.9), 0.2, 31.7)
+    both = ml.Flux.multi(one, ml.Flux(np.full((1, 4), 0.5), 0.0, 77.7))
+    cube = ml.simulate(both, SYSTEM, engine="renewal", realizations=1000).reshape(-1, SYSTEM.bins)
+    parts = SYSTEM.bins * 64
+    wave = 0.9 * SYSTEM.pulse.bin_energy(31.7, 100.0, parts) + 0.5 * SYSTEM.pulse.bin_energy(77.7, 100.0, parts)
+    exact = exposure_moments(None, 0.2, SYSTEM, waveform=np.maximum(wave, 0.0)).histogram
+    seen = cube.sum(0, dtype=np.int64)
+    require({"shape": goodness(seen, exact / exact.sum() * seen.sum())}, "renewal, two returns")
+
+
+def test_any_part_alone():
+    rng = np.random.default_rng(3)
+    flux = ml.Flux(rng.choice([0.0, 0.5, 2.0], (4, 5)), rng.choice([0.0, 0.4], (4, 5)), rng.uniform(0, 100, (4, 5)))
+    whole = ml.simulate(flux, SYSTEM, engine="renewal", realizations=2, seed=4, threads=2)
+    part = ml.simulate(flux[2:], SYSTEM, engine="renewal", realizations=2, seed=4, pixel_index=np.arange(10, 20))
+    assert np.array_equal(whole[:, 2:], part)
+    assert not whole[:, flux.total == 0].any()

@@ -45,10 +45,17 @@ def _reference(request: Request) -> list[Path]:
     return run(request)
 
 
+def _table(request: Request) -> list[Path]:
+    from mars_lidar.studies.table import run
+
+    return run(request)
+
+
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
+    "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
 }
 
 __all__ = ["STUDIES", "Request", "Study", "Tell"]

@@ -12,7 +12,7 @@ from mars_lidar.studies import Request
 from mars_lidar.studies.report import Row, configuration, save_csv, save_text, table
 from mars_lidar.system import Detector, System
 from mars_lidar.table import LawError, QuantisationError, Table
-from mars_lidar.table.axes import PAPER_GRID, Grid
+from mars_lidar.table.axes import PAPER_GRID
 
 _PERIOD_NS = 1e3 / 7.5
 _SEED = 20263
@@ -96,7 +96,7 @@ class Case:
 
 def run(request: Request) -> list[Path]:
     """Build the tables, measure, write ``table.md`` and ``table.csv``."""
-    grids: dict[str, Grid] = dict(PAPER_GRID)
+    grids = dict(PAPER_GRID)
     samples, laws = _SAMPLES, _LAWS
     if request.quick:
         grids, samples, laws = {"signal": (0.01, 10.0, 24), "background": (0.01, 10.0, 16)}, 20, 4
@@ -129,7 +129,7 @@ def run(request: Request) -> list[Path]:
     return [save_text(request.out / "table.md", text), save_csv(request.out / "table.csv", rows)]
 
 
-def _measure(case: Mapping[str, Any], grids: Mapping[str, Grid], samples: int, laws: int) -> Case:
+def _measure(case: Mapping[str, Any], grids: Mapping[str, tuple[float, float, int]], samples: int, laws: int) -> Case:
     system = System(
         period_ns=_PERIOD_NS,
         cycles=case.get("cycles", 1000),

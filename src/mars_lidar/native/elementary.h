@@ -34,7 +34,8 @@ inline double ieee_log(double x) {
     std::memcpy(&m, &word, sizeof m);
     const double s = (m - 1.0) / (m + 1.0), q = s * s;
     double sum = 1.0 / 23;
-    for (const double c : {1.0 / 21, 1.0 / 19, 1.0 / 17, 1.0 / 15, 1.0 / 13, 1.0 / 11, 1.0 / 9, 1.0 / 7, 1.0 / 5, 1.0 / 3})
+    for (const double c : {1.0 / 21, 1.0 / 19, 1.0 / 17, 1.0 / 15, 1.0 / 13, 1.0 / 11, 1.0 / 9, 1.0 / 7, 1.0 / 5,
+                           1.0 / 3})
         sum = sum * q + c;
     return static_cast<double>(e) * 0x1.62e42fefa39efp-1 + (2.0 * s + 2.0 * s * q * sum);
 }

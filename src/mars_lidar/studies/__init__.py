@@ -39,6 +39,12 @@ def _law(request: Request) -> list[Path]:
     return run(request)
 
 
+def _matched(request: Request) -> list[Path]:
+    from mars_lidar.studies.matched_report import run
+
+    return run(request)
+
+
 def _reference(request: Request) -> list[Path]:
     from mars_lidar.studies.reference import run
 
@@ -54,6 +60,7 @@ def _table(request: Request) -> list[Path]:
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
+    "matched": ("a law of the count from four cumulants: total variation to the exact law", _matched),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
 }

@@ -108,6 +108,7 @@ def test_pixels_beyond_the_axes():
     assert found.weights[1].tolist() == [1, 0, 0, 0]
     assert np.array_equal(found.cumulants[[0, 2, 3]], table.lookup([0.5, 2.0, 3.0], 1.0).cumulants)
     assert not found.trusted()[1]
+    assert table.lookup([11.0, 12.0], 1.0, outside="exact").outside.all()
 
 
 def test_a_pixel_does_not_depend_on_the_others_or_on_threads():

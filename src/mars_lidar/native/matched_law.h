@@ -22,6 +22,7 @@ public:
     explicit MatchedLaw(const Cumulants& k) {
         if (!(k.mean > 0.0)) {
             set_pair(0.0);
+            trusted_ = k.mean == 0.0;
         } else if (k.variance >= kAtomsBelow) {
             set_smooth(k);
         } else {
@@ -47,6 +48,7 @@ public:
     }
 
     Form form() const { return form_; }
+
     // Whether the law is sure to be close to that of a pixel with these cumulants: a total variation of 0.002,
     // by a study of exact laws (docs/studies/matched.md).
     bool trusted() const { return trusted_; }
@@ -78,6 +80,8 @@ private:
     static constexpr double kAtomsBelow = 9.0;    // variance
     static constexpr double kSheppard = 0.7;      // variance, from where his corrections are right
     static constexpr double kOneSided = 1e-5, kTwoSided = 0.05;  // misfits
+    // thresholds of `trusted`, set by the study
+    static constexpr double kSureReach = 4.0;   // standard deviations over which the quantile rises
     static constexpr double kSureRatio = 0.93;  // of gains that are rare, on top of losses
     static constexpr double kSureFit = 3e-6, kSureSmooth = 2.3, kSureVariance = 0.19;
     static constexpr double kReach = 8.3;         // no word of 52 bits is beyond
@@ -108,6 +112,7 @@ private:
             // the least slope on [-kReach, kReach] is at least this
             if (c1_ - 2.0 * kReach * std::fabs(c2_) + 3.0 * kReach * kReach * std::min(c3_, 0.0) > 0.0) return;
             find_range();
+            trusted_ = trusted_ && low_ <= -kSureReach && high_ >= kSureReach;
             if (low_ <= -kNeeded && high_ >= kNeeded) return;
             trusted_ = false;
             g1 *= 0.75;

@@ -169,8 +169,9 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
         throw nb::value_error("correction must be (sub_signal * sub_background, phases * 4)");
     if (background.shape(0) != signal.shape(0) || at.shape(0) != signal.shape(0))
         throw nb::value_error("signal, background and at must agree");
-    if (rows.shape(0) != signal.shape(0) || weights.shape(0) != signal.shape(0) || cumulants.shape(0) != signal.shape(0) ||
-        rows.shape(1) != 4 || weights.shape(1) != 4 || cumulants.shape(1) != kCumulants)
+    if (rows.shape(0) != signal.shape(0) || weights.shape(0) != signal.shape(0) ||
+        cumulants.shape(0) != signal.shape(0) || rows.shape(1) != 4 || weights.shape(1) != 4 ||
+        cumulants.shape(1) != kCumulants)
         throw nb::value_error("rows, weights and cumulants must be (pixels, 4)");
     run_chunks((pixels + kBlock - 1) / kBlock, threads, nb::none(), [&](int64_t block, const std::atomic<bool>&) {
         const int64_t last = std::min(pixels, (block + 1) * kBlock);

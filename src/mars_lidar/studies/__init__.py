@@ -91,6 +91,12 @@ def _quantisation(request: Request) -> list[Path]:
     return run(request)
 
 
+def _table(request: Request) -> list[Path]:
+    from mars_lidar.studies.table import run
+
+    return run(request)
+
+
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
     "joint": ("the histogram's covariance in closed form against simulation; --data adds reference cases", _joint),
@@ -102,6 +108,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "joint-table": ("variance of signal window and bins, covariance of neighbours: every engine", _joint_table),
     "quantisation": ("what a table's lookup costs, nearest and interpolated, over its size", _quantisation),
     "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
+    "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
 }
 
 __all__ = ["STUDIES", "Request", "Study", "Tell"]

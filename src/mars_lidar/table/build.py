@@ -107,16 +107,18 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
         "take fewer points or bins",
     )
     cells = signal.size * background.size
+    total = cells + max(1, cells // 10)  # the start phases take about so much of the time
     entries = recipe.entries(
-        np.repeat(signal, background.size), np.tile(background, signal.size), system, progress
+        np.repeat(signal, background.size), np.tile(background, signal.size), system, _part(progress, 0, cells, total)
     )
     phases = StartPhases.none()
     if recipe.method == "exposure":
         phases = start_phases(
-            system, signal, background, entries.cumulants, entries.bins, threads=recipe.threads, progress=progress
-        )
+            system, signal, background, entries.cumulants, entries.bins, threads=recipe.threads,
+            progress=_part(progress, cells, total, total),
+        )  # fmt: skip
     if progress is not None:
-        progress(cells, cells)
+        progress(total, total)
     provenance = {"version": __version__, "signal": describe(signal), "background": describe(background)}
     return Table(
         system, recipe.method, signal, background, recipe.rearm, recipe.tolerance, provenance, entries, phases
@@ -138,3 +140,17 @@ def _refined(
         f"refine must be an error that can be met, got {goal:g}: reached {error.largest:.2g} with "
         f"{axes[0].size} x {axes[1].size} points at S = {error.worst_signal:g}, B = {error.worst_background:g}"
     )
+
+
+def _part(progress: Progress | None, first: int, last: int, total: int) -> Progress | None:
+    """Progress of one part of the work, from `first` to `last` of `total`; never backward."""
+    if progress is None:
+        return None
+    reached = first
+
+    def update(done: int, of: int) -> object:
+        nonlocal reached
+        reached = max(reached, first + (last - first) * done // max(of, 1))
+        return progress(reached, total)
+
+    return update

@@ -96,7 +96,9 @@ def cached_path(system: System, signal: Grid, background: Grid, **options: Any) 
                 return path
     table = Table.build(system, signal, background, **options)
     folder.mkdir(parents=True, exist_ok=True)
-    table.save(own, overwrite=True)
+    mine = own.with_name(f"{own.stem}-{os.getpid()}{SUFFIX}")  # several processes may build the same table at once
+    table.save(mine, overwrite=True)
+    os.replace(mine, own)
     return own
 
 

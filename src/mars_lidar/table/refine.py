@@ -31,7 +31,7 @@ def refined_axes(
     signal = _refined(signal, lambda s: evaluated(np.repeat(s, lines.size), np.tile(lines, s.size)), lines, goal)
     across = _lines(signal)
     background = _refined(
-        background, lambda b: evaluated(np.repeat(b, across.size), np.tile(across, b.size)), across, goal
+        background, lambda b: evaluated(np.tile(across, b.size), np.repeat(b, across.size)), across, goal
     )
     return signal, background
 

@@ -192,8 +192,8 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
         error[[left, right]] = 0.0
 
     settle(0, coarsest)
-    for quarter in range(1, 32):  # at least every 32nd of the period: cells between those of the sample
-        at = quarter * coarsest // 32
+    for part in range(1, 32):  # at least every 32nd of the period: cells between those of the sample
+        at = part * coarsest // 32
         if at not in nodes:
             nodes.append(at)
     nodes.sort()

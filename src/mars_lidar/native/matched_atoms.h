@@ -46,7 +46,7 @@ inline bool solve(const Cumulants& k, double offset, double sign, GainLoss& law)
     const double v = k.variance, w = sign * k.third + v, d = sign * (k.mean - offset), b = 4.0 * v + w;
     const double under = b * b - 16.0 * v * v + 8.0 * w * d;
     if (!(w > 0.0 && under >= 0.0 && offset >= 0.0)) return false;
-    double loss = 0.5 * (2.0 * v * v - w * d) / (0.25 * (b + std::sqrt(under)));
+    double loss = 2.0 * (2.0 * v * v - w * d) / (b + std::sqrt(under));
     if (!(loss > -0.02 * v && loss < v)) return false;
     loss = std::max(loss, 0.0);
     const double gain = loss + d;

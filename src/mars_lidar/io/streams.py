@@ -181,7 +181,7 @@ def _module(path: Path) -> Any:
 
 
 def _write_npz(path: Path, times: Timestamps) -> None:
-    arrays: dict[str, Any] = {"times_ns": times.times_ns, "cycle": times.cycle, "bin": times.bin, "offsets": times.offsets}
+    arrays: dict[str, Any] = {name: getattr(times, name) for name in ("times_ns", "cycle", "bin", "offsets")}
     with open(path, "wb") as file:  # by name, numpy appends its suffix
         np.savez_compressed(file, **arrays, attributes=np.asarray(json.dumps(attributes(times))))
 

@@ -230,7 +230,7 @@ def open_store(path: Path) -> OpenedStore:
     shapes: Mapping[str, list[int]] = attrs.pop("shapes")
 
     def read(name: str) -> NDArray[Any]:
-        return np.asarray(ours[name]).reshape(shapes[name])
+        return np.ascontiguousarray(np.asarray(ours[name]).reshape(shapes[name]))  # sums keep their bits
 
     recipe = layout.recipe_from(attrs, frozenset(shapes), read, 1)
     counts = _MatCounts(path, found["spad"], recipe)

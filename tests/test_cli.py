@@ -218,7 +218,7 @@ def test_view_draws_a_cube(tmp_path):
         (["--scene", "room", "--pulse-file", "irf.csv", "--pulse-bin-ns", "1"], "1-D .npy array, got"),
         (["--scene", "room", "--seed", "-1"], "seed must be an integer in [0, "),
         (["--scene", "room", "--realizations", "0"], "realizations must be an integer in [1, "),
-        (["--scene", "room", "--out", "cube.mat"], "out must end in one of .zarr, .h5, .hdf5, .npz"),
+        (["--scene", "room", "--out", "cube.csv"], "out must end in one of .zarr, .h5, .hdf5, .npz"),
         (["--scene", "room", "--out", "nowhere/cube.h5"], "out must lie in an existing folder"),
     ],
 )

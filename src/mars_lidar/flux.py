@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from mars_lidar.system import System
 
 MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
 FloatArray = NDArray[np.float64]
@@ -105,6 +108,19 @@ class Flux:
         tau = np.concatenate([np.broadcast_to(f.returns_delay_ns, (len(f.returns_delay_ns), *shape)) for f in fluxes])
         _fill(self, s, tau, back, None, info)
         return self
+
+    @classmethod
+    def from_transient(
+        cls, values: ArrayLike, system: System, *, bin_ns: float, start_ns: float = 0.0, **level: Any
+    ) -> Flux:
+        """The flux of a rendered transient (H, W, T): light in bins of `bin_ns` from the time `start_ns`.
+
+        `level` takes the arguments of `mars_lidar.io.Transient.flux`: ``signal`` or ``photons_per_unit``, and
+        ``sbr``, ``dark_counts_per_s``, ``pulse``, ``parts``. Files are read by `mars_lidar.io.read_transient`.
+        """
+        from mars_lidar.transient import Transient
+
+        return Transient(values, bin_ns, start_ns=start_ns).flux(system, **level)
 
     @property
     def shape(self) -> tuple[int, int]:

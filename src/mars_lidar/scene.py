@@ -230,13 +230,15 @@ class Scene:
         size: int | tuple[int, int] | None = None,
         depth_unit_m: float | None = None,
         focal_px: float | None = None,
+        index: int | None = None,
     ) -> Scene:
         """A scene from a depth file and an image; what is read, and how: `mars_lidar.io.rgbd.read_rgbd`.
 
         Parameters
         ----------
         depth_path
-            16-bit PNG (or TIFF), ``.npy``, ``.npz``, or the folder of a Middlebury 2005/2006 scene.
+            16-bit PNG (or TIFF), ``.pfm``, ``.exr``, ``.npy``, ``.npz``, NYUv2's labelled ``.mat``, or the
+            folder of a Middlebury scene.
         image_path
             Image whose linear luminance stands for the reflectivity; None: what the depth file or folder
             brings along, else 1 everywhere.
@@ -247,6 +249,8 @@ class Scene:
         focal_px
             Focal length in pixels of the depth file: turns depth perpendicular to the image plane, which
             RGB-D cameras give, into range along the ray. None: the depth is taken as it is.
+        index
+            Frame of a NYUv2 ``.mat``, from 0; None for everything else.
 
         Raises
         ------
@@ -257,7 +261,8 @@ class Scene:
 
         if size is not None:  # refuse a bad size before reading anything
             cls(np.ones((1, 1)), 1.0).resize(size)
-        scene = cls(*read_rgbd(depth_path, image_path, depth_unit_m=depth_unit_m, focal_px=focal_px))
+        read = read_rgbd(depth_path, image_path, depth_unit_m=depth_unit_m, focal_px=focal_px, index=index)
+        scene = cls(*read)
         return scene if size is None else scene.resize(size)
 
 

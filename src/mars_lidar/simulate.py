@@ -129,7 +129,16 @@ def simulate_timestamps(
     times_ns = records.times
     times_ns *= system.period_ns
     return Timestamps(
-        times_ns, records.cycle, records.bin, records.offsets, flux.shape, system.bins, system.histogram_dtype
+        times_ns,
+        records.cycle,
+        records.bin,
+        records.offsets,
+        flux.shape,
+        system.bins,
+        system.histogram_dtype,
+        system.period_ns,
+        system.cycles,
+        {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)},
     )
 
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from mars_lidar.system import System
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +33,11 @@ class Timestamps:
         (H, W).
     bins
         Bins of the histogram.
+    period_ns, cycles
+        Laser period, ns, and laser periods of the exposure.
+    info
+        Where they come from: ``system`` (as `System.to_dict` gives it), ``engine``, ``seed``, ``realization``,
+        ``source``, as far as they are known.
     """
 
     times_ns: NDArray[np.float64]
@@ -36,6 +47,54 @@ class Timestamps:
     shape: tuple[int, int]
     bins: int
     dtype: np.dtype[Any]
+    period_ns: float = math.nan
+    cycles: int = 0
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def system(self) -> System | None:
+        """Laser, detector and histogram, or None where they are not known (a measured stream)."""
+        from mars_lidar.system import System
+
+        told = self.info.get("system")
+        return None if told is None else System.from_dict(told)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write to a ``.npz`` (exact), ``.ptu`` or ``.h5`` / ``.hdf5`` (Photon-HDF5); see docs/formats.md.
+
+        Raises
+        ------
+        ValueError
+            Another suffix, or a stream that the format cannot hold.
+        OSError
+            `path` exists and `overwrite` is false, or cannot be written.
+        """
+        from mars_lidar.io.streams import save
+
+        save(path, self, overwrite=overwrite)
+
+    @classmethod
+    def load(cls, path: str | Path, *, period_ns: float | None = None, bins: int | None = None) -> Timestamps:
+        """Read what `save` wrote, or a photon stream that others recorded: PTU (T2, T3) or Photon-HDF5.
+
+        Parameters
+        ----------
+        path
+            ``.npz``, ``.ptu``, ``.h5`` or ``.hdf5``. In files of others a pixel is a detector (channel), and
+            the image is (1, detectors).
+        period_ns
+            Laser period, for files of others that do not tell (T2), or tell a rounded one.
+        bins
+            Histogram bins, for files of others; None: their own, one per unit of their fine clock.
+
+        Raises
+        ------
+        ValueError
+            A file of the wrong kind, damaged or incomplete: the message names it.
+        """
+        from mars_lidar.io.streams import load
+
+        return load(path, period_ns=period_ns, bins=bins)
 
     def pixel(self, y: int, x: int) -> Timestamps:
         """The registrations of one pixel, as views."""
@@ -45,8 +104,13 @@ class Timestamps:
         k = (y % h) * w + x % w
         part = slice(self.offsets[k], self.offsets[k + 1])
         offsets = np.array([0, self.offsets[k + 1] - self.offsets[k]], np.int64)
-        return Timestamps(
-            self.times_ns[part], self.cycle[part], self.bin[part], offsets, (1, 1), self.bins, self.dtype
+        return dataclasses.replace(
+            self,
+            times_ns=self.times_ns[part],
+            cycle=self.cycle[part],
+            bin=self.bin[part],
+            offsets=offsets,
+            shape=(1, 1),
         )
 
     def __len__(self) -> int:

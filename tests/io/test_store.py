@@ -240,8 +240,8 @@ def test_bad_arguments_leave_nothing_on_disk(tmp_path, suffix):
 
 def test_the_place_to_write_to_is_checked_first(tmp_path):
     flux = one_return()
-    with pytest.raises(ValueError, match=r"out must end in one of \.zarr, \.h5, .*, got .*cube\.mat"):
-        io.simulate_to(tmp_path / "cube.mat", flux, SYSTEM)
+    with pytest.raises(ValueError, match=r"out must end in one of \.zarr, \.h5, .*, got .*cube\.csv"):
+        io.simulate_to(tmp_path / "cube.csv", flux, SYSTEM)
     with pytest.raises(FileNotFoundError, match="out must lie in an existing folder"):
         io.simulate_to(tmp_path / "nowhere" / "cube.h5", flux, SYSTEM)
     (tmp_path / "photos.zarr").mkdir()

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mars_lidar.cli.compare import COMPARE_EPILOG, compare
+from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
 from mars_lidar.cli.init import init
 from mars_lidar.cli.inspect import info, view
 from mars_lidar.cli.simulate import EPILOG, simulate
@@ -27,6 +28,8 @@ app.command(no_args_is_help=True, epilog=EPILOG)(simulate)
 app.command(no_args_is_help=True, epilog=COMPARE_EPILOG)(compare)
 app.command(no_args_is_help=True)(info)
 app.command(no_args_is_help=True)(view)
+app.command(no_args_is_help=True, epilog=CONVERT_EPILOG)(convert)
+app.command(no_args_is_help=True, epilog=TIMESTAMPS_EPILOG)(timestamps)
 app.command()(init)
 app.add_typer(table_app, name="table")
 

@@ -20,7 +20,7 @@ Out = Annotated[
     Path,
     _option(
         "-o", "--out", panel=_OUTPUT,
-        help="The cube: .zarr (any size, written as it is simulated), .h5, .hdf5 or .npz.",
+        help="The cube: .zarr (any size, written as it is simulated), .h5, .hdf5, .npz, .mat or .ptu.",
     ),
 ]
 Scene = Annotated[str | None, _option("--scene", panel=_SCENE, help="A built-in scene: room.")]
@@ -40,7 +40,7 @@ Depth = Annotated[
     Path | None,
     _option(
         "--depth", panel=_SCENE,
-        help="Depth: 16-bit PNG or TIFF in mm, .npy or .npz in m, or a Middlebury folder with its image.",
+        help="Depth: 16-bit PNG or TIFF in mm, .pfm, .exr, .npy or .npz in m, NYUv2's .mat, or a Middlebury folder.",
     ),
 ]
 Image = Annotated[
@@ -61,6 +61,10 @@ FocalPx = Annotated[
         help="Focal length, pixels: turns depth along the axis into range along the ray.",
         default="depth as it is",
     ),
+]
+Index = Annotated[
+    int | None,
+    _option("--index", panel=_SCENE, help="Frame of a NYUv2 .mat given as --depth, from 0."),
 ]
 System = Annotated[
     Path | None,

@@ -43,6 +43,7 @@ def simulate(
     image: options.Image = None,
     depth_unit_m: options.DepthUnitM = None,
     focal_px: options.FocalPx = None,
+    index: options.Index = None,
     system: options.System = None,
     period_ns: options.PeriodNs = None,
     dead_time_ns: options.DeadTimeNs = None,
@@ -105,7 +106,7 @@ def simulate(
             pulse_bin_ns=pulse_bin_ns,
             pulse_origin=pulse_origin,
         )
-        view, source = chosen_scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px)
+        view, source = chosen_scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px, index)
         flux = view.flux(
             instrument,
             signal=signal,
@@ -147,6 +148,7 @@ def chosen_scene(
     image: Path | None,
     unit: float | None,
     focal: float | None,
+    index: int | None = None,
 ) -> tuple[Scene, str]:
     """The scene of a command line, and what it is in words."""
     from mars_lidar.scene import Scene
@@ -155,13 +157,14 @@ def chosen_scene(
         told = "neither" if name is None else "both"
         raise ValueError(f"the scene is one of --scene and --depth, got {told}")
     if depth is None:
-        for option, value in (("--image", image), ("--depth-unit-m", unit), ("--focal-px", focal)):
+        for option, value in (("--image", image), ("--depth-unit-m", unit), ("--focal-px", focal), ("--index", index)):
             if value is not None:
                 raise ValueError(f"{option} belongs to --depth, which is not given")
         size = 128 if size is None else size
         return Scene.example(name or "", size=size, seed=seed), f"example {name}, size {size}, seed {seed}"
-    source = f"depth {depth}" + ("" if image is None else f", image {image}")
-    return Scene.from_rgbd(depth, image, size=size, depth_unit_m=unit, focal_px=focal), source
+    source = f"depth {depth}" + ("" if index is None else f", frame {index}")
+    source += "" if image is None else f", image {image}"
+    return Scene.from_rgbd(depth, image, size=size, depth_unit_m=unit, focal_px=focal, index=index), source
 
 
 def _table(file: Path | None, system: System) -> Table | None:

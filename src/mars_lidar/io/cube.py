@@ -18,7 +18,7 @@ from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.store import INCOMPLETE_SUFFIX, CountArray, IncompleteFileError, Writer, check_target
 from mars_lidar.system import System
 
-SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")
+SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz", ".mat", ".ptu")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -115,12 +115,12 @@ class Cube:
 
 
 def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
-    """Write a cube to a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz``.
+    """Write a cube to a ``.zarr``, ``.h5``, ``.hdf5``, ``.npz``, ``.mat`` or ``.ptu``.
 
     Raises
     ------
     ValueError
-        Another suffix.
+        Another suffix, or a cube that the format cannot hold.
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
     """
@@ -145,7 +145,7 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     Parameters
     ----------
     path
-        ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` written by mars-lidar.
+        ``.zarr``, ``.h5``, ``.hdf5``, ``.npz``, ``.mat`` or ``.ptu`` written by mars-lidar.
     allow_incomplete
         Open what an unfinished run left; parts that were not written read as zeros.
 
@@ -196,6 +196,8 @@ def check_output(path: str | Path, recipe: Recipe, *, overwrite: bool = False) -
     if form.__name__.endswith(".npz"):  # it could be written, but never read back here
         what = f"the counts of {target}, which NumPy reads whole,"
         check_memory(recipe.nbytes, what, "a .zarr or .h5 is read in parts")
+    if target.suffix in (".mat", ".ptu"):  # formats with limits of their own
+        form.check(recipe)
 
 
 def create(path: str | Path, recipe: Recipe, *, overwrite: bool = False) -> Writer:
@@ -213,6 +215,10 @@ def _format(path: Path, argument: str) -> Any:
         from mars_lidar.io import hdf5 as module
     elif path.suffix == ".npz":
         from mars_lidar.io import npz as module
+    elif path.suffix == ".mat":
+        from mars_lidar.io import mat as module
+    elif path.suffix == ".ptu":
+        from mars_lidar.io import ptu as module
     else:
         raise ValueError(f"{argument} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
     return module

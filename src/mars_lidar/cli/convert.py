@@ -1,0 +1,98 @@
+"""`mars-lidar convert` and `mars-lidar timestamps`: other file formats, and photons instead of counts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mars_lidar.cli.console import progress_bar, reported, table
+
+CONVERT_EPILOG = "\n\n".join(
+    (
+        "[bold]Examples[/bold]",
+        "mars-lidar convert room.zarr room.h5",
+        "mars-lidar convert set.zarr first.mat --realization 0",
+        "mars-lidar convert lab.ptu lab.h5 --bins 1024",
+        "Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
+        "pip install 'mars-lidar[io]'. docs/formats.md tells what is in each.",
+    )
+)
+TIMESTAMPS_EPILOG = "\n\n".join(
+    (
+        "[bold]Examples[/bold]",
+        "mars-lidar simulate --scene room -o room.zarr",
+        "mars-lidar timestamps room.zarr -o room.ptu",
+        "mars-lidar timestamps set.zarr --realization 3 -o photons.h5",
+    )
+)
+
+_Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+
+
+def convert(
+    source: Annotated[
+        Path, typer.Argument(help="A cube, or a photon stream (of a lab, too: .ptu, Photon-HDF5).", show_default=False)
+    ],
+    target: Annotated[Path, typer.Argument(help="The new file; its suffix names the format.", show_default=False)],
+    realization: Annotated[
+        int | None,
+        typer.Option("--realization", help="Of a cube, this exposure alone, from 0; a .mat holds one."),
+    ] = None,
+    period_ns: Annotated[
+        float | None,
+        typer.Option("--period-ns", help="Laser period of a recorded stream that does not tell it (T2), ns."),
+    ] = None,
+    bins: Annotated[
+        int | None,
+        typer.Option("--bins", help="Histogram bins of a recorded stream. [dim]Default: its finest clock.[/dim]"),
+    ] = None,
+    overwrite: _Overwrite = False,
+) -> None:
+    """Write a cube or a photon stream in another format, and tell what the other format cannot hold."""
+    with reported():
+        from mars_lidar.io.convert import convert as converted
+
+        done = converted(
+            source, target, realization=realization, period_ns=period_ns, bins=bins, overwrite=overwrite
+        )
+        rows = [("wrote", str(done.path)), ("content", done.content)]
+        table(rows + [("lost", text) for text in done.lost or ("nothing",)])
+
+
+def timestamps(
+    cube: Annotated[Path, typer.Argument(help="A cube written by mars-lidar.", show_default=False)],
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--out", help="The stream: .npz, .ptu or .h5 (Photon-HDF5).", show_default=False),
+    ],
+    realization: Annotated[int, typer.Option("--realization", help="Which exposure, from 0 in the file.")] = 0,
+    threads: Annotated[
+        int | None, typer.Option("--threads", help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
+    ] = None,
+    overwrite: _Overwrite = False,
+) -> None:
+    """Write the photons of a stored cube, one by one, with their times: the cube is simulated again.
+
+    The histogram of the photons is the cube's exposure, count by count; this is checked.
+    """
+    with reported():
+        from mars_lidar.io.convert import photons, resolution_ns
+        from mars_lidar.io.cube import load
+        from mars_lidar.io.streams import check_output
+
+        check_output(out, overwrite=overwrite)
+        with load(cube) as stored, progress_bar("simulating") as progress:
+            times = photons(stored, realization=realization, threads=threads, progress=progress)
+        times.save(out, overwrite=overwrite)
+        unit = resolution_ns(out, times)
+        height, width = times.shape
+        told = "as simulated" if unit == 0.0 else f"in units of {1e3 * unit:.4g} ps; cycles and bins are exact"
+        table(
+            [
+                ("wrote", str(out)),
+                ("content", f"{len(times):,} photons of {height} × {width} pixels"),
+                ("times", told),
+            ]
+        )

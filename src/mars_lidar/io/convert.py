@@ -1,0 +1,181 @@
+"""From one file format to another, and from a stored cube to its photons; what does not survive is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mars_lidar import _validate
+from mars_lidar.io.cube import SUFFIXES, Cube, load, save
+from mars_lidar.io.streams import STREAM_SUFFIXES, is_stream
+from mars_lidar.timestamps import Timestamps
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What `convert` did.
+
+    Attributes
+    ----------
+    path
+        The new file.
+    content
+        What is in it, in words.
+    lost
+        What the source has and the new file has not, a sentence each.
+    """
+
+    path: Path
+    content: str
+    lost: tuple[str, ...]
+
+
+def convert(
+    source: str | Path,
+    target: str | Path,
+    *,
+    realization: int | None = None,
+    period_ns: float | None = None,
+    bins: int | None = None,
+    overwrite: bool = False,
+) -> Converted:
+    """Write a cube or a photon stream in the format that the target's suffix names.
+
+    Cubes: ``.zarr .h5 .hdf5 .npz .mat .ptu``; their counts and recipe are kept in all of them. Streams:
+    ``.npz .ptu .h5 .hdf5`` (the last two as Photon-HDF5); times are kept to the resolution of the format. A
+    cube stays a cube and a stream a stream; `photons` makes a stream of a cube.
+
+    Parameters
+    ----------
+    source, target
+        The two files.
+    realization
+        Of a cube: this exposure alone, counted from 0 in the file. A ``.mat`` holds no more than one.
+    period_ns, bins
+        Of a recorded stream: see `mars_lidar.Timestamps.load`.
+    overwrite
+        Replace an existing target.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Files of the wrong kind, damaged, incomplete, or beyond what the target's format can hold.
+    OSError
+        The target exists and `overwrite` is false, or cannot be written.
+    """
+    old, new = Path(source), Path(target)
+    allowed = sorted({*SUFFIXES, *STREAM_SUFFIXES})
+    for name, path in (("source", old), ("target", new)):
+        if path.suffix not in allowed:
+            raise ValueError(f"{name} must end in one of {', '.join(allowed)}, got {str(path)!r}")
+    if new.exists() and old.exists() and new.resolve() == old.resolve():
+        raise ValueError(f"target must not be the source, got {str(new)!r} for both")
+    if old.is_file() and is_stream(old):
+        if realization is not None:
+            raise ValueError(f"realization is for cubes, and {old} holds photons of one exposure")
+        return _stream(Timestamps.load(old, period_ns=period_ns, bins=bins), old, new, overwrite)
+    for name, value in (("period_ns", period_ns), ("bins", bins)):
+        if value is not None:
+            raise ValueError(f"{name} is for recorded photon streams, and {old} is none")
+    with load(old) as cube:
+        return _cube(cube, old, new, realization, overwrite)
+
+
+def photons(
+    cube: Cube,
+    *,
+    realization: int = 0,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Timestamps:
+    """The photons of one exposure of a stored cube, simulated again from its recipe.
+
+    Parameters
+    ----------
+    cube
+        What `load` returned.
+    realization
+        Which exposure, counted from 0 in the file.
+    threads, progress
+        As for `mars_lidar.simulate_timestamps`.
+
+    Returns
+    -------
+    Timestamps
+        Their histogram is the stored exposure, count by count.
+
+    Raises
+    ------
+    ValueError
+        The photons do not have the stored counts (another version made the cube), or the engine draws
+        histograms only.
+    """
+    from mars_lidar.simulate import simulate_timestamps
+
+    k = _validate.integer("realization", realization, low=0, high=cube.shape[0] - 1)
+    arguments = cube.recipe.part(slice(k, k + 1), slice(0, cube.shape[1]))
+    del arguments["realizations"]
+    arguments["realization"] = arguments.pop("first_realization")
+    times = simulate_timestamps(**arguments, threads=threads, progress=progress)
+    if cube.recipe.source:
+        times.info["source"] = cube.recipe.source
+    for y in range(times.shape[0]):  # row by row: the whole image may be larger than its photons
+        first, last = times.offsets[y * times.shape[1]], times.offsets[(y + 1) * times.shape[1]]
+        counts = np.diff(times.offsets[y * times.shape[1] : (y + 1) * times.shape[1] + 1])
+        pixel = np.repeat(np.arange(times.shape[1]), counts)
+        flat = np.bincount(pixel * times.bins + times.bin[first:last], minlength=times.shape[1] * times.bins)
+        if not np.array_equal(flat.reshape(times.shape[1], times.bins), np.asarray(cube.histogram[k, y])):
+            raise ValueError(
+                f"the photons of row {y} do not have the counts of {cube.path}: it was made by mars-lidar "
+                f"{cube.version}, or changed since"
+            )
+    return times
+
+
+def _cube(cube: Cube, old: Path, new: Path, realization: int | None, overwrite: bool) -> Converted:
+    from mars_lidar import __version__
+
+    if new.suffix not in SUFFIXES:
+        raise ValueError(f"{old} is a cube, which goes into one of {', '.join(SUFFIXES)}, not {str(new)!r}")
+    lost = []
+    if realization is not None:
+        count = cube.shape[0]
+        k = _validate.integer("realization", realization, low=0, high=count - 1)
+        recipe = cube.recipe.replace(realizations=1, first_realization=cube.recipe.first_realization + k)
+        cube = Cube(histogram=np.asarray(cube.histogram[k : k + 1]), recipe=recipe, version=cube.version)
+        if count > 1:
+            lost.append(f"{count - 1} of {count} realizations")
+    if cube.version not in ("", __version__):
+        lost.append(f"that mars-lidar {cube.version} made the counts: the new file names {__version__}")
+    save(new, cube, overwrite=overwrite)
+    n, height, width, bins = cube.shape
+    return Converted(new, f"cube {n} × {height} × {width} × {bins} (realization, y, x, time)", tuple(lost))
+
+
+def _stream(times: Timestamps, old: Path, new: Path, overwrite: bool) -> Converted:
+    if new.suffix not in STREAM_SUFFIXES:
+        raise ValueError(
+            f"{old} is a photon stream, which goes into one of {', '.join(STREAM_SUFFIXES)}, not {str(new)!r}"
+        )
+    lost = []
+    if new.suffix != ".npz":
+        unit_ns = resolution_ns(new, times)
+        lost.append(f"times below {1e3 * unit_ns:.4g} ps (units of {new.suffix} here); cycles and bins are exact")
+    if times.system is None:
+        lost.append("header entries of the other program that wrote the source, beyond period, detectors and times")
+    times.save(new, overwrite=overwrite)
+    height, width = times.shape
+    return Converted(new, f"{len(times):,} photons of {height} × {width} pixels", tuple(lost))
+
+
+def resolution_ns(path: Path, times: Timestamps) -> float:
+    """Unit of the times that the format of `path` stores, ns; 0 for .npz, which holds them as they are."""
+    if path.suffix == ".npz":
+        return 0.0
+    from mars_lidar.io import photon_hdf5, ptu_stream
+
+    module = ptu_stream if path.suffix == ".ptu" else photon_hdf5
+    return float(times.period_ns / (times.bins * module.units_per_bin(times.bins)))

@@ -1,0 +1,253 @@
+"""MATLAB v5 ``.mat``, the layout that depth networks of the field load: one exposure, counts sparse.
+
+==========  ==================  =============================================================================
+variable    shape               holds
+==========  ==================  =============================================================================
+spad        (H W, bins) sparse  counts; pixel (y, x), from 0, is row y + H x (MATLAB's column-major order)
+rates       (H, W, bins)        signal alone, before dead time, in each bin; largest bin of a pixel = 1
+bin         (H, W)              bin of the return, from 1; 0 = no return
+bin_hr      (8 H, 8 W)          the same as a real number, from 1, at the size of the network's colour image;
+                                NaN = no return
+SBR         (1, 1)              mean S / mean B
+photons     (1, 1)              mean expected signal photons of a pixel in the exposure, S times cycles
+mars_lidar  (1, 1) struct       ours: ``attributes`` (JSON) and the maps of `mars_lidar.io.layout`
+==========  ==================  =============================================================================
+
+All numbers are of MATLAB's class double; whole ones are stored as small integers, as MATLAB does, and so
+`scipy.io.loadmat` returns `bin` as uint16. ``rates`` is zero where there is no return.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._memory import check_memory
+from mars_lidar.flux import Flux
+from mars_lidar.io import layout
+from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
+from mars_lidar.io.store import INCOMPLETE_SUFFIX, IncompleteFileError, OpenedStore, TemporarySibling, Writer
+from mars_lidar.system import System
+
+UPSAMPLING = 8  # bin_hr over bin: 512 x 512 and 64 x 64 in the files that the networks were trained on
+_MAX_BYTES = 2**31 - 2**16  # a variable of a v5 file, before compression
+_COMPRESSED, _DOUBLE_CLASS, _HEADER_BYTES = 15, 6, 128  # MAT-File Level 5: element type, array class, header
+
+
+def check(recipe: Recipe) -> None:
+    """Raise ValueError for what the format cannot hold, before any work."""
+    realizations, height, width, bins = recipe.shape
+    if realizations != 1:
+        raise ValueError(
+            f"a .mat holds one exposure, got {realizations} realizations; "
+            f"write them one by one (mars-lidar convert --realization K) or use .h5"
+        )
+    size = 8 * height * width * bins
+    if size > _MAX_BYTES:
+        raise ValueError(
+            f"a variable of a .mat (v5) must take less than 2 GiB, and rates of {height} x {width} x {bins} takes "
+            f"{size / 2**30:.3g} GiB; use .h5, which MATLAB reads with h5read, or a crop"
+        )
+
+
+class MatWriter(Writer):
+    """Keeps the counts sparse until the end, writes a sibling of the target, and renames it."""
+
+    def __init__(self, path: Path, recipe: Recipe, bin_hr: NDArray[np.float64] | None = None) -> None:
+        check(recipe)
+        size = 3 * 8 * int(np.prod(recipe.shape))
+        check_memory(size, f"the rates of {path}", "a .zarr or .h5 is written in parts")
+        self._recipe, self._bin_hr = recipe, bin_hr
+        self.chunks = recipe.chunks(BLOCK_BYTES)
+        self._parts: list[Any] = []
+        self._sibling = TemporarySibling(path)
+        self._file = open(self._sibling.path, "wb")  # noqa: SIM115  # closed by `finish` and `abandon`
+
+    def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
+        """Keep the non-zero counts of the rows."""
+        y, x, k = np.nonzero(block[0])
+        self._parts.append((y + rows.start, x, k, block[0][y, x, k]))
+
+    def finish(self, registrations: int) -> None:
+        """Write the variables, one after the other, close the file, and put it in its place."""
+        from scipy import sparse
+
+        recipe = self._recipe
+        _, height, width, bins = recipe.shape
+        y, x, k, counts = (np.concatenate(part) for part in zip(*self._parts, strict=True))
+        spad = sparse.csc_matrix((counts.astype(np.float64), (y + height * x, k)), shape=(height * width, bins))
+        first, fine = return_bins(recipe.flux, recipe.system)
+        if self._bin_hr is None:
+            fine = fine.repeat(UPSAMPLING, axis=0).repeat(UPSAMPLING, axis=1)
+        else:
+            fine = self._bin_hr
+        flux = recipe.flux
+        background = float(flux.background.mean())
+        sbr = float(flux.signal.mean()) / background if background > 0 else np.inf
+        attrs: dict[str, Any] = {**layout.attributes(recipe), "complete": True, "registrations": registrations}
+        ours: dict[str, Any] = {v.name: v.data for v in layout.variables(recipe)}
+        attrs["shapes"] = {name: list(array.shape) for name, array in ours.items()}
+        header, _ = _element("", 0.0)
+        self._file.write(header)
+        variables = {
+            "spad": spad,
+            "SBR": sbr,
+            "bin": first,
+            "bin_hr": fine,
+            "photons": float(flux.signal.mean()) * recipe.system.cycles,
+            "rates": rates(flux, recipe.system),
+            "mars_lidar": {"attributes": json.dumps(attrs), **ours},
+        }
+        for name, value in variables.items():
+            self._file.write(_element(name, value)[1])
+        self._file.close()
+        self._sibling.publish()
+
+    def abandon(self) -> str:
+        """Remove the unfinished sibling."""
+        with contextlib.suppress(Exception):
+            self._file.close()
+        return self._sibling.discard()
+
+
+def _element(name: str, value: Any) -> tuple[bytes, bytes]:
+    """The header of a file, and one compressed variable."""
+    from scipy.io import savemat
+
+    buffer: Any = BytesIO()  # scipy's stubs know paths only
+    savemat(buffer, {name: value} if name else {}, long_field_names=True)
+    raw = bytearray(buffer.getvalue())
+    header, variable = bytes(raw[:_HEADER_BYTES]), raw[_HEADER_BYTES:]
+    if isinstance(value, np.ndarray) and value.dtype.kind == "u":
+        variable[16] = _DOUBLE_CLASS  # the class in the array's flags; the stored type stays small
+    packed = zlib.compress(variable, 5)
+    return header, struct.pack("<II", _COMPRESSED, len(packed)) + packed
+
+
+def return_bins(flux: Flux, system: System) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Bin of the strongest return from 1, (H, W) uint16 or uint32, and as a real number, (H, W).
+
+    The centre of bin k, from 1, is the real number k. A waveform's return is its largest bin.
+    """
+    if flux.waveform is None:
+        fine = bins_of_delay(flux.delay_ns, system)
+        fine = np.where(flux.signal > 0, fine, np.nan)
+    else:
+        wave = np.concatenate([band.argmax(-1) for band in _rate_bands(flux, system)])
+        fine = np.where(flux.signal > 0, wave + 1.0, np.nan)
+    small = np.uint16 if system.bins < 2**16 else np.uint32
+    whole = np.clip(np.floor(np.nan_to_num(fine) + 0.5), 0, system.bins).astype(small)
+    return whole, fine
+
+
+def bins_of_delay(delay_ns: ArrayLike, system: System) -> NDArray[np.float64]:
+    """Delays as real bin numbers from 1; in [0.5, bins + 0.5)."""
+    wrapped = np.mod(np.asarray(delay_ns, np.float64), system.period_ns)
+    return np.asarray(wrapped / system.bin_ns + 0.5, np.float64)
+
+
+def rates(flux: Flux, system: System) -> NDArray[np.float64]:
+    """Signal in each bin (H, W, bins), largest bin 1; column-major, as MATLAB stores it."""
+    out = np.empty((*flux.shape, system.bins), order="F")
+    row = 0
+    for band in _rate_bands(flux, system):
+        peak = band.max(-1, keepdims=True)
+        out[row : row + len(band)] = np.divide(band, peak, out=np.zeros_like(band), where=peak > 0)
+        row += len(band)
+    return out
+
+
+def _rate_bands(flux: Flux, system: System) -> Iterator[NDArray[np.float64]]:
+    """The signal in each bin, photons per period, row after row."""
+    for y in range(flux.shape[0]):
+        if flux.waveform is not None:
+            wave = flux.waveform[y : y + 1]
+            parts = wave.shape[-1]
+            total = np.concatenate([np.zeros((*wave.shape[:2], 1)), wave.cumsum(-1)], axis=-1)
+            place = np.linspace(0.0, parts, system.bins + 1)
+            left = np.minimum(place.astype(np.int64), parts - 1)
+            at = total[..., left] + (place - left) * (total[..., left + 1] - total[..., left])
+            yield np.maximum(np.diff(at, axis=-1), 0.0)
+            continue
+        band = np.zeros((1, flux.shape[1], system.bins))
+        for s, tau in zip(flux.returns_signal[:, y], flux.returns_delay_ns[:, y], strict=True):
+            delay = np.where(s > 0, tau, 0.0)
+            band[0] += s[:, None] * system.pulse.bin_energy(delay, system.period_ns, system.bins)
+        yield band
+
+
+class _MatCounts:
+    """The counts of a file, sparse in memory; dense when they are indexed."""
+
+    def __init__(self, path: Path, spad: Any, recipe: Recipe) -> None:
+        self._path = path
+        self._spad = spad
+        self.shape: tuple[int, ...] = recipe.shape
+        self.dtype = recipe.dtype
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        _, height, width, bins = self.shape
+        size = height * width * bins * self.dtype.itemsize
+        check_memory(2 * size, f"the counts of {self._path}", "mars-lidar convert makes a .zarr of it elsewhere")
+        dense = self._spad.astype(self.dtype).toarray(order="C")
+        image = dense.reshape(width, height, bins).transpose(1, 0, 2)
+        return np.ascontiguousarray(image, dtype=dtype)[None]
+
+    def __getitem__(self, key: Any) -> Any:
+        return self.__array__()[key]
+
+    def __len__(self) -> int:
+        return 1
+
+
+def open_writer(path: Path, recipe: Recipe) -> Writer:
+    """Begin a file; an existing one is replaced."""
+    return MatWriter(path, recipe)
+
+
+def open_store(path: Path) -> OpenedStore:
+    """Open a file for reading; its variables are read at once, its counts stay sparse."""
+    if path.name.endswith(INCOMPLETE_SUFFIX):
+        raise IncompleteFileError(f"{path} is incomplete: a run that was stopped left it")
+    found = read_variables(path)
+    if "mars_lidar" not in found:
+        raise ValueError(
+            f"{path} is not a cube written by mars-lidar (no variable 'mars_lidar'); "
+            f"mars_lidar.io.read_mat reads such files of others"
+        )
+    ours = found["mars_lidar"][0, 0]
+    attrs = json.loads(str(ours["attributes"].item()))
+    layout.check_format(path, attrs)
+    shapes: Mapping[str, list[int]] = attrs.pop("shapes")
+
+    def read(name: str) -> NDArray[Any]:
+        return np.ascontiguousarray(np.asarray(ours[name]).reshape(shapes[name]))  # sums keep their bits
+
+    recipe = layout.recipe_from(attrs, frozenset(shapes), read, 1)
+    counts = _MatCounts(path, found["spad"], recipe)
+    if found["spad"].shape != (counts.shape[1] * counts.shape[2], counts.shape[3]):
+        raise ValueError(f"{path}: spad must be (H W, bins) of {counts.shape[1:]}, got {found['spad'].shape}")
+    return OpenedStore(attrs, frozenset(shapes), read, counts, True, "", lambda: None)
+
+
+def read_variables(path: Path) -> dict[str, Any]:
+    """All variables of a v5 file; ValueError where it is none or is damaged."""
+    from scipy.io import loadmat
+
+    content = path.read_bytes()
+    if content.startswith((b"MATLAB 7.3", b"\x89HDF")):
+        raise ValueError(f"{path} is a MATLAB v7.3 file (HDF5), and a v5 .mat is needed: save it with -v7")
+    try:
+        file: Any = BytesIO(content)  # scipy's stubs know paths only
+        return dict(loadmat(file))
+    except Exception as error:
+        raise ValueError(f"{path} is not a .mat file that can be read ({error})") from error

@@ -1,0 +1,20 @@
+"""Libraries of the extra `io`: imported when their format is first used."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+
+class MissingLibraryError(ImportError, ValueError):
+    """A format needs a library that is not installed."""
+
+
+def needed(module: str, what: str) -> Any:
+    """The module, or an error that says how to install it; `what` names the format."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingLibraryError(
+            f"{what} needs the library {module.partition('.')[0]}: pip install 'mars-lidar[io]' ({error})"
+        ) from error

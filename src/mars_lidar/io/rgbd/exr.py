@@ -1,0 +1,37 @@
+"""OpenEXR depth, as renderers write it; needs the library OpenEXR of the extra ``io``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.io.optional import needed
+from mars_lidar.io.rgbd.pixels import reason
+
+_CHANNELS = ("Z", "Y", "R")  # depth, luminance; red where a grey image was written in colour
+
+
+def read_exr(path: Path) -> NDArray[Any]:
+    """The channel Z (H, W), else Y, R or the only one.
+
+    Raises
+    ------
+    ValueError
+        Not an EXR that can be read, or several channels of which none is depth; the message starts with the
+        file. `mars_lidar.io.MissingLibraryError` where OpenEXR is not installed.
+    """
+    openexr = needed("OpenEXR", f"{path}: depth in .exr")
+    if not path.read_bytes()[:4] == b"\x76\x2f\x31\x01":  # the library would write to standard error
+        raise ValueError(f"{path}: cannot be read (not an OpenEXR file)")
+    try:
+        with openexr.File(str(path), separate_channels=True) as file:
+            found = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except Exception as error:
+        raise ValueError(f"{path}: cannot be read ({reason(error)})") from error
+    for name in _CHANNELS if len(found) > 1 else tuple(found):
+        if name in found:
+            return found[name]
+    raise ValueError(f"{path}: must have a channel Z, Y or R, got {', '.join(sorted(found)) or 'none'}")

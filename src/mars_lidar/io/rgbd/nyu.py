@@ -1,0 +1,58 @@
+"""The labelled data set of NYUv2, ``nyu_depth_v2_labeled.mat``: 1449 frames of depth and colour.
+
+It is a MATLAB v7.3 file, that is HDF5 with MATLAB's axes reversed: ``depths`` (N, W, H) in metres, holes filled
+by its authors, and ``images`` (N, 3, W, H), 8 bits. Depth is perpendicular to the image plane (focal length
+about 519 px; N. Silberman et al., ECCV 2012).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import _validate
+from mars_lidar.io.rgbd.pixels import describe, reason
+
+
+def frames(path: Path) -> int:
+    """Number of frames in the file."""
+    with _opened(path) as file:
+        return int(file["depths"].shape[0])
+
+
+def read_frame(path: Path, index: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Depth (H, W), m, and colours (H, W, 3), uint8, of a frame; only this frame is read."""
+    with _opened(path) as file:
+        depths, images = file["depths"], file["images"]
+        k = _validate.integer("index", index, low=0, high=int(depths.shape[0]) - 1)
+        try:
+            depth, image = np.asarray(depths[k]), np.asarray(images[k])
+        except OSError as error:
+            raise ValueError(f"{path}: frame {k} cannot be read ({reason(error)})") from error
+    return depth.T, image.transpose(2, 1, 0)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    import h5py
+
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise ValueError(
+            f"{path}: cannot be read (NYUv2's labelled .mat is MATLAB v7.3, HDF5: {reason(error)})"
+        ) from error
+    with file:
+        for name in ("depths", "images"):
+            if not isinstance(file.get(name), h5py.Dataset):
+                raise ValueError(f"{path}: must hold 'depths' and 'images' as NYUv2 does, got {', '.join(file)}")
+        depths, images = file["depths"], file["images"]
+        if depths.ndim != 3 or images.shape != (depths.shape[0], 3, *depths.shape[1:]) or depths.size == 0:
+            told = f"{describe(depths)} and {describe(images)}"
+            raise ValueError(f"{path}: depths must be (N, W, H) and images (N, 3, W, H), got {told}")
+        yield file

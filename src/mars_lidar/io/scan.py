@@ -1,0 +1,237 @@
+"""All the scenes in a folder: a manifest, a pattern, or the layouts that data sets have; bad files are told."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mars_lidar.scene import Scene
+
+MANIFEST = "manifest.csv"
+_COLUMNS = ("depth", "image", "index", "depth_unit_m", "focal_px")
+_DEPTH = (".png", ".tif", ".tiff", ".npy", ".pfm", ".exr")
+_ALONE = (".npz", ".pfm", ".exr")  # depth whatever their name
+_IMAGE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".npy")
+_DEPTH_FOLDERS = ("depth", "depths")
+_IMAGE_WORDS = ("rgb", "colors", "color", "colours", "colour", "image", "images", "img")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFile:
+    """Where a scene is; `load` reads it. The arguments are those of `mars_lidar.Scene.from_rgbd`."""
+
+    depth: Path
+    image: Path | None = None
+    index: int | None = None
+    depth_unit_m: float | None = None
+    focal_px: float | None = None
+
+    def load(self, *, size: int | tuple[int, int] | None = None) -> Scene:
+        """Read the scene, at `size` as in `mars_lidar.Scene.resize`."""
+        return Scene.from_rgbd(
+            self.depth,
+            self.image,
+            size=size,
+            depth_unit_m=self.depth_unit_m,
+            focal_px=self.focal_px,
+            index=self.index,
+        )
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A file that cannot be used, and why."""
+
+    path: Path
+    reason: str
+
+    def __str__(self) -> str:
+        return self.reason if self.reason.startswith(str(self.path)) else f"{self.path}: {self.reason}"
+
+
+def scan(
+    folder: str | Path,
+    *,
+    pattern: str | None = None,
+    image: tuple[str, str] | None = None,
+    manifest: str | Path | None = None,
+    depth_unit_m: float | None = None,
+    focal_px: float | None = None,
+    check: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[list[SceneFile], list[Problem]]:
+    """Find the scenes in a folder and in the folders below it.
+
+    What is a scene, in this order:
+
+    - `manifest`, or a ``manifest.csv`` in the folder: a CSV with a header; columns ``depth``, and where needed
+      ``image``, ``index``, ``depth_unit_m``, ``focal_px``; paths are relative to the manifest. Empty means
+      "not given".
+    - `pattern`: every depth file or folder that it matches (``"**/*_depth.png"``); its image is the file whose
+      path, relative to `folder`, has the second text of `image` in place of the first
+      (``("_depth.png", "_colors.png")``).
+    - otherwise: Middlebury folders; NYUv2's labelled ``.mat``, every frame; ``.npz``, ``.pfm`` and ``.exr``
+      files; and depth images or ``.npy`` whose name ends in ``depth`` (``0001_depth.png``) or that lie in a
+      folder ``depth``. The image is the file of the same name with ``rgb``, ``color``, ``colors``, ``image``
+      or ``img`` in place of ``depth``, in the name or in the folder's; without one, reflectivity is 1.
+
+    Parameters
+    ----------
+    depth_unit_m, focal_px
+        As for `mars_lidar.Scene.from_rgbd`, for all scenes; a manifest's own values come first.
+    check
+        Read every scene once, so that damaged files are found now and not in the middle of a long run.
+    progress
+        Called as ``progress(done, total)``.
+
+    Returns
+    -------
+    scenes, problems
+        `SceneFile` in the order of their paths, and what was left out, with the reason.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A folder or manifest that does not exist, a manifest without a column ``depth``, or a bad argument.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder")
+    if image is not None and (pattern is None or len(image) != 2):
+        raise ValueError(f"image must be two texts that go with a pattern, got {image!r}")
+    if pattern is not None and manifest is not None:
+        raise ValueError("scenes come from a pattern or from a manifest, got both")
+    problems: list[Problem] = []
+    if manifest is None and pattern is None and (root / MANIFEST).is_file():
+        manifest = root / MANIFEST
+    if manifest is not None:
+        found = _listed(Path(manifest), depth_unit_m, focal_px, problems)
+    elif pattern is not None:
+        found = _matching(root, pattern, image, problems)
+    else:
+        found = _recognised(root, problems)
+    candidates = list(found)
+    if manifest is None:
+        candidates = [_with(one, depth_unit_m, focal_px) for one in candidates]
+    if not check:
+        return candidates, problems
+    scenes = []
+    for k, one in enumerate(candidates):
+        try:
+            one.load()
+        except (ValueError, TypeError, OSError, MemoryError) as error:
+            problems.append(Problem(one.depth, " ".join(str(error).split()) or type(error).__name__))
+        else:
+            scenes.append(one)
+        if progress is not None:
+            progress(k + 1, len(candidates))
+    return scenes, problems
+
+
+def _with(one: SceneFile, unit: float | None, focal: float | None) -> SceneFile:
+    own_unit = one.depth.is_dir() or one.depth.suffix.lower() == ".mat"  # these are in metres
+    return SceneFile(
+        depth=one.depth,
+        image=one.image,
+        index=one.index,
+        depth_unit_m=None if own_unit else unit,
+        focal_px=focal,
+    )
+
+
+def _listed(path: Path, unit: float | None, focal: float | None, problems: list[Problem]) -> Iterator[SceneFile]:
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as lines:
+            reader = csv.DictReader(lines)
+            names = list(reader.fieldnames or ())
+            rows = list(reader)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: cannot be read as CSV ({error})") from error
+    unknown = [name for name in names if name not in _COLUMNS]
+    if "depth" not in names or unknown:
+        raise ValueError(f"{path}: columns must be depth and any of {', '.join(_COLUMNS[1:])}, got {', '.join(names)}")
+    for number, row in enumerate(rows, start=2):
+        try:
+            if not row["depth"] or None in row:
+                raise ValueError("must give depth, and no more than the columns of the header")
+            yield SceneFile(
+                depth=path.parent / row["depth"],
+                image=path.parent / row["image"] if row.get("image") else None,
+                index=int(row["index"]) if row.get("index") else None,
+                depth_unit_m=float(row["depth_unit_m"]) if row.get("depth_unit_m") else unit,
+                focal_px=float(row["focal_px"]) if row.get("focal_px") else focal,
+            )
+        except ValueError as error:
+            problems.append(Problem(path, f"line {number}: {error}"))
+
+
+def _matching(
+    root: Path, pattern: str, image: tuple[str, str] | None, problems: list[Problem]
+) -> Iterator[SceneFile]:
+    for path in sorted(root.glob(pattern)):
+        if image is None:
+            yield from _frames(path, None, problems)
+            continue
+        name = path.relative_to(root).as_posix()
+        other = root / name.replace(*image)
+        if other == path or not other.is_file():
+            problems.append(Problem(path, f"its image {other} is missing"))
+            continue
+        yield from _frames(path, other, problems)
+
+
+def _recognised(root: Path, problems: list[Problem]) -> Iterator[SceneFile]:
+    from mars_lidar.io.rgbd import middlebury
+
+    if middlebury.is_scene(root):
+        yield SceneFile(depth=root)
+        return
+    for path in sorted(root.iterdir()):
+        suffix = path.suffix.lower()
+        if path.is_dir():
+            yield from _recognised(path, problems)
+        elif suffix == ".mat":
+            yield from _frames(path, None, problems)
+        elif suffix in _ALONE or (suffix in _DEPTH and _is_depth(path)):
+            yield SceneFile(depth=path, image=None if suffix == ".npz" else _partner(path))
+
+
+def _frames(path: Path, image: Path | None, problems: list[Problem]) -> Iterator[SceneFile]:
+    """The file, or each frame of an NYUv2 .mat."""
+    if path.suffix.lower() != ".mat":
+        yield SceneFile(depth=path, image=image)
+        return
+    from mars_lidar.io.rgbd import nyu
+
+    try:
+        count = nyu.frames(path)
+    except ValueError as error:
+        problems.append(Problem(path, str(error)))
+        return
+    for k in range(count):
+        yield SceneFile(depth=path, image=image, index=k)
+
+
+def _is_depth(path: Path) -> bool:
+    return path.stem.lower().endswith("depth") or path.parent.name.lower() in _DEPTH_FOLDERS
+
+
+def _partner(path: Path) -> Path | None:
+    """The image that belongs to a depth file by its name."""
+    stems = []
+    if path.stem.lower().endswith("depth"):
+        stems += [path.with_name(path.stem[:-5] + word) for word in _IMAGE_WORDS]
+    if path.parent.name.lower() in _DEPTH_FOLDERS:
+        above = path.parent.parent
+        for stem in [path.stem, *(one.name for one in stems)]:
+            stems += [above / word / stem for word in _IMAGE_WORDS]
+    for one in stems:
+        for suffix in _IMAGE:
+            found = one.with_name(one.name + suffix)
+            if found.is_file():
+                return found
+    return None

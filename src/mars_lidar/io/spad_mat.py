@@ -1,0 +1,141 @@
+"""The `.mat` files of depth networks (layout: `mars_lidar.io.mat`), whoever wrote them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar._memory import check_memory
+from mars_lidar.io import mat
+from mars_lidar.io.cube import Cube
+from mars_lidar.io.store import check_target
+
+
+@dataclass(frozen=True, eq=False)
+class SpadMat:
+    """What such a file holds.
+
+    Attributes
+    ----------
+    histogram
+        (H, W, bins) uint16 or uint32, counts.
+    rates
+        (H, W, bins), signal before dead time; of a unit of its own.
+    bin
+        (H, W), bin of the return, from 1.
+    bin_hr
+        (h, w), the same at a finer size, real numbers from 1.
+    sbr
+        Signal over background.
+    photons
+        Mean signal photons of a pixel.
+    """
+
+    histogram: NDArray[Any]
+    rates: NDArray[np.float64]
+    bin: NDArray[Any]
+    bin_hr: NDArray[np.float64]
+    sbr: float
+    photons: float
+
+
+def read_mat(path: str | Path) -> SpadMat:
+    """Read a file of this layout, of mars-lidar or of others.
+
+    Raises
+    ------
+    ValueError
+        Not such a file, or damaged; the message starts with the file.
+    """
+    source = Path(path)
+    found = mat.read_variables(source)
+    missing = [name for name in ("spad", "rates", "bin", "bin_hr", "SBR", "photons") if name not in found]
+    if missing:
+        raise ValueError(f"{source}: has no variable {', '.join(missing)}")
+    spad, rates = found["spad"], found["rates"]
+    height, width = found["bin"].shape
+    bins = rates.shape[-1]
+    if rates.shape != (height, width, bins) or spad.shape != (height * width, bins):
+        raise ValueError(
+            f"{source}: rates must be (H, W, bins) and spad (H W, bins) for bin {(height, width)}, "
+            f"got {rates.shape} and {spad.shape}"
+        )
+    check_memory(16 * height * width * bins, f"the counts of {source}", "read it on a larger machine")
+    dense = np.asarray(spad.todense() if hasattr(spad, "todense") else spad)
+    if not ((dense >= 0) & (dense == np.round(dense)) & (dense < 2**32)).all():
+        raise ValueError(f"{source}: spad must hold counts, whole numbers from 0")
+    kind = np.uint16 if dense.max(initial=0) < 2**16 else np.uint32
+    histogram = dense.astype(kind).reshape(width, height, bins).transpose(1, 0, 2)
+    return SpadMat(
+        np.ascontiguousarray(histogram),
+        np.ascontiguousarray(rates, np.float64),
+        found["bin"],
+        np.asarray(found["bin_hr"], np.float64),
+        float(np.ravel(found["SBR"])[0]),
+        float(np.ravel(found["photons"])[0]),
+    )
+
+
+def save_mat(
+    path: str | Path,
+    cube: Cube,
+    *,
+    realization: int = 0,
+    depth_hr_m: ArrayLike | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write one exposure of a cube, with a finer depth map for the training of upsampling networks.
+
+    Parameters
+    ----------
+    path
+        ``.mat``.
+    cube
+        What `load` returned, or a cube in memory.
+    realization
+        Which exposure, counted from 0 in the cube.
+    depth_hr_m
+        Depth (8 H, 8 W) in m, or any other size, for ``bin_hr``; NaN = no return. None: the cube's own bins,
+        each repeated 8 x 8 times, which adds no detail.
+    overwrite
+        Replace an existing file.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A bad argument, or a cube that the format cannot hold.
+    OSError
+        `path` exists and `overwrite` is false, or cannot be written.
+    """
+    target = Path(path)
+    if target.suffix != ".mat":
+        raise ValueError(f"path must end in .mat, got {str(path)!r}")
+    k = _validate.integer("realization", realization, low=0, high=cube.shape[0] - 1)
+    recipe = cube.recipe.replace(realizations=1, first_realization=cube.recipe.first_realization + k)
+    fine = None
+    if depth_hr_m is not None:
+        depth = np.asarray(depth_hr_m)
+        if depth.ndim != 2 or depth.size == 0 or depth.dtype.kind not in "fiu":
+            raise ValueError(f"depth_hr_m must be real numbers (h, w), got shape {depth.shape} of {depth.dtype}")
+        with np.errstate(invalid="ignore"):
+            if not (np.isnan(depth) | ((depth > 0) & (depth < np.inf))).all():
+                raise ValueError("depth_hr_m must be positive, or NaN for no return")
+        fine = mat.bins_of_delay(recipe.system.delay_ns(depth), recipe.system)
+    mat.check(recipe)
+    check_target(target, folder=False, overwrite=overwrite)
+    writer = mat.MatWriter(target, recipe, fine)
+    try:
+        total = 0
+        for _, rows in recipe.blocks(writer.chunks):
+            block = np.asarray(cube.histogram[k : k + 1, rows])
+            writer.write(slice(0, 1), rows, block)
+            total += int(block.sum(dtype=np.uint64))
+        writer.finish(total)
+    except BaseException:
+        writer.abandon()
+        raise

@@ -1,0 +1,223 @@
+"""Rendered transients: light against time at each pixel, as the detector's input.
+
+A transient path tracer gives what a delta pulse sends back. `Transient.flux` puts it on the laser period, gives
+it the system's pulse, and scales it to photons.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar._memory import check_memory
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
+
+FloatArray = NDArray[np.float64]
+_BAND_BYTES = 64 * 2**20
+_MAX_PARTS = 2**20
+_DELAYS = 64  # midpoints inside a part for the pulse's average: error below (part / pulse width)^2 / 1e5
+
+
+class RateArray(Protocol):
+    """Rates (H, W, T) in memory or on disk: `shape`, and rows by ``values[first:last]``."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W, T)."""
+
+    def __getitem__(self, key: Any) -> Any:
+        """The selected rows, in memory."""
+
+
+class Transient:
+    """Light in each time bin at each pixel.
+
+    Parameters
+    ----------
+    values
+        (H, W, T), >= 0, in any linear unit (radiance per bin): an array, a memory map, or anything with `shape`
+        that gives rows when it is sliced. It is read in bands of rows, never whole.
+    bin_ns
+        Width of a time bin, ns of travel time (for a bin of d metres of optical path, d / c).
+    start_ns
+        Travel time at the start of bin 0, ns.
+    source
+        Where it comes from, for the record.
+    """
+
+    def __init__(
+        self, values: RateArray | ArrayLike, bin_ns: float, *, start_ns: float = 0.0, source: str = ""
+    ) -> None:
+        self.bin_ns = _validate.real("bin_ns", bin_ns, low=0.0, strict_low=True)
+        self.start_ns = _validate.real("start_ns", start_ns)
+        rates: Any = values if hasattr(values, "shape") else np.asarray(values)
+        if len(rates.shape) != 3 or 0 in rates.shape:
+            raise ValueError(f"values must be (H, W, T) with at least one bin, got shape {tuple(rates.shape)}")
+        self.values: RateArray = rates
+        self.source = source
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        height, width, _ = self.values.shape
+        return height, width
+
+    def __repr__(self) -> str:
+        h, w, bins = self.values.shape
+        return f"Transient({h} x {w} pixels, {bins} bins of {self.bin_ns:.6g} ns from {self.start_ns:.6g} ns)"
+
+    @cached_property
+    def totals(self) -> FloatArray:
+        """Light of each pixel (H, W): the sum over all bins. Reads the whole transient once, band by band."""
+        return np.concatenate([self._rows(rows).sum(-1) for rows in self.bands()])
+
+    def bands(self, band_bytes: int = _BAND_BYTES) -> Iterator[slice]:
+        """Rows that take at most about `band_bytes` as float64 each, at least one; together the image."""
+        height, width, bins = self.values.shape
+        step = max(1, band_bytes // (8 * width * bins))
+        for first in range(0, height, step):
+            yield slice(first, min(first + step, height))
+
+    def pixel_index(self, rows: slice) -> NDArray[np.int64]:
+        """What `mars_lidar.simulate` needs as `pixel_index`, so that some rows have the photons of the whole."""
+        first, last, _ = rows.indices(self.shape[0])
+        width = self.shape[1]
+        return np.arange(first * width, last * width, dtype=np.int64)
+
+    def flux(
+        self,
+        system: System,
+        *,
+        signal: float | None = None,
+        photons_per_unit: float | None = None,
+        sbr: float = math.inf,
+        dark_counts_per_s: float = 0.0,
+        pulse: bool = True,
+        parts: int | None = None,
+        rows: slice = slice(None),
+    ) -> Flux:
+        """The photon flux at each pixel, as a waveform.
+
+        With L the light of a pixel, summed over all bins, and V the pixels with any light::
+
+            S = signal * L / mean_V(L)      or      S = photons_per_unit * L
+            B = mean_V(S) / sbr  +  dark_counts_per_s * t_r
+
+        Time is folded with the laser period: light that arrives after its end comes in the next one.
+
+        Parameters
+        ----------
+        system
+            Gives the laser period and the pulse.
+        signal
+            Mean detectable signal photons per laser period over the pixels with light, > 0.
+        photons_per_unit
+            Instead of `signal`: detectable photons per laser period for one unit of light, > 0.
+        sbr
+            Mean signal over ambient photons, uniform over the image; inf: no ambient light.
+        dark_counts_per_s
+            Dark count rate of a pixel, counts/s.
+        pulse
+            Convolve with the system's pulse (for what a delta pulse sends back). False: the pulse and the
+            detector's response are in the transient already.
+        parts
+            Parts of the waveform in a period. Default: as fine as the transient and the histogram. A transient
+            whose bins fit the period a whole number of times is taken over unchanged.
+        rows
+            Rows of the image, of step 1; the levels are those of the whole image whatever the rows.
+
+        Raises
+        ------
+        ValueError, TypeError
+            A bad argument; light that is negative or not finite; no light anywhere.
+        """
+        if (signal is None) == (photons_per_unit is None):
+            raise ValueError("the level is one of signal and photons_per_unit, got neither or both")
+        for name, value in (("signal", signal), ("photons_per_unit", photons_per_unit)):
+            if value is not None:
+                _validate.real(name, value, low=0.0, strict_low=True)
+        if sbr != math.inf:
+            _validate.real("sbr", sbr, low=0.0, strict_low=True)
+        _validate.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
+        first, last, step = rows.indices(self.shape[0])
+        if step != 1 or first >= last:
+            raise ValueError(f"rows must select a run of at least one of {self.shape[0]}, got {rows!r}")
+        number = max(system.bins, math.ceil(system.period_ns / self.bin_ns * (1 - 1e-12)))
+        number = _validate.integer("parts", number if parts is None else parts, low=1, high=_MAX_PARTS)
+        lit = self.totals[self.totals > 0]
+        if lit.size == 0:
+            raise ValueError("values must have light in some pixel, got none")
+        mean = float(lit.mean())
+        scale = signal / mean if signal is not None else float(photons_per_unit or 0.0)
+        dark = dark_counts_per_s * 1e-9 * system.period_ns
+        background = (scale * mean / sbr if sbr != math.inf else 0.0) + dark
+        size = 8 * (last - first) * self.shape[1] * number
+        check_memory(4 * size, "the waveforms of these rows", "take fewer rows at a time")  # Flux keeps a copy
+        waveform = np.empty((last - first, self.shape[1], number))
+        spread = _spread_spectrum(system, number) if pulse else None
+        for band in self.bands():
+            here = slice(max(band.start, first), min(band.stop, last))
+            if here.start >= here.stop:
+                continue
+            light = self._on_period(self._rows(here), system.period_ns, number)
+            if spread is not None:
+                total = light.sum(-1, keepdims=True)
+                light = np.fft.irfft(np.fft.rfft(light) * spread, n=number)
+                light = np.maximum(light, 0.0)  # the transform's rounding
+                light *= np.divide(total, light.sum(-1, keepdims=True), out=np.zeros_like(total), where=total > 0)
+            waveform[here.start - first : here.stop - first] = scale * light
+        info = {
+            "transient": self.source,
+            "bin_ns": self.bin_ns,
+            "start_ns": self.start_ns,
+            "mean_signal": scale * mean,
+            "mean_background": background,
+            "sbr": None if sbr == math.inf else sbr,
+            "dark_counts_per_s": dark_counts_per_s,
+            "pulse_convolved": pulse,
+        }
+        return Flux(waveform=waveform, background=background, info=info)
+
+    def _rows(self, rows: slice) -> FloatArray:
+        values = np.asarray(self.values[rows])
+        if values.dtype.kind not in "fiu":
+            raise TypeError(f"values must be real numbers, got dtype {values.dtype}")
+        light = values.astype(np.float64)
+        wrong = ~((light >= 0.0) & (light < np.inf))
+        if wrong.any():
+            y, x, k = (int(n) for n in np.argwhere(wrong)[0])
+            place = (y + rows.start, x, k)
+            raise ValueError(f"values must be finite and >= 0, got {light[y, x, k]} at (y, x, bin) {place}")
+        return light
+
+    def _on_period(self, light: FloatArray, period_ns: float, number: int) -> FloatArray:
+        """Light in `number` equal parts of the period, energy kept; constant inside each bin of the source."""
+        bins = light.shape[-1]
+        before = np.concatenate([np.zeros((*light.shape[:2], 1)), light.cumsum(-1)], axis=-1)
+        edges = np.arange(number + 1) * (period_ns / number)
+        out = np.zeros((*light.shape[:2], number))
+        end_ns = self.start_ns + bins * self.bin_ns
+        for n in range(math.floor(self.start_ns / period_ns), math.floor(end_ns / period_ns) + 1):
+            place = (edges + n * period_ns - self.start_ns) / self.bin_ns
+            whole = np.round(place)  # edges that meet must meet exactly, or light leaks into a neighbour
+            place = np.clip(np.where(np.abs(place - whole) < 1e-9 * bins, whole, place), 0.0, bins)
+            left = np.minimum(place.astype(np.int64), bins - 1)
+            at = before[..., left] + (place - left) * light[..., left]
+            out += np.diff(at, axis=-1)
+        return np.maximum(out, 0.0)
+
+
+def _spread_spectrum(system: System, number: int) -> NDArray[np.complex128]:
+    """Transform of the pulse's energy in each part, for light that is spread evenly over part 0."""
+    part_ns = system.period_ns / number
+    energy = np.zeros(number)
+    for k in range(_DELAYS):
+        energy += system.pulse.bin_energy((k + 0.5) / _DELAYS * part_ns, system.period_ns, number)
+    return np.fft.rfft(energy / _DELAYS)

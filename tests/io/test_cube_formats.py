@@ -1,0 +1,249 @@
+"""Cubes as .mat and PTU: what comes back, what programs of others see, limits, damage."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from store_cases import SYSTEM, one_return
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.io import mat, optional, recipe
+
+FIELD_MAT = Path(__file__).resolve().parents[2].parent / "shared/data/rgbd/nyuv2_home_office_spad_0161_p1.mat"
+PTU = pytest.param(
+    ".ptu",
+    marks=pytest.mark.skipif(
+        not __import__("importlib.util").util.find_spec("ptufile"), reason="ptufile (extra io) is not installed"
+    ),
+)
+
+
+def several_returns() -> ml.Flux:
+    return ml.Flux.multi(one_return(), ml.Flux(0.3, 0.1, 70.0), ml.Flux(0.1, 0.0, 99.9))
+
+
+def waveform() -> ml.Flux:
+    return ml.Flux(waveform=np.random.default_rng(2).uniform(0.0, 0.05, (6, 5, 40)), background=0.2)
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    """Blocks of two rows, so that a writer sees an image in parts."""
+    monkeypatch.setattr(recipe, "BLOCK_BYTES", 2 * 5 * 64 * 2)
+    monkeypatch.setattr(mat, "BLOCK_BYTES", 2 * 5 * 64 * 2)
+
+
+@pytest.mark.parametrize("suffix", [".mat", PTU])
+@pytest.mark.parametrize("make", [one_return, several_returns, waveform])
+def test_a_file_holds_the_cube_and_makes_it_again(tmp_path, small_blocks, suffix, make):
+    flux = make()
+    path = tmp_path / f"cube{suffix}"
+    number = 1 if suffix == ".mat" else 3
+    values = np.exp(-np.arange(30) / 7.0)
+    system = SYSTEM.replace(pulse=ml.SampledPulse(values, 0.37, "centroid"), start="stationary")
+    arguments = {"realizations": number, "first_realization": 2, "seed": 2**64 - 1}
+    share = np.linspace(0.0, 1.0, 30).reshape(6, 5)
+    maps = {"depth_m": np.full((6, 5), 3.7), "reflectivity": share, "source": "a test"}
+    written = io.simulate_to(path, flux, system, **arguments, **maps)
+    expected = ml.simulate(flux, system, **arguments)
+    with io.load(path) as cube:
+        assert np.array_equal(np.asarray(cube.histogram), expected)
+        assert np.array_equal(np.asarray(cube.histogram[0, 2:4, 3]), expected[0, 2:4, 3])
+        assert cube.histogram.dtype == expected.dtype == np.asarray(cube.histogram).dtype
+        assert cube.registrations == written.registrations == expected.sum()
+        assert (cube.system, cube.engine, cube.seed, cube.version) == (system, "exact", 2**64 - 1, ml.__version__)
+        assert cube.recipe.first_realization == 2
+        assert (cube.recipe.source, cube.flux.info) == ("a test", flux.info and {"made": "by hand", "sbr": 2.5})
+        assert np.array_equal(cube.reflectivity, share)
+        assert np.array_equal(cube.depth_m, maps["depth_m"])
+        for name in ("signal", "background", "delay_ns", "returns_signal", "returns_delay_ns"):
+            assert np.array_equal(getattr(cube.flux, name), getattr(flux, name), equal_nan=True)
+        if flux.waveform is not None:
+            assert np.array_equal(cube.flux.waveform, flux.waveform)
+        assert io.verify(cube)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+# --- .mat, as depth networks load it -----------------------------------------------------------------------
+
+
+def test_mat_has_the_keys_shapes_and_types_of_the_field(tmp_path):
+    flux, path = one_return(), tmp_path / "cube.mat"
+    io.simulate_to(path, flux, SYSTEM, seed=3)
+    counts = ml.simulate(flux, SYSTEM, seed=3)[0]
+    found = scipy.io.loadmat(path)
+    assert {k for k in found if not k.startswith("__")} == {
+        "spad", "rates", "bin", "bin_hr", "SBR", "photons", "mars_lidar",
+    }  # fmt: skip
+    # the load of the networks: dense, (W, H, T), then turned
+    spad = np.asarray(scipy.sparse.csc_matrix.todense(found["spad"])).reshape([1, 5, 6, -1])
+    assert np.array_equal(np.transpose(spad, (0, 3, 2, 1))[0], counts.transpose(2, 0, 1))
+    assert found["spad"].dtype == np.float64
+    assert (found["bin"].shape, found["bin"].dtype) == ((6, 5), np.uint16)
+    assert (found["bin_hr"].shape, found["bin_hr"].dtype) == ((48, 40), np.float64)
+    assert (found["rates"].shape, found["rates"].dtype) == ((6, 5, 64), np.float64)
+    assert {name: kind for name, _, kind in scipy.io.whosmat(path)}["bin"] == "double"  # as in MATLAB
+    valid = flux.signal > 0
+    # a return is in the bin that its delay falls into, from 1; this pulse's largest bin is there or beside it
+    assert np.array_equal(found["bin"][valid], np.floor(flux.delay_ns[valid] / SYSTEM.bin_ns) + 1)
+    assert (np.abs(found["rates"].argmax(-1) + 1 - found["bin"])[valid] <= 0).all()
+    assert np.array_equal(found["rates"].max(-1), valid.astype(float))
+    assert found["bin"][~valid].tolist() == [0]
+    fine = found["bin_hr"][::8, ::8]
+    assert np.isnan(fine[~valid]).all()
+    assert np.array_equal(np.floor(fine[valid] + 0.5), found["bin"][valid])
+    assert found["SBR"].item() == pytest.approx(flux.signal.mean() / flux.background.mean(), rel=1e-15)
+    assert found["photons"].item() == pytest.approx(60 * flux.signal.mean(), rel=1e-15)
+
+
+@pytest.mark.skipif(not FIELD_MAT.is_file(), reason=f"the field's file is absent: {FIELD_MAT}")
+def test_mat_loads_like_the_file_of_the_field(tmp_path):
+    field = scipy.io.loadmat(FIELD_MAT)
+    system = SYSTEM.replace(bins=1024)
+    delay = (field["bin"] - 0.5) * system.bin_ns
+    path = tmp_path / "cube.mat"
+    io.simulate_to(path, ml.Flux(0.01, 0.05, delay), system)
+    mine = scipy.io.loadmat(path)
+    for name, theirs in field.items():
+        if not name.startswith("__"):
+            assert type(mine[name]) is type(theirs), name
+            assert mine[name].shape == theirs.shape, name
+            if name != "photons":  # theirs is the whole number 10, which MATLAB stores in a byte
+                assert mine[name].dtype == theirs.dtype, name
+    assert np.array_equal(mine["bin"], field["bin"])
+    classes = [{n: kind for n, _, kind in scipy.io.whosmat(p)} for p in (path, FIELD_MAT)]
+    assert all(classes[0][name] == kind for name, kind in classes[1].items())
+
+
+@pytest.mark.skipif(not FIELD_MAT.is_file(), reason=f"the field's file is absent: {FIELD_MAT}")
+def test_the_field_s_own_file_is_read(tmp_path):
+    read = io.read_mat(FIELD_MAT)
+    assert read.histogram.shape == read.rates.shape == (64, 64, 1024)
+    assert (read.sbr, read.photons, read.bin_hr.shape) == (0.2, 10.0, (512, 512))
+    # 10 signal photons over 50 of background: counts follow the rates only where pixels are in the right order
+    at_return = np.take_along_axis(read.histogram, read.bin[..., None].astype(int) - 1, -1).mean()
+    assert at_return > 10 * read.histogram.mean()
+    with pytest.raises(ValueError, match=r"not a cube written by mars-lidar .*read_mat"):
+        io.load(FIELD_MAT)
+
+
+def test_a_finer_depth_map_becomes_bin_hr(tmp_path):
+    system, flux = SYSTEM, one_return()
+    depth = np.full((48, 40), 4.0)
+    depth[0, 0] = np.nan
+    counts = ml.simulate(flux, system, realizations=3)
+    cube = io.Cube(histogram=counts, recipe=io.Recipe(system=system, flux=flux, realizations=3))
+    io.save_mat(tmp_path / "a.mat", cube, realization=2, depth_hr_m=depth)
+    read = io.read_mat(tmp_path / "a.mat")
+    assert np.array_equal(read.histogram, counts[2])
+    assert np.isnan(read.bin_hr[0, 0])
+    assert np.allclose(read.bin_hr[1:], system.delay_ns(4.0) / system.bin_ns + 0.5, rtol=1e-14)
+    with io.load(tmp_path / "a.mat") as again:
+        assert again.recipe.first_realization == 2
+        assert io.verify(again)
+    with pytest.raises(ValueError, match="depth_hr_m must be positive"):
+        io.save_mat(tmp_path / "b.mat", cube, depth_hr_m=-depth)
+    with pytest.raises(ValueError, match=r"realization must be an integer in \[0, 2\]"):
+        io.save_mat(tmp_path / "b.mat", cube, realization=3)
+    with pytest.raises(FileExistsError):
+        io.save_mat(tmp_path / "a.mat", cube)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mat"]
+
+
+# --- PTU, as labs open it ----------------------------------------------------------------------------------
+
+
+def test_ptufile_makes_the_cube_of_a_ptu(tmp_path):
+    ptufile = pytest.importorskip("ptufile", reason="ptufile (extra io) is not installed")
+    flux = one_return()
+    path = tmp_path / "cube.ptu"
+    io.simulate_to(path, flux, SYSTEM, realizations=2)
+    with ptufile.PtuFile(path) as ptu:
+        assert (ptu.is_image, ptu.is_t3) == (True, True)
+        assert ptu.record_type == ptufile.PtuRecordType.GenericT3
+        assert ptu.global_resolution == pytest.approx(100e-9, rel=1e-14)
+        assert ptu.tcspc_resolution == pytest.approx(100e-9 / 64, rel=1e-14)
+        image = ptu.decode_image(channel=0, dtime=64, keepdims=False)
+    assert np.array_equal(image, ml.simulate(flux, SYSTEM, realizations=2))
+
+
+def test_a_pixel_without_dead_time_may_have_more_photons_than_periods(tmp_path):
+    pytest.importorskip("ptufile", reason="ptufile (extra io) is not installed")
+    system = SYSTEM.replace(detector=ml.Detector(dead_time_ns=0.0))
+    flux = ml.Flux([[9.0, 0.0]], 0.5, 20.0)
+    io.simulate_to(tmp_path / "cube.ptu", flux, system, realizations=2)
+    with io.load(tmp_path / "cube.ptu") as cube:
+        assert np.asarray(cube.histogram).sum(-1).max() > 2 * system.cycles
+        assert io.verify(cube)
+
+
+# --- limits, damage, interruption --------------------------------------------------------------------------
+
+
+def test_limits_are_told_before_any_work(tmp_path):
+    with pytest.raises(ValueError, match=r"a \.mat holds one exposure, got 2 realizations"):
+        io.simulate_to(tmp_path / "a.mat", one_return(), SYSTEM, realizations=2)
+    wide = ml.Flux(np.full((600, 600), 0.1), 0.1, 20.0)
+    with pytest.raises(ValueError, match=r"less than 2 GiB, and rates of 600 x 600 x 1024 takes 2\.75 GiB"):
+        io.simulate_to(tmp_path / "a.mat", wide, SYSTEM.replace(bins=1024))
+    pytest.importorskip("ptufile", reason="ptufile (extra io) is not installed")
+    with pytest.raises(ValueError, match=r"bins must be at most 32768 in a \.ptu, got 40000"):
+        io.simulate_to(tmp_path / "a.ptu", one_return(), SYSTEM.replace(bins=40000))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_library_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ptufile", None)
+    with pytest.raises(io.MissingLibraryError, match=r"a \.ptu needs the library ptufile: pip install"):
+        io.simulate_to(tmp_path / "a.ptu", one_return(), SYSTEM)
+    assert list(tmp_path.iterdir()) == []
+    assert issubclass(optional.MissingLibraryError, ImportError)
+
+
+@pytest.mark.parametrize("suffix", [".mat", PTU])
+def test_damaged_files_are_named(tmp_path, suffix):
+    path = tmp_path / f"cube{suffix}"
+    for content in (b"", b"garbage" * 40):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"cube\..* is not a "):
+            io.load(path)
+    io.simulate_to(path, one_return(), SYSTEM, overwrite=True)
+    whole = path.read_bytes()
+    for size in (100, len(whole) // 2, len(whole) - 40):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match=r"cube\..*(cut short|cannot be read|can be read)"):
+            io.load(path)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        io.load(path)
+
+
+@pytest.mark.parametrize("suffix", [".mat", PTU])
+def test_an_interrupted_file_leaves_what_was_there(tmp_path, small_blocks, suffix):
+    path = tmp_path / f"cube{suffix}"
+
+    def stop(done: int, total: int) -> None:
+        if done >= 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(io.Interrupted, match="nothing was left at"):
+        io.simulate_to(path, one_return(), SYSTEM, progress=stop)
+    assert list(tmp_path.iterdir()) == []
+    io.simulate_to(path, one_return(), SYSTEM, seed=5)
+    with pytest.raises(io.Interrupted, match="is what it was before"):
+        io.simulate_to(path, one_return(), SYSTEM, progress=stop, overwrite=True)
+    with io.load(path) as cube:
+        assert cube.seed == 5
+    # what a killed process leaves
+    path.rename(tmp_path / f"cube{suffix}.incomplete")
+    with contextlib.suppress(FileNotFoundError):
+        path.unlink()
+    for name in (path, tmp_path / f"cube{suffix}.incomplete"):
+        with pytest.raises(io.IncompleteFileError, match=r"never finished|is incomplete"):
+            io.load(name, allow_incomplete=name != path)

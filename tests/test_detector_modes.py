@@ -95,7 +95,8 @@ def modes_of(case: Case, k: int, random: np.random.Generator) -> Case:
 
 
 _RANDOM = np.random.default_rng(7)
-RANDOM = [modes_of(case, k, _RANDOM) for k, case in enumerate(random_cases(32, seed=31, photons=8e5, least=1000))]
+_CASES = random_cases(32, seed=31, photons=8e5, least=1000, most=4000)
+RANDOM = [modes_of(case, k, _RANDOM) for k, case in enumerate(_CASES)]
 
 
 @pytest.mark.parametrize("case", RANDOM, ids=lambda case: case.name)

@@ -19,7 +19,7 @@ inline GateView gate_view(const Gate& gate) {
 }
 
 // Phase in [0, 1) at which the gate of a period opens, with 24 bits.
-inline float gate_position(const GateView& gate, int32_t cycle) {
+MARS_INLINE float gate_position(const GateView& gate, int32_t cycle) {
     const uint32_t turns = (cycle > 0 ? static_cast<uint32_t>(cycle) : 0u) / gate.cycles;
     return static_cast<float>(static_cast<int32_t>((gate.start + gate.step * turns) >> 40)) * 0x1p-24f;
 }

@@ -6,7 +6,6 @@ the exposure recursion holds for it with that flux: docs/detectors.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,25 +43,11 @@ def require_mode(what: str, system: System, modes: tuple[Mode, ...] = PLAIN) -> 
         )
 
 
-@dataclass(frozen=True)
-class GateIntervals:
-    """The open parts [low, high) of the period [0, 1), in periods and in order."""
-
-    parts: tuple[tuple[float, float], ...]
-
-    @classmethod
-    def of(cls, system: System) -> GateIntervals:
-        """Of a system with a gate that does not move; the whole period without a gate."""
-        start, _, width = system.detector.gate_periods(system.period_ns)
-        end = start + width
-        if end <= 1.0:
-            return cls(((start, end),))
-        return cls(((0.0, end - 1.0), (start, 1.0)))
-
-    def open(self, edges: FloatArray) -> FloatArray:
-        """Share of each of the intervals between `edges` (n + 1,) that is open (n,)."""
-        covered = sum((np.clip(edges, low, high) for low, high in self.parts), np.zeros(edges.shape))
-        return np.asarray(np.diff(covered) / np.diff(edges), dtype=np.float64)
+def open_parts(system: System) -> tuple[tuple[float, float], ...]:
+    """The parts [low, high) of the period [0, 1), in order, in which a gate that does not move is open."""
+    start, _, width = system.detector.gate_periods(system.period_ns)
+    end = start + width
+    return ((start, end),) if end <= 1.0 else ((0.0, end - 1.0), (start, 1.0))
 
 
 def photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
@@ -73,7 +58,7 @@ def photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
     if cells.system.detector.mode != "gated":
         return _photons_before(cells, edges)
     total = np.zeros((cells.size, edges.size))
-    for low, high in GateIntervals.of(cells.system).parts:
+    for low, high in open_parts(cells.system):
         bounded = np.concatenate([[low], np.clip(edges, low, high)])
         inside = _photons_before(cells, bounded)
         total += inside[:, 1:] - inside[:, :1]

@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
-from mars_lidar.detector import Mode
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.system import System
 
 Progress = Callable[[int, int], object]
 
-_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")  # that the delay recursion treats
 _ORDERS = 4
 _MAX_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
 _UNSETTLED = -2  # the native core's code: gave up
@@ -116,8 +114,9 @@ def exposure_moments(
         repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
     """
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="exposure_moments", modes=_MODES
-    )
+        signal, background, system, delay_ns=delay_ns, waveform=waveform,
+        what="exposure_moments", modes=("nonparalyzable", "gated"),
+    )  # fmt: skip
     return refined_moments(cells, system.bins, tolerance=tolerance, threads=threads, progress=progress)
 
 

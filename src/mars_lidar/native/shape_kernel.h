@@ -53,22 +53,24 @@ struct ShapeBlock {
     bool full;    // result: a bin would have exceeded the output's type
 };
 
+// Functions of this header have internal linkage: one compiled for AVX-512 must not be linked in place of another.
+
 constexpr int64_t kShapeStep = 64;  // bins that are drawn together
 
 // Bins j, j + classes, j + 2 classes, ... are a class: photons find their class first, then their bin in it. About
 // as many classes as bins in each, in steps of 64.
-inline constexpr int64_t shape_classes(int64_t bins) {
+static inline constexpr int64_t shape_classes(int64_t bins) {
     int64_t classes = kShapeStep;
     while (classes * classes < 4 * bins) classes *= 2;
     return classes;
 }
-inline constexpr int64_t padded_bins(int64_t bins) {
+static inline constexpr int64_t padded_bins(int64_t bins) {
     const int64_t classes = shape_classes(bins);
     return (bins + classes - 1) / classes * classes;
 }
 
 // Bins on either side of the frame that a dead time of `offset` bins, whole periods apart, reaches.
-inline int64_t frame_reach(double offset) { return static_cast<int64_t>(offset < 0 ? -offset : offset) + 2; }
+static inline int64_t frame_reach(double offset) { return static_cast<int64_t>(offset < 0 ? -offset : offset) + 2; }
 
 using ShapeKernel = void (*)(ShapeBlock&);
 

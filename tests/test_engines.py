@@ -42,6 +42,8 @@ CLAIMS = {
     "exact": {COUNTS, SHAPE, JOINT, INTERVALS},
     "sequential": {COUNTS, SHAPE, JOINT, INTERVALS},
     "poisson": {COUNTS, SHAPE, JOINT},
+    "feedback": {COUNTS, SHAPE, JOINT},
+    "auto": {COUNTS, SHAPE, JOINT},
 }
 WITHOUT_DEAD_TIME = {"poisson"}  # the law of the arrivals, whatever the detector
 TRUTH = "sequential"

@@ -21,7 +21,7 @@ FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures 
 FEWEST_PERIODS_ECHO = 1000  # ... and where pulses meet their echo: phases settle slowly
 BRIGHTEST_ECHO = 4.0  # signal photons of a pulse that meets its own echo; beyond, phases hardly settle at all
 MOST_BINS = 2**16  # internal bins; beyond, the memory of a batch leaves every cache
-_GRID_ERROR, _GRID_GOAL = 1.1e-3, 0.05  # see internal_bins
+_GRID_ERROR, _GRID_GOAL, _GRID_GOAL_ECHO = 1.1e-3, 0.05, 0.02  # see internal_bins
 _ECHO_SIGMAS = 5.0
 
 
@@ -31,7 +31,7 @@ class FeedbackEngine(Engine):
     The pixel is armed iff nothing was registered within the last dead time. Folded over the exposure, the counts
     of a bin are binomial given those of the preceding dead time; this engine finds the histogram that satisfies
     all these laws at once for one uniform number per bin. Its mean and covariance are those of
-    ``H = lambda (N_r + e - G H) + M``; the law is right bin by bin and jointly (derivation: docs/theory.md).
+    ``H = lambda (N_r + e - G H) + M``; the law is right bin by bin and jointly (docs/feedback.md).
     The cost is that of some sweeps over the bins, whatever the number of cycles.
 
     Pixels that it cannot do are given to the exact engine, by a rule on the pixel and the system alone: exposures
@@ -114,7 +114,7 @@ def internal_bins(flux: Flux, system: System) -> NDArray[np.int64]:
     The grid's error of a bin's mean is about c (width / sigma)^2 of its standard deviation for one period, and
     grows as the root of the number of periods. c = 1.1e-3 S up to S = 4 (measured against n = 16384), twenty times
     that where a pulse meets its own echo one dead time later. Bins are narrow enough for 1/20 of a standard
-    deviation, at most 0.3 sigma wide, 0.15 above 5 signal photons, and at most a quarter of the dead time.
+    deviation (1/50 with an echo, which shifts many bins alike), at most 0.3 sigma wide, 0.15 above 5 signal photons, and at most a quarter of the dead time.
     """
     if system.dead_time_periods == 0.0:  # independent bins
         return np.full(flux.shape, system.bins, dtype=np.int64)
@@ -123,8 +123,10 @@ def internal_bins(flux: Flux, system: System) -> NDArray[np.int64]:
         finest = np.minimum(finest, 1.0 / flux.waveform.shape[-1])
     else:
         sigma = _pulse_sigma(system) / system.period_ns
-        error = _GRID_ERROR * np.where(_echo(flux, system)[0], 20.0, 1.0) * np.clip(flux.signal, 1e-3, 4.0) * math.sqrt(system.cycles)
-        width = np.minimum(np.where(flux.signal > 5, 0.15, 0.3), np.sqrt(_GRID_GOAL / error))
+        echo, _ = _echo(flux, system)
+        error = _GRID_ERROR * np.where(echo, 20.0, 1.0) * np.clip(flux.signal, 1e-3, 4.0) * math.sqrt(system.cycles)
+        goal = np.where(echo, _GRID_GOAL_ECHO, _GRID_GOAL)
+        width = np.minimum(np.where(flux.signal > 5, 0.15, 0.3), np.sqrt(goal / error))
         finest = np.where(flux.signal > 0, np.minimum(finest, width * sigma), finest)
     parts = np.ceil(1.0 / (finest * system.bins) - 1e-9)
     return np.asarray(np.maximum(parts, 1.0) * system.bins, dtype=np.int64)

@@ -44,6 +44,8 @@ CLAIMS = {
     "sequential": {COUNTS, SHAPE, JOINT, INTERVALS},
     "mars": {COUNTS, SHAPE},  # its bins are multinomial given the count: the joint law is known to be wrong
     "poisson": {COUNTS, SHAPE, JOINT},
+    "feedback": {COUNTS, SHAPE, JOINT},
+    "auto": {COUNTS, SHAPE, JOINT},
     "renewal": set(),  # a baseline whose count law is wrong on purpose: tests/engines/test_renewal.py
 }
 WITHOUT_DEAD_TIME = {"poisson"}  # the law of the arrivals, whatever the detector

@@ -17,10 +17,12 @@ from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.system import System
 
-FEWEST_PERIODS = 100  # exposures below so many dead times (rounded up to periods) are drawn exactly
-_GRID_ERROR, _GRID_GOAL = 1.1e-3, 0.05  # see internal_bins
-_ECHO_SIGMAS = 5.0
+FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly ...
+FEWEST_PERIODS_ECHO = 1000  # ... and where pulses meet their echo: phases settle slowly
+BRIGHTEST_ECHO = 4.0  # signal photons of a pulse that meets its own echo; beyond, phases hardly settle at all
 MOST_BINS = 2**16  # internal bins; beyond, the memory of a batch leaves every cache
+_GRID_ERROR, _GRID_GOAL, _GRID_GOAL_ECHO = 1.1e-3, 0.05, 0.02  # see internal_bins
+_ECHO_SIGMAS = 5.0
 
 
 class FeedbackEngine(Engine):
@@ -29,13 +31,14 @@ class FeedbackEngine(Engine):
     The pixel is armed iff nothing was registered within the last dead time. Folded over the exposure, the counts
     of a bin are binomial given those of the preceding dead time; this engine finds the histogram that satisfies
     all these laws at once for one uniform number per bin. Its mean and covariance are those of
-    ``H = lambda (N_r + e - G H) + M``; the law is right bin by bin and jointly (derivation: docs/theory.md).
+    ``H = lambda (N_r + e - G H) + M``; the law is right bin by bin and jointly (docs/feedback.md).
     The cost is that of some sweeps over the bins, whatever the number of cycles.
 
     Pixels that it cannot do are given to the exact engine, by a rule on the pixel and the system alone: exposures
     below 100 dead times, sweeps that contract too slowly (about eight or more background photons per dead time),
-    count laws of a few counts under several blind periods, bins too fine or too many. Without dead time the bins
-    are independent Poisson numbers.
+    counts that hardly vary under a dead time of more than a period, pulses that meet their own echo after whole
+    periods (bright, or below 1000 dead times), more than 65,536 internal bins. Without dead time the bins are
+    independent Poisson numbers.
 
     The same seed gives the same bits whatever the threads, chunks, parts of the image and vector width. `level`
     forces one of ``_core.levels()``.
@@ -61,8 +64,7 @@ class FeedbackEngine(Engine):
             draw_pixels(PoissonEngine(), task, out, pixels)
             return pixels[:0]
         merge = internal_bins(task.flux, task.system) // task.system.bins
-        few = task.system.cycles < FEWEST_PERIODS * math.ceil(task.system.dead_time_periods)
-        merge = np.where(few | (merge * task.system.bins > MOST_BINS), 0, merge).reshape(-1)[pixels]
+        merge = np.where(_in_range(task.flux, task.system), merge, 0).reshape(-1)[pixels]
         refused = [pixels[merge == 0]]
         # lanes go through their sweeps together: neighbours in background need about as many
         order = np.lexsort((task.flux.background.reshape(-1)[pixels], merge))
@@ -78,23 +80,53 @@ class FeedbackEngine(Engine):
         return np.sort(np.concatenate(refused))
 
 
+def _in_range(flux: Flux, system: System) -> NDArray[np.bool_]:
+    """Pixels (H, W) that the sweeps may be tried on."""
+    periods = math.ceil(system.dead_time_periods)
+    _, echo = _echo(flux, system)
+    fewest = np.where(echo, FEWEST_PERIODS_ECHO, FEWEST_PERIODS)
+    fine = internal_bins(flux, system) <= MOST_BINS
+    return np.asarray((system.cycles >= fewest * periods) & ~(echo & (flux.signal > BRIGHTEST_ECHO)) & fine)
+
+
+def _echo(flux: Flux, system: System) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels (H, W) that are armed again within a return after another one, or the same one, has blinded them.
+
+    First all of these; then without those whose dead time ends within the pulse that it began in: nothing is
+    remembered from period to period there.
+    """
+    every, lasting = np.zeros((2, *flux.shape), dtype=np.bool_)
+    reach = _ECHO_SIGMAS * _pulse_sigma(system) / system.period_ns
+    lit = flux.returns_signal > 0
+    delay = np.where(lit, flux.returns_delay_ns, 0.0) / system.period_ns
+    for i, j in np.ndindex(len(lit), len(lit)):
+        apart = delay[i] - delay[j] + system.dead_time_periods
+        close = lit[i] & lit[j] & (np.abs(apart - np.rint(apart)) < reach)
+        every |= close
+        if i != j or round(system.dead_time_periods) > 0:
+            lasting |= close
+    return every, lasting
+
+
 def internal_bins(flux: Flux, system: System) -> NDArray[np.int64]:
     """Bins (H, W) of the period on which the sweeps run: those of the histogram, cut into equal parts.
 
     The grid's error of a bin's mean is about c (width / sigma)^2 of its standard deviation for one period, and
     grows as the root of the number of periods. c = 1.1e-3 S up to S = 4 (measured against n = 16384), twenty times
-    that where the pulse meets its own echo after whole periods. Bins are narrow enough for 1/20 of a standard
-    deviation, at most 0.3 sigma wide, 0.15 above 5 signal photons, and no wider than the dead time.
+    that where a pulse meets its own echo one dead time later. Bins are narrow enough for 1/20 of a standard
+    deviation (1/50 with an echo, which shifts many bins alike), at most 0.3 sigma wide, 0.15 above 5 signal photons, and at most a quarter of the dead time.
     """
-    finest = np.full(flux.shape, min(1.0, system.dead_time_periods))
+    if system.dead_time_periods == 0.0:  # independent bins
+        return np.full(flux.shape, system.bins, dtype=np.int64)
+    finest = np.full(flux.shape, min(1.0, 0.25 * system.dead_time_periods))
     if flux.waveform is not None:
         finest = np.minimum(finest, 1.0 / flux.waveform.shape[-1])
     else:
         sigma = _pulse_sigma(system) / system.period_ns
-        apart = abs(system.dead_time_periods - round(system.dead_time_periods))
-        near = 20.0 if apart < _ECHO_SIGMAS * sigma else 1.0
-        error = _GRID_ERROR * near * np.clip(flux.signal, 1e-3, 4.0) * math.sqrt(system.cycles)
-        width = np.minimum(np.where(flux.signal > 5, 0.15, 0.3), np.sqrt(_GRID_GOAL / error))
+        echo, _ = _echo(flux, system)
+        error = _GRID_ERROR * np.where(echo, 20.0, 1.0) * np.clip(flux.signal, 1e-3, 4.0) * math.sqrt(system.cycles)
+        goal = np.where(echo, _GRID_GOAL_ECHO, _GRID_GOAL)
+        width = np.minimum(np.where(flux.signal > 5, 0.15, 0.3), np.sqrt(goal / error))
         finest = np.where(flux.signal > 0, np.minimum(finest, width * sigma), finest)
     parts = np.ceil(1.0 / (finest * system.bins) - 1e-9)
     return np.asarray(np.maximum(parts, 1.0) * system.bins, dtype=np.int64)

@@ -114,30 +114,21 @@ private:
 
     int64_t row(int32_t j) const { return static_cast<int64_t>(j) * kTeam; }
 
-    // w and sum w, by sweeps from a constant rate's; how fast they contract.
+    // w and sum w, by sweeps from nothing; how fast they contract.
     void solve_mean() {
         Real *old = real_sums_[0], *fresh = real_sums_[1];
-        const double part = (grid_.shift + grid_.fraction) / n_;
         alignas(64) Real ones[kTeam], change[kTeam];
         alignas(64) int32_t active[kTeam];
-        float first[kTeam];
+        float first[kTeam], last[kTeam];
         for (int i = 0; i < kTeam; ++i) {
             ones[i] = 1;
             active[i] = 1;
-            first[i] = 0.0f;
             least_[i] = 1;
-            rate_[i] = 0.0f;
-            old[i] = 0;
+            rate_[i] = first[i] = last[i] = 0.0f;
         }
-        alignas(64) Real scale[kTeam];
-        for (int i = 0; i < kTeam; ++i) scale[i] = 0;
-        for (int32_t j = 0; j < n_; ++j)
-            for (int i = 0; i < kTeam; ++i) scale[i] += rates_.fire(j)[i];
-        for (int i = 0; i < kTeam; ++i) scale[i] = Real(1) / (Real(1) + scale[i] * static_cast<Real>(part));
-        for (int32_t j = 0; j < n_; ++j)
-            for (int i = 0; i < kTeam; ++i) old[row(j + 1) + i] = old[row(j) + i] + rates_.fire(j)[i] * scale[i];
+        for (int64_t k = 0; k < row(n_ + 1); ++k) old[k] = 0;
 
-        const double wanted = 0.1 / root(static_cast<double>(grid_.cycles));
+        const double wanted = 0.1 / root(static_cast<double>(grid_.cycles > 10000 ? grid_.cycles : 10000));
         const Real tolerance = static_cast<Real>(sizeof(Real) == 4 && wanted < 4e-6 ? 4e-6 : wanted);
         for (int sweep = 1; sweep <= kMeanSweeps; ++sweep) {
             real_sweep<Real>(grid_, rates_, ones, nullptr, nullptr, active, old, fresh, change);
@@ -145,14 +136,17 @@ private:
             bool some = false;
             for (int i = 0; i < kTeam; ++i) {
                 if (!active[i]) continue;
-                if (sweep == 1) first[i] = static_cast<float>(change[i]);
-                if (change[i] <= tolerance) {
+                const float moved = clip(static_cast<float>(change[i]));
+                if (sweep == 1) first[i] = moved;
+                if (change[i] <= tolerance && sweep > 1) {
                     active[i] = 0;
-                    const float fallen = log_of(clip(static_cast<float>(change[i]) / clip(first[i])));
-                    if (sweep > 1 && fallen < 0.0f) rate_[i] = exp_of(fallen / static_cast<float>(sweep - 1));
+                    const float once = moved / last[i];
+                    const float often = exp_of(lesser(log_of(moved / first[i]) / static_cast<float>(sweep - 1), 0.0f));
+                    rate_[i] = once > often ? once : often;
                 } else {
                     some = true;
                 }
+                last[i] = moved;
             }
             if (!some) break;
         }
@@ -167,7 +161,8 @@ private:
         spare_sums_ = fresh;
     }
 
-    static float clip(float x) { return x > 1e-30f ? x : 1e-30f; }
+    static float clip(float x) { return x > 1e-12f ? x : 1e-12f; }
+    static float lesser(float x, float y) { return x < y ? x : y; }
 
     // Mean and variance of every bin's count given its past, at the means; where quantiles cannot be followed.
     void linearise() {

@@ -8,6 +8,7 @@ from scipy import stats
 
 import mars_lidar as ml
 from harness import goodness, require
+from mars_lidar.statistics._pmf import Window
 from mars_lidar.statistics.matched import matched_counts, matched_pmf, trusted
 from mars_lidar.studies.__main__ import main
 from mars_lidar.studies.distance import Pmf, total_variation
@@ -178,6 +179,18 @@ def test_cumulants_that_no_count_has():
     wild = [(5.0, 2.0, 1e300, -1e300), (5.0, 2.0, -1e300, 1e300), (1e-300, 1e-300, 0.0, 0.0), (5.0, 1e9, 0.0, 0.0)]
     for window in matched_pmf(wild):
         assert abs(window.pmf.sum() - 1) < 1e-9
+
+
+@pytest.mark.parametrize("atoms", [2, 3, 4, 5])
+def test_laws_on_a_few_integers_keep_mean_and_variance(atoms):
+    random = np.random.default_rng(atoms)
+    p = random.dirichlet(np.full(atoms, 0.3), 2000)
+    first = random.integers(0, 5000, 2000)
+    cells = np.array([cumulants_of(Window(int(f), q, 0.0)) for f, q in zip(first, p, strict=True)])
+    spread = np.sqrt(np.maximum(cells[:, 1], 1e-12))
+    found = np.array([cumulants_of(window) for window in matched_pmf(cells)])
+    assert (np.abs(found[:, 0] - cells[:, 0]) <= 0.02 * spread + 1e-6).all()
+    assert (np.abs(found[:, 1] - cells[:, 1]) <= 0.05 * cells[:, 1] + 1e-6).all()
 
 
 def test_next_to_no_step_at_the_change_of_form():

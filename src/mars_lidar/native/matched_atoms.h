@@ -136,9 +136,10 @@ inline bool normalise(int size, double* weight) {
     return true;
 }
 
-// Multiplies the weights by the polynomial of degree 4 that gives them the four cumulants: their moments in
-// the orthonormal polynomials of the weights. Returns the probability that came out negative and was cut.
-inline double mend_once(const Cumulants& k, double first, int size, double* weight) {
+// Multiplies the weights by the polynomial of a degree up to 4 that gives them as many of the cumulants: their
+// moments in the orthonormal polynomials of the weights. Returns the probability that came out negative and
+// was cut.
+inline double mend_once(const Cumulants& k, int degrees, double first, int size, double* weight) {
     const double unit = std::sqrt(std::max(k.variance, 0.25)), scale = 1.0 / unit;
     const double v = k.variance * scale * scale;
     const double moments[] = {1.0, 0.0, v, k.third * scale * scale * scale,
@@ -151,7 +152,7 @@ inline double mend_once(const Cumulants& k, double first, int size, double* weig
         before[i] = 0.0;
     }
     double length = 0.0;
-    for (int degree = 1; degree <= 4; ++degree) {  // Stieltjes: t p_k - (t p_k, p_k) p_k - |.| p_(k-1)
+    for (int degree = 1; degree <= degrees; ++degree) {  // Stieltjes: t p_k - (t p_k, p_k) p_k - |.| p_(k-1)
         double along = 0.0, square = 0.0;
         for (int i = 0; i < size; ++i) along += weight[i] * at[i] * now[i] * now[i];
         for (int i = 0; i < size; ++i) {
@@ -190,12 +191,18 @@ inline double mend_once(const Cumulants& k, double first, int size, double* weig
 }
 
 // Repeated while cutting what is negative moves the cumulants again; cumulants that no law has never settle.
-// False if nothing is left to mend.
-inline bool mend(const Cumulants& k, double first, int size, double* weight) {
+// False if mean and variance did not come out: weights on too few integers, or on the wrong ones.
+inline bool mend(const Cumulants& k, int degrees, double first, int size, double* weight) {
     if (!normalise(size, weight)) return false;
     for (int round = 0; round < 6; ++round)
-        if (!(mend_once(k, first, size, weight) > 1e-9)) break;
-    return weight[0] >= 0.0;  // false for NaN
+        if (!(mend_once(k, degrees, first, size, weight) > 1e-9)) break;
+    double mean = 0.0, square = 0.0;
+    for (int i = 0; i < size; ++i) {
+        const double off = first + i - k.mean;
+        mean += weight[i] * off;
+        square += weight[i] * off * off;
+    }
+    return std::fabs(mean) < 0.02 * std::sqrt(k.variance) && std::fabs(square - k.variance) < 0.05 * k.variance;
 }
 
 }  // namespace atoms

@@ -4,6 +4,7 @@
 // Three forms. *Smooth*: the Cornish-Fisher quantile with four cumulants, rounded; Sheppard's corrections
 // take out what rounding adds. *Atoms*: probabilities on up to 64 integers, matched_atoms.h. *Pair*: the two
 // integers about the mean, where the variance is the least that an integer can have, or less.
+// less.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -78,12 +79,14 @@ public:
 
 private:
     static constexpr double kAtomsBelow = 9.0;    // variance
+    static constexpr double kBare = 1e-5;         // variance, below which there is nothing to mend
+    static constexpr double kNarrow = 0.3;        // variance, below which a normal base is as good as any
     static constexpr double kSheppard = 0.7;      // variance, from where his corrections are right
     static constexpr double kOneSided = 1e-5, kTwoSided = 0.05;  // misfits
     // thresholds of `trusted`, set by the study
     static constexpr double kSureReach = 4.0;   // standard deviations over which the quantile rises
     static constexpr double kSureRatio = 0.93;  // of gains that are rare, on top of losses
-    static constexpr double kSureFit = 3e-6, kSureSmooth = 2.3, kSureVariance = 0.19;
+    static constexpr double kSureFit = 3e-6, kSureSmooth = 3.5, kSureVariance = 0.19;
     static constexpr double kReach = 8.3;         // no word of 52 bits is beyond
     static constexpr double kNeeded = 1.5;        // where the quantile must rise for the law to be any good
 
@@ -164,17 +167,26 @@ private:
         // Rare gains and losses have a fourth cumulant close to the variance. Where it is far less the law is
         // smooth, and an offset with gains and losses would fit by accident.
         const bool one_sided = law.loss < 1e-3 * k.variance && law.misfit < kOneSided;
-        if (one_sided || (k.fourth > 0.3 * k.variance && law.misfit < kTwoSided)) {
-            if (set_atoms(k, [&](double first) { atoms::base(law, first, size_, below_); })) {
+        const bool two_sided = k.fourth > 0.3 * k.variance && law.misfit < kTwoSided;
+        if (k.variance < kBare && !(law.misfit < kOneSided)) return set_three(k);
+        // of a variance so small five integers hold all, and any base with them will do
+        if (one_sided || two_sided || (k.variance < kSureVariance && law.misfit < HUGE_VAL)) {
+            if (set_atoms(k, 4, [&](double first) { atoms::base(law, first, size_, below_); })) {
                 trusted_ = one_sided || (law.misfit < kSureFit && law.ratio > kSureRatio) ||
                            k.variance < kSureVariance;
                 return;
             }
         }
         set_smooth(k);
-        trusted_ = k.variance < kSureVariance || (trusted_ && k.variance > kSureSmooth);
-        if (k.variance > kSheppard) return;
-        if (!set_atoms(k, [&](double first) { round_smooth(k, first); })) set_pair(k.mean);
+        const bool rises = trusted_;
+        trusted_ = k.variance < kSureVariance || (rises && k.variance > kSureSmooth);
+        if (rises && k.variance > kSheppard) return;
+        const auto normal = [&](double first) { atoms::normal_base(k, first, size_, below_); };
+        if (k.variance < kNarrow ? set_atoms(k, 4, normal)
+                                 : set_atoms(k, 4, [&](double first) { round_smooth(k, first); }))
+            return;
+        trusted_ = false;  // no count has these cumulants: two of them then, and the least law else
+        if (!set_atoms(k, 2, normal)) set_three(k);
     }
 
     // Probabilities of the smooth law, and a little of a normal one where it has none: what `mend` needs.
@@ -199,9 +211,22 @@ private:
         below_[1] = 1.0;
     }
 
+    // An integer, and now and then one of its neighbours: mean and variance leave no choice.
+    void set_three(const Cumulants& k) {
+        const double middle = std::floor(k.mean + 0.5), off = k.mean - middle, both = k.variance + off * off;
+        const double less = std::max(0.5 * (both - off), 0.0), more = std::max(0.5 * (both + off), 0.0);
+        if (middle < 1.0 || less + more > 1.0) return set_pair(k.mean);
+        form_ = Form::atoms;
+        size_ = 3;
+        first_ = static_cast<int64_t>(middle) - 1;
+        below_[0] = less;
+        below_[1] = 1.0 - more;
+        below_[2] = 1.0;
+    }
+
     // `fill` puts weights into below_, from the count it is given on.
     template <class Fill>
-    bool set_atoms(const Cumulants& k, const Fill& fill) {
+    bool set_atoms(const Cumulants& k, int degrees, const Fill& fill) {
         const double spread = std::sqrt(k.variance), first = std::max(0.0, std::floor(k.mean - 6.5 * spread - 4.0));
         const double size = std::ceil(k.mean + 6.5 * spread + 6.0) - first;
         size_ = static_cast<int>(std::min<double>(size, atoms::kMost));
@@ -209,14 +234,12 @@ private:
         fill(first);
         // of the least variances the base is right to the last digit that matters
         const bool good =
-            k.variance < kBare ? atoms::normalise(size_, below_) : atoms::mend(k, first, size_, below_);
+            k.variance < kBare ? atoms::normalise(size_, below_) : atoms::mend(k, degrees, first, size_, below_);
         form_ = Form::atoms;
         double sum = 0.0;
         for (int i = 0; i < size_; ++i) below_[i] = sum += below_[i];
         return good;
     }
-
-    static constexpr double kBare = 1e-5;
 
     Form form_ = Form::pair;
     bool trusted_ = true;

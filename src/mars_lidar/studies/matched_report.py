@@ -65,7 +65,7 @@ def _text(settings: Settings, parts: list[Part], others: list[Part], quick: bool
         "had better keep the exact probabilities, *missed* are cells that it trusts and that are beyond the "
         "aim, *needless* those that it does not trust but that are within.",
         "![Total variation to the exact law](matched_map.png)",
-        f"Grid, armed start; crosses: not trusted. White: below {_LOW:g}.",
+        "Grid, armed start; columns: dead time; crosses: not trusted. The line on the scale is the aim.",
         "## By variance",
         "All cells. The law errs where the count all but locks to the laser: a variance between 0.2 and "
         "about 2, where the law is neither rare gains and losses about one integer nor smooth.",
@@ -150,7 +150,7 @@ def _draw(path: Path, settings: Settings, parts: Sequence[Part]) -> Path:
     rows = [(n, "matched", f"{n} cycles") for n in settings.cycles]
     rows.append((settings.cycles[0], "gaussian", f"Gaussian,\n{settings.cycles[0]} cycles"))
     with style():
-        figure, axes = panels(1.3 * len(rows), len(rows), len(settings.dead), sharex=True, sharey=True)
+        figure, axes = panels(0.5 + 0.95 * len(rows), len(rows), len(settings.dead), sharex=True, sharey=True)
         norm, mesh = LogNorm(_LOW, _HIGH), None
         for row, (cycles, law, words) in zip(axes, rows, strict=True):
             for ax, dead in zip(row, settings.dead, strict=True):
@@ -162,7 +162,7 @@ def _draw(path: Path, settings: Settings, parts: Sequence[Part]) -> Path:
                     ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
             row[0].set_ylabel(f"{words}\nB")
         for ax, dead in zip(axes[0], settings.dead, strict=True):
-            ax.set_title(f"$t_d$ = {dead:g} $t_r$")
+            ax.set_title(f"{dead:g} $t_r$")
         axes[-1, len(settings.dead) // 2].set_xlabel("S, photons per period")
         bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01)
         bar.set_label("total variation to the exact law")

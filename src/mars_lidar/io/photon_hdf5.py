@@ -42,7 +42,8 @@ def write(path: Path, times: Timestamps) -> None:
     counts = times.counts.ravel()
     pixels = np.arange(counts.size, dtype=np.uint16 if counts.size <= 2**16 else np.uint32)
     detectors = np.repeat(pixels, counts)
-    order = np.lexsort((detectors, nanotimes, times.cycle))
+    # in order of time; photons at the same time keep the order of their pixels
+    order = np.argsort(times.cycle.astype(np.int64) * (times.bins * fine) + nanotimes, kind="stable")
     period_s = 1e-9 * times.period_ns
     rate_hz = 1.0 / period_s
     content: dict[str, Any] = {

@@ -181,9 +181,13 @@ def _module(path: Path) -> Any:
 
 
 def _write_npz(path: Path, times: Timestamps) -> None:
-    arrays: dict[str, Any] = {name: getattr(times, name) for name in ("times_ns", "cycle", "bin", "offsets")}
-    with open(path, "wb") as file:  # by name, numpy appends its suffix
-        np.savez_compressed(file, **arrays, attributes=np.asarray(json.dumps(attributes(times))))
+    arrays = {name: getattr(times, name) for name in ("times_ns", "cycle", "bin", "offsets")}
+    arrays["attributes"] = np.asarray(json.dumps(attributes(times)))
+    # 14 million photons: 10 s and 132 MB; NumPy's own level takes 36 s for 114 MB
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def _npz_attributes(path: Path) -> dict[str, Any]:

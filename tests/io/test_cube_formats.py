@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
@@ -19,7 +21,7 @@ FIELD_MAT = Path(__file__).resolve().parents[2].parent / "shared/data/rgbd/nyuv2
 PTU = pytest.param(
     ".ptu",
     marks=pytest.mark.skipif(
-        not __import__("importlib.util").util.find_spec("ptufile"), reason="ptufile (extra io) is not installed"
+        importlib.util.find_spec("ptufile") is None, reason="ptufile (extra io) is not installed"
     ),
 )
 
@@ -181,6 +183,15 @@ def test_a_pixel_without_dead_time_may_have_more_photons_than_periods(tmp_path):
     with io.load(tmp_path / "cube.ptu") as cube:
         assert np.asarray(cube.histogram).sum(-1).max() > 2 * system.cycles
         assert io.verify(cube)
+
+
+@pytest.mark.parametrize("suffix", [".mat", PTU])
+def test_a_cube_without_a_count(tmp_path, suffix):
+    number = 1 if suffix == ".mat" else 2
+    io.simulate_to(tmp_path / f"dark{suffix}", ml.Flux(np.zeros((2, 3)), 0.0), SYSTEM, realizations=number)
+    with io.load(tmp_path / f"dark{suffix}") as cube:
+        assert cube.shape == (number, 2, 3, 64)
+        assert not np.asarray(cube.histogram).any()
 
 
 # --- limits, damage, interruption --------------------------------------------------------------------------

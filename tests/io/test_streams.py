@@ -256,6 +256,14 @@ def test_nothing_is_left_of_a_stream_that_fails(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_layout_from_the_future_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("mars_lidar.io.streams.FORMAT_VERSION", 2)
+    photons().save(tmp_path / "photons.npz")
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match=r"photons\.npz.*layout version 2; version 1 can be read"):
+        ml.Timestamps.load(tmp_path / "photons.npz")
+
+
 def test_the_info_of_timestamps_is_plain_data():
     times = photons()
     assert json.loads(json.dumps(times.info)) == times.info

@@ -13,8 +13,8 @@ photons     (1, 1)              mean expected signal photons of a pixel in the e
 mars_lidar  (1, 1) struct       ours: ``attributes`` (JSON) and the maps of `mars_lidar.io.layout`
 ==========  ==================  =============================================================================
 
-All numbers are of MATLAB's class double; whole ones are stored as small integers, as MATLAB does, and so
-`scipy.io.loadmat` returns `bin` as uint16. ``rates`` is zero where there is no return.
+All numbers are of MATLAB's class double; ``bin`` is stored as small integers, as MATLAB does with whole numbers, and
+so `scipy.io.loadmat` returns it as uint16. ``rates`` is zero where there is no return.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar.io.optional import needed
 from mars_lidar.timestamps import Timestamps
@@ -38,7 +39,7 @@ def write(path: Path, times: Timestamps) -> None:
     kind = np.uint16 if times.bins * fine <= 2**16 else np.uint32
     bin_ = times.bin.astype(np.int64)
     within = (times.times_ns / times.period_ns - times.cycle) * times.bins - bin_  # of a bin: 0 to 1
-    nanotimes = (bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)).astype(kind)
+    nanotimes: NDArray[Any] = (bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)).astype(kind)
     counts = times.counts.ravel()
     pixels = np.arange(counts.size, dtype=np.uint16 if counts.size <= 2**16 else np.uint32)
     detectors = np.repeat(pixels, counts)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.io.optional import needed
+from mars_lidar.io.store import INCOMPLETE_SUFFIX
 from mars_lidar.timestamps import Timestamps
 
 _GROUP, _ATTRIBUTES = "mars_lidar", "attributes"  # below /user, which the format leaves to its writers
@@ -91,6 +92,7 @@ def write(path: Path, times: Timestamps) -> None:
         file = content.get("_data_file")
         if file is not None and file.isopen:
             file.close()
+    _rename(path, path.with_name(path.name.removesuffix(INCOMPLETE_SUFFIX)))
 
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
@@ -146,6 +148,21 @@ def is_stream(path: Path) -> bool:
     """Whether the file has a group of photons."""
     with _opened(path) as file:
         return _PHOTONS in file
+
+
+def _rename(path: Path, target: Path) -> None:
+    """Put the name that the file will have where phconvert put the one that it has now."""
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        for name, value in (("filename", target.name), ("filename_full", str(target.absolute()))):
+            place = f"identity/{name}"
+            if place not in file:
+                continue
+            labels = dict(file[place].attrs)
+            del file[place]
+            file[place] = np.bytes_(value.encode())
+            file[place].attrs.update(labels)
 
 
 def _opened(path: Path) -> Any:

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.io import mat, optional, recipe
+from mars_lidar.plot.data import incident_rate
 
 FIELD_MAT = Path(__file__).resolve().parents[2].parent / "shared/data/rgbd/nyuv2_home_office_spad_0161_p1.mat"
 PTU = pytest.param(
     ".ptu",
     marks=pytest.mark.skipif(
-        not __import__("importlib.util").util.find_spec("ptufile"), reason="ptufile (extra io) is not installed"
+        importlib.util.find_spec("ptufile") is None, reason="ptufile (extra io) is not installed"
     ),
 )
 
@@ -102,6 +105,16 @@ def test_mat_has_the_keys_shapes_and_types_of_the_field(tmp_path):
     assert found["photons"].item() == pytest.approx(60 * flux.signal.mean(), rel=1e-15)
 
 
+@pytest.mark.parametrize("make", [several_returns, waveform])
+def test_rates_are_the_signal_of_all_returns(tmp_path, make):
+    flux = make()
+    io.simulate_to(tmp_path / "cube.mat", flux, SYSTEM)
+    read = io.read_mat(tmp_path / "cube.mat")
+    for y, x in ((0, 0), (1, 2), (5, 4)):
+        rate = incident_rate(flux, SYSTEM, y, x) - flux.background[y, x] / SYSTEM.bins
+        np.testing.assert_allclose(read.rates[y, x], rate / rate.max(), atol=1e-13)
+
+
 @pytest.mark.skipif(not FIELD_MAT.is_file(), reason=f"the field's file is absent: {FIELD_MAT}")
 def test_mat_loads_like_the_file_of_the_field(tmp_path):
     field = scipy.io.loadmat(FIELD_MAT)
@@ -170,7 +183,14 @@ def test_ptufile_makes_the_cube_of_a_ptu(tmp_path):
         assert ptu.global_resolution == pytest.approx(100e-9, rel=1e-14)
         assert ptu.tcspc_resolution == pytest.approx(100e-9 / 64, rel=1e-14)
         image = ptu.decode_image(channel=0, dtime=64, keepdims=False)
-    assert np.array_equal(image, ml.simulate(flux, SYSTEM, realizations=2))
+    counts = ml.simulate(flux, SYSTEM, realizations=2)
+    assert np.array_equal(image, counts)
+    # an independent reader of the records: no photon is missing
+    reader = pytest.importorskip("phconvert.pqreader", reason="phconvert (extra io) is not installed")
+    macro, channel, nano, meta, _ = reader.load_ptu(str(path))
+    assert np.array_equal(np.bincount(nano[channel < 64], minlength=64), counts.sum((0, 1, 2)))
+    assert (np.diff(macro) >= 0).all()
+    assert meta["timestamps_unit"] == pytest.approx(100e-9, rel=1e-12)
 
 
 def test_a_pixel_without_dead_time_may_have_more_photons_than_periods(tmp_path):
@@ -181,6 +201,15 @@ def test_a_pixel_without_dead_time_may_have_more_photons_than_periods(tmp_path):
     with io.load(tmp_path / "cube.ptu") as cube:
         assert np.asarray(cube.histogram).sum(-1).max() > 2 * system.cycles
         assert io.verify(cube)
+
+
+@pytest.mark.parametrize("suffix", [".mat", PTU])
+def test_a_cube_without_a_count(tmp_path, suffix):
+    number = 1 if suffix == ".mat" else 2
+    io.simulate_to(tmp_path / f"dark{suffix}", ml.Flux(np.zeros((2, 3)), 0.0), SYSTEM, realizations=number)
+    with io.load(tmp_path / f"dark{suffix}") as cube:
+        assert cube.shape == (number, 2, 3, 64)
+        assert not np.asarray(cube.histogram).any()
 
 
 # --- limits, damage, interruption --------------------------------------------------------------------------

@@ -115,6 +115,7 @@ def test_others_read_the_photon_hdf5(tmp_path):
         assert np.abs(absolute - mine).max() <= 0.5e9 * fine + 1e-5
         assert np.array_equal(np.bincount(data["detectors"][...], minlength=30), times.counts.ravel())
         assert file["setup/laser_repetition_rates"][0] == pytest.approx(1e7)
+        assert file["identity/filename"][()] == b"photons.h5"
         assert file["acquisition_duration"][()] == pytest.approx(3000 * 100e-9)
 
 
@@ -159,6 +160,24 @@ def test_a_lab_s_t3_stream(tmp_path):
     assert (coarse.bins, coarse.bin.tolist()) == (50, [0, 49, 1, 0])
     coarse.save(tmp_path / "lab.npz")
     assert np.array_equal(ml.Timestamps.load(tmp_path / "lab.npz").times_ns, coarse.times_ns)
+
+
+def test_a_lab_s_stream_is_converted(tmp_path):
+    for library in ("ptufile", "phconvert"):
+        pytest.importorskip(library, reason=f"{library} (extra io) is not installed")
+    rng = np.random.default_rng(4)
+    cycle, channel, dtime = np.sort(rng.integers(0, 1024, 500)), rng.integers(0, 4, 500), rng.integers(0, 3125, 500)
+    lab_ptu(tmp_path / "lab.ptu", 0x00010307, (channel << 25) | (dtime << 10) | cycle)
+    done = io.convert(tmp_path / "lab.ptu", tmp_path / "lab.h5", bins=625)
+    assert len(done.lost) == 2
+    assert "header entries of the other program" in done.lost[1]
+    times = ml.Timestamps.load(tmp_path / "lab.h5")
+    assert (times.shape, times.bins, times.info) == ((1, 4), 625, {"source": str(tmp_path / "lab.ptu")})
+    for k in range(4):
+        mine = times.pixel(0, k)
+        order = np.lexsort((dtime[channel == k], cycle[channel == k]))
+        assert np.array_equal(mine.cycle, cycle[channel == k][order])
+        assert np.array_equal(mine.bin, dtime[channel == k][order] // 5)
 
 
 def test_a_lab_s_t2_stream_is_folded_with_the_period(tmp_path):
@@ -254,6 +273,14 @@ def test_nothing_is_left_of_a_stream_that_fails(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         photons().save(tmp_path / "photons.ptu")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_layout_from_the_future_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("mars_lidar.io.streams.FORMAT_VERSION", 2)
+    photons().save(tmp_path / "photons.npz")
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match=r"photons\.npz.*layout version 2; version 1 can be read"):
+        ml.Timestamps.load(tmp_path / "photons.npz")
 
 
 def test_the_info_of_timestamps_is_plain_data():

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def info(
-    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5 or .npz.", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
     verify: Annotated[
         bool,
         typer.Option("--verify", help="Simulate again and compare every count; exit code 1 if they differ."),
@@ -48,7 +48,7 @@ def info(
 
 
 def view(
-    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5 or .npz.", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
     out: Annotated[
         Path, typer.Option("-o", "--out", help="The picture: .png, .pdf or .svg.", show_default=False)
     ],

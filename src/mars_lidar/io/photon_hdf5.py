@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar.io.optional import needed
+from mars_lidar.io.store import INCOMPLETE_SUFFIX
 from mars_lidar.timestamps import Timestamps
 
 _GROUP, _ATTRIBUTES = "mars_lidar", "attributes"  # below /user, which the format leaves to its writers
@@ -38,11 +40,12 @@ def write(path: Path, times: Timestamps) -> None:
     kind = np.uint16 if times.bins * fine <= 2**16 else np.uint32
     bin_ = times.bin.astype(np.int64)
     within = (times.times_ns / times.period_ns - times.cycle) * times.bins - bin_  # of a bin: 0 to 1
-    nanotimes = (bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)).astype(kind)
+    nanotimes: NDArray[Any] = (bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)).astype(kind)
     counts = times.counts.ravel()
     pixels = np.arange(counts.size, dtype=np.uint16 if counts.size <= 2**16 else np.uint32)
     detectors = np.repeat(pixels, counts)
-    order = np.lexsort((detectors, nanotimes, times.cycle))
+    # in order of time; photons at the same time keep the order of their pixels
+    order = np.argsort(times.cycle.astype(np.int64) * (times.bins * fine) + nanotimes, kind="stable")
     period_s = 1e-9 * times.period_ns
     rate_hz = 1.0 / period_s
     content: dict[str, Any] = {
@@ -89,6 +92,7 @@ def write(path: Path, times: Timestamps) -> None:
         file = content.get("_data_file")
         if file is not None and file.isopen:
             file.close()
+    _rename(path, path.with_name(path.name.removesuffix(INCOMPLETE_SUFFIX)))
 
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
@@ -144,6 +148,21 @@ def is_stream(path: Path) -> bool:
     """Whether the file has a group of photons."""
     with _opened(path) as file:
         return _PHOTONS in file
+
+
+def _rename(path: Path, target: Path) -> None:
+    """Put the name that the file will have where phconvert put the one that it has now."""
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        for name, value in (("filename", target.name), ("filename_full", str(target.absolute()))):
+            place = f"identity/{name}"
+            if place not in file:
+                continue
+            labels = dict(file[place].attrs)
+            del file[place]
+            file[place] = np.bytes_(value.encode())
+            file[place].attrs.update(labels)
 
 
 def _opened(path: Path) -> Any:

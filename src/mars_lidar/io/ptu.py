@@ -22,6 +22,7 @@ from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.store import OpenedStore, TemporarySibling, Writer
 
 KIND = "cube"
+_OVERFLOW = ((1 << 31) | (63 << 25) | 1).to_bytes(4, "little")  # generic T3: 1024 laser periods more
 _MAX_PIXEL_PERIODS = 2**31  # ptufile counts the periods of a pixel in 32 bits
 
 
@@ -82,10 +83,13 @@ class PtuWriter(Writer):
             if most > self._periods:  # the writer would leave photons out without a word
                 raise ValueError(f"a pixel of {most} counts does not fit the {self._periods} laser periods of a .ptu")
             self._ptu.write(self._image[None, :, :, None])
+            self._file.write(_OVERFLOW)  # the next image begins with its time at 0: time must not run backwards
 
     def finish(self, registrations: int) -> None:
         """Put the number of records into the header, close the file, and put it in its place."""
+        records = (self._file.tell() - self._header_bytes) // 4
         self._ptu.close()
+        ptu_header.set_integer(self._file, self._header_bytes, b"TTResult_NumberOfRecords", records)
         ptu_header.set_integer(self._file, self._header_bytes, ptu_header.PHOTONS.encode(), registrations)
         self._file.close()
         self._sibling.publish()

@@ -110,6 +110,9 @@ def from_attributes(
     counts: NDArray[Any],
 ) -> Timestamps:
     """Timestamps of the photons of all pixels, row-major, with `counts` (H * W,) of them each."""
+    version = attrs.get("format_version", FORMAT_VERSION)
+    if version != FORMAT_VERSION:
+        raise ValueError(f"these timestamps have layout version {version}; version {FORMAT_VERSION} can be read")
     height, width = (int(n) for n in attrs["shape"])
     if counts.size != height * width or int(counts.sum()) != times_ns.size:
         raise ValueError(f"{times_ns.size} photons do not make an image of {height} x {width}")
@@ -181,16 +184,23 @@ def _module(path: Path) -> Any:
 
 
 def _write_npz(path: Path, times: Timestamps) -> None:
-    arrays: dict[str, Any] = {name: getattr(times, name) for name in ("times_ns", "cycle", "bin", "offsets")}
-    with open(path, "wb") as file:  # by name, numpy appends its suffix
-        np.savez_compressed(file, **arrays, attributes=np.asarray(json.dumps(attributes(times))))
+    arrays = {name: getattr(times, name) for name in ("times_ns", "cycle", "bin", "offsets")}
+    arrays["attributes"] = np.asarray(json.dumps(attributes(times)))
+    # 14 million photons: 10 s and 132 MB; NumPy's own level takes 36 s for 114 MB
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def _npz_attributes(path: Path) -> dict[str, Any]:
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} is not an .npz archive")
-    with np.load(path, allow_pickle=False) as archive:
-        attrs = json.loads(archive["attributes"].item()) if "attributes" in archive.files else {}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            attrs = json.loads(archive["attributes"].item()) if "attributes" in archive.files else {}
+    except (ValueError, zipfile.BadZipFile, OSError, zlib.error) as error:
+        raise ValueError(f"{path} is damaged ({error})") from error
     return dict(attrs)
 
 

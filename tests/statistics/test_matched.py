@@ -232,9 +232,9 @@ def test_study(tmp_path):
         rows = list(csv.DictReader(file))
     cells = len(QUICK.signal) * len(QUICK.background)
     maps = len(QUICK.dead) * len(QUICK.cycles) + len(QUICK.stationary)
-    assert len(rows) == maps * cells + QUICK.systems * QUICK.pixels
-    assert {row["kind"] for row in rows} == {"armed", "stationary", "random"}
-    sure = [float(row["tv_exact_matched"]) for row in rows if row["trusted"] == "True"]
-    assert max(sure) <= AIM
-    assert "matched_map.png" in (tmp_path / "matched.md").read_text()
+    assert 0 < len(rows) < maps * cells + QUICK.systems * QUICK.pixels
+    assert all(row["trusted"] == "False" or AIM / 4 < float(row["tv_exact_matched"]) <= AIM for row in rows)
+    text = (tmp_path / "matched.md").read_text()
+    assert "matched_map.png" in text
+    assert f"| grid, armed | {len(QUICK.dead) * len(QUICK.cycles) * cells} |" in text
     assert 5_000 < (tmp_path / "matched_map.png").stat().st_size <= MAX_FIGURE_BYTES

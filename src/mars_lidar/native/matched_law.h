@@ -4,7 +4,6 @@
 // Three forms. *Smooth*: the Cornish-Fisher quantile with four cumulants, rounded; Sheppard's corrections
 // take out what rounding adds. *Atoms*: probabilities on up to 64 integers, matched_atoms.h. *Pair*: the two
 // integers about the mean, where the variance is the least that an integer can have, or less.
-// less.
 #pragma once
 #include <algorithm>
 #include <cmath>

@@ -71,7 +71,10 @@ def drawn(engine: Any, request: Case, seed: int = 1) -> NDArray[np.int64]:
 
 
 def dense_law(request: Case, merge: int) -> tuple[FloatArray, FloatArray]:
-    """Mean (bins,) and covariance (bins, bins) of an armed start: H = lambda (N_r + e - G H) + M on bins * merge bins."""
+    """Mean (bins,) and covariance (bins, bins) from an armed start: H = lambda (N_r + e - G H) + M.
+
+    Solved on bins * merge internal bins.
+    """
     system, flux = request.system, request.flux
     n = system.bins * merge
     photons = flux.background[0, 0] / n + flux.signal[0, 0] * system.pulse.bin_energy(
@@ -287,7 +290,8 @@ KINDS = ("short", "long", "sampled", "whole periods", "returns", "waveform")
 
 
 def image(kind: str) -> tuple[ml.Flux, System]:
-    flux, system = mixture({"long": 20_000_000, "whole periods": 6000}.get(kind, 600), start="stationary" if kind == "sampled" else "armed")
+    cycles = {"long": 20_000_000, "whole periods": 6000}.get(kind, 600)
+    flux, system = mixture(cycles, start="stationary" if kind == "sampled" else "armed")
     flux = flux if kind != "long" else ml.Flux(flux.signal, np.minimum(flux.background, 1.0), flux.delay_ns)
     if kind == "sampled":
         system = system.replace(pulse=SAMPLED)

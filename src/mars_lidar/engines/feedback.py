@@ -112,9 +112,10 @@ def internal_bins(flux: Flux, system: System) -> NDArray[np.int64]:
     """Bins (H, W) of the period on which the sweeps run: those of the histogram, cut into equal parts.
 
     The grid's error of a bin's mean is about c (width / sigma)^2 of its standard deviation for one period, and
-    grows as the root of the number of periods. c = 1.1e-3 S up to S = 4 (measured against n = 16384), twenty times
-    that where a pulse meets its own echo one dead time later. Bins are narrow enough for 1/20 of a standard
-    deviation (1/50 with an echo, which shifts many bins alike), at most 0.3 sigma wide, 0.15 above 5 signal photons, and at most a quarter of the dead time.
+    grows as the root of the number of periods. c = 1.1e-3 S up to S = 4 (measured against 16 times finer grids),
+    twenty times that where a pulse meets its own echo one dead time later. Bins are narrow enough for 1/20 of a
+    standard deviation (1/50 with an echo, which shifts many bins alike), at most 0.3 sigma wide, 0.15 above 5
+    signal photons, and at most a quarter of the dead time.
     """
     if system.dead_time_periods == 0.0:  # independent bins
         return np.full(flux.shape, system.bins, dtype=np.int64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,8 +55,12 @@ class FeedbackEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Poisson numbers, feedback, or the exact engine, pixel by pixel."""
-        rest = self.sample(task, out, np.arange(task.pixel_index.size))
-        draw_pixels(ExactEngine(self.level), task, out, rest)
+        share = 1.0
+        if task.system.dead_time_periods > 0.0:
+            share = float(_in_range(task.flux, task.system).mean())
+        every = np.arange(task.pixel_index.size)
+        rest = self.sample(replace(task, progress=stage(task.progress, 0.0, share)), out, every)
+        draw_pixels(ExactEngine(self.level), replace(task, progress=stage(task.progress, share, 1.0)), out, rest)
         task.report["pixels given to exact"] = float(rest.size)
 
     def sample(self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -74,7 +79,7 @@ class FeedbackEngine(Engine):
             status = np.zeros(group.size, np.uint8)
             _core.feedback_histogram(
                 task.job, task.pulse, out, group, status, int(factor), task.threads, self.level,
-                stage(task.progress, k, len(groups)),
+                stage(task.progress, k / len(groups), (k + 1) / len(groups)),
             )  # fmt: skip
             refused.append(group[status != 0])
         return np.sort(np.concatenate(refused))

@@ -117,8 +117,8 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates<Real>& r
 
 // Blind time rho at a period's edge in the stationary state: returns its whole periods, and in `bins` how many bins
 // of the period lie in the rest. Registrations in the last y before the edge number R(y) per period; R(y) = u gives
-// the last one, and rho = t_d - y. `sums`: prefix sums of the mean at K = 0, of one lane (stride kTeam), `total` in all; `share`
-// = 1 / (1 + K total); the lane's bin 0 is bin `first_bin` of the period.
+// the last one, and rho = t_d - y. `sums`: prefix sums of the mean at K = 0, of one lane (stride kTeam), `total` in
+// all; `share` = 1 / (1 + K total); the lane's bin 0 is bin `first_bin` of the period.
 template <class Real>
 MARS_NOINLINE int32_t blind_bins(const FeedbackGrid& grid, const Real* sums, double total, double share,
                                  int32_t first_bin, double u, int32_t& bins) {

@@ -49,8 +49,10 @@ def simulate(
     system
         Laser, detector and histogram.
     engine
-        ``"exact"`` (default), ``"sequential"`` (slow, independent gold standard), ``"mars"`` (count law x
-        shape), ``"renewal"`` and ``"poisson"`` (baselines), or an `Engine` of your own settings.
+        ``"exact"`` (default), ``"feedback"`` (whole histograms, at a cost independent of the exposure),
+        ``"auto"`` (the faster of these two, pixel by pixel), ``"sequential"`` (slow, independent gold standard),
+        ``"mars"`` (count law x shape), ``"renewal"`` and ``"poisson"`` (baselines), or an `Engine` of your own
+        settings.
     realizations
         Independent exposures of the whole image.
     first_realization

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,16 +11,16 @@ from numpy.typing import NDArray
 from mars_lidar.engines.base import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine, internal_bins
-from mars_lidar.engines.parts import draw_pixels
+from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
 
 BREAK_EVEN = 4.0
 """Registrations per internal bin above which feedback is the faster engine.
 
-Measured on one core of an AMD EPYC (1024 bins, N_r = 1e3 to 3e4, 0.6 to 32 registrations per bin; other work on the
-machine): feedback 12-18 ns per internal bin at fluxes up to 1 photon and 23-28 ns up to 5, exact 4.4-5.2 ns per
-registration; they break even at 2.6-4.0 and 5.2-6.3 registrations (AVX2: 2.7-5.1 and 4.9-6.4).
+Measured on one core of an AMD EPYC (1024 bins, N_r = 1e3 to 3e4, 0.6 to 32 registrations per bin; processor time, other
+work on the machine): feedback 11-15 ns per internal bin at fluxes up to 1 photon and 22-26 ns up to 5, exact 4.4-5.1 ns
+per registration; they break even at 2.4-3.5 and 4.9-6.1 registrations (AVX2: 2.2-3.3 and 4.2-5.0).
 """
 
 
@@ -44,9 +45,11 @@ class AutoEngine(Engine):
         """Feedback where it pays, exact for the rest."""
         cost = BREAK_EVEN * internal_bins(task.flux, task.system)
         many = (expected_registrations(task.flux, task.system) > cost).reshape(-1)
-        refused = FeedbackEngine(self.level).sample(task, out, np.flatnonzero(many))
+        share = float(many.mean())
+        first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))
+        refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many))
         rest = np.sort(np.concatenate([np.flatnonzero(~many), refused]))
-        draw_pixels(ExactEngine(self.level), task, out, rest)
+        draw_pixels(ExactEngine(self.level), second, out, rest)
         task.report["pixels drawn by exact"] = float(rest.size)
         task.report["pixels drawn by feedback"] = float(many.size - rest.size)
 

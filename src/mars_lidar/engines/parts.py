@@ -11,14 +11,19 @@ from numpy.typing import NDArray
 from mars_lidar.engines.base import Engine, Progress, Task
 from mars_lidar.flux import Flux
 
+_TICKS = 1000
 _BUFFER_BYTES = 64 << 20  # of histograms drawn aside before they are put in place
 
 
-def stage(progress: Progress | None, number: int, of: int) -> Progress | None:
-    """A progress callback for one of several calls, so that the whole runs from 0 to its end once."""
-    if progress is None or of == 1:
-        return progress
-    return lambda done, total: progress(number * total + done, of * total)
+def stage(progress: Progress | None, start: float, end: float) -> Progress | None:
+    """A progress callback for one of several calls: from `start` to `end` of the whole."""
+    if progress is None:
+        return None
+
+    def told(done: int, total: int) -> object:
+        return progress(round(_TICKS * (start + (end - start) * done / max(total, 1))), _TICKS)
+
+    return told
 
 
 def part_of(flux: Flux, pixels: NDArray[np.int64]) -> Flux:
@@ -55,7 +60,8 @@ def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[n
         number = min(deep, task.realizations - first)
         part = replace(
             task, flux=part_of(task.flux, some), realizations=number, first_realization=task.first_realization + first,
-            pixel_index=task.pixel_index[some], progress=stage(task.progress, k, len(steps)), report={},
+            pixel_index=task.pixel_index[some], report={},
+            progress=stage(task.progress, k / len(steps), (k + 1) / len(steps)),
         )  # fmt: skip
         rows = np.empty((part.items, task.system.bins), out.dtype)
         engine.histogram(part, rows)

@@ -4,6 +4,8 @@
 #include <type_traits>
 #include <utility>
 
+#include "feedback_laws.h"
+#include "feedback_output.h"
 #include "feedback_sweeps.h"
 
 #define MARS_JOIN2(a, b) a##b
@@ -22,18 +24,15 @@ constexpr float kLinearFrom = 0.1f;    // and from which the linear response is 
 constexpr double kLeastVariance = 12.0;  // of the count, for each whole period of dead time: 0.2 to 0.5 are added
 constexpr double kFewArmed = 32.0, kFewCounts = 0.03;  // quantiles are taken anew below this many exposures armed
 
-double floor_of(double x) {
-    const double whole = static_cast<double>(static_cast<int64_t>(x));
-    return whole > x ? whole - 1.0 : whole;
-}
-
 template <class Real>
 class Batch {
 public:
     explicit Batch(const FeedbackBatch& batch) : batch_(batch), grid_(*batch.grid), n_(batch.grid->bins) {
-        const size_t rows = static_cast<size_t>(n_) * kTeam, lit = static_cast<size_t>(batch.lit_end - batch.lit_begin) * kTeam;
+        const size_t rows = static_cast<size_t>(n_) * kTeam;
+        const size_t lit = static_cast<size_t>(batch.lit_end - batch.lit_begin) * kTeam;
         const size_t reals = 2 * kTeam + 2 * lit + 4 * rows + 4 * (rows + kTeam);
-        const size_t bytes = reals * sizeof(Real) + 2 * (rows + kTeam) * 4 + rows * 2 + static_cast<size_t>(n_) * 4 + 64 * 32;
+        const size_t integers = 2 * (rows + kTeam) * 4 + rows * 2 + static_cast<size_t>(n_) * 4;
+        const size_t bytes = reals * sizeof(Real) + integers + 64 * 32;  // with room to align every array
         if (batch.memory->size() < bytes) batch.memory->resize(bytes);
         unsigned char* at = batch.memory->data();
         auto take = [&at](auto*& pointer, size_t count) {
@@ -76,42 +75,12 @@ public:
             draw_numbers(draw);
             start_history();
             if (!sweep_integers()) return true;
-            if (!write(draw)) return false;
+            if (!write_histograms(batch_, sums_[0], drawing_, draw)) return false;
         }
         return true;
     }
 
 private:
-    // p = 1 - e^-l and q = 1 - p / l: Taylor series at l / 64, then six times 1 - e^-2x = p (2 - p).
-    MARS_NOINLINE static void set_rates(const double* photons, size_t number, Real* fire, Real* refire) {
-        for (size_t i = 0; i < number; ++i) {
-            const double l = photons[i] < 40.0 ? photons[i] : 40.0, x = l * 0x1p-6;
-            double p = 1.0;
-            p = 1.0 - p * x * (1.0 / 12);
-            p = 1.0 - p * x * (1.0 / 11);
-            p = 1.0 - p * x * (1.0 / 10);
-            p = 1.0 - p * x * (1.0 / 9);
-            p = 1.0 - p * x * (1.0 / 8);
-            p = 1.0 - p * x * (1.0 / 7);
-            p = 1.0 - p * x * (1.0 / 6);
-            p = 1.0 - p * x * (1.0 / 5);
-            p = 1.0 - p * x * (1.0 / 4);
-            p = 1.0 - p * x * (1.0 / 3);
-            p = 1.0 - p * x * (1.0 / 2);
-            p *= x;
-            p *= 2.0 - p;
-            p *= 2.0 - p;
-            p *= 2.0 - p;
-            p *= 2.0 - p;
-            p *= 2.0 - p;
-            p *= 2.0 - p;
-            const double series = l * (0.5 - l * (1.0 / 6 - l * (1.0 / 24 - l * (1.0 / 120 - l * (1.0 / 720)))));
-            const double bright = photons[i] > 1e-300 ? photons[i] : 1e-300;
-            fire[i] = static_cast<Real>(p);
-            refire[i] = static_cast<Real>(l < 0.02 ? series : 1.0 - p / bright);
-        }
-    }
-
     int64_t row(int32_t j) const { return static_cast<int64_t>(j) * kTeam; }
 
     // w and sum w, by sweeps from nothing; how fast they contract.
@@ -196,35 +165,11 @@ private:
         }
     }
 
-    // Where whole periods of the dead time are blind, the total is found by a fixed point, to half a count. Pixels
-    // whose count varies by little more than that are refused: Var N = sum y^2 v / (1 + K sum w)^2, y the adjoint of 1.
+    // Where whole periods of the dead time are blind, the total is found by a fixed point, to half a count.
     void refuse_locked() {
-        Real *sums = spare_sums_, *fresh = real_sums_[2], *values = real_sums_[3];
-        alignas(64) Real moved[kTeam];
-        for (int64_t k = 0; k < row(n_); ++k) values[k] = 1;
-        for (int i = 0; i < kTeam; ++i) sums[row(n_) + i] = 0;
-        for (int32_t j = n_ - 1; j >= 0; --j)
-            for (int i = 0; i < kTeam; ++i) sums[row(j) + i] = sums[row(j + 1) + i] + rates_.fire(j)[i];
-        double variance[kTeam] = {};
-        int32_t done[kTeam] = {};
-        for (int sweep = 0; sweep < kMeanSweeps; ++sweep) {
-            adjoint_sweep<Real>(grid_, rates_, sums, fresh, values, moved);
-            std::swap(sums, fresh);
-            bool some = false;
-            for (int i = 0; i < kTeam; ++i) {
-                if (done[i]) continue;
-                if (moved[i] > Real(1e-3) && sweep + 1 < kMeanSweeps) {
-                    some = true;
-                    continue;
-                }
-                done[i] = 1;
-                for (int32_t j = 0; j < n_; ++j) {
-                    const double y = static_cast<double>(values[row(j) + i]);
-                    variance[i] += y * y * static_cast<double>(variance_[row(j) + i]);
-                }
-            }
-            if (!some) break;
-        }
+        double variance[kTeam];
+        count_variance<Real>(grid_, rates_, variance_, spare_sums_, real_sums_[2], real_sums_[3], kMeanSweeps,
+                             variance);
         for (int i = 0; i < kTeam; ++i)
             if (variance[i] * share_[i] * share_[i] < kLeastVariance * grid_.whole)
                 batch_.status[i] = FeedbackStatus::kLocked;
@@ -250,43 +195,16 @@ private:
         for (int i = 0; i < kTeam; ++i) {
             exposure_.place[i] = batch_.first_bin[i];
             exposure_.active[i] = drawing_[i] ? -1 : 0;
-            const int32_t whole = blind_bins(i, 1u, exposure_.end[i]);
-            int32_t before = exposure_.start[i] = 0;
-            if (grid_.stationary) before = blind_bins(i, 2u, exposure_.start[i]);
-            spare_[i] = whole - before;
+            spare_[i] = blind_at_an_end(i, 1u, exposure_.end[i]);
+            exposure_.start[i] = 0;
+            if (grid_.stationary) spare_[i] -= blind_at_an_end(i, 2u, exposure_.start[i]);
         }
     }
 
-    // Blind time rho at a period's edge in the stationary state: returns its whole periods, and how many bins of the
-    // period lie in the rest. Registrations in the last y before the edge number R(y) per period; R(y) = u gives the
-    // last one, and rho = t_d - y.
-    int32_t blind_bins(int i, uint32_t stage, int32_t& bins) const {
-        bins = 0;
+    int32_t blind_at_an_end(int i, uint32_t stage, int32_t& bins) const {
         const Pair<uint32_t> words = threefry<13, uint32_t>(kEndEvent, stage, key0_[i], key1_[i]);
         const double u = (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
-        if (!(total_[i] > 0.0)) return 0;
-        const double level = u / share_[i], periods = floor_of(level / total_[i]);
-        if (periods > grid_.dead_time) return 0;
-        const int32_t edge = batch_.first_bin[i] == 0 ? 0 : n_ - batch_.first_bin[i];
-        const Real* sums = mean_sums_ + i;
-        const double here = static_cast<double>(sums[row(edge)]);
-        double target = here - (level - periods * total_[i]);
-        const bool round = target < 0.0;
-        if (round) target += total_[i];
-        int32_t low = 0, high = n_;  // sums[low] <= target < sums[high]
-        while (high - low > 1) {
-            const int32_t middle = (low + high) / 2;
-            (static_cast<double>(sums[row(middle)]) <= target ? low : high) = middle;
-        }
-        const double below = static_cast<double>(sums[row(low)]), step = static_cast<double>(sums[row(high)]) - below;
-        const double inside = step > 0.0 ? (target - below) / step : 0.0;
-        const double back = edge - (low + (inside < 1.0 ? inside : 1.0)) + (round ? n_ : 0);
-        const double rho = grid_.dead_time - periods - back / n_;
-        if (!(rho > 0.0)) return 0;
-        const double whole = floor_of(rho), rest = (rho - whole) * n_;
-        bins = static_cast<int32_t>(rest);
-        if (bins < rest) ++bins;
-        return static_cast<int32_t>(whole);
+        return blind_bins(grid_, mean_sums_ + i, total_[i], share_[i], batch_.first_bin[i], u, bins);
     }
 
     // The first history: the mean, and the linear response to this draw's noise where sweeps contract slowly.
@@ -370,41 +288,6 @@ private:
             if (grid_.whole > 0) set_blind();
         }
         return true;
-    }
-
-    // Bins of the histogram from prefix sums, 32 at a time so that both sides stay in the first-level cache.
-    bool write(int32_t draw) const {
-        return batch_.wide ? write<uint32_t>(draw) : write<uint16_t>(draw);
-    }
-    template <class Count>
-    bool write(int32_t draw) const {
-        constexpr int32_t kBlock = 32;
-        const int32_t bins = n_ / grid_.merge;
-        const int32_t* sums = sums_[0];
-        uint32_t largest = 0;
-        alignas(64) Count block[kTeam][kBlock];
-        for (int32_t first = 0; first < bins; first += kBlock) {
-            const int32_t count = bins - first < kBlock ? bins - first : kBlock;
-            for (int32_t b = 0; b < count; ++b) {
-                const int32_t* from = sums + row((first + b) * grid_.merge);
-                const int32_t* to = from + row(grid_.merge);
-                for (int i = 0; i < kTeam; ++i) {
-                    const uint32_t counts = static_cast<uint32_t>(to[i]) - static_cast<uint32_t>(from[i]);
-                    largest = drawing_[i] && counts > largest ? counts : largest;
-                    block[i][b] = static_cast<Count>(counts);
-                }
-            }
-            for (int i = 0; i < kTeam; ++i) {
-                if (!drawing_[i]) continue;
-                Count* out = static_cast<Count*>(batch_.rows[i]) + static_cast<int64_t>(draw) * batch_.row_step;
-                int32_t to = first + batch_.first_bin[i] / grid_.merge;
-                if (to >= bins) to -= bins;
-                const int32_t straight = bins - to < count ? bins - to : count;
-                memcpy(out + to, block[i], sizeof(Count) * static_cast<size_t>(straight));
-                memcpy(out, block[i] + straight, sizeof(Count) * static_cast<size_t>(count - straight));
-            }
-        }
-        return sizeof(Count) == 4 || largest <= 0xffffu;
     }
 
     const FeedbackBatch& batch_;

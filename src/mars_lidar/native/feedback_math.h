@@ -38,7 +38,7 @@ MARS_INLINE float log_of(float x) {
     return static_cast<float>(e) * 0.693147182464599609375f + ((t - 0.5f * z) + (z * t) * p);
 }
 
-// log(1 - p), 0 <= p < 1, relatively accurate: the series below 1/8.
+// log(1 - p), 0 <= p < 1/8, relatively accurate; beyond, log_of(1 - p) is.
 MARS_INLINE float log_one_minus(float p) {
     float s = 0.125f;
     s = s * p + 0.14285715f;
@@ -47,10 +47,7 @@ MARS_INLINE float log_one_minus(float p) {
     s = s * p + 0.25f;
     s = s * p + 0.33333334f;
     s = s * p + 0.5f;
-    s = -(s * p + 1.0f) * p;
-    const float rest = 1.0f - p;
-    const float direct = log_of(rest > 1e-30f ? rest : 1e-30f);
-    return p < 0.125f ? s : direct;
+    return -(s * p + 1.0f) * p;
 }
 
 // e^x, -87 <= x <= 0: x = k log 2 + r, Taylor series to r^7 for |r| <= log(2)/2.
@@ -83,13 +80,14 @@ MARS_INLINE float tail_of(uint32_t word) {
 MARS_INLINE float normal_size(float tail) {
     const float q = 0.5f - tail;
     const float c = 0.180625f - q * q;
-    const float centre =
-        q * (((5.9109374720e1f * c + 1.5929113202e2f) * c + 5.0434271938e1f) * c + 3.3871327179f) /
-        (((6.7187563600e1f * c + 7.8757757664e1f) * c + 1.7895169469e1f) * c + 1.0f);
+    const float over =
+        q * (((5.9109374720e1f * c + 1.5929113202e2f) * c + 5.0434271938e1f) * c + 3.3871327179f);
+    const float under = ((6.7187563600e1f * c + 7.8757757664e1f) * c + 1.7895169469e1f) * c + 1.0f;
     const float t = root(-log_of(tail)) - 1.6f;
-    const float far = (((1.7023821103e-1f * t + 1.3067284816f) * t + 2.7568153900f) * t + 1.4234372777f) /
-                      ((1.2021132975e-1f * t + 7.3700164250e-1f) * t + 1.0f);
-    return q <= 0.425f ? centre : far;
+    const float far_over = ((1.7023821103e-1f * t + 1.3067284816f) * t + 2.7568153900f) * t + 1.4234372777f;
+    const float far_under = (1.2021132975e-1f * t + 7.3700164250e-1f) * t + 1.0f;
+    const bool centre = q <= 0.425f;
+    return (centre ? over : far_over) / (centre ? under : far_under);
 }
 
 }  // namespace MARS_LEVEL

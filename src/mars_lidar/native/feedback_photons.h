@@ -16,6 +16,7 @@ class PulseEnergy {
 public:
     explicit PulseEnergy(const PulseShape& shape) : shape_(shape) {
         if (!shape.gaussian()) return;
+        scale_ = 1.0 / shape.sigma;
         constexpr int cells = static_cast<int>(kReach * kCells) + 2;
         for (int k = 0; k <= cells; ++k) {
             const double x = k / kCells;
@@ -27,13 +28,15 @@ public:
     double low() const { return shape_.low(); }
     double high() const { return shape_.high(); }
 
-    // Times relative to the delay, from <= to, no wrapping.
-    double between(double from, double to) const {
-        if (!shape_.gaussian()) return shape_.cumulative(to) - shape_.cumulative(from);
-        const double a = from / shape_.sigma, b = to / shape_.sigma;
-        if (a >= 0.0) return tail(a) - tail(b);
-        if (b <= 0.0) return tail(-b) - tail(-a);
-        return 1.0 - tail(-a) - tail(b);
+    // Energy before a time relative to the delay, no wrapping; of a Gaussian 1 less from the delay on.
+    double below(double time) const {
+        if (!shape_.gaussian()) return shape_.cumulative(time);
+        const double x = time * scale_;
+        return x < 0.0 ? tail(-x) : -tail(x);
+    }
+    // Energy from one time to a later one, given what `below` says there.
+    double between(double from, double to, double below_from, double below_to) const {
+        return below_to - below_from + (shape_.gaussian() && from < 0.0 && to >= 0.0 ? 1.0 : 0.0);
     }
 
 private:
@@ -59,6 +62,7 @@ private:
     }
 
     const PulseShape& shape_;
+    double scale_ = 0.0;  // 1 / sigma
     std::vector<double> tail_, density_;
 };
 
@@ -114,8 +118,9 @@ private:
             for (int64_t k = 0; k < job.returns; ++k) {
                 if (!(job.signal[k * job.pixels + pixels[i]] > 0.0)) continue;
                 const double at = offset(job, k, pixels[i], i);
-                lit_begin = std::min(lit_begin, static_cast<int32_t>(std::max(-1.0, std::floor(at + reach_low_))));
-                lit_end = std::max(lit_end, static_cast<int32_t>(std::min(n_ + 1.0, std::floor(at + reach_high_) + 1.0)));
+                const double low = std::floor(at + reach_low_), high = std::floor(at + reach_high_) + 1.0;
+                lit_begin = std::min(lit_begin, static_cast<int32_t>(std::max(-1.0, low)));
+                lit_end = std::max(lit_end, static_cast<int32_t>(std::min(n_ + 1.0, high)));
             }
         if (lit_begin < 0 || lit_end > n_) {  // a pulse goes on at the other end
             lit_begin = 0;
@@ -128,11 +133,15 @@ private:
         const int64_t first = static_cast<int64_t>(std::floor(at + reach_low_));
         const int64_t last = static_cast<int64_t>(std::floor(at + reach_high_));
         const double width = 1.0 / n_;
+        int64_t bin = (first % n_ + n_) % n_;
+        double from = (static_cast<double>(first) - at) * width, below = energy.below(from);
         for (int64_t edge = first; edge <= last; ++edge) {
-            const double from = (static_cast<double>(edge) - at) * width;
-            const double more = photons * energy.between(from, from + width);
-            const int64_t bin = (edge % n_ + n_) % n_;
+            const double to = (static_cast<double>(edge + 1) - at) * width, next = energy.below(to);
+            const double more = photons * energy.between(from, to, below, next);
             if (more > 0.0) lit[static_cast<size_t>((bin - lit_begin) * kTeam + lane)] += more;
+            from = to;
+            below = next;
+            if (++bin == n_) bin = 0;
         }
     }
 

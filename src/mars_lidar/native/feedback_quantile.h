@@ -29,14 +29,15 @@ struct Uniforms {
     }
 };
 
-// Cornish-Fisher to the third cumulant and the kurtosis of a binomial; the "- 2" holds the lattice's 1/12.
+// Cornish-Fisher to the third cumulant and the kurtosis of a binomial; the "- 2" holds the lattice's 1/12. `slope`: its
+// derivative with respect to the mean, variance / mean kept.
 template <class Real>
-MARS_INLINE Real expansion(Real mean, Real variance, Real z) {
-    const Real s = root(variance), keep = variance / mean, p = Real(1) - keep;
-    const Real pq = p * keep;
-    const Real square = z * z;
+MARS_INLINE Real expansion(Real mean, Real variance, Real z, Real& slope) {
+    const Real s = root(variance), per_mean = Real(1) / mean, per_s = Real(1) / s;
+    const Real keep = variance * per_mean, p = Real(1) - keep, pq = p * keep, square = z * z;
+    slope = Real(1) + Real(0.5) * z * s * per_mean;
     return mean + s * z + (Real(1) - Real(2) * p) * (square - Real(1)) * Real(1.0 / 6) +
-           z * ((Real(14) * pq - Real(2)) - square * (Real(1) + Real(2) * pq)) / (Real(72) * s) - Real(0.5);
+           z * ((Real(14) * pq - Real(2)) - square * (Real(1) + Real(2) * pq)) * (per_s * Real(1.0 / 72)) - Real(0.5);
 }
 
 // Terms of the binomial up to the one that the uniform number falls into.
@@ -47,49 +48,60 @@ struct Terms {
 
     template <class Real>
     MARS_INLINE void sum(const Real* mean, const Real* variance, const float* uniform) {
-        alignas(64) float left[kTeam], odds[kTeam];
-        alignas(64) int32_t open[kTeam];
-        int32_t some = 0;
+        alignas(64) float trials[kTeam], odds[kTeam], limit[kTeam], chance[kTeam], exponent[kTeam];
+        int32_t large = 0;
         for (int i = 0; i < kTeam; ++i) {
-            const bool few = mean[i] < Real(kInversionBelow);
-            const bool dark = !(mean[i] > Real(1e-25));
+            const bool few = mean[i] < Real(kInversionBelow), dark = !(mean[i] > Real(1e-25));
             const float mu = few ? (dark ? 1e-25f : static_cast<float>(mean[i])) : 1.0f;
-            const float keep = few && !dark ? static_cast<float>(variance[i]) / mu : 1.0f;
-            const float spare = few && !dark ? static_cast<float>((mean[i] - variance[i])) / mu : 0.0f;
+            const float per_mean = 1.0f / mu;
+            const float keep = few && !dark ? static_cast<float>(variance[i]) * per_mean : 1.0f;
+            const float spare = few && !dark ? static_cast<float>(mean[i] - variance[i]) * per_mean : 0.0f;
             const float p = spare > 1e-9f ? spare : 1e-9f;
-            const float trials = mu / p;
-            const float exponent = trials * log_one_minus(p);
-            const float none = exp_of(exponent > -80.0f ? exponent : -80.0f);
-            // 1 - e^x without loss for small x
-            const float e = exponent;
-            const float series = -e * (1.0f + e * (0.5f + e * (0.16666667f + e * 0.041666668f)));
-            term[i] = none;
-            before[i] = 0.0f;
-            beyond[i] = e > -0.02f ? series : 1.0f - none;
-            above[i] = 1.0f;
-            count[i] = 0.0f;
-            left[i] = trials;
+            trials[i] = mu / p;
             odds[i] = p / (keep > 1e-7f ? keep : 1e-7f);
-            open[i] = few && uniform[i] < beyond[i] ? 1 : 0;
-            some |= open[i];
+            chance[i] = p;
+            limit[i] = few ? uniform[i] : 2.0f;  // a uniform number of 2 falls into the first term
+            exponent[i] = trials[i] * log_one_minus(p);
+            large |= p >= 0.125f ? 1 : 0;
         }
-        for (int k = 1; some && k < kMostTerms; ++k) {
-            const float inverse = 1.0f / static_cast<float>(k);
-            some = 0;
+        if (large)
             for (int i = 0; i < kTeam; ++i) {
-                const float rest = left[i] > 0.0f ? left[i] : 0.0f;
-                const float next = term[i] * (rest * inverse) * odds[i];
-                const bool go = open[i] != 0;
-                before[i] = go ? term[i] : before[i];
-                above[i] = go ? beyond[i] : above[i];
-                term[i] = go ? next : term[i];
-                beyond[i] = go ? beyond[i] - next : beyond[i];
-                count[i] = go ? count[i] + 1.0f : count[i];
-                left[i] = left[i] - 1.0f;
-                open[i] = go && uniform[i] < beyond[i] && next > 1e-12f ? 1 : 0;
-                some |= open[i];
+                const float rest = 1.0f - chance[i];
+                const float direct = trials[i] * log_of(rest > 1e-30f ? rest : 1e-30f);
+                exponent[i] = chance[i] < 0.125f ? exponent[i] : direct;
             }
+        for (int i = 0; i < kTeam; ++i) {
+            const float e = exponent[i], none = exp_of(e > -80.0f ? e : -80.0f);
+            const float series = -e * (1.0f + e * (0.5f + e * (0.16666667f + e * 0.041666668f)));  // 1 - e^x, small x
+            term[i] = none;
+            beyond[i] = e > -0.02f ? series : 1.0f - none;
         }
+        for (int first = 0; first < kTeam; first += kLanes) add_terms(first, trials, odds, limit);
+    }
+
+private:
+    MARS_INLINE void add_terms(int first, const float* trials, const float* odds, const float* limit) {
+        const Float number = load<Float>(trials + first), ratio = load<Float>(odds + first);
+        const Float u = load<Float>(limit + first);
+        Float now = load<Float>(term + first), left = load<Float>(beyond + first);
+        Float earlier = splat(0.0f), more = splat(1.0f), k = splat(0.0f);
+        Mask open = u < left;
+        for (int step = 1; any(open) && step < kMostTerms; ++step) {
+            const float here = static_cast<float>(step);
+            const Float rest = maximum(number - (here - 1.0f), splat(0.0f));
+            const Float next = now * (rest * (1.0f / here)) * ratio;
+            earlier = select(open, now, earlier);
+            more = select(open, left, more);
+            now = select(open, next, now);
+            left = select(open, left - next, left);
+            k = select(open, splat(here), k);
+            open = open & (u < left) & (next > 1e-12f);
+        }
+        store(term + first, now);
+        store(before + first, earlier);
+        store(beyond + first, left);
+        store(above + first, more);
+        store(count + first, k);
     }
 };
 
@@ -108,8 +120,10 @@ MARS_INLINE void follow_quantile(const Real* mean, const Real* variance, const U
         const Real mu = mean[i] > Real(1) ? mean[i] : Real(1), least = mu * Real(1e-7);
         const Real var = variance[i] > least ? variance[i] : least;
         const Real z = static_cast<Real>(uniforms.normal[i]);
-        alpha[i] = Real(1) + Real(0.5) * z * var / (mu * root(var));
-        beta[i] = expansion(mu, var, z) - alpha[i] * mu;
+        Real slope;
+        const Real x = expansion(mu, var, z, slope);
+        alpha[i] = slope;
+        beta[i] = x - slope * mu;
     }
     if (!any_few(mean)) return;
     Terms terms;
@@ -136,7 +150,8 @@ MARS_INLINE void quantile(const Real* mean, const Real* variance, const Uniforms
     for (int i = 0; i < kTeam; ++i) {
         const Real mu = mean[i] > Real(1) ? mean[i] : Real(1), least = mu * Real(1e-7);
         const Real var = variance[i] > least ? variance[i] : least;
-        const Real x = expansion(mu, var, static_cast<Real>(uniforms.normal[i]));
+        Real slope;
+        const Real x = expansion(mu, var, static_cast<Real>(uniforms.normal[i]), slope);
         const int32_t down = static_cast<int32_t>(x);
         const int32_t up = down + (x > static_cast<Real>(down) ? 1 : 0);
         count[i] = up > 0 ? up : 0;

@@ -2,7 +2,7 @@
 //
 // C_j counts registrations before bin j, cyclically: C_{j-n} = C_j - N. With the re-armed count
 //     RA_j = (1 - f) C_{j-d} + f C_{j-d-1}
-// E_j = N_r + e_j - K N - (C_j - RA_j) exposures are armed at the start of bin j and I_j = RA_{j+1} - RA_j re-arm inside.
+// E_j = N_r + e_j - K N - (C_j - RA_j) exposures are armed at the start of bin j, I_j = RA_{j+1} - RA_j re-arm inside.
 // One sweep goes through the bins with the newest prefix sums; `old` are those of the sweep before, one period earlier.
 #pragma once
 #include "feedback_quantile.h"
@@ -74,13 +74,14 @@ MARS_NOINLINE void real_sweep(const FeedbackGrid& grid, const Rates<Real>& rates
         const Real *p = rates.fire(j), *q = rates.refire(j);
         const Real *late = history.row(j + 1 - d), *late_less = history.less(j + 1 - d);
         const Real *early = history.row(j - d), *early_less = history.less(j - d);
-        const Real* before = old + static_cast<int64_t>(j + 1) * kTeam;
-        Real* after = fresh + static_cast<int64_t>(j + 1) * kTeam;
+        const int64_t row = static_cast<int64_t>(j) * kTeam;
+        const Real* before = old + row + kTeam;
+        Real* after = fresh + row + kTeam;
         const bool watch = j + 1 >= n - d - 1;
         for (int i = 0; i < kTeam; ++i) {
             const Real next = g * (late[i] - late_less[i]) + f * (early[i] - early_less[i]);
             Real h = p[i] * (armed[i] - (c[i] - re[i])) + q[i] * (next - re[i]);
-            if (alpha) h = alpha[static_cast<int64_t>(j) * kTeam + i] * h + beta[static_cast<int64_t>(j) * kTeam + i] + Real(0.5);
+            if (alpha) h = alpha[row + i] * h + beta[row + i] + Real(0.5);
             re[i] = next;
             c[i] = active[i] ? c[i] + h : before[i];
             after[i] = c[i];
@@ -95,42 +96,6 @@ MARS_NOINLINE void real_sweep(const FeedbackGrid& grid, const Rates<Real>& rates
     for (int i = 0; i < kTeam; ++i) {
         const Real total = c[i] - history.total[i];
         change[i] = most[i] - total > total - least[i] ? most[i] - total : total - least[i];
-    }
-}
-
-// Sweep of the adjoint, backwards: y_j = 1 - sum of G_ij p_i y_i + sum of Shift_ij q_i y_i, for the variance of the
-// count. `old`, `fresh`: suffix sums of p y (n + 1 rows); `values`: y, replaced in place.
-// `moved`: the largest change of y.
-template <class Real>
-MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const Rates<Real>& rates,
-                                 const Real* __restrict__ old, Real* __restrict__ fresh,
-                                 Real* __restrict__ values, Real* __restrict__ moved) {
-    const int32_t n = grid.bins, d = grid.shift;
-    const Real f = static_cast<Real>(grid.fraction), g = Real(1) - f;
-    alignas(64) Real total[kTeam], sum[kTeam], nothing[kTeam];
-    for (int i = 0; i < kTeam; ++i) {
-        total[i] = old[i];
-        sum[i] = nothing[i] = moved[i] = 0;
-        fresh[static_cast<int64_t>(n) * kTeam + i] = 0;
-    }
-    auto row = [](auto* rows, int32_t j) { return rows + static_cast<int64_t>(j) * kTeam; };
-    for (int32_t j = n - 1; j >= 0; --j) {
-        const int32_t near = (j + d) % n, far = (j + d + 1) % n, to_near = j + 1 + d, to_far = j + 2 + d;
-        const Real *q_near = rates.refire(near), *q_far = rates.refire(far), *p = rates.fire(j);
-        const Real *y_near = row(values, near), *y_far = row(values, far);
-        const Real* s_near = to_near <= n ? row(fresh, to_near) : row(old, to_near - n);
-        const Real* s_far = to_far <= n ? row(fresh, to_far) : row(old, to_far <= 2 * n ? to_far - n : n);
-        const Real *less_near = to_near > n ? total : nothing, *less_far = to_far > n ? total : nothing;
-        Real *value = row(values, j), *after = row(fresh, j);
-        for (int i = 0; i < kTeam; ++i) {
-            const Real window = sum[i] - g * (s_near[i] - less_near[i]) - f * (s_far[i] - less_far[i]);
-            const Real y = Real(1) - window + g * q_near[i] * y_near[i] + f * q_far[i] * y_far[i];
-            const Real step = y > value[i] ? y - value[i] : value[i] - y;
-            moved[i] = step > moved[i] ? step : moved[i];
-            value[i] = y;
-            sum[i] += p[i] * y;
-            after[i] = sum[i];
-        }
     }
 }
 

@@ -1,0 +1,47 @@
+// Histograms from prefix sums.
+#pragma once
+#include "feedback_kernel.h"
+#include "feedback_math.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+// 32 bins of all lanes at a time, so that both sides stay in the first-level cache. False if a count does not fit.
+template <class Count>
+MARS_NOINLINE bool write_counts(const FeedbackBatch& batch, const int32_t* sums, const bool* drawing, int32_t draw) {
+    constexpr int32_t kBlock = 32;
+    const FeedbackGrid& grid = *batch.grid;
+    const int32_t bins = grid.bins / grid.merge;
+    uint32_t largest = 0;
+    alignas(64) Count block[kTeam][kBlock];
+    for (int32_t first = 0; first < bins; first += kBlock) {
+        const int32_t count = bins - first < kBlock ? bins - first : kBlock;
+        for (int32_t b = 0; b < count; ++b) {
+            const int32_t* from = sums + static_cast<int64_t>(first + b) * grid.merge * kTeam;
+            const int32_t* to = from + static_cast<int64_t>(grid.merge) * kTeam;
+            for (int i = 0; i < kTeam; ++i) {
+                const uint32_t counts = static_cast<uint32_t>(to[i]) - static_cast<uint32_t>(from[i]);
+                largest = drawing[i] && counts > largest ? counts : largest;
+                block[i][b] = static_cast<Count>(counts);
+            }
+        }
+        for (int i = 0; i < kTeam; ++i) {
+            if (!drawing[i]) continue;
+            Count* out = static_cast<Count*>(batch.rows[i]) + static_cast<int64_t>(draw) * batch.row_step;
+            int32_t to = first + batch.first_bin[i] / grid.merge;
+            if (to >= bins) to -= bins;
+            const int32_t straight = bins - to < count ? bins - to : count;
+            memcpy(out + to, block[i], sizeof(Count) * static_cast<size_t>(straight));
+            memcpy(out, block[i] + straight, sizeof(Count) * static_cast<size_t>(count - straight));
+        }
+    }
+    return sizeof(Count) == 4 || largest <= 0xffffu;
+}
+
+MARS_INLINE bool write_histograms(const FeedbackBatch& batch, const int32_t* sums, const bool* drawing, int32_t draw) {
+    return batch.wide ? write_counts<uint32_t>(batch, sums, drawing, draw)
+                      : write_counts<uint16_t>(batch, sums, drawing, draw);
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

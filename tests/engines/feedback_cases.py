@@ -1,0 +1,43 @@
+"""Cases for the feedback engine, and an engine that fails where it does not sample itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import PERIOD_NS, Case, flux_of, task_of, two_lobes
+from mars_lidar import Detector, GaussianPulse, SampledPulse, System
+from mars_lidar.engines.base import Task
+from mars_lidar.engines.feedback import FeedbackEngine
+
+GIVEN = "pixels given to exact"
+SAMPLED = SampledPulse(two_lobes(), 0.1, "centroid")
+
+
+class Sampler(FeedbackEngine):
+    """The feedback engine that fails where it would give a pixel to the exact engine."""
+
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        super().histogram(task, out)
+        assert task.report[GIVEN] == 0
+
+
+def case(
+    signal: float, background: float, dead: float, cycles: int, *, delay: float = 0.37, sigma: float = 0.01,
+    items: int = 4000, **changes: Any,
+) -> Case:  # fmt: skip
+    system = System(
+        period_ns=PERIOD_NS, cycles=cycles, bins=128, pulse=GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        detector=Detector(dead_time_ns=dead * PERIOD_NS),
+    ).replace(**changes)  # fmt: skip
+    name = f"S {signal:g}, B {background:g}, t_d {dead:g}, {cycles} cycles, {system.start}"
+    return Case(name, flux_of(signal, background, delay), system, items)
+
+
+def drawn(engine: Any, request: Case, seed: int = 1) -> NDArray[np.int64]:
+    task = task_of(request, seed)
+    out = np.empty((task.items, request.system.bins), request.system.histogram_dtype)
+    engine.histogram(task, out)
+    return out.astype(np.int64)

@@ -1,0 +1,190 @@
+"""Which pixels the feedback engine gives to the exact one, its bits, and the auto engine's choice."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from feedback_cases import GIVEN, SAMPLED, Sampler, case, drawn
+from numpy.typing import NDArray
+from scipy import stats
+
+import mars_lidar as ml
+from harness import PERIOD_NS, Case, require, task_of, two_lobes
+from mars_lidar import Detector, System, _core
+from mars_lidar.engines.auto import AutoEngine, expected_registrations
+from mars_lidar.engines.base import Task
+from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.feedback import MOST_BINS, FeedbackEngine, internal_bins
+
+# What is given to other engines
+
+
+def mixture(cycles: int = 600, **changes: Any) -> tuple[ml.Flux, System]:
+    """Dim and bright pixels, some of them beyond the sampler."""
+    y, x = np.mgrid[:6, :11]
+    signal = np.where((x + y) % 5 == 0, 0.0, 0.01 * 2.0 ** ((3 * x + 7 * y) % 11))
+    background = 0.02 * 4.0 ** ((x + 5 * y) % 7)
+    system = case(0, 0, 0.6375, cycles, bins=50, **changes).system
+    return ml.Flux(signal, background, 9.7 * x - 31.3 * y), system
+
+
+def test_refused_pixels_have_the_bits_of_exact():
+    flux, system = mixture()
+    report: dict[str, float] = {}
+    cube = ml.simulate(flux, system, engine="feedback", realizations=3, seed=5, report=report)
+    exact = ml.simulate(flux, system, realizations=3, seed=5)
+    same = (cube == exact).all((0, 3))
+    assert same.sum() == report[GIVEN] > 3
+    assert same[flux.background > 40].all()
+    assert not same[flux.background < 5].any()
+
+
+@pytest.mark.parametrize(
+    ("request_", "why"),
+    [
+        (case(1.0, 1.0, 0.6375, 99), "short exposure"),
+        (case(1.0, 1.0, 2.5, 299), "short for its dead time"),
+        (case(6.0, 0.05, 0.99, 2000), "bright echo"),
+        (case(1.0, 0.05, 0.99, 999), "short exposure with an echo"),
+        (case(3.0, 3.0, 3.5, 1000), "count hardly varies"),
+        (case(1.0, 40.0, 0.6375, 1000), "slow sweeps"),
+        (case(1.0, 1.0, 1e-6, 1000), "bins"),
+    ],
+)
+def test_what_the_rule_refuses(request_: Case, why: str):
+    given = task_of(request_, 1, realizations=2)
+    out = np.empty((given.items, request_.system.bins), request_.system.histogram_dtype)
+    FeedbackEngine().histogram(given, out)
+    assert given.report[GIVEN] == 4, why
+    again = np.empty_like(out)
+    ExactEngine().histogram(given, again)
+    assert np.array_equal(out, again)
+
+
+def test_no_dead_time_is_poisson_at_any_length():
+    request = case(0.5, 0.5, 0.0, 100_000_000, items=2000)
+    x = drawn(Sampler(), request)
+    mean = 1e8 * (0.5 / 128 + 0.5 * request.system.pulse.bin_energy(37.0, PERIOD_NS, 128))
+    z = (x.sum(0) - 2000 * mean) / np.sqrt(2000 * mean)
+    require({"bins": float(stats.chi2.sf(z @ z, z.size))}, "feedback, no dead time")
+
+
+def test_internal_bins():
+    fine = case(1.0, 1.0, 0.6375, 1000)
+    assert internal_bins(fine.flux, fine.system)[0, 0] == 384  # 0.26 sigma
+    bright = case(8.0, 1.0, 0.6375, 1000)
+    assert internal_bins(bright.flux, bright.system)[0, 0] == 768
+    longer = fine.system.replace(cycles=100_000_000)
+    assert internal_bins(fine.flux, longer)[0, 0] > 2 * 384
+    dark = case(0.0, 1.0, 0.6375, 1000)
+    assert internal_bins(dark.flux, dark.system)[0, 0] == 128
+    short = case(0.0, 1.0, 1e-6, 1000)
+    assert internal_bins(short.flux, short.system)[0, 0] > MOST_BINS
+
+
+# Bits
+
+
+KINDS = ("short", "long", "sampled", "whole periods", "returns", "waveform")
+
+
+def image(kind: str) -> tuple[ml.Flux, System]:
+    cycles = {"long": 20_000_000, "whole periods": 6000}.get(kind, 600)
+    flux, system = mixture(cycles, start="stationary" if kind == "sampled" else "armed")
+    flux = flux if kind != "long" else ml.Flux(flux.signal, np.minimum(flux.background, 1.0), flux.delay_ns)
+    if kind == "sampled":
+        system = system.replace(pulse=SAMPLED)
+    elif kind == "whole periods":
+        system = system.replace(detector=Detector(dead_time_ns=200.0))
+        flux = ml.Flux(np.minimum(flux.signal, 1.0), np.minimum(flux.background, 0.1), flux.delay_ns)
+    elif kind == "returns":
+        flux = ml.Flux.multi(flux, ml.Flux(0.3 * flux.signal, 0.1, flux.delay_ns + 20.0))
+    elif kind == "waveform":
+        wave = flux.signal[..., None] * np.roll(two_lobes(), 7) / two_lobes().sum()
+        flux = ml.Flux(waveform=wave, background=flux.background)
+    return flux, system
+
+
+@pytest.mark.parametrize("level", _core.levels())
+@pytest.mark.parametrize("kind", KINDS)
+def test_levels_give_the_same_bits(kind: str, level: str):
+    flux, system = image(kind)
+    report: dict[str, float] = {}
+    if kind == "long":
+        flux = flux[:, :8][flux.shape[0] // 2 :]
+    same = [
+        ml.simulate(flux, system, engine=Sampling(name), realizations=2, seed=7, report=report)
+        for name in ("scalar", level)
+    ]
+    assert np.array_equal(*same)
+    assert report["pixels sampled"] > 0.5 * flux.background.size
+
+
+class Sampling(FeedbackEngine):
+    """The sampled pixels only: rows of the others stay 0."""
+
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        out[...] = 0
+        rest = self.sample(task, out, np.arange(task.pixel_index.size))
+        task.report["pixels sampled"] = float(task.pixel_index.size - rest.size)
+
+
+@pytest.mark.parametrize("engine", ["feedback", "auto"])
+def test_parts_threads_and_order(engine: str):
+    flux, system = mixture(3000)
+    whole = ml.simulate(flux, system, engine=engine, realizations=5, seed=3, threads=1)
+    index = np.arange(66).reshape(6, 11)
+    random = np.random.default_rng(0)
+    for threads in (1, 2, 3):
+        rows, columns, run = (slice(*np.sort(random.choice(n + 1, 2, replace=False))) for n in (6, 11, 5))
+        part = ml.simulate(
+            flux[rows, columns], system, engine=engine, realizations=run.stop - run.start, threads=threads,
+            first_realization=int(run.start), pixel_index=index[rows, columns], seed=3,
+        )  # fmt: skip
+        assert np.array_equal(part, whole[run, rows, columns])
+
+
+def test_level_must_run_here():
+    with pytest.raises(ValueError, match="level must be one that this processor runs, got 'mmx'"):
+        drawn(FeedbackEngine("mmx"), case(1.0, 1.0, 0.6375, 1000, items=4))
+
+
+@pytest.mark.parametrize("engine", ["feedback", "auto"])
+def test_progress_runs_once_to_its_end(engine: str):
+    flux, system = mixture()
+    seen: list[float] = []
+    ml.simulate(flux, system, engine=engine, realizations=1500, progress=lambda done, of: seen.append(done / of))
+    assert len(seen) > 3
+    assert seen[-1] == 1.0
+    assert seen == sorted(seen)
+
+
+# The choice
+
+
+def test_auto_takes_the_cheaper_engine():
+    flux, system = mixture(3000)
+    report: dict[str, float] = {}
+    cube = ml.simulate(flux, system, engine="auto", seed=5, report=report)
+    feedback = ml.simulate(flux, system, engine="feedback", seed=5)
+    exact = ml.simulate(flux, system, seed=5)
+    by_feedback = (cube == feedback).all((0, 3)) & ~(cube == exact).all((0, 3))
+    by_exact = (cube == exact).all((0, 3))
+    assert (by_feedback | by_exact).all()
+    assert report["pixels drawn by feedback"] == by_feedback.sum() > 10
+    assert report["pixels drawn by exact"] == by_exact.sum() > 10
+    registrations = expected_registrations(flux, system)
+    assert registrations[by_feedback].min() > 4 * system.bins
+
+
+def test_auto_is_exact_for_short_exposures():
+    flux, system = mixture(50)
+    assert np.array_equal(ml.simulate(flux, system, engine="auto", seed=5), ml.simulate(flux, system, seed=5))
+
+
+def test_auto_draws_no_timestamps():
+    flux, system = mixture(50)
+    with pytest.raises(ValueError, match="draws histograms only"):
+        ml.simulate_timestamps(flux, system, engine=AutoEngine())

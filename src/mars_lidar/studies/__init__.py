@@ -61,8 +61,8 @@ def _reference(request: Request) -> list[Path]:
     return run(request)
 
 
-def _joint(request: Request) -> list[Path]:
-    from mars_lidar.studies.joint_report import run
+def _joint_covariance(request: Request) -> list[Path]:
+    from mars_lidar.studies.joint_covariance_report import run
 
     return run(request)
 
@@ -93,7 +93,10 @@ def _quantisation(request: Request) -> list[Path]:
 
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
-    "joint": ("the histogram's covariance in closed form against simulation; --data adds reference cases", _joint),
+    "joint-covariance": (
+        "the histogram's covariance in closed form against simulation; --data adds reference cases",
+        _joint_covariance,
+    ),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "detectors": ("what each mode of a detector does to the same flux, simulated and in closed form", _detectors),
     "matched": ("a law of the count from four cumulants: total variation to the exact law", _matched),

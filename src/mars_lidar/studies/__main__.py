@@ -13,7 +13,7 @@ from mars_lidar.studies import STUDIES, Request
 
 
 def _parser() -> argparse.ArgumentParser:
-    told = "\n".join(f"  {name:<12} {words}" for name, (words, _) in STUDIES.items())
+    told = "\n".join(f"  {name:<17} {words}" for name, (words, _) in STUDIES.items())
     parser = argparse.ArgumentParser(
         prog="python -m mars_lidar.studies",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -33,7 +33,8 @@ def _parser() -> argparse.ArgumentParser:
         "--quick", action="store_true", help="small grids, few realizations: seconds, not for citing"
     )
     parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="folder of the reference cases, *.json (studies 'reference', 'joint')"
+        "--data", type=Path, metavar="DIR",
+        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance')",
     )
     parser.add_argument(
         "--truth", choices=("sequential", "exact"), default="sequential",

@@ -15,7 +15,7 @@ from mars_lidar.simulate import simulate
 from mars_lidar.statistics import JointLaw, joint_law
 from mars_lidar.studies import Request
 from mars_lidar.studies.draw import panels
-from mars_lidar.studies.joint import (
+from mars_lidar.studies.joint_covariance import (
     FULL,
     OFTEN,
     PERIOD_NS,
@@ -45,9 +45,9 @@ def run(request: Request) -> list[Path]:
     cases = [reference_case(path) for path in sorted(request.data.glob("*.json"))] if request.data else []
     scores = _scores(systems, settings)
     with style():
-        figure = _figure(request.out / "joint.png", scores, 4000 if request.quick else 40_000)
-    text = save_text(request.out / "joint.md", _text(settings, systems, cases, scores, request.quick))
-    return [text, figure, save_csv(request.out / "joint.csv", [_row(o) for o in [*cases, *systems]])]
+        figure = _figure(request.out / "joint_covariance.png", scores, 4000 if request.quick else 40_000)
+    text = save_text(request.out / "joint_covariance.md", _text(settings, systems, cases, scores, request.quick))
+    return [text, figure, save_csv(request.out / "joint_covariance.csv", [_row(o) for o in [*cases, *systems]])]
 
 
 def _scores(systems: Sequence[Outcome], settings: Settings) -> dict[str, FloatArray]:
@@ -74,7 +74,7 @@ def _text(
         "(of variances: of their logarithm, error from the sample's fourth moment). Derivation: "
         "[joint_law.md](../joint_law.md).",
         "## Configuration",
-        f"Command: `python -m mars_lidar.studies joint{' --quick' if quick else ''} --data DIR --out DIR`",
+        f"Command: `python -m mars_lidar.studies joint-covariance{' --quick' if quick else ''} --data DIR --out DIR`",
         configuration({
             "random systems": f"{settings.systems}: S 0.01-10, B 0.001-10, t_d 0.02-4 periods (a third within 0.1 of "
             f"a whole period), sigma 0.002-0.03 periods, {low:g}-{high:g} cycles, all log-uniform, delays uniform, "
@@ -98,7 +98,7 @@ def _text(
         "*again*: z of the same number from four times as many other exposures; what was chance does not come back.",
         *_reference_text(cases),
         "## A look",
-        "![closed form and simulation](joint.png)",
+        "![closed form and simulation](joint_covariance.png)",
         "S = 2, B = 5, t_d = 0.1, sigma = 0.01 periods, 1000 cycles. Left: variance over mean of each bin, "
         "and that of a multinomial histogram with the exact law of the count. Middle: correlations, closed form "
         "(upper triangle) and simulation (lower): bins within one dead time repel, and more so around the pulse. "

@@ -107,7 +107,7 @@ def random_systems(settings: Settings, tell: Tell) -> list[Outcome]:
         system = system_of(sigma, dead, cycles, settings.bins, start)
         found.append(_compare(k, float(signal), float(background), float(delay), system, settings))
         if k % 20 == 19:
-            tell(f"joint: {k + 1} of {settings.systems} systems")
+            tell(f"joint-covariance: {k + 1} of {settings.systems} systems")
     return found
 
 

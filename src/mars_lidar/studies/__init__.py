@@ -61,6 +61,12 @@ def _reference(request: Request) -> list[Path]:
     return run(request)
 
 
+def _joint(request: Request) -> list[Path]:
+    from mars_lidar.studies.joint_report import run
+
+    return run(request)
+
+
 def _joint_covariance(request: Request) -> list[Path]:
     from mars_lidar.studies.joint_covariance_report import run
 
@@ -93,6 +99,7 @@ def _quantisation(request: Request) -> list[Path]:
 
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
+    "joint": ("can a classifier tell an engine's histograms from exact ones? needs scikit-learn", _joint),
     "joint-covariance": (
         "the histogram's covariance in closed form against simulation; --data adds reference cases",
         _joint_covariance,

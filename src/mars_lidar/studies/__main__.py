@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from mars_lidar.studies import STUDIES, Request
+from mars_lidar.studies.classifiers import MissingExtra
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -64,6 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for path in STUDIES[name][1](request):
                 print(path)
             tell(f"{name}: done in {time.monotonic() - began:.0f} s")
+    except MissingExtra as error:
+        tell(str(error))
+        return 1
     except KeyboardInterrupt:
         tell("interrupted")
         return 130

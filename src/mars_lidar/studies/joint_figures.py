@@ -25,17 +25,14 @@ def figure(path: Path, settings: Settings, outcomes: Sequence[Outcome]) -> Path:
     """Cases above, one panel a classifier; the random systems below, in the order of each engine's AUCs."""
     named, drawn = ([o for o in outcomes if o.random is kind and o.aucs] for kind in (False, True))
     page = Figure(figsize=(WIDTH, 5.2), dpi=DPI, layout="constrained")
-    grid = page.add_gridspec(2, 4, height_ratios=(1.5, 1.0))
-    first = None
-    for k, test in enumerate(TESTS):
-        ax = page.add_subplot(grid[0, k], sharey=first)
+    upper, lower = page.subfigures(2, 1, height_ratios=(1.5, 1.0))
+    above = upper.subplots(1, len(TESTS), sharey=True)
+    for ax, test in zip(above, TESTS, strict=True):
         _cases(ax, test, [c.name for c in settings.cases], named, 2.0 * _chance(settings.exposures))
-        ax.tick_params(labelleft=first is None)
-        first = first or ax
-    for k, test in enumerate(TESTS[:2]):
-        _random(page.add_subplot(grid[1, 2 * k : 2 * k + 2]), test, drawn, 2.0 * _chance(settings.random_exposures))
-    handles, words = first.get_legend_handles_labels() if first else ([], [])
-    page.legend(handles, words, loc="outside lower center", ncols=len(ENGINES), frameon=False)
+    for ax, test in zip(lower.subplots(1, 2, sharey=True), TESTS[:2], strict=True):
+        _random(ax, test, drawn, 2.0 * _chance(settings.random_exposures))
+    lower.axes[0].set_ylabel("share of systems below")
+    lower.legend(*above[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(ENGINES), frameon=False)
     return save_figure(path, page)
 
 
@@ -72,4 +69,4 @@ def _random(ax: Any, test: str, outcomes: Sequence[Outcome], band: float) -> Non
         value = np.sort([o.aucs[test][0] - 0.5 for o in outcomes if o.engine == engine])
         share = (np.arange(value.size) + 0.5) / max(value.size, 1)
         ax.plot(value, share, _MARK[engine], color=_COLOUR[engine], ms=2.5, mew=0.8, mfc="none")
-    ax.set(ylim=(0, 1), title=f"random systems, {test}", ylabel="share of systems below")
+    ax.set(ylim=(0, 1), title=f"random systems, {test}")

@@ -36,6 +36,7 @@ FloatArray = NDArray[np.float64]
 
 _SEEN = 4.0  # standard errors beyond which a figure is marked
 _WORST = 5  # random systems listed
+_LEAST_P = 1e-100  # told as a number
 
 
 def run(request: Request) -> list[Path]:
@@ -116,6 +117,10 @@ def _chance(exposures: int) -> float:
     return chance_error(exposures - exposures // 2, exposures - exposures // 2)
 
 
+def _p(value: float) -> str:
+    return f"{value:.2g}" if value >= _LEAST_P else f"< {_LEAST_P:g}"
+
+
 def _findings(named: list[Outcome], settings: Settings) -> list[str]:
     lines = []
     for engine in ENGINES:
@@ -129,7 +134,7 @@ def _findings(named: list[Outcome], settings: Settings) -> list[str]:
         lines.append(
             f"- {engine}: {z.size} AUCs in {z.size // len(TESTS)} cases, {value.min():.3f} to {value.max():.3f}; "
             f"{int((np.abs(z) > _SEEN).sum())} beyond {_SEEN:g} standard errors of chance. Furthest off: {test} in "
-            f"{o.case.name}, {o.aucs[test][0]:.3f} (p = {p:.2g} after Bonferroni)."
+            f"*{o.case.name}*: {o.aucs[test][0]:.3f} (p {_p(p)} after Bonferroni)."
         )
     return lines
 
@@ -139,7 +144,7 @@ def _handed(outcomes: Sequence[Outcome]) -> list[str]:
     gone = [o.case.name for o in here if o.handed]
     return [
         f"- feedback gave {len(gone)} of {len(here)} pixels to the exact engine"
-        + (f" ({', '.join(gone)}); its own AUC is of the others." if gone else ".")
+        + (f" ({', '.join(gone)}), which are not judged." if gone else ".")
     ]
 
 
@@ -199,7 +204,7 @@ def _random_row(drawn: list[Outcome], engine: str, test: str, settings: Settings
         "largest": f"{value.max():.3f}" if some else "-",
         f"beyond {_SEEN:g} errors": int((np.abs(z) > _SEEN).sum()),
         "rms z": f"{np.sqrt(np.mean(z**2)):.2f}" if some else "-",
-        "chi-square p": f"{stats.chi2.sf(float(z @ z), z.size):.2g}" if some else "-",
+        "chi-square p": _p(float(stats.chi2.sf(float(z @ z), z.size))) if some else "-",
     }  # fmt: skip
 
 
@@ -219,6 +224,7 @@ def _spread_row(drawn: list[Outcome], engine: str) -> Row:
 
 def _worst_rows(drawn: list[Outcome], settings: Settings) -> list[Row]:
     """Of the engine feedback: the largest |z| of QDA and fine QDA."""
+
     def worst(o: Outcome) -> float:
         return max(abs(auc_score(o, test, settings)) for test in TESTS[:2])
 

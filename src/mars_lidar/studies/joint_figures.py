@@ -24,7 +24,7 @@ _MARK = dict(zip(ENGINES, "|osD", strict=True))
 def figure(path: Path, settings: Settings, outcomes: Sequence[Outcome]) -> Path:
     """Cases above, one panel a classifier; the random systems below, in the order of each engine's AUCs."""
     named, drawn = ([o for o in outcomes if o.random is kind and o.aucs] for kind in (False, True))
-    page = Figure(figsize=(WIDTH, 5.2), dpi=DPI, layout="constrained")
+    page: Any = Figure(figsize=(WIDTH, 5.2), dpi=DPI, layout="constrained")
     upper, lower = page.subfigures(2, 1, height_ratios=(1.5, 1.0))
     above = upper.subplots(1, len(TESTS), sharey=True)
     for ax, test in zip(above, TESTS, strict=True):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-LEVEL = 2e-7  # of each check: 5.2 standard deviations
-FAMILY_LEVEL = 1e-3  # of all checks of a run together; more than 5000 of them make the run fail
+LEVEL = 1e-7  # of each check: 5.3 standard deviations
+FAMILY_LEVEL = 1e-3  # of all checks of a run together; more than 10,000 of them make the run fail
 
 _done: list[tuple[float, str]] = []
 

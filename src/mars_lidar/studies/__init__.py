@@ -67,6 +67,12 @@ def _joint(request: Request) -> list[Path]:
     return run(request)
 
 
+def _joint_covariance(request: Request) -> list[Path]:
+    from mars_lidar.studies.joint_covariance_report import run
+
+    return run(request)
+
+
 def _count_law(request: Request) -> list[Path]:
     from mars_lidar.studies.count_law_report import run
 
@@ -99,7 +105,11 @@ def _table(request: Request) -> list[Path]:
 
 STUDIES: dict[str, tuple[str, Study]] = {
     "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
-    "joint": ("the histogram's covariance in closed form against simulation; --data adds reference cases", _joint),
+    "joint": ("can a classifier tell an engine's histograms from exact ones? needs scikit-learn", _joint),
+    "joint-covariance": (
+        "the histogram's covariance in closed form against simulation; --data adds reference cases",
+        _joint_covariance,
+    ),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "detectors": ("what each mode of a detector does to the same flux, simulated and in closed form", _detectors),
     "matched": ("a law of the count from four cumulants: total variation to the exact law", _matched),

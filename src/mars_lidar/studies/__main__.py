@@ -10,10 +10,11 @@ from functools import partial
 from pathlib import Path
 
 from mars_lidar.studies import STUDIES, Request
+from mars_lidar.studies.classifiers import MissingExtra
 
 
 def _parser() -> argparse.ArgumentParser:
-    told = "\n".join(f"  {name:<12} {words}" for name, (words, _) in STUDIES.items())
+    told = "\n".join(f"  {name:<17} {words}" for name, (words, _) in STUDIES.items())
     parser = argparse.ArgumentParser(
         prog="python -m mars_lidar.studies",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -33,7 +34,8 @@ def _parser() -> argparse.ArgumentParser:
         "--quick", action="store_true", help="small grids, few realizations: seconds, not for citing"
     )
     parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="folder of the reference cases, *.json (studies 'reference', 'joint')"
+        "--data", type=Path, metavar="DIR",
+        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance')",
     )
     parser.add_argument(
         "--truth", choices=("sequential", "exact"), default="sequential",
@@ -63,6 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for path in STUDIES[name][1](request):
                 print(path)
             tell(f"{name}: done in {time.monotonic() - began:.0f} s")
+    except MissingExtra as error:
+        tell(str(error))
+        return 1
     except KeyboardInterrupt:
         tell("interrupted")
         return 130

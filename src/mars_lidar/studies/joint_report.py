@@ -1,226 +1,258 @@
-"""The report on the closed-form covariance of the histogram."""
+"""The report of the classifier study."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
-from mars_lidar.flux import Flux
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
-from mars_lidar.simulate import simulate
-from mars_lidar.statistics import JointLaw, joint_law
+from mars_lidar.plot.style import style
 from mars_lidar.studies import Request
-from mars_lidar.studies.draw import panels
+from mars_lidar.studies.classifiers import LEAF, REGULARISATION, TREES, chance_error, require_sklearn
 from mars_lidar.studies.joint import (
+    ENGINES,
+    FINE,
     FULL,
     OFTEN,
-    PERIOD_NS,
     QUICK,
+    RATIOS,
+    REACH,
+    TESTS,
     TOLERANCE,
-    FloatArray,
     Outcome,
     Settings,
-    random_systems,
-    reference_case,
-    second_look,
-    system_of,
+    compute,
 )
-from mars_lidar.studies.report import Row, configuration, save_csv, save_figure, save_text, table
+from mars_lidar.studies.joint_figures import figure
+from mars_lidar.studies.joint_table import AGAIN, COARSE, PERIOD_NS
+from mars_lidar.studies.machine import machine
+from mars_lidar.studies.report import Row, configuration, save_csv, save_text, table
 
-_SINGLE = (
-    "count, mean", "count, variance", "window, mean", "window, variance", "random weights, mean",
-    "random weights, variance",
-)  # fmt: skip
-_WORST = 10  # systems listed
+FloatArray = NDArray[np.float64]
+
+_SEEN = 4.0  # standard errors beyond which a figure is marked
+_WORST = 5  # random systems listed
+_LEAST_P = 1e-100  # told as a number
 
 
 def run(request: Request) -> list[Path]:
-    """Compare, draw and write; returns the paths written."""
+    """Compute, draw and write; returns the paths written. Raises MissingExtra without scikit-learn."""
     settings = QUICK if request.quick else FULL
-    systems = random_systems(settings, request.tell)
-    cases = [reference_case(path) for path in sorted(request.data.glob("*.json"))] if request.data else []
-    scores = _scores(systems, settings)
+    began = time.monotonic()
+    outcomes = compute(settings, request.tell)
     with style():
-        figure = _figure(request.out / "joint.png", scores, 4000 if request.quick else 40_000)
-    text = save_text(request.out / "joint.md", _text(settings, systems, cases, scores, request.quick))
-    return [text, figure, save_csv(request.out / "joint.csv", [_row(o) for o in [*cases, *systems]])]
-
-
-def _scores(systems: Sequence[Outcome], settings: Settings) -> dict[str, FloatArray]:
-    """z of each kind, one number from each system: independent of each other."""
-    random = np.random.default_rng(settings.seed + 1)
-    found = {name: [o.single[name] for o in systems if name in o.single] for name in _SINGLE}
-    for kind, words in (("bins", "variance of a bin at random"), ("lags", "lag-1 covariance at random")):
-        drawn = [o.chosen(kind, random) for o in systems]
-        found[words] = [z for z in drawn if z is not None]
-    return {name: np.array(z) for name, z in found.items()}
-
-
-def _text(
-    settings: Settings, systems: list[Outcome], cases: list[Outcome], scores: dict[str, FloatArray], quick: bool
-) -> list[str]:
-    numbers = sum(len(o.single) + o.bins.size + o.lags.size for o in systems)
-    by_z = sorted(systems, key=lambda o: -o.worst()[0])
-    settled = sum(o.law.settled >= 0 for o in systems)
-    low, high = settings.cycles
+        drawn = figure(request.out / "joint.png", settings, outcomes)
+    text = _text(settings, outcomes, request.quick, time.monotonic() - began)
     return [
-        "# The covariance of the histogram in closed form, against simulation",
-        "_Quick form: a look, not for citing._" if quick else "",
-        "`joint_law` knows no simulation, the simulators no statistics. z is simulation less law in standard errors "
-        "(of variances: of their logarithm, error from the sample's fourth moment). Derivation: "
-        "[joint_law.md](../joint_law.md).",
-        "## Configuration",
-        f"Command: `python -m mars_lidar.studies joint{' --quick' if quick else ''} --data DIR --out DIR`",
-        configuration({
-            "random systems": f"{settings.systems}: S 0.01-10, B 0.001-10, t_d 0.02-4 periods (a third within 0.1 of "
-            f"a whole period), sigma 0.002-0.03 periods, {low:g}-{high:g} cycles, all log-uniform, delays uniform, "
-            f"armed and stationary start by turns, {settings.bins} bins",
-            "simulation": f"exact engine, {settings.exposures} exposures a system, seed {settings.seed}",
-            "law": f"tolerance {TOLERANCE:g}",
-            "left out": f"numbers that differ from their usual value in fewer than {OFTEN} exposures (variance x "
-            "exposures)",
-        }),
-        "## Random systems",
-        table([_law_row(name, z) for name, z in scores.items()]),
-        "One number from each system, so that the rows of z are independent: KS is the Kolmogorov-Smirnov test "
-        "against the "
-        "standard normal, chi-square the sum of z squared, as a p-value.",
-        f"All {numbers} numbers together, bins and neighbours of one system being dependent: root mean square "
-        f"z {_rms(systems):.3f}; the largest |z| is {by_z[0].worst()[0]:.2f}, where {numbers} independent ones would "
-        f"reach some {stats.norm.isf(0.5 / numbers):.2f}. {settled} of {len(systems)} exposures forget their "
-        "start; the others were run through period by period.",
-        "The systems with the largest |z|:",
-        table([_worst_row(o, second_look(o, settings)) for o in by_z[:_WORST]]),
-        "*again*: z of the same number from four times as many other exposures; what was chance does not come back.",
-        *_reference_text(cases),
-        "## A look",
-        "![closed form and simulation](joint.png)",
-        "S = 2, B = 5, t_d = 0.1, sigma = 0.01 periods, 1000 cycles. Left: variance over mean of each bin, "
-        "and that of a multinomial histogram with the exact law of the count. Middle: correlations, closed form "
-        "(upper triangle) and simulation (lower): bins within one dead time repel, and more so around the pulse. "
-        "Right: quantiles of the z of the random systems.",
-    ]  # fmt: skip
-
-
-def _reference_text(cases: list[Outcome]) -> list[str]:
-    if not cases:
-        return ["## Reference cases", "None given (`--data`)."]
-    return [
-        "## Reference cases",
-        "Cases simulated photon by photon by a program that shares nothing with this package (armed start).",
-        table([_reference_row(o) for o in cases]),
-        "*window*: within 3 sigma of the delay. *N_r term*: the leading term alone, without start and end of the "
-        "exposure. rms: root mean square z over the bins (variance) and pairs of neighbours (lag-1 covariance); the "
-        "standard error of a bin's variance is that of a Poisson number there, the files hold no fourth moments.",
+        save_text(request.out / "joint.md", text),
+        drawn,
+        save_csv(request.out / "joint.csv", [_csv_row(o) for o in outcomes]),
     ]
 
 
-def _rms(systems: Sequence[Outcome]) -> float:
-    z = np.concatenate([np.concatenate([list(o.single.values()), o.bins, o.lags]) for o in systems])
-    return float(np.sqrt(np.mean(z**2)))
+def auc_score(outcome: Outcome, test: str, settings: Settings) -> float:
+    """AUC less 1/2 in standard errors of chance: standard normal if the two samples have one law."""
+    exposures = settings.random_exposures if outcome.random else settings.exposures
+    held = exposures - exposures // 2
+    return (outcome.aucs[test][0] - 0.5) / chance_error(held, held)
 
 
-def _law_row(name: str, z: FloatArray) -> Row:
-    return {
-        "of": name,
-        "systems": z.size,
-        "mean z": f"{z.mean():+.3f}",
-        "sd of z": f"{z.std():.3f}",
-        "KS p": f"{stats.kstest(z, 'norm').pvalue:.3f}",
-        "chi-square p": f"{stats.chi2.sf(float(np.sum(z**2)), z.size):.3f}",
-        "largest abs z": f"{np.abs(z).max():.2f}",
-    }
+def _text(settings: Settings, outcomes: list[Outcome], quick: bool, spent: float) -> list[str]:
+    named, drawn = ([o for o in outcomes if o.random is kind] for kind in (False, True))
+    return [
+        "# Can a classifier tell an engine's histograms from exact ones?",
+        "_Quick form: a look, not for citing._" if quick else "",
+        "A classifier learns from half of the histograms of two engines which engine drew which, and is judged on the "
+        "other halves: an area under the ROC curve (AUC) of 1/2 is chance. It looks at all bins together, so it sees "
+        "what no comparison of means or variances would. The exact engine, which knows no statistics, is told from "
+        "itself (another seed) and from the others.",
+        "## Configuration",
+        f"Command: `python -m mars_lidar.studies joint{' --quick' if quick else ''} --out DIR`",
+        configuration({
+            "engines": f"{', '.join(ENGINES)}; as shipped, mars and renewal without a table",
+            "exposures": f"{settings.exposures} a sample, {settings.random_exposures} in the random systems; half to "
+            f"learn from, half to judge; seed {settings.seed}",
+            "histogram": f"{settings.bins} bins, t_r = {PERIOD_NS:.6g} ns, armed start",
+            "what classifiers see": f"the histogram summed to {COARSE} bins, its total and the count within 3 sigma of "
+            f"the return; *{FINE}*: single bins, {REACH} on either side of the return and of its echo one dead time on",
+            "classifiers": f"scikit-learn {require_sklearn()}: quadratic discriminant (QDA, covariances of "
+            f"standardised features regularised by {REGULARISATION:g}), histogram gradient boosting (default "
+            f"settings, no early stopping), random forest ({TREES} trees, at least {LEAF} a leaf)",
+            "random systems": f"{settings.systems}: S 0.01-10, B 0.001-10, t_d 0.02-4 periods (a third within 0.1 of a "
+            "whole period), sigma 0.002-0.03 periods, 1e3-2e4 cycles, all log-uniform, delays uniform; QDA alone",
+            "closed form": f"`joint_law`, tolerance {TOLERANCE:g}",
+            "machine": machine(),
+            "run time": f"{spent:.0f} s",
+        }),
+        table([_case_row(o) for o in named if o.engine == "exact"]),
+        "S and B in photons per period, times in periods.",
+        "## Result",
+        "\n".join([*_findings(named, settings), *_handed(outcomes)]),
+        "![AUC of every case and engine](joint.png)",
+        f"Grey: two standard errors of chance about 1/2, {2 * _chance(settings.exposures):.4f} above and "
+        f"{2 * _chance(settings.random_exposures):.4f} below. The axis is linear within 0.02 of chance, logarithmic "
+        "beyond. All engines of a case are told from the same exact sample, so their chance deviations are not "
+        "independent.",
+        *(part for test in TESTS for part in (f"### AUC, {test}", table(_auc_rows(named, test, settings)))),
+        f"In brackets the standard error; \\* beyond {_SEEN:g} standard errors of chance; *exact*: pixel given to the "
+        "exact engine.",
+        *_ratio_text(named),
+        "## Random systems",
+        table([_random_row(drawn, engine, test, settings) for test in TESTS[:2] for engine in ENGINES]),
+        "*chi-square p*: of the squares of all z = (AUC - 1/2) / (standard error of chance), one from each system.",
+        "Variances and covariances over the closed form:",
+        table([_spread_row(drawn, engine) for engine in ("exact", *ENGINES)]),
+        "Mean and standard deviation of z = (ratio - 1) / (standard error) over systems, and the ratio furthest off "
+        "in standard errors. Squares of few counts are skewed, so z of the smallest variances is not quite normal.",
+        "The random systems in which *feedback* differs most from chance:",
+        table(_worst_rows(drawn, settings)),
+    ]  # fmt: skip
 
 
-def _worst_row(o: Outcome, again: float | None) -> Row:
-    z, what = o.worst()
-    given = {k: v if isinstance(v, str) else f"{v:.4g}" for k, v in o.settings.items()}
-    numbers = len(o.single) + o.bins.size + o.lags.size
-    return {
-        "system": o.name, **given, "z": f"{o.scores()[what]:+.2f}" if numbers else "", "of": what, "among": numbers,
-        "p, Bonferroni": f"{min(1.0, 2 * numbers * stats.norm.sf(z)):.2g}",
-        "again": "" if again is None else f"{again:+.2f}",
-    }  # fmt: skip
+def _chance(exposures: int) -> float:
+    return chance_error(exposures - exposures // 2, exposures - exposures // 2)
 
 
-def _reference_row(o: Outcome) -> Row:
-    s, v = o.single, o.leading
-    return {
-        "case": o.name,
-        "count variance": f"{v['count']:.5g}",
-        "N_r term": f"{v['count leading']:.5g}",
-        "simulated": f"{v['count simulated']:.5g}",
-        "z": f"{s['count, variance']:+.1f}",
-        "window variance": f"{v['window']:.5g}",
-        "N_r term ": f"{v['window leading']:.5g}",
-        "simulated ": f"{v['window simulated']:.5g}",
-        "z ": f"{s['window, variance']:+.1f}",
-        "z of means": f"{s['count, mean']:+.1f}, {s['window, mean']:+.1f}",
-        "bins, rms": f"{np.sqrt(np.mean(o.bins**2)):.2f}",
-        "lag 1, rms": f"{np.sqrt(np.mean(o.lags**2)):.2f}",
-    }
+def _p(value: float) -> str:
+    return f"{value:.2g}" if value >= _LEAST_P else f"< {_LEAST_P:g}"
 
 
-def _row(o: Outcome) -> Row:
-    given = {k: o.settings.get(k, "") for k in ("S", "B", "t_d", "cycles", "sigma", "start")}
-    worst, what = o.worst()
-    return {
-        "name": o.name, **given, "count_mean": o.law.count_mean, "count_variance": o.law.count_variance,
-        **{"z_" + name.replace(", ", "_").replace(" ", "_"): o.single.get(name, "") for name in _SINGLE},
-        "bins": o.bins.size, "rms_z_bins": float(np.sqrt(np.mean(o.bins**2))) if o.bins.size else "",
-        "lags": o.lags.size, "rms_z_lags": float(np.sqrt(np.mean(o.lags**2))) if o.lags.size else "",
-        "worst_z": worst, "worst_of": what, "grid_bins": o.law.grid_bins, "movement": o.law.movement,
-        "sweeps": o.law.sweeps, "settled": o.law.settled,
-    }  # fmt: skip
-
-
-def _figure(path: Path, scores: dict[str, FloatArray], exposures: int) -> Path:
-    system = system_of(0.01, 0.1, 1000, 64)
-    law = joint_law(2.0, 5.0, system)
-    flux = Flux(signal=2.0, background=5.0, delay_ns=0.5 * PERIOD_NS)
-    x = simulate(flux, system, realizations=exposures, seed=7).reshape(exposures, -1).astype(float)
-    figure, axes = panels(2.5, 1, 3)
-    _variances(axes[0, 0], law, x)
-    _correlations(figure, axes[0, 1], law.covariance(), np.cov(x, rowvar=False))
-    _quantiles(axes[0, 2], scores)
-    return save_figure(path, figure)
-
-
-def _variances(ax: Any, law: JointLaw, x: FloatArray) -> None:
-    mean, variance = law.mean, law.variance
-    phase = (np.arange(mean.size) + 0.5) / mean.size
-    multinomial = 1.0 - mean / law.count_mean * (1.0 - law.count_variance / law.count_mean)
-    ax.plot(phase, multinomial, color=MUTED, lw=0.9, label="count x multinomial")
-    ax.plot(phase, variance / mean, color=COLOURS[0], lw=1.1, label="closed form")
-    ax.plot(phase, x.var(0) / x.mean(0), "o", ms=2.2, mfc="none", mew=0.6, color=COLOURS[1], label="simulation")
-    ax.set(xlabel="phase (periods)", ylabel="variance / mean of a bin", ylim=(0.0, 1.05))
-    ax.legend(frameon=False, loc="lower left")
-
-
-def _correlations(figure: Any, ax: Any, law: FloatArray, sample: FloatArray) -> None:
-    both = [c / np.sqrt(np.outer(np.diag(c), np.diag(c))) for c in (law, sample)]
-    image = np.triu(both[0], 1) + np.tril(both[1], -1)
-    np.fill_diagonal(image, np.nan)
-    limit = float(np.nanmax(np.abs(image)))
-    shown = ax.imshow(image, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=(0, 1, 1, 0))
-    ax.set(xlabel="phase (periods)", ylabel="phase (periods)", title="correlation of two bins")
-    figure.colorbar(shown, ax=ax, fraction=0.046)
-
-
-def _quantiles(ax: Any, scores: dict[str, FloatArray]) -> None:
-    named = {
-        "count variance": "count, variance", "window variance": "window, variance",
-        "bin variance": "variance of a bin at random", "lag 1": "lag-1 covariance at random",
-    }  # fmt: skip
-    ax.plot([-3.3, 3.3], [-3.3, 3.3], color=INK, lw=0.7)
-    for (words, key), colour in zip(named.items(), COLOURS, strict=False):
-        z = np.sort(scores[key])
-        ax.plot(
-            stats.norm.ppf((np.arange(z.size) + 0.5) / z.size), z, "o", ms=2.0, mew=0, color=colour, label=words
+def _findings(named: list[Outcome], settings: Settings) -> list[str]:
+    lines = []
+    for engine in ENGINES:
+        here = [(o, test) for o in named if o.engine == engine and o.aucs for test in TESTS]
+        if not here:
+            continue
+        z = np.array([auc_score(o, test, settings) for o, test in here])
+        value = np.array([o.aucs[test][0] for o, test in here])
+        o, test = here[int(np.abs(z).argmax())]
+        p = min(1.0, 2 * z.size * float(stats.norm.sf(np.abs(z).max())))
+        lines.append(
+            f"- {engine}: {z.size} AUCs in {z.size // len(TESTS)} cases, {value.min():.3f} to {value.max():.3f}; "
+            f"{int((np.abs(z) > _SEEN).sum())} beyond {_SEEN:g} standard errors of chance. Furthest off: {test} in "
+            f"*{o.case.name}*: {o.aucs[test][0]:.3f} (p {_p(p)} after Bonferroni)."
         )
-    ax.set(xlabel="normal quantile", ylabel="z, random systems", xlim=(-3.3, 3.3), ylim=(-4, 4))
-    ax.legend(frameon=False, loc="upper left", handletextpad=0.1, borderaxespad=0.0)
+    return lines
+
+
+def _handed(outcomes: Sequence[Outcome]) -> list[str]:
+    here = [o for o in outcomes if o.engine == "feedback"]
+    gone = [o.case.name for o in here if o.handed]
+    return [
+        f"- feedback gave {len(gone)} of {len(here)} pixels to the exact engine"
+        + (f" ({', '.join(gone)}), which are not judged." if gone else ".")
+    ]
+
+
+def _case_row(o: Outcome) -> Row:
+    c = o.case
+    return {
+        "case": c.name, "S": f"{c.signal:g}", "B": f"{c.background:g}", "t_d": f"{c.dead:g}", "tau": f"{c.delay:g}",
+        "sigma": f"{c.sigma:g}", "cycles": c.cycles,
+    }  # fmt: skip
+
+
+def _auc_rows(named: list[Outcome], test: str, settings: Settings) -> list[Row]:
+    rows: dict[str, dict[str, str]] = {}
+    for o in named:
+        if o.engine == "exact":
+            rows[o.case.name] = {"case": o.case.name}
+        elif o.handed:
+            rows[o.case.name][o.engine] = "exact"
+        else:
+            value, error = o.aucs[test]
+            star = "*" if abs(auc_score(o, test, settings)) > _SEEN else ""
+            rows[o.case.name][o.engine] = f"{value:.3f} ({error:.3f}){star}"
+    return list(rows.values())
+
+
+def _ratio_text(named: list[Outcome]) -> list[str]:
+    words = {
+        "window": "Variance of the count within 3 sigma of the return",
+        "bin": f"Variance of a bin of {COARSE}, mean over bins",
+        "neighbour": "Covariance with the next bin, least squares over bins",
+    }
+    parts = []
+    for key, title in words.items():
+        rows: dict[str, dict[str, str]] = {}
+        for o in named:
+            value, error = o.ratios[key]
+            told = "-" if np.isnan(value) else f"{value:.3f} ({error:.3f})"
+            star = "*" if abs(value - 1.0) > _SEEN * error else ""
+            rows.setdefault(o.case.name, {"case": o.case.name})[o.engine] = told + star
+        parts += [f"### {title}, engine / closed form", table(list(rows.values()))]
+    return [
+        *parts,
+        f"In brackets the standard error; \\* beyond {_SEEN:g} of them. Bins that differ from their usual count in "
+        f"fewer than {OFTEN} exposures (variance x exposures) are left out.",
+    ]
+
+
+def _random_row(drawn: list[Outcome], engine: str, test: str, settings: Settings) -> Row:
+    here = [o for o in drawn if o.engine == engine and o.aucs]
+    value = np.array([o.aucs[test][0] for o in here])
+    z = np.array([auc_score(o, test, settings) for o in here])
+    some = value.size > 0
+    return {
+        "classifier": test, "engine": engine, "systems": value.size,
+        "median AUC": f"{np.median(value):.3f}" if some else "-",
+        "smallest": f"{value.min():.3f}" if some else "-",
+        "largest": f"{value.max():.3f}" if some else "-",
+        f"beyond {_SEEN:g} errors": int((np.abs(z) > _SEEN).sum()),
+        "rms z": f"{np.sqrt(np.mean(z**2)):.2f}" if some else "-",
+        "chi-square p": _p(float(stats.chi2.sf(float(z @ z), z.size))) if some else "-",
+    }  # fmt: skip
+
+
+def _spread_row(drawn: list[Outcome], engine: str) -> Row:
+    row: dict[str, object] = {"engine": engine}
+    here = [o for o in drawn if o.engine == engine and not o.handed]
+    row["systems"] = len(here)
+    for key in RATIOS:
+        pairs: FloatArray = np.array([o.ratios[key] for o in here]).reshape(-1, 2)
+        value, error = pairs[np.isfinite(pairs[:, 0])].T
+        z = (value - 1.0) / error
+        worst = int(np.abs(z).argmax()) if z.size else -1
+        row[f"{key}: z"] = f"{z.mean():+.2f}, {z.std():.2f}" if z.size else "-"
+        row[f"{key}: worst"] = f"{value[worst]:.3f} ({error[worst]:.3f})" if z.size else "-"
+    return row
+
+
+def _worst_rows(drawn: list[Outcome], settings: Settings) -> list[Row]:
+    """Of the engine feedback: the largest |z| of QDA and fine QDA."""
+
+    def worst(o: Outcome) -> float:
+        return max(abs(auc_score(o, test, settings)) for test in TESTS[:2])
+
+    here = sorted((o for o in drawn if o.engine == "feedback" and o.aucs), key=worst, reverse=True)
+    again = {o.case.name: o for o in drawn if o.engine == AGAIN}
+    rows: list[Row] = []
+    for o in here[:_WORST]:
+        row = dict(_case_row(o))
+        for key in ("S", "B", "t_d", "tau", "sigma"):
+            row[key] = f"{float(row[key]):.4g}"
+        for test in TESTS[:2]:
+            row[test] = f"{o.aucs[test][0]:.3f} (z {auc_score(o, test, settings):+.1f})"
+        row[f"{AGAIN}, QDA"] = f"{again[o.case.name].aucs[TESTS[0]][0]:.3f}"
+        row["window variance"] = "{:.3f} ({:.3f})".format(*o.ratios["window"])
+        rows.append(row)
+    return rows
+
+
+def _csv_row(o: Outcome) -> Row:
+    c = o.case
+    row: dict[str, object] = {
+        "case": c.name, "random": int(o.random), "signal": c.signal, "background": c.background, "dead": c.dead,
+        "delay": c.delay, "sigma": c.sigma, "cycles": c.cycles, "engine": o.engine,
+        "given_to_exact": int(o.handed),
+    }  # fmt: skip
+    for test in TESTS:
+        name = "auc_" + test.lower().replace(" ", "_")
+        row[name], row[f"{name}_error"] = o.aucs.get(test, ("", ""))
+    for key in RATIOS:
+        row[f"{key}_ratio"], row[f"{key}_ratio_error"] = o.ratios[key]
+    return row

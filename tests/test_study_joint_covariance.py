@@ -8,9 +8,9 @@ import pytest
 from scipy import stats
 
 from harness import require
-from mars_lidar.studies import joint_report
+from mars_lidar.studies import joint_covariance_report
 from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.joint import QUICK, random_systems
+from mars_lidar.studies.joint_covariance import QUICK, random_systems
 from mars_lidar.studies.report import MAX_FIGURE_BYTES
 
 
@@ -21,21 +21,21 @@ def systems():
 
 def test_random_systems(systems):
     """One z from each system and kind: independent, standard normal."""
-    for name, z in joint_report._scores(systems, QUICK).items():
+    for name, z in joint_covariance_report._scores(systems, QUICK).items():
         outcome = {"normal": stats.kstest(z, "norm").pvalue, "chi-square": stats.chi2.sf((z**2).sum(), z.size)}
-        require(outcome, f"joint study, {name}")
+        require(outcome, f"joint-covariance study, {name}")
     assert {o.law.settled >= 0 for o in systems} == {True, False}, "both routes"
 
 
 def test_report(systems, tmp_path, monkeypatch):
-    monkeypatch.setattr(joint_report, "random_systems", lambda *_: systems)
-    assert main(["joint", "--quick", "--out", str(tmp_path)]) == 0
-    text = (tmp_path / "joint.md").read_text()
+    monkeypatch.setattr(joint_covariance_report, "random_systems", lambda *_: systems)
+    assert main(["joint-covariance", "--quick", "--out", str(tmp_path)]) == 0
+    text = (tmp_path / "joint_covariance.md").read_text()
     assert "Quick form" in text
     assert "None given" in text
-    assert "![closed form and simulation](joint.png)" in text
-    assert 5_000 < (tmp_path / "joint.png").stat().st_size <= MAX_FIGURE_BYTES
-    with (tmp_path / "joint.csv").open() as file:
+    assert "![closed form and simulation](joint_covariance.png)" in text
+    assert 5_000 < (tmp_path / "joint_covariance.png").stat().st_size <= MAX_FIGURE_BYTES
+    with (tmp_path / "joint_covariance.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == QUICK.systems
     assert all(float(row["movement"]) <= 1e-4 for row in rows)

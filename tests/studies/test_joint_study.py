@@ -1,0 +1,118 @@
+"""The classifier study: its AUC and features against what is known of them, and its quick form."""
+
+from __future__ import annotations
+
+import csv
+import sys
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from harness import require
+from mars_lidar.studies import classifiers, joint, joint_report
+from mars_lidar.studies.__main__ import main
+from mars_lidar.studies.report import MAX_FIGURE_BYTES
+
+
+def test_auc_and_its_error():
+    """Against a count of pairs; errors against the scatter of repeated samples."""
+    random = np.random.default_rng(3)
+    low, high = random.integers(0, 6, 40).astype(float), random.integers(1, 8, 30).astype(float)
+    pairs = high[:, None] - low
+    assert classifiers.auc(low, high)[0] == pytest.approx(np.mean((pairs > 0) + 0.5 * (pairs == 0)))
+    assert classifiers.auc(high, low)[0] == pytest.approx(1.0 - classifiers.auc(low, high)[0])
+    shifted = [classifiers.auc(random.normal(size=300), random.normal(1.0, size=200)) for _ in range(400)]
+    value, error = np.array(shifted).T
+    truth = stats.norm.cdf(np.sqrt(0.5))
+    z = (value - truth) / error
+    require({"normal": stats.kstest(z, "norm").pvalue}, "AUC of shifted normals")
+    null = [classifiers.auc(random.normal(size=300), random.normal(size=200))[0] for _ in range(400)]
+    z = (np.array(null) - 0.5) / classifiers.chance_error(300, 200)
+    require({"normal": stats.kstest(z, "norm").pvalue}, "AUC of one law")
+
+
+@pytest.mark.parametrize("kind", classifiers.CLASSIFIERS)
+def test_classifiers(kind):
+    """Of two normal laws the best AUC is known; of one law it is chance, collinear and constant features or not."""
+    pytest.importorskip("sklearn", reason="extra 'studies'")
+    random = np.random.default_rng(5)
+    x, y, z = (random.normal(size=(2000, 3)) for _ in range(3))
+    y[:, 0] += 1.0
+    x, y, z = (np.column_stack([a, a.sum(-1), np.full(len(a), 7.0)]) for a in (x, y, z))
+    found, error = classifiers.separate(kind, x, y, 1)
+    best = stats.norm.cdf(np.sqrt(0.5))
+    assert best - 0.05 - 4 * error < found < best + 5.2 * error
+    found, _ = classifiers.separate(kind, x, z, 1)
+    p = 2 * stats.norm.sf(abs(found - 0.5) / classifiers.chance_error(1000, 1000))
+    require({kind: p}, "one law, two samples")
+    assert classifiers.separate(kind, x[:, 4:], y[:, 4:], 1) == (0.5, 0.0)
+
+
+def test_qda_sees_covariance():
+    """Normal laws of one mean and correlations +-0.6: the AUC of the likelihood ratio is known by simulation of it."""
+    pytest.importorskip("sklearn", reason="extra 'studies'")
+    random = np.random.default_rng(6)
+    laws = [np.array([[1.0, c], [c, 1.0]]) for c in (0.6, -0.6)]
+    x, y = (random.multivariate_normal([0, 0], law, size=4000) for law in laws)
+    best, _ = classifiers.auc(*(-np.prod(random.multivariate_normal([0, 0], law, size=50_000), -1) for law in laws))
+    found, error = classifiers.separate(classifiers.QDA, x, y, 1)
+    assert abs(found - best) < 5.2 * error + 0.003
+    assert found > 0.7
+
+
+def test_features():
+    case = joint.REFERENCE[0]
+    x, handed = joint.sample(case, 256, "feedback", 50, 1)
+    assert not handed
+    assert x.coarse.shape == (50, joint.COARSE)
+    fine = joint.near(case, 256)
+    assert {128 - 16, 128, 128 + 16} <= set(fine.tolist())
+    echo = int(256 * (0.5 + 0.6375 - 1.0))
+    assert {echo - 16, echo + 16} <= set(fine.tolist())
+    assert x.fine.shape == (50, fine.size) == (50, 66)
+    short = joint.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
+    assert joint.sample(short, 256, "feedback", 5, 1)[1], "given to exact"
+
+
+def test_pixels_given_to_exact_are_not_judged():
+    pytest.importorskip("sklearn", reason="extra 'studies'")
+    settings = joint.Settings((), 60, 0, 60, bins=256)
+    case = joint.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
+    found = {o.engine: o for o in joint.examine(case, settings, 0, 300, joint.TESTS[:1])}
+    assert found["feedback"].handed
+    assert not found["feedback"].aucs
+    assert found["mars"].aucs
+    assert "too short" in joint_report._handed(list(found.values()))[0]
+
+
+def test_files(tmp_path):
+    pytest.importorskip("sklearn", reason="extra 'studies'")
+    assert main(["joint", "--quick", "--out", str(tmp_path)]) == 0
+    text = (tmp_path / "joint.md").read_text()
+    assert "Quick form" in text
+    assert 5_000 < (tmp_path / "joint.png").stat().st_size <= MAX_FIGURE_BYTES
+    with (tmp_path / "joint.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    quick = joint.QUICK
+    assert len(rows) == (1 + len(joint.ENGINES)) * (len(quick.cases) + quick.systems)
+    chance = classifiers.chance_error(quick.exposures // 2, quick.exposures // 2)
+    outcomes = {}
+    for row in rows:
+        if row["random"] == "0" and row["engine"] in (joint.AGAIN, "feedback"):
+            for key in ("qda", "fine_qda", "gradient_boosting", "random_forest"):
+                z = (float(row[f"auc_{key}"]) - 0.5) / chance
+                outcomes[f"{row['case']}, {row['engine']}, {key}"] = 2 * stats.norm.sf(abs(z))
+    assert len(outcomes) == 16
+    require(outcomes, "joint study")
+    bright = [row for row in rows if row["case"] == joint.SEVEN[6].name]
+    seen = {row["engine"]: float(row["auc_qda"]) for row in bright if row["auc_qda"]}
+    assert seen["mars"] > 0.7, "its window variance is more than twice the exact one"
+    assert seen["renewal"] > 0.7
+
+
+def test_without_scikit_learn(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    assert main(["joint", "--quick", "--out", str(tmp_path)]) == 1
+    assert "mars-lidar[studies]" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

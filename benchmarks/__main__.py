@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks import engines, laws, memory, numpy_mars, paths, startup, sweeps
+from benchmarks import engines, exposures, laws, memory, numpy_mars, paths, startup, sweeps
 from benchmarks.config import DEFAULT, FULL, QUICK, Config
 from benchmarks.floor import Bandwidth, measure_bandwidth
 from benchmarks.machine import Interference, describe_machine
@@ -20,6 +20,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "exact": engines.exact_levels,
     "numpy": engines.baselines,
     "pipeline": numpy_mars.pipeline,
+    "long": exposures.long_exposures,
     "flux": sweeps.flux_sweep,
     "cycles": sweeps.exposure_sweep,
     "pixels": sweeps.image_sweep,

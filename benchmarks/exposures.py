@@ -1,0 +1,64 @@
+"""One whole cube over the exposure: the engines whose cost does not grow with it, beside exact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.config import Config
+from benchmarks.floor import Bandwidth
+from benchmarks.report import Goal, Section
+from benchmarks.rows import timing_row
+from benchmarks.timing import in_turn
+from benchmarks.workload import Workload, canonical, system
+from mars_lidar.engines import ENGINES, Engine, MarsEngine
+from mars_lidar.table import Table
+
+GOAL_FEEDBACK_S, GOAL_MARS_S, GOAL_MARS_SHORT_S = 0.15, 0.2, 0.02
+_MOST_EXACT = 2e9  # registrations, some 5 s on two cores
+
+
+def long_exposures(config: Config, bandwidth: Bandwidth) -> Section:
+    """Canonical fluxes, all threads, warm memory, from a thousand to ten million cycles."""
+    points = (256, 100) if config.mode == "full" else (32, 24)
+    table = Table.build(system(config), (0.01, 10.0, points[0]), (0.01, 10.0, points[1]))
+    engines: dict[str, Engine] = {name: ENGINES[name] for name in ("feedback", "auto", "exact")}
+    engines["mars"] = MarsEngine(table)
+    exposures = [10**k for k in range(3, 8)] if config.mode != "quick" else [10**3, 10**5]
+    section = Section(
+        "One cube over the exposure",
+        notes=[
+            f"All threads, warm memory. mars: with a table of {points[0]} x {points[1]} entries. x reference: over "
+            "feedback, in turn. exact is left out beyond 2e9 registrations."
+        ],
+    )
+    each = replace(config, seconds=config.seconds / len(exposures))
+    for cycles in exposures:
+        workload = canonical(config, cycles=cycles)
+        out = workload.warm()
+        names = [n for n in engines if n != "exact" or workload.photons * cycles * workload.pixels < _MOST_EXACT]
+        times = in_turn({n: _Run(engines[n], workload, config.threads, out) for n in names}, each)
+        registrations = int(out.sum(dtype=np.int64))  # of whichever ran last: all agree to a part in a thousand
+        for name in names:
+            row = timing_row(
+                f"N_r = {cycles:,}", workload, times[name], bandwidth, engine=name, threads=config.threads,
+                reference=times["feedback"], registrations=registrations,
+            )  # fmt: skip
+            section.rows.append(row)
+        goals = {"feedback": GOAL_FEEDBACK_S, "mars": GOAL_MARS_SHORT_S if cycles == 1000 else GOAL_MARS_S}
+        for name, wanted in goals.items():
+            what = f"{name}, whole cube, {cycles:,} cycles, all threads"
+            section.goals.append(Goal(what, 1e3 * times[name].median, 1e3 * wanted, "ms"))
+    return section
+
+
+class _Run:
+    def __init__(self, engine: Engine, workload: Workload, threads: int, out: NDArray[Any]) -> None:
+        self.engine, self.workload, self.threads, self.out = engine, workload, threads, out
+
+    def __call__(self) -> NDArray[Any]:
+        self.engine.histogram(self.workload.task(self.threads), self.out)
+        return self.out

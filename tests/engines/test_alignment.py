@@ -10,7 +10,7 @@ from harness import require, two_lobes
 from harness.pvalues import goodness
 from mars_lidar import _core
 from mars_lidar.engines._alignment import Alignment
-from mars_lidar.engines.mars import normalised
+from mars_lidar.engines._count_shape import normalised
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 

@@ -155,8 +155,8 @@ def test_level_must_run_here():
 def test_progress_runs_once_to_its_end(engine: str):
     flux, system = mixture()
     seen: list[float] = []
-    ml.simulate(flux, system, engine=engine, realizations=1500, progress=lambda done, of: seen.append(done / of))
-    assert len(seen) > 3
+    ml.simulate(flux, system, engine=engine, realizations=3000, progress=lambda done, of: seen.append(done / of))
+    assert len(seen) > 1  # every 50 ms, and at the end
     assert seen[-1] == 1.0
     assert seen == sorted(seen)
 

@@ -107,11 +107,11 @@ def test_any_part_alone_on_any_threads(with_table: bool):
 
 
 def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import _synthesis, mars
+    from mars_lidar.engines import _count_shape, _synthesis
 
     whole = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5)
     monkeypatch.setattr(_synthesis, "_BATCH", 4)
-    monkeypatch.setattr(mars, "PIXELS", 11)
+    monkeypatch.setattr(_count_shape, "PIXELS", 11)
     assert np.array_equal(whole, ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5))
 
 

@@ -6,8 +6,9 @@ One word of the pixel's own random stream makes one count, whatever the law.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,17 @@ class Streams:
     first: int
     seed: int
     threads: int
+
+    def fill(self, draw: Callable[..., None], out: IndexArray, **law: NDArray[Any]) -> None:
+        """Let a function of the native core draw `out` (realizations, pixels) from `law`, its arrays by name."""
+        draw(
+            **{name: np.ascontiguousarray(array) for name, array in law.items()},
+            pixel_index=self.pixel_index,
+            first_realization=self.first,
+            seed=self.seed,
+            out=out,
+            threads=self.threads,
+        )
 
 
 class CountLaws(ABC):
@@ -60,15 +72,7 @@ class RoundedGaussian(CountLaws):
     def fill(self, streams: Streams, out: IndexArray) -> None:
         from mars_lidar import _core
 
-        _core.gaussian_counts(
-            mean=np.ascontiguousarray(self.mean),
-            variance=np.ascontiguousarray(self.variance),
-            pixel_index=streams.pixel_index,
-            first_realization=streams.first,
-            seed=streams.seed,
-            out=out,
-            threads=streams.threads,
-        )
+        streams.fill(_core.gaussian_counts, out, mean=self.mean, variance=self.variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +87,7 @@ class Poisson(CountLaws):
     def fill(self, streams: Streams, out: IndexArray) -> None:
         from mars_lidar import _core
 
-        _core.poisson_counts(
-            mean=np.ascontiguousarray(self.mean),
-            pixel_index=streams.pixel_index,
-            first_realization=streams.first,
-            seed=streams.seed,
-            out=out,
-            threads=streams.threads,
-        )
+        streams.fill(_core.poisson_counts, out, mean=self.mean)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +102,7 @@ class Matched(CountLaws):
     def fill(self, streams: Streams, out: IndexArray) -> None:
         from mars_lidar import _core
 
-        _core.matched_counts(
-            cumulants=np.ascontiguousarray(self.cumulants),
-            pixel_index=streams.pixel_index,
-            first_realization=streams.first,
-            seed=streams.seed,
-            out=out,
-            threads=streams.threads,
-        )
+        streams.fill(_core.matched_counts, out, cumulants=self.cumulants)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,14 +132,5 @@ class Tabulated(CountLaws):
     def fill(self, streams: Streams, out: IndexArray) -> None:
         from mars_lidar import _core
 
-        _core.tabulated_counts(
-            first=self.first,
-            offsets=self.offsets,
-            cumulative=self.cumulative,
-            law=np.ascontiguousarray(self.law),
-            pixel_index=streams.pixel_index,
-            first_realization=streams.first,
-            seed=streams.seed,
-            out=out,
-            threads=streams.threads,
-        )
+        laws = {"first": self.first, "offsets": self.offsets, "cumulative": self.cumulative}
+        streams.fill(_core.tabulated_counts, out, law=self.law, **laws)

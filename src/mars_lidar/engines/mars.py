@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _validate
+from mars_lidar.engines._count_shape import CountTimesShape, normalised
 from mars_lidar.engines._counts import CountLaws, Matched, Poisson, RoundedGaussian, Tabulated
 from mars_lidar.engines._pixels import Group, groups
 from mars_lidar.engines._synthesis import Batch, Run
-from mars_lidar.engines._table import PIXELS, TableReader
-from mars_lidar.engines.base import Engine, Task
-from mars_lidar.flux import Flux
+from mars_lidar.engines._table import Entries
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ IndexArray = NDArray[np.int64]
 _COUNTS = ("exact", "gaussian")
 
 
-class MarsEngine(Engine):
+class MarsEngine(CountTimesShape):
     """Whole histograms from two statistics of a pixel: N from the count law, Multinomial(N, pi) from the shape pi.
 
     arXiv 2512.04924, with the finite exposure's exact statistics in place of the stationary chain's. The law of the
@@ -68,35 +67,12 @@ class MarsEngine(Engine):
         level: str = "",
     ) -> None:
         self.count = _validate.choice("count", count, _COUNTS)
-        self.reader = table_reader(table, interpolation)
-        self.level = level
+        super().__init__(table, interpolation, level)
 
     @property
     def settings(self) -> dict[str, Any]:
         """Count law, and the table if there is one."""
-        return {"count": self.count} | (self.reader.settings if self.reader else {})
-
-    def check(self, flux: Flux, system: System) -> None:
-        """A table must be of the system, and knows one return a pixel."""
-        if self.reader:
-            self.reader.check(flux, system)
-
-    def histogram(self, task: Task, out: NDArray[Any]) -> None:
-        """Look up or evaluate, draw the counts, draw their places: batch by batch."""
-        run = Run(task, out, self.level)
-        pixels = np.arange(task.pixel_index.size)
-        if self.reader is None:
-            self._evaluate(run, pixels)
-            return
-        left = [self._look_up(run, self.reader, pixels[k : k + PIXELS]) for k in range(0, pixels.size, PIXELS)]
-        self._evaluate(run, np.concatenate(left))
-
-    def _look_up(self, run: Run, reader: TableReader, pixels: IndexArray) -> IndexArray:
-        """Draws the pixels on the grid; returns the others."""
-        with run.stage("lookup_s"):
-            entries, left = reader.read(run.task, pixels)
-        run.draw(entries.batch(self._laws(run.task.system, entries.cumulants)))
-        return left
+        return {"count": self.count} | super().settings
 
     def _evaluate(self, run: Run, pixels: IndexArray) -> None:
         """The exact statistics of each distinct pixel, at its own delay."""
@@ -122,26 +98,11 @@ class MarsEngine(Engine):
             laws = self._laws(task.system, cumulants[group.cell])
         return Batch.unmixed(group.pixels, normalised(exposure.histogram), group.cell, laws)
 
+    def _laws_of(self, system: System, entries: Entries) -> CountLaws:
+        return self._laws(system, entries.cumulants)
+
     def _laws(self, system: System, cumulants: FloatArray) -> CountLaws:
         """Laws from cumulants (pixels, 4)."""
         if self.count == "gaussian":
             return RoundedGaussian(cumulants[:, 0], cumulants[:, 1])
         return Poisson(cumulants[:, 0]) if system.dead_time_periods == 0.0 else Matched(cumulants)
-
-
-def table_reader(table: Table | None, interpolation: str | None) -> TableReader | None:
-    """A reader of the table, if there is one; without one there is nothing to interpolate."""
-    if table is not None:
-        return TableReader(table, interpolation)
-    if interpolation is not None:
-        raise ValueError(f"interpolation must be None without a table, got {interpolation!r}")
-    return None
-
-
-def normalised(histogram: FloatArray) -> NDArray[np.float32]:
-    """Shapes (cells, bins) of sum 1; uniform where nothing registers."""
-    flat = histogram.reshape(-1, histogram.shape[-1])
-    total = flat.sum(-1, keepdims=True)
-    dark = total == 0.0
-    shape = np.where(dark, 1.0 / flat.shape[-1], flat / np.where(dark, 1.0, total))
-    return np.ascontiguousarray(shape.astype(np.float32))

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.engines._alignment import Alignment
+from mars_lidar.engines._count_shape import CountTimesShape, normalised
 from mars_lidar.engines._counts import CountLaws, RoundedGaussian
 from mars_lidar.engines._pixels import Group, groups, single_return
 from mars_lidar.engines._synthesis import Batch, Run
-from mars_lidar.engines._table import PIXELS, TableReader
-from mars_lidar.engines.base import Engine, Task
-from mars_lidar.engines.mars import normalised, table_reader
-from mars_lidar.flux import Flux
+from mars_lidar.engines._table import Entries
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
@@ -24,7 +22,7 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 
-class RenewalEngine(Engine):
+class RenewalEngine(CountTimesShape):
     """N from the Gaussian law of a constant-rate renewal process of equal energy, Multinomial(N, pi) from the chain.
 
     The baseline "Renewal" of the MaRS paper (arXiv 2512.04924): mean t lambda / (1 + lambda t_d) and variance
@@ -54,37 +52,12 @@ class RenewalEngine(Engine):
         interpolation: Literal["bilinear", "nearest"] | None = None,
         level: str = "",
     ) -> None:
-        self.reader = table_reader(table, interpolation)
-        self.level = level
+        super().__init__(table, interpolation, level)
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The table, if there is one."""
-        return self.reader.settings if self.reader else {}
+    def _laws_of(self, system: System, entries: Entries) -> CountLaws:
+        return _laws(system, entries.signal, entries.background)
 
-    def check(self, flux: Flux, system: System) -> None:
-        """A table must be of the system, and knows one return a pixel."""
-        if self.reader:
-            self.reader.check(flux, system)
-
-    def histogram(self, task: Task, out: NDArray[Any]) -> None:
-        """Look up or solve, draw the counts, draw their places: batch by batch."""
-        run = Run(task, out, self.level)
-        pixels = np.arange(task.pixel_index.size)
-        if self.reader is None:
-            self._solve(run, pixels)
-            return
-        left = [self._look_up(run, self.reader, pixels[k : k + PIXELS]) for k in range(0, pixels.size, PIXELS)]
-        self._solve(run, np.concatenate(left))
-
-    def _look_up(self, run: Run, reader: TableReader, pixels: IndexArray) -> IndexArray:
-        """Draws the pixels on the grid; returns the others."""
-        with run.stage("lookup_s"):
-            entries, left = reader.read(run.task, pixels)
-        run.draw(entries.batch(_laws(run.task.system, entries.signal, entries.background)))
-        return left
-
-    def _solve(self, run: Run, pixels: IndexArray) -> None:
+    def _evaluate(self, run: Run, pixels: IndexArray) -> None:
         """The chain of each distinct pixel; one return is solved at the canonical delay and moved."""
         run.count("pixels_evaluated", pixels.size)
         task = run.task

@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 from mars_lidar._memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
-from mars_lidar.io.store import INCOMPLETE_SUFFIX, IncompleteFileError, OpenedStore, TemporarySibling, Writer
+from mars_lidar.io.store import (
+    INCOMPLETE_SUFFIX,
+    IncompleteFileError,
+    LazyCounts,
+    OpenedStore,
+    TemporarySibling,
+    Writer,
+)
 
 _LEVEL = 1  # zlib; on the room of zarr_store.py 0.6 s and 6.6 MB, level 6 takes 3.9 s for 5.0 MB
 
@@ -74,32 +81,22 @@ class NpzWriter(Writer):
         return self._sibling.discard()
 
 
-class _NpzCounts:
-    """The counts of an archive: shape and type at once, the counts on first use."""
+class _NpzCounts(LazyCounts):
+    """The counts of an archive."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._loaded: NDArray[Any] | None = None
         with zipfile.ZipFile(path) as archive, archive.open("histogram.npy") as member:
             np.lib.format.read_magic(member)
             shape, _, self.dtype = np.lib.format.read_array_header_1_0(member)
-        self.shape: tuple[int, ...] = shape
+        self.shape = shape
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        if self._loaded is None:
-            size = math.prod(self.shape) * self.dtype.itemsize
-            check_memory(size, f"the counts of {self._path}", "a .zarr or .h5 is read in parts")
-            with np.load(self._path, allow_pickle=False) as archive:
-                self._loaded = archive["histogram"]
-        if copy:
-            return np.array(self._loaded, dtype=dtype)
-        return np.asarray(self._loaded, dtype=dtype)
-
-    def __getitem__(self, key: Any) -> Any:
-        return self.__array__()[key]
-
-    def __len__(self) -> int:
-        return self.shape[0]
+    def _read(self) -> NDArray[Any]:
+        size = math.prod(self.shape) * self.dtype.itemsize
+        check_memory(size, f"the counts of {self._path}", "a .zarr or .h5 is read in parts")
+        with np.load(self._path, allow_pickle=False) as archive:
+            counts: NDArray[Any] = archive["histogram"]
+        return counts
 
 
 def open_writer(path: Path, recipe: Recipe) -> Writer:

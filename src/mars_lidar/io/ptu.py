@@ -19,7 +19,7 @@ from mars_lidar._memory import check_memory
 from mars_lidar.io import layout, ptu_header
 from mars_lidar.io.optional import needed
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import OpenedStore, TemporarySibling, Writer
+from mars_lidar.io.store import LazyCounts, OpenedStore, TemporarySibling, Writer
 
 KIND = "cube"
 _OVERFLOW = ((1 << 31) | (63 << 25) | 1).to_bytes(4, "little")  # generic T3: 1024 laser periods more
@@ -101,37 +101,26 @@ class PtuWriter(Writer):
         return self._sibling.discard()
 
 
-class _PtuCounts:
-    """The counts of a file: shape and type at once, the counts on first use."""
+class _PtuCounts(LazyCounts):
+    """The counts of a file."""
 
     def __init__(self, path: Path, recipe: Recipe) -> None:
         self._path, self._recipe = path, recipe
-        self._loaded: NDArray[Any] | None = None
-        self.shape: tuple[int, ...] = recipe.shape
+        self.shape = recipe.shape
         self.dtype = recipe.dtype
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        if self._loaded is None:
-            whole = self._recipe.nbytes + self._path.stat().st_size
-            check_memory(whole, f"the counts of {self._path}", "mars-lidar convert makes a .zarr of it elsewhere")
-            ptu = ptu_header.opened(self._path)
-            try:
-                image = ptu.decode_image(channel=0, dtime=self.shape[-1], dtype=self.dtype)
-            finally:
-                ptu.close()
-            if image.shape != (*self.shape[:3], 1, self.shape[3]):
-                told = f"{image.shape[:3]} instead of {self.shape[:3]} (realization, y, x)"
-                raise ValueError(f"{self._path} is damaged: its records make an image of {told}")
-            self._loaded = np.ascontiguousarray(image[:, :, :, 0])
-        if copy:
-            return np.array(self._loaded, dtype=dtype)
-        return np.asarray(self._loaded, dtype=dtype)
-
-    def __getitem__(self, key: Any) -> Any:
-        return self.__array__()[key]
-
-    def __len__(self) -> int:
-        return self.shape[0]
+    def _read(self) -> NDArray[Any]:
+        whole = self._recipe.nbytes + self._path.stat().st_size
+        check_memory(whole, f"the counts of {self._path}", "mars-lidar convert makes a .zarr of it elsewhere")
+        ptu = ptu_header.opened(self._path)
+        try:
+            image = ptu.decode_image(channel=0, dtime=self.shape[-1], dtype=self.dtype)
+        finally:
+            ptu.close()
+        if image.shape != (*self.shape[:3], 1, self.shape[3]):
+            told = f"{image.shape[:3]} instead of {self.shape[:3]} (realization, y, x)"
+            raise ValueError(f"{self._path} is damaged: its records make an image of {told}")
+        return np.ascontiguousarray(image[:, :, :, 0])
 
 
 def open_writer(path: Path, recipe: Recipe) -> Writer:

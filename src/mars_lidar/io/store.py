@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is written to
@@ -35,6 +36,31 @@ class CountArray(Protocol):
 
     def __getitem__(self, key: Any) -> Any:
         """The selected counts, in memory."""
+
+
+class LazyCounts(ABC):
+    """Counts of a file that can only be read whole: shape and type at once, the counts on first use."""
+
+    shape: tuple[int, ...]
+    dtype: Any
+    _loaded: NDArray[Any] | None = None
+
+    @abstractmethod
+    def _read(self) -> NDArray[Any]:
+        """All counts; a MemoryError before any work where they do not fit."""
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        if self._loaded is None:
+            self._loaded = self._read()
+        if copy:
+            return np.array(self._loaded, dtype=dtype)
+        return np.asarray(self._loaded, dtype=dtype)
+
+    def __getitem__(self, key: Any) -> Any:
+        return self.__array__()[key]
+
+    def __len__(self) -> int:
+        return self.shape[0]
 
 
 @dataclass(frozen=True, eq=False)

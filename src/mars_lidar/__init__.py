@@ -1,6 +1,7 @@
 """mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
 
 from mars_lidar._version import __version__
+from mars_lidar.estimate import Calibration, Validation, calibrate, validate
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.scene import Scene
@@ -18,6 +19,7 @@ from mars_lidar.table import Lookup, QuantisationError, Table
 from mars_lidar.timestamps import Timestamps
 
 __all__ = [
+    "Calibration",
     "CountLaw",
     "Detector",
     "Flux",
@@ -31,11 +33,14 @@ __all__ = [
     "System",
     "Table",
     "Timestamps",
+    "Validation",
     "__version__",
+    "calibrate",
     "count_law",
     "holding_time_covariance",
     "joint_law",
     "registration_pdf",
     "simulate",
     "simulate_timestamps",
+    "validate",
 ]

@@ -37,7 +37,7 @@ class Timestamps:
         Laser period, ns, and laser periods of the exposure.
     info
         Where they come from: ``system`` (as `System.to_dict` gives it), ``engine``, ``seed``, ``realization``,
-        ``source``, as far as they are known.
+        ``source``, ``unit_ns`` (resolution of the clock that recorded them), as far as they are known.
     """
 
     times_ns: NDArray[np.float64]
@@ -74,18 +74,29 @@ class Timestamps:
         save(path, self, overwrite=overwrite)
 
     @classmethod
-    def load(cls, path: str | Path, *, period_ns: float | None = None, bins: int | None = None) -> Timestamps:
-        """Read what `save` wrote, or a photon stream that others recorded: PTU (T2, T3) or Photon-HDF5.
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        period_ns: float | None = None,
+        bins: int | None = None,
+        unit_ns: float | None = None,
+        variable: str | None = None,
+    ) -> Timestamps:
+        """Read what `save` wrote, or a photon stream that others recorded: PTU (T2, T3), Photon-HDF5, .mat, .npz.
 
         Parameters
         ----------
         path
-            ``.npz``, ``.ptu``, ``.h5`` or ``.hdf5``. In files of others a pixel is a detector (channel), and
-            the image is (1, detectors).
+            ``.npz``, ``.ptu``, ``.h5``, ``.hdf5`` or ``.mat``. In PTU and Photon-HDF5 of others a pixel is a
+            detector (channel), and the image is (1, detectors); in ``.mat`` and ``.npz`` an array of absolute times
+            is one pixel, and a cell array (.mat) an image of them.
         period_ns
             Laser period, for files of others that do not tell (T2), or tell a rounded one.
         bins
             Histogram bins, for files of others; None: their own, one per unit of their fine clock.
+        unit_ns, variable
+            For ``.mat`` and ``.npz`` of others: unit of the times in ns, and the variable that holds them.
 
         Raises
         ------
@@ -94,7 +105,7 @@ class Timestamps:
         """
         from mars_lidar.io.streams import load
 
-        return load(path, period_ns=period_ns, bins=bins)
+        return load(path, period_ns=period_ns, bins=bins, unit_ns=unit_ns, variable=variable)
 
     def pixel(self, y: int, x: int) -> Timestamps:
         """The registrations of one pixel, as views."""

@@ -172,7 +172,8 @@ def test_a_lab_s_stream_is_converted(tmp_path):
     assert len(done.lost) == 2
     assert "header entries of the other program" in done.lost[1]
     times = ml.Timestamps.load(tmp_path / "lab.h5")
-    assert (times.shape, times.bins, times.info) == ((1, 4), 625, {"source": str(tmp_path / "lab.ptu")})
+    assert (times.shape, times.bins) == ((1, 4), 625)
+    assert times.info == {"source": str(tmp_path / "lab.ptu"), "unit_ns": pytest.approx(0.016)}
     for k in range(4):
         mine = times.pixel(0, k)
         order = np.lexsort((dtime[channel == k], cycle[channel == k]))

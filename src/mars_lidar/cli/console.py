@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 _PATIENCE_S = 0.5  # a bar that would vanish at once is not drawn
@@ -94,6 +99,28 @@ def _new_bar() -> Any:
         console=Console(stderr=True),
         transient=True,
     )
+
+
+def check_picture(out: Path | None, overwrite: bool) -> None:
+    """Raise, before any work, what `save_picture` would raise."""
+    if out is None:
+        return
+    if out.suffix not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"--out must end in .png, .pdf or .svg, got {str(out)!r}")
+    if out.exists() and not overwrite:
+        raise FileExistsError(f"{out} exists already; choose another name or give --overwrite")
+    if not out.parent.is_dir():
+        raise FileNotFoundError(f"{out} cannot be written: there is no folder {out.parent}")
+
+
+def save_picture(figure: Figure, out: Path) -> None:
+    """Write a figure beside its name and rename it when it is whole."""
+    unfinished = out.with_name(out.name + ".incomplete")
+    try:
+        figure.savefig(unfinished, format=out.suffix[1:])
+        os.replace(unfinished, out)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def table(rows: list[tuple[str, str]]) -> None:

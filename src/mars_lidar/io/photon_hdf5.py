@@ -116,7 +116,7 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
                 cycle = np.floor(periods).astype(np.int64)
                 tick = 1e9 * unit_s if bins is None else period_ns / bins
                 rest = (periods - cycle) * (period_ns / tick) - 0.5
-                return measured(cycle, rest, tick, detectors, period_ns, bins, str(path))
+                return measured(cycle, rest, tick, detectors, period_ns, bins, str(path), 1e9 * unit_s)
             nanotimes = np.asarray(data["nanotimes"][...])
             tcspc_s = _tcspc_unit(file)
         except (KeyError, OSError, ValueError) as error:

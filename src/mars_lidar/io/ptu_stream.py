@@ -179,4 +179,4 @@ def _absolute(photons: Any, clock_ns: float, period_ns: float, bins: int | None,
     cycle = np.floor(periods).astype(np.int64)
     unit = clock_ns if bins is None else period_ns / bins
     fine = (periods - cycle) * (period_ns / unit) - 0.5  # `measured` adds half a unit
-    return measured(cycle, fine, unit, photons["channel"], period_ns, bins, source)
+    return measured(cycle, fine, unit, photons["channel"], period_ns, bins, source, clock_ns)

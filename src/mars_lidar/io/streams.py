@@ -19,6 +19,7 @@ from mars_lidar.io.store import INCOMPLETE_SUFFIX, IncompleteFileError, Temporar
 from mars_lidar.timestamps import Timestamps
 
 STREAM_SUFFIXES = (".npz", ".ptu", ".h5", ".hdf5")
+READ_SUFFIXES = (*STREAM_SUFFIXES, ".mat")
 FORMAT = "mars-lidar timestamps"
 FORMAT_VERSION = 1
 
@@ -53,15 +54,29 @@ def check_output(path: str | Path, *, overwrite: bool = False) -> None:
     check_target(Path(path), folder=False, overwrite=overwrite)
 
 
-def load(path: str | Path, *, period_ns: float | None = None, bins: int | None = None) -> Timestamps:
+def load(
+    path: str | Path,
+    *,
+    period_ns: float | None = None,
+    bins: int | None = None,
+    unit_ns: float | None = None,
+    variable: str | None = None,
+) -> Timestamps:
     """Read timestamps; see `Timestamps.load`."""
     if period_ns is not None:
         period_ns = _validate.real("period_ns", period_ns, low=0.0, strict_low=True)
     if bins is not None:
         bins = _validate.integer("bins", bins, low=1, high=2**20)
+    if unit_ns is not None:
+        unit_ns = _validate.real("unit_ns", unit_ns, low=0.0, strict_low=True)
     source = Path(path)
     plain = source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX))
-    module = _module(plain)
+    if plain.suffix not in READ_SUFFIXES:
+        raise ValueError(f"path of timestamps must end in one of {', '.join(READ_SUFFIXES)}, got {str(path)!r}")
+    bare = plain.suffix in (".mat", ".npz")
+    if not bare and (unit_ns is not None or variable is not None):
+        raise ValueError(f"unit_ns and variable are for .mat and .npz: a {plain.suffix} tells both, got {str(path)!r}")
+    module = None if bare else _module(plain)
     if not source.is_file():
         if source.with_name(source.name + INCOMPLETE_SUFFIX).exists():
             raise IncompleteFileError(f"{source} was never finished: a stopped run left a {INCOMPLETE_SUFFIX} file")
@@ -71,7 +86,11 @@ def load(path: str | Path, *, period_ns: float | None = None, bins: int | None =
     if module is not None:
         times: Timestamps = module.read(source, period_ns, bins)
         return times
-    if period_ns is not None or bins is not None:
+    if source.suffix == ".mat" or _npz_attributes(source).get("format") is None:
+        from mars_lidar.io import bare_stream
+
+        return bare_stream.read(source, period_ns, bins, unit_ns, variable)
+    if not (period_ns is None and bins is None and unit_ns is None and variable is None):
         raise ValueError(f"{source} tells its period and bins: period_ns and bins are for the streams of others")
     return _read_npz(source)
 
@@ -139,11 +158,12 @@ def measured(
     period_ns: float,
     bins: int | None,
     source: str,
+    clock_ns: float | None = None,
 ) -> Timestamps:
     """Timestamps of a recorded stream: laser period and fine time of each photon, and its detector.
 
     `fine` counts units of `unit_ns` since the laser pulse. Without `bins`, a bin is one unit, and the last
-    one may be cut by the end of the period.
+    one may be cut by the end of the period. `clock_ns` is the resolution of the clock, where it is not `unit_ns`.
     """
     pixels = int(detector.max()) + 1 if detector.size else 1
     phase = (np.asarray(fine, np.float64) + 0.5) * unit_ns  # the middle of what the clock tells apart
@@ -165,7 +185,7 @@ def measured(
         "dtype": "uint16" if counts.size == 0 or counts.max() < 2**16 else "uint32",
         "period_ns": period_ns,
         "cycles": cycles,
-        "info": {"source": source},
+        "info": {"source": source, "unit_ns": unit_ns if clock_ns is None else clock_ns},
     }
     return from_attributes(attrs, times_ns[order], cycle[order], bin_[order], counts)
 

@@ -1,0 +1,205 @@
+"""Maximum likelihood of the light from registrations and armed passes, by Fisher scoring.
+
+log L = sum_j h_j log l_j - sum_j l_j D_j with h_j registrations, D_j armed passes and l_j photons per period in bin
+j: the exact likelihood of a free-running pixel, for bins that are narrow beside the pulse. The armed passes take the
+place of the exposure, so that the dead time needs no further thought: score J'(h / l - D), information J' (D / l) J.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mars_lidar.estimate.intervals import ArmedTime, FloatArray
+from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
+
+_STEPS = 200
+_CONVERGED = 1e-8  # Newton decrement: twice what log L could still gain
+_LEAST = 1e-9  # photons per period that stand for none
+_WIDTHS = 24  # pulse widths tried to begin with, where it is not known
+_SPREAD = 1e-3  # step of a numerical derivative, in widths of the pulse
+
+
+@dataclass(frozen=True)
+class Light:
+    """Background, K returns and the pulse: the parameters, in the order background, signals, delays, width.
+
+    With `fit_width` the pulse is Gaussian and its sigma is the last parameter.
+    """
+
+    period_ns: float
+    bins: int
+    pulse: Pulse
+    returns: int
+    fit_width: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters; those of several returns are numbered from 1."""
+        tails = [""] if self.returns == 1 else [f"_{k}" for k in range(1, self.returns + 1)]
+        width = ("sigma_ns",) if self.fit_width else ()
+        return ("background", *(f"signal{t}" for t in tails), *(f"delay_ns{t}" for t in tails), *width)
+
+    def pulse_of(self, theta: FloatArray) -> Pulse:
+        """The pulse with its fitted width."""
+        return GaussianPulse(sigma_ns=float(theta[-1])) if self.fit_width else self.pulse
+
+    def rate(self, theta: FloatArray) -> FloatArray:
+        """Photons per period in each bin (n,)."""
+        k = self.returns
+        pulse = self.pulse_of(theta)
+        energy = pulse.bin_energy(theta[1 + k : 1 + 2 * k], self.period_ns, self.bins)
+        return np.asarray(theta[0] / self.bins + theta[1 : 1 + k] @ energy)
+
+    def jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rate (n,) and its derivatives (n, parameters)."""
+        k = self.returns
+        signal, delay = theta[1 : 1 + k], theta[1 + k : 1 + 2 * k]
+        pulse = self.pulse_of(theta)
+        step = _SPREAD * pulse.sigma_ns if isinstance(pulse, GaussianPulse) else 0.5 * _sample_ns(pulse)
+        energy = pulse.bin_energy(delay, self.period_ns, self.bins)
+        later = pulse.bin_energy(delay + step, self.period_ns, self.bins)
+        earlier = pulse.bin_energy(delay - step, self.period_ns, self.bins)
+        columns = [np.full((1, self.bins), 1.0 / self.bins), energy, signal[:, None] * (later - earlier) / (2 * step)]
+        if self.fit_width:
+            sigma = float(theta[-1])
+            step = _SPREAD * sigma
+            wide = GaussianPulse(sigma_ns=sigma + step).bin_energy(delay, self.period_ns, self.bins)
+            narrow = GaussianPulse(sigma_ns=sigma - step).bin_energy(delay, self.period_ns, self.bins)
+            columns.append((signal @ (wide - narrow) / (2 * step))[None])
+        return theta[0] / self.bins + signal @ energy, np.concatenate(columns).T
+
+    def bounded(self, theta: FloatArray) -> FloatArray:
+        """Parameters within their ranges."""
+        k = self.returns
+        out = theta.copy()
+        out[: 1 + k] = np.maximum(out[: 1 + k], _LEAST)
+        if self.fit_width:
+            out[-1] = np.clip(out[-1], 2e-6 * self.period_ns, 0.5 * self.period_ns)
+        return out
+
+
+def _sample_ns(pulse: Pulse) -> float:
+    return pulse.bin_ns if isinstance(pulse, SampledPulse) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The maximum: parameters, their information matrix, log L, and whether the scoring converged."""
+
+    theta: FloatArray
+    information: FloatArray
+    log_likelihood: float
+    converged: bool
+
+
+def log_likelihood(seen: ArmedTime, rate: FloatArray) -> float:
+    """log L up to a constant; -inf where something registered in a bin without light."""
+    some = seen.registrations > 0
+    if (rate[some] <= 0).any():
+        return -np.inf
+    return float(seen.registrations[some] @ np.log(rate[some]) - rate @ seen.passes)
+
+
+def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
+    """Fisher scoring with step halving from `theta`; parameters at 0 that want to be negative stay there."""
+    theta = light.bounded(theta)
+    best = log_likelihood(seen, light.rate(theta))
+    converged = False
+    information = np.zeros((theta.size, theta.size))
+    for _ in range(_STEPS):
+        rate, slopes = light.jacobian(theta)
+        rate = np.maximum(rate, 1e-300)
+        score = slopes.T @ (seen.registrations / rate - seen.passes)
+        information = slopes.T @ ((seen.passes / rate)[:, None] * slopes)
+        free = _free(light, theta, score, information)
+        step = np.zeros(theta.size)
+        step[free] = _solve(information[np.ix_(free, free)], score[free])
+        decrement = float(step @ score)
+        if decrement < _CONVERGED:
+            converged = True
+            break
+        scale = 1.0
+        while scale > 1e-8:
+            trial = light.bounded(theta + scale * step)
+            found = log_likelihood(seen, light.rate(trial))
+            if found > best:
+                break
+            scale *= 0.5
+        else:  # log L is at the end of its digits
+            converged = decrement < 1e-3
+            break
+        theta, best = trial, found
+    return Fit(theta, information, best, converged)
+
+
+def _free(light: Light, theta: FloatArray, score: FloatArray, information: FloatArray) -> FloatArray:
+    """Which parameters may move: not a light at 0 that should be less, and no delay of a return without light."""
+    k = light.returns
+    free = np.ones(theta.size, bool)
+    at_zero = (theta[: 1 + k] <= _LEAST) & (score[: 1 + k] <= 0)
+    free[: 1 + k] = ~at_zero
+    free[1 + k : 1 + 2 * k] = ~at_zero[1:]
+    if light.fit_width and at_zero[1:].all():
+        free[-1] = False
+    free &= np.diag(information) > 0
+    return free
+
+
+def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Symmetric positive solution, scaled; by least squares where the matrix has lost rank."""
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    scaled = matrix * scale * scale[:, None]
+    return np.asarray(scale * np.linalg.lstsq(scaled, scale * right, rcond=1e-12)[0])
+
+
+def covariance(light: Light, found: Fit) -> FloatArray:
+    """Inverse of the information (parameters, parameters); NaN for what cannot be told (a delay without light)."""
+    k = light.returns
+    told = np.diag(found.information) > 0
+    dark = found.theta[1 : 1 + k] <= 2 * _LEAST
+    told[1 + k : 1 + 2 * k] &= ~dark
+    if light.fit_width and dark.all():
+        told[-1] = False
+    out = np.full(found.information.shape, np.nan)
+    matrix = found.information[np.ix_(told, told)]
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    inverse = np.linalg.pinv(matrix * scale * scale[:, None], rcond=1e-12, hermitian=True)
+    out[np.ix_(told, told)] = inverse * scale * scale[:, None]
+    return out
+
+
+def initial(seen: ArmedTime, light: Light) -> FloatArray:
+    """Where to begin: the returns one after the other by a matched filter on the unrestricted rates."""
+    total = float(seen.registrations.sum()) / max(float(seen.passes.mean()), 1e-300)
+    rate = seen.rate
+    weight = np.minimum(seen.passes / max(float(seen.passes.mean()), 1e-300), 1.0)  # noisy where hardly armed
+    level = float(np.median(rate))
+    left = (rate - level) * weight
+    pulse, sigma = light.pulse, 0.0
+    if light.fit_width:
+        widths = np.geomspace(1.0 / light.bins, 0.15, _WIDTHS) * light.period_ns
+        gains = [float(_matched(left, GaussianPulse(sigma_ns=float(w)), light)[0].max()) for w in widths]
+        sigma = float(widths[int(np.argmax(gains))])
+        pulse = GaussianPulse(sigma_ns=sigma)
+    signals, delays = [], []
+    for _ in range(light.returns):
+        gain, norm = _matched(left, pulse, light)
+        place = int(np.argmax(gain))
+        delay = place * light.period_ns / light.bins
+        strength = max(float(gain[place]) / norm, 1e-3 * total / light.returns)
+        signals.append(strength)
+        delays.append(delay)
+        left = left - strength * pulse.bin_energy(delay, light.period_ns, light.bins) * weight
+    background = max(float(rate.sum()) - sum(signals), 1e-2 * total, 1e-6)
+    return np.array([background, *signals, *delays, *([sigma] if light.fit_width else [])])
+
+
+def _matched(rate: FloatArray, pulse: Pulse, light: Light) -> tuple[FloatArray, float]:
+    """Correlation (n,) of the rates with the unit-norm pulse at each delay, and that norm."""
+    template = pulse.bin_energy(0.0, light.period_ns, light.bins)
+    norm = float(np.sqrt((template**2).sum()))
+    spectrum = np.fft.rfft(rate) * np.conj(np.fft.rfft(template))
+    return np.fft.irfft(spectrum, light.bins) / norm, norm
+

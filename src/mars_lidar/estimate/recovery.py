@@ -1,0 +1,198 @@
+"""How a pixel recovers: the rate of registrations against the time since the last one, in units of the light.
+
+An ideal pixel is at 0 until its dead time is over and at 1 from then on. Above 1 are afterpulses, below 1 a second
+dead time behind the first (electronics that are blind while the detector is not, or a slow quench), and a rise
+that is not a step is jitter. No model of the detector is used: at age a the expected number is the light that
+fell on the pixel while it was a old.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
+from mars_lidar.timestamps import Timestamps
+
+_MOST = 250_000  # intervals looked at: more would show nothing new
+_AGES = 60
+_SIGNIFICANT = 5.0  # standard deviations of what is told
+_LEAST = 10.0  # registrations that must be expected before the rate of an age is judged
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """Registrations by age (time since the last registration).
+
+    Attributes
+    ----------
+    edges_ns
+        (m + 1,) edges of the ages, ns.
+    observed, expected
+        (m,) registrations, and photons that arrived at that age.
+    dead_time_ns, hold_off_ns
+        What the light was calibrated with.
+    """
+
+    edges_ns: FloatArray
+    observed: FloatArray
+    expected: FloatArray
+    dead_time_ns: float
+    hold_off_ns: float
+
+    @property
+    def ratio(self) -> FloatArray:
+        """(m,) observed / expected; NaN where no light is expected."""
+        some = self.expected > 0
+        return np.where(some, self.observed / np.where(some, self.expected, 1.0), np.nan)
+
+    @property
+    def score(self) -> FloatArray:
+        """(m,) (observed - expected) / sqrt(expected); 0 where too little is expected to tell.
+
+        Given the light the differences are uncorrelated, of variance `expected`: a martingale's increments.
+        """
+        enough = self.expected >= _LEAST
+        return np.where(enough, (self.observed - self.expected) / np.sqrt(np.where(enough, self.expected, 1.0)), 0.0)
+
+    @property
+    def after(self) -> NDArray[np.bool_]:
+        """(m,) whether an age lies wholly beyond the dead time."""
+        return np.asarray(self.edges_ns[:-1] >= self.dead_time_ns - 1e-9)
+
+    def _part(self, low_ns: float, high_ns: float) -> tuple[float, float]:
+        inside = (self.edges_ns[:-1] >= low_ns - 1e-9) & (self.edges_ns[1:] <= high_ns + 1e-9)
+        return float(self.observed[inside].sum()), float(self.expected[inside].sum())
+
+    @property
+    def p_value(self) -> float:
+        """Of all ages beyond the dead time, by chi-square."""
+        from scipy.stats import chi2
+
+        judged = self.after & (self.expected >= _LEAST)
+        number = int(judged.sum())
+        return float(chi2.sf(float((self.score[judged] ** 2).sum()), number)) if number else 1.0
+
+    @property
+    def recovered_ns(self) -> float:
+        """Age from which on the rate is that of the light: the end of the last age, in one run from the dead time
+        on, that is off by more than 3 standard deviations (a gap of one age is bridged).
+        """
+        bad = np.flatnonzero(self.after & (np.abs(self.score) > 3.0))
+        first = int(np.argmax(self.after))
+        last = first - 1
+        for k in bad:
+            if k > last + 2:
+                break
+            last = int(k)
+        return float(self.edges_ns[last + 1])
+
+    def findings(self) -> list[str]:
+        """What is not as it should be, a sentence each."""
+        told = []
+        until = self.recovered_ns
+        if until > self.dead_time_ns:
+            seen, expected = self._part(self.dead_time_ns, until)
+            z = (seen - expected) / np.sqrt(max(expected, 1.0))
+            ratio = seen / max(expected, 1e-300)
+            if z < -_SIGNIFICANT:
+                told.append(
+                    f"rate {ratio:.3g} of the light's from {self.dead_time_ns:.4g} to {until:.4g} ns after a "
+                    f"registration ({z:.0f} standard deviations): a second dead time, of electronics t_e = "
+                    f"{self.dead_time_ns:.4g} ns over a detector's t_d of about {until - self.dead_time_ns:.3g} ns, "
+                    f"or a slow recovery; a hold-off of {until:.4g} ns keeps it out"
+                )
+            elif z > _SIGNIFICANT:
+                told.append(
+                    f"{seen - expected:.0f} registrations too many ({ratio:.3g} of the light's rate, {z:.0f} standard "
+                    f"deviations) from {self.dead_time_ns:.4g} to {until:.4g} ns after a registration: afterpulses, "
+                    f"or a dead time set too long; a hold-off of {until:.4g} ns keeps them out"
+                )
+        return told
+
+
+def recovery_of(
+    stream: Stream, rate: FloatArray, dead_time_ns: float, hold_off_ns: float, reach_ns: float | None = None
+) -> Recovery:
+    """Registrations by age against the light `rate` (n,), photons per period in each of n bins."""
+    begin = 0.0 if dead_time_ns == 0.0 else 0.5 * dead_time_ns
+    if reach_ns is None:
+        reach_ns = max(2.0 * hold_off_ns, hold_off_ns + stream.period_ns)
+    step = (reach_ns - dead_time_ns) / _AGES
+    ages = dead_time_ns + step * np.arange(_AGES + 1)
+    before = np.arange(dead_time_ns, begin - 1e-9 * step, -step)[1:][::-1]
+    edges = np.concatenate([before[before >= 0.0], ages])
+    cumulative = np.concatenate([[0.0], np.cumsum(rate)])
+    start, dt = _intervals(stream)
+    observed = np.histogram(dt, edges)[0].astype(np.float64)
+    expected = np.zeros(edges.size - 1)
+    alive = dt > edges[0]
+    start, dt = start[alive], dt[alive]
+    light = _light(start, edges[0], cumulative, stream.period_ns)
+    for k, edge in enumerate(edges[1:]):
+        later = _light(start, np.minimum(dt, edge), cumulative, stream.period_ns)
+        expected[k] = float((later - light).sum())
+        alive = dt > edge
+        start, dt, light = start[alive], dt[alive], later[alive]
+    return Recovery(edges, observed, expected, dead_time_ns, hold_off_ns)
+
+
+def _intervals(stream: Stream) -> tuple[FloatArray, FloatArray]:
+    """Time of a registration and time to the next, ns, of the first intervals of the stream."""
+    start: list[FloatArray] = [np.empty(0)]
+    dt: list[FloatArray] = [np.empty(0)]
+    left = _MOST
+    for piece in stream.pieces:
+        t = piece.times_ns[: left + 1]
+        start.append(t[:-1])
+        dt.append(np.diff(t))
+        left -= max(t.size - 1, 0)
+        if left <= 0:
+            break
+    return np.concatenate(start), np.concatenate(dt)
+
+
+def _light(start: FloatArray, age: FloatArray | float, cumulative: FloatArray, period_ns: float) -> FloatArray:
+    """Photons from time 0 to `start` + `age`."""
+    x = (start + age) / period_ns
+    cycle = np.floor(x)
+    phase = np.interp(x - cycle, np.linspace(0.0, 1.0, cumulative.size), cumulative)
+    return np.asarray(phase + cumulative[-1] * cycle, dtype=np.float64)
+
+
+def recovery(
+    times: Timestamps | Sequence[Timestamps],
+    rate: ArrayLike,
+    dead_time_ns: float,
+    *,
+    hold_off_ns: float | None = None,
+    reach_ns: float | None = None,
+    pooled: bool = False,
+) -> Recovery:
+    """Registrations by time since the last one, against what the light would make of an armed pixel.
+
+    Parameters
+    ----------
+    times, pooled
+        As for `calibrate`.
+    rate
+        (n,) photons per period in each of n equal parts of the period: `Calibration.rate`.
+    dead_time_ns
+        Dead time, ns.
+    hold_off_ns
+        Time after a registration that `rate` was estimated without, ns; default: the dead time.
+    reach_ns
+        Largest age, ns; default: twice the hold-off, at least a period more than it.
+    """
+    light = np.asarray(rate, dtype=np.float64)
+    if light.ndim != 1 or light.size == 0 or not (np.isfinite(light).all() and (light >= 0).all()):
+        raise ValueError(f"rate must be (n,) photons per period, finite and >= 0, got shape {light.shape}")
+    dead = _validate.real("dead_time_ns", dead_time_ns, low=0.0)
+    hold = dead if hold_off_ns is None else _validate.real("hold_off_ns", hold_off_ns, low=dead)
+    if reach_ns is not None:
+        reach_ns = _validate.real("reach_ns", reach_ns, low=hold, strict_low=True)
+    return recovery_of(stream_of(times, pooled=pooled), light, dead, hold, reach_ns)

@@ -16,6 +16,7 @@ from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 
 _STEPS = 200
 _CONVERGED = 1e-8  # Newton decrement: twice what log L could still gain
+_DIGITS, _CORNERS = 1e-3, 0.5  # the same where no step gains: half a standard error, with corners
 _LEAST = 1e-9  # photons per period that stand for none
 _WIDTHS = 24  # pulse widths tried to begin with, where it is not known
 _SPREAD = 1e-3  # step of a numerical derivative, in widths of the pulse
@@ -127,8 +128,8 @@ def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
             if found > best:
                 break
             scale *= 0.5
-        else:  # log L is at the end of its digits
-            converged = decrement < 1e-3
+        else:  # log L is at the end of its digits, or has the corners of a sampled pulse
+            converged = decrement < (_CORNERS if isinstance(light.pulse, SampledPulse) else _DIGITS)
             break
         theta, best = trial, found
     return Fit(theta, information, best, converged)

@@ -101,16 +101,17 @@ class Recovery:
             ratio = seen / max(expected, 1e-300)
             if z < -_SIGNIFICANT:
                 told.append(
-                    f"rate {ratio:.3g} of the light's from {self.dead_time_ns:.4g} to {until:.4g} ns after a "
-                    f"registration ({z:.0f} standard deviations): a second dead time, of electronics t_e = "
-                    f"{self.dead_time_ns:.4g} ns over a detector's t_d of about {until - self.dead_time_ns:.3g} ns, "
-                    f"or a slow recovery; a hold-off of {until:.4g} ns keeps it out"
+                    f"only {ratio:.3g} of the light's rate from {self.dead_time_ns:.4g} to {until:.4g} ns after a "
+                    f"registration ({z:.0f} standard deviations): a dead time of more than {self.dead_time_ns:.4g} ns, "
+                    f"or a second one (electronics t_e = {self.dead_time_ns:.4g} ns, detector t_d about "
+                    f"{until - self.dead_time_ns:.3g} ns), or a slow recovery, where the light itself fits; a "
+                    f"hold-off of {until:.4g} ns keeps it out"
                 )
             elif z > _SIGNIFICANT:
                 told.append(
                     f"{seen - expected:.0f} registrations too many ({ratio:.3g} of the light's rate, {z:.0f} standard "
-                    f"deviations) from {self.dead_time_ns:.4g} to {until:.4g} ns after a registration: afterpulses, "
-                    f"or a dead time set too long; a hold-off of {until:.4g} ns keeps them out"
+                    f"deviations) from {self.dead_time_ns:.4g} to {until:.4g} ns after a registration: "
+                    f"afterpulses; a hold-off of {until:.4g} ns keeps them out"
                 )
         return told
 

@@ -6,8 +6,6 @@ Times count from a laser pulse, in a unit that the caller gives (or the end of a
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ def read(
     """Read a stream; see `Timestamps.load`."""
     try:
         found = _mat(path) if path.suffix == ".mat" else _npz(path)
-    except (OSError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error, KeyError) as error:
+    except Exception as error:  # whatever the readers make of a damaged file: they know a dozen errors
         raise ValueError(f"{path} cannot be read ({error})") from error
     name, cells = _chosen(path, found, variable)
     unit = unit_ns

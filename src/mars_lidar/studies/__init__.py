@@ -18,7 +18,8 @@ Tell = Callable[[str], object]
 class Request:
     """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
 
-    `truth` is the engine whose simulation the study "count-law" takes for true.
+    `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
+    the study "hardware".
     """
 
     out: Path
@@ -26,6 +27,7 @@ class Request:
     data: Path | None = None
     tell: Tell = str
     truth: str = "sequential"
+    stream: Path | None = None
 
 
 Study = Callable[[Request], list[Path]]
@@ -97,6 +99,12 @@ def _quantisation(request: Request) -> list[Path]:
     return run(request)
 
 
+def _hardware(request: Request) -> list[Path]:
+    from mars_lidar.studies.hardware_report import run
+
+    return run(request)
+
+
 def _table(request: Request) -> list[Path]:
     from mars_lidar.studies.table import run
 
@@ -117,6 +125,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "count-law": ("T1: every simulator's count law and shape against simulation", _count_law),
     "joint-table": ("variance of signal window and bins, covariance of neighbours: every engine", _joint_table),
     "quantisation": ("what a table's lookup costs, nearest and interpolated, over its size", _quantisation),
+    "hardware": ("T6: streams calibrated and validated, faulty detectors; --stream adds a measured one", _hardware),
     "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
 }

@@ -38,6 +38,10 @@ def _parser() -> argparse.ArgumentParser:
         help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance')",
     )
     parser.add_argument(
+        "--stream", type=Path, metavar="FILE",
+        help="measured photon stream: a .mat with times in units of 64 ps (study 'hardware')",
+    )  # fmt: skip
+    parser.add_argument(
         "--truth", choices=("sequential", "exact"), default="sequential",
         help="engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is "
         "several times faster (default: %(default)s)",
@@ -53,12 +57,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("study 'reference' needs --data DIR, the folder of the reference cases")
     if given.data is not None and not any(given.data.glob("*.json")):
         parser.error(f"--data must be a folder with *.json cases, got {str(given.data)!r}")
+    if given.stream is not None and not given.stream.is_file():
+        parser.error(f"--stream must be a file, got {str(given.stream)!r}")
     try:
         given.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         parser.error(f"--out must be a folder that can be made, got {str(given.out)!r}: {error.strerror}")
     tell = partial(print, file=sys.stderr, flush=True)
-    request = Request(given.out, given.quick, given.data, tell, given.truth)
+    request = Request(given.out, given.quick, given.data, tell, given.truth, given.stream)
     try:
         for name in dict.fromkeys(given.studies):
             began = time.monotonic()

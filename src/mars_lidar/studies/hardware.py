@@ -1,0 +1,305 @@
+"""T6 of the MaRS paper: calibrate and validate streams, simulated at its settings, mismatched, and measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.detector import Detector
+from mars_lidar.estimate import Calibration, Validation, calibrate, calibration_bound, validate
+from mars_lidar.flux import Flux
+from mars_lidar.pulse import GaussianPulse
+from mars_lidar.simulate import simulate_timestamps
+from mars_lidar.studies import Tell
+from mars_lidar.studies.hardware_detectors import Faults, detect
+from mars_lidar.system import System
+from mars_lidar.timestamps import Timestamps
+
+PERIOD_NS, DEAD_NS, SIGMA_NS, DELAY_NS, BINS = 1e3 / 7.5, 85.0, 0.5, 40.0, 1024
+EXAMPLE_UNIT_NS = 0.064  # of the times in the measured stream
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Configuration: cycles and realizations of each part."""
+
+    cycles: int = 9975  # of a realization, as in the paper
+    realizations: int = 10_000  # of the bright and the dark pixel, as in the paper
+    swept_cycles: int = 1000
+    swept_realizations: int = 1000
+    fault_cycles: int = 2000
+    fault_realizations: int = 1000
+    replicates: int = 60
+    replicate_cycles: int = 20_000
+    example_cycles: int = 100
+    fluxes: tuple[float, ...] = (0.05, 0.5, 5.0)
+    signals: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+    delays: tuple[float, ...] = (0.2, 20.0, 60.0, 100.0, 133.0)
+    mismatched: int = 100  # the first so many of `MISMATCHES`
+    seed: int = 2026
+
+
+FULL = Settings()
+QUICK = Settings(
+    cycles=500, realizations=300, swept_cycles=200, swept_realizations=200, fault_cycles=500, fault_realizations=200,
+    replicates=8, replicate_cycles=4000, fluxes=(0.5,), signals=(0.1, 3.0), delays=(0.2,), mismatched=4,
+)  # fmt: skip
+
+PIXELS = {"bright": (0.8, 0.1), "dark": (0.25, 0.1)}  # the paper's S and B are not known
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A stream, what made it (S, B, delay in ns), and how its validation ended."""
+
+    name: str
+    truth: tuple[float, float, float]
+    found: Validation
+
+    @property
+    def scores(self) -> tuple[float, float, float]:
+        """(calibrated - true) / standard error of S, B and delay, of a single return."""
+        light = self.found.calibration
+        errors = light.errors
+        got = (light.signal, light.background, light.delay_ns)
+        names = ("signal", "background", "delay_ns")
+        return tuple(  # type: ignore[return-value]
+            (value - true) / errors.get(name, np.nan) for value, true, name in zip(got, self.truth, names, strict=True)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Calibrations of many streams of the same light: estimates over the truth and the Cramer-Rao bound.
+
+    Each (3,): background, signal, delay. `bias` in standard errors of the mean of the replicates, `scatter` the
+    standard deviation of the estimates and `stated` the mean stated standard error, both over the bound; `rapp`
+    the scatter of Rapp's total over that of the likelihood's.
+    """
+
+    signal: float
+    background: float
+    registrations: float
+    bias: NDArray[np.float64]
+    scatter: NDArray[np.float64]
+    stated: NDArray[np.float64]
+    rapp: float
+
+
+def system_of(cycles: int, dead_ns: float = DEAD_NS, mode: Any = "nonparalyzable") -> System:
+    """The paper's laser and detector, started ready as a recording is."""
+    return System(
+        period_ns=PERIOD_NS, cycles=cycles, bins=BINS, pulse=GaussianPulse(sigma_ns=SIGMA_NS),
+        detector=Detector(dead_time_ns=dead_ns, mode=mode),
+    )  # fmt: skip
+
+
+def recorded(times: Timestamps) -> Timestamps:
+    """The stream as a laboratory has it: without what it knows of light and detector."""
+    return replace(times, info={"source": "simulated"})
+
+
+def _stream(light: Flux, cycles: int, seed: int, **changes: Any) -> Timestamps:
+    return recorded(simulate_timestamps(light, system_of(cycles, **changes), seed=seed))
+
+
+def matched(settings: Settings, tell: Tell) -> list[Case]:
+    """The bright and the dark pixel: one continuous stream each, with pulse and dead time known."""
+    cases = []
+    for number, (name, (signal, background)) in enumerate(PIXELS.items()):
+        tell(f"hardware: {name} pixel, {settings.realizations:,} realizations of {settings.cycles:,} cycles")
+        light = Flux(signal, background, DELAY_NS)
+        times = _stream(light, settings.cycles * settings.realizations, settings.seed + number)
+        known = system_of(settings.cycles)
+        found = validate(times, calibrate(times, known), cycles=settings.cycles)
+        cases.append(Case(name, (signal, background, DELAY_NS), found))
+    return cases
+
+
+def sweeps(settings: Settings, tell: Tell) -> list[Case]:
+    """Distance, dynamic range, and several returns: width of the pulse fitted, dead time known."""
+    seed = settings.seed + 100
+    cases = []
+    tell("hardware: sweeps")
+    for k, delay in enumerate(settings.delays):
+        name = f"distance, delay {delay:g} ns"
+        cases.append(_swept(settings, name, (0.8, 0.1, delay), Flux(0.8, 0.1, delay), seed + k))
+    for k, signal in enumerate(settings.signals):
+        name, light = f"dynamic range, S = {signal:g}", Flux(signal, 0.1, DELAY_NS)
+        cases.append(_swept(settings, name, (signal, 0.1, DELAY_NS), light, seed + 20 + k))
+    two = Flux.multi(Flux(0.5, 0.1, 30.0), Flux(0.3, 0.0, 34.0))
+    truth = (0.8, 0.1, 30.0)
+    cases.append(_swept(settings, "two returns, 4 ns apart", truth, two, seed + 40, returns=2))
+    three = Flux.multi(two, Flux(0.1, 0.0, 90.0))
+    cases.append(_swept(settings, "three returns", (0.9, 0.1, 30.0), three, seed + 41, returns=3))
+    return cases
+
+
+def _swept(
+    settings: Settings, name: str, truth: tuple[float, float, float], light: Flux, seed: int, returns: int = 1
+) -> Case:
+    times = _stream(light, settings.swept_cycles * settings.swept_realizations, seed)
+    found = calibrate(times, dead_time_ns=DEAD_NS, returns=returns)
+    return Case(name, truth, validate(times, found, cycles=settings.swept_cycles))
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """A detector that is not the model's, and how it is calibrated; `fits` is what the verdict should be."""
+
+    name: str
+    fits: bool = False
+    faults: Faults | None = None
+    mode: str = "nonparalyzable"
+    dead_ns: float = DEAD_NS
+    assumed_ns: float | None = DEAD_NS
+    hold_off_ns: float | None = None
+    known_pulse: bool = True
+    second_return: bool = False
+    drift: float = 0.0
+    background: float = 0.1
+
+
+MISMATCHES = (
+    Mismatch("none (control)", fits=True),
+    Mismatch("none, drawn photon by photon (control)", fits=True, faults=Faults()),
+    Mismatch("none, dead time and pulse not told", fits=True, assumed_ns=None, known_pulse=False),
+    Mismatch("dead time set 5 ns too short", assumed_ns=80.0),  # to here the quick study
+    Mismatch("dead time set 0.5 ns too short", assumed_ns=84.5),
+    Mismatch("dead time set 5 ns too long", assumed_ns=90.0),
+    Mismatch("paralyzable detector, B = 1", mode="paralyzable", background=1.0),
+    Mismatch("paralyzable detector, B = 0.1", mode="paralyzable"),
+    Mismatch("jitter 0.2 ns, pulse as without", faults=Faults(jitter_ns=0.2)),
+    Mismatch("jitter 0.2 ns, all fitted", faults=Faults(jitter_ns=0.2), assumed_ns=None, known_pulse=False),
+    Mismatch("afterpulses 2 %", faults=Faults(afterpulse=0.02)),
+    Mismatch("afterpulses 2 %, hold-off 400 ns", faults=Faults(afterpulse=0.02), hold_off_ns=400.0),
+    Mismatch(
+        "electronics dead 85 ns, detector 50 ns, B = 1", faults=Faults(electronics_ns=DEAD_NS), dead_ns=50.0,
+        background=1.0,
+    ),
+    Mismatch(
+        "the same, hold-off 135 ns", faults=Faults(electronics_ns=DEAD_NS), dead_ns=50.0,
+        hold_off_ns=DEAD_NS + 50.0, background=1.0,
+    ),
+    Mismatch("the same, B = 0.1, no hold-off", faults=Faults(electronics_ns=DEAD_NS), dead_ns=50.0),
+    Mismatch("a second return 4 ns behind, not fitted", second_return=True),
+    Mismatch("signal drifts by 10 %", drift=0.1),
+)
+
+
+def mismatches(settings: Settings, tell: Tell) -> list[tuple[Mismatch, Case]]:
+    """Detectors and scenes that the model does not have: the validation should fail, and say where."""
+    cases = []
+    signal = PIXELS["bright"][0]
+    cycles = settings.fault_cycles * settings.fault_realizations
+    for number, one in enumerate(MISMATCHES[: settings.mismatched]):
+        tell(f"hardware: {one.name}")
+        background = one.background
+        light = Flux(signal, background, DELAY_NS)
+        if one.second_return:
+            light = Flux.multi(light, Flux(0.1 * signal, 0.0, DELAY_NS + 4.0))
+        seed = settings.seed + 200 + number
+        if one.faults is not None:
+            raw = simulate_timestamps(light, system_of(cycles, 0.0), seed=seed)
+            times = recorded(detect(raw, one.dead_ns, one.faults, seed))
+        elif one.drift:
+            parts = [Flux(signal * (1.0 + d), background, DELAY_NS) for d in np.linspace(-1, 1, 20) * one.drift / 2]
+            times = joined([_stream(part, cycles // 20, seed + k) for k, part in enumerate(parts)])
+        else:
+            times = _stream(light, cycles, seed, dead_ns=one.dead_ns, mode=one.mode)
+        known = GaussianPulse(sigma_ns=SIGMA_NS) if one.known_pulse else None
+        fitted = calibrate(times, pulse=known, dead_time_ns=one.assumed_ns, hold_off_ns=one.hold_off_ns)
+        found = validate(times, fitted, cycles=settings.fault_cycles)
+        cases.append((one, Case(one.name, (signal, background, DELAY_NS), found)))
+    return cases
+
+
+def joined(parts: list[Timestamps]) -> Timestamps:
+    """Recordings of one pixel, one after the other, as a single one."""
+    begins = np.cumsum([0, *(part.cycles for part in parts)])
+    cycle = np.concatenate([part.cycle + begin for part, begin in zip(parts, begins, strict=False)])
+    times_ns = np.concatenate(
+        [part.times_ns + begin * part.period_ns for part, begin in zip(parts, begins, strict=False)]
+    )
+    bins = np.concatenate([part.bin for part in parts])
+    offsets = np.array([0, times_ns.size], np.int64)
+    return replace(
+        parts[0], times_ns=times_ns, cycle=cycle.astype(np.int32), bin=bins, offsets=offsets, cycles=int(begins[-1])
+    )
+
+
+def spreads(settings: Settings, tell: Tell) -> list[Spread]:
+    """Bias and scatter of calibrations of short streams, against the Cramer-Rao bound."""
+    out = []
+    number = 0
+    for signal in settings.fluxes:
+        for background in settings.fluxes:
+            tell(f"hardware: calibrations of S = {signal:g}, B = {background:g}")
+            out.append(_spread(settings, signal, background, settings.seed + 300 + number))
+            number += 1
+    return out
+
+
+def _spread(settings: Settings, signal: float, background: float, seed: int) -> Spread:
+    known = system_of(settings.replicate_cycles)
+    flux = Flux(np.full((1, settings.replicates), signal), background, DELAY_NS)
+    times = simulate_timestamps(flux, known, seed=seed)
+    truth = np.array([background, signal, DELAY_NS])
+    bound = np.array(list(calibration_bound(signal, background, known, delay_ns=DELAY_NS).errors.values()))
+    found = list(_each(times, known))
+    got = np.array([[one.background, one.signal, one.delay_ns] for one in found])
+    stated = np.array([list(one.errors.values()) for one in found])
+    scatter = got.std(0, ddof=1)
+    bias = (got.mean(0) - truth) / (scatter / np.sqrt(len(found)))
+    totals = np.array([one.total for one in found]), np.array([one.rapp.total for one in found])
+    ratio = float(totals[1].std() / totals[0].std()) if np.isfinite(totals[1]).all() else float("inf")
+    return Spread(signal, background, len(times) / len(found), bias, scatter / bound, stated.mean(0) / bound, ratio)
+
+
+def _each(times: Timestamps, known: System) -> Iterator[Calibration]:
+    for k in range(times.shape[1]):
+        yield calibrate(times.pixel(0, k), known)
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """The measured stream, calibrated in several ways, each validated; `told` what the file says of its dead times."""
+
+    registrations: int
+    cycles: int
+    period_ns: float
+    told: dict[str, float]
+    cases: list[tuple[str, Validation]]
+
+
+def example(path: Path, settings: Settings, tell: Tell) -> Example:
+    """The stream of a TCSPC instrument: light of any shape, two dead times, few photons."""
+    import h5py
+
+    tell(f"hardware: {path.name}")
+    times = Timestamps.load(path, unit_ns=EXAMPLE_UNIT_NS)
+    with h5py.File(path) as file:
+        told = {
+            name: float(np.asarray(file[name])[0, 0]) * EXAMPLE_UNIT_NS
+            for name in ("DT_electronics", "DT_detector")
+            if name in file
+        }
+    electronics, detector = told.get("DT_electronics"), told.get("DT_detector")
+    ways: list[tuple[str, dict[str, Any]]] = [("free shape, dead time by the smallest interval", {"pulse": "free"})]
+    if electronics is not None and detector is not None:
+        ways += [
+            (f"free shape, t_e = {electronics:g} ns", {"pulse": "free", "dead_time_ns": electronics}),
+            (
+                f"free shape, t_e, hold-off t_e + t_d = {electronics + detector:g} ns",
+                {"pulse": "free", "dead_time_ns": electronics, "hold_off_ns": electronics + detector},
+            ),
+            (f"free shape, t_d = {detector:g} ns alone", {"pulse": "free", "dead_time_ns": detector}),
+            ("Gaussian pulse, t_e", {"pulse": "gaussian", "dead_time_ns": electronics}),
+        ]
+    cases = [(name, validate(times, calibrate(times, **way), cycles=settings.example_cycles)) for name, way in ways]
+    return Example(len(times), times.cycles, times.period_ns, told, cases)

@@ -1,0 +1,87 @@
+"""The study of hardware in its quick form, and the detector that it draws photon by photon."""
+
+from __future__ import annotations
+
+import csv
+
+import h5py
+import numpy as np
+import pytest
+from scipy import stats
+
+import mars_lidar as ml
+from mars_lidar.studies.__main__ import main
+from mars_lidar.studies.hardware import joined, system_of
+from mars_lidar.studies.hardware_detectors import Faults, detect
+from mars_lidar.studies.report import MAX_FIGURE_BYTES
+
+
+def test_quick(tmp_path):
+    example = tmp_path / "decay.mat"
+    flux = ml.Flux(waveform=1.5 * np.exp(-np.arange(100) / 8.0) / 8.0)
+    made_by = ml.System(
+        period_ns=50.0, cycles=8000, bins=100, pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=80.0),
+    )  # fmt: skip
+    times = ml.simulate_timestamps(flux, made_by, seed=3)
+    with h5py.File(example, "w") as file:
+        file["tPhoton"] = np.floor(times.times_ns / 0.064)[None]
+        file["syncPeriod"] = [[50.0 / 0.064]]
+    out = tmp_path / "out"
+    assert main(["hardware", "--quick", "--out", str(out), "--stream", str(example)]) == 0
+    text = (out / "hardware.md").read_text()
+    figures = sorted(path.name for path in out.glob("*.png"))
+    assert figures == [f"hardware_{name}.png" for name in ("measured", "pixels", "range", "recovery")]
+    assert all(f"]({name})" in text and (out / name).stat().st_size <= MAX_FIGURE_BYTES for name in figures)
+    with (out / "hardware.csv").open() as file:
+        rows = {row["stream"]: row for row in csv.DictReader(file)}
+    assert rows["bright"]["consistent"] == rows["dark"]["consistent"] == rows["two returns, 4 ns apart"]["consistent"]
+    assert rows["bright"]["consistent"] == "True"
+    assert rows["dead time set 5 ns too short"]["consistent"] == "False"
+    for row in rows.values():
+        if row["true_signal"] == "0.8" and row["stream"].startswith("none"):
+            assert abs(float(row["signal"]) - 0.8) < 5 * float(row["signal_error"])
+    with pytest.raises(SystemExit):
+        main(["hardware", "--quick", "--out", str(out), "--stream", str(tmp_path / "none.mat")])
+
+
+def test_the_faulty_detector_is_what_it_says():
+    """Without faults the engine's law; with electronics, jitter and afterpulses what each is defined by."""
+    arrivals = ml.simulate_timestamps(ml.Flux(0.8, 0.5, 40.0), system_of(60_000, 0.0), seed=1)
+    t = arrivals.times_ns
+    kept, ready = [], 0.0
+    for photon in t:
+        if photon >= ready:
+            kept.append(photon)
+            ready = photon + 85.0
+    assert np.array_equal(detect(arrivals, 85.0, Faults(), 2).times_ns, kept)
+    kept, ready, recorded = [], 0.0, 0.0
+    for photon in t:
+        if photon >= ready:
+            ready = photon + 50.0
+            if photon >= recorded:
+                kept.append(photon)
+                recorded = photon + 85.0
+    assert np.array_equal(detect(arrivals, 50.0, Faults(electronics_ns=85.0), 2).times_ns, kept)
+    clean = detect(arrivals, 85.0, Faults(), 2).times_ns
+    blurred = detect(arrivals, 85.0, Faults(jitter_ns=0.3), 2).times_ns
+    assert stats.kstest(blurred - clean, "norm", args=(0.0, 0.3)).pvalue > 1e-4
+    few = ml.simulate_timestamps(ml.Flux(0.0, 0.001, 0.0), system_of(5_000_000, 0.0), seed=4)
+    more = detect(few, 20.0, Faults(afterpulse=0.5, afterpulse_ns=100.0), 5)
+    # released after the dead time: 0.5 e^-0.2 of each avalanche, whose own afterpulses follow
+    p = 0.5 * np.exp(-0.2)
+    expected = len(few) / (1 - p)
+    assert abs(len(more) - expected) < 5 * np.sqrt(len(few) * p / (1 - p) ** 3)
+    late = np.diff(more.times_ns)
+    late = late[(late < 600.0)] - 20.0
+    assert late.min() > 0
+    assert abs(late.mean() / 100.0 - 1.0) < 0.15
+
+
+def test_recordings_are_joined():
+    parts = [ml.simulate_timestamps(ml.Flux(0.8, 0.1, 40.0), system_of(500), seed=k) for k in range(3)]
+    whole = joined(parts)
+    assert whole.cycles == 1500
+    assert (np.diff(whole.times_ns) > 0).all()
+    assert np.array_equal(np.floor(whole.times_ns / whole.period_ns), whole.cycle)
+    assert len(whole) == sum(map(len, parts))

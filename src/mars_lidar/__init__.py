@@ -1,7 +1,8 @@
 """mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
 
 from mars_lidar._version import __version__
-from mars_lidar.flux import Flux
+from mars_lidar.effects import Jitter, SampledJitter
+from mars_lidar.flux import Flux, dark_count_map
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.scene import Scene
 from mars_lidar.simulate import simulate, simulate_timestamps
@@ -22,10 +23,12 @@ __all__ = [
     "Detector",
     "Flux",
     "GaussianPulse",
+    "Jitter",
     "JointLaw",
     "Lookup",
     "Pulse",
     "QuantisationError",
+    "SampledJitter",
     "SampledPulse",
     "Scene",
     "System",
@@ -33,6 +36,7 @@ __all__ = [
     "Timestamps",
     "__version__",
     "count_law",
+    "dark_count_map",
     "holding_time_covariance",
     "joint_law",
     "registration_pdf",

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar import _validate
+
 if TYPE_CHECKING:
     from mars_lidar.system import System
 
@@ -19,6 +21,8 @@ FloatArray = NDArray[np.float64]
 @dataclass(frozen=True, eq=False, init=False)
 class Flux:
     """Expected *detectable* photons per laser period at each pixel (photon detection efficiency included).
+
+    For a detector with a `Detector.detection_efficiency` below 1: photons on the pixel, of which it detects that share.
 
     The arrival rate at a pixel is periodic: ``lambda(t) = S s(t - tau) + B / t_r`` with the pulse s of the
     `System`, or any non-negative waveform.
@@ -122,6 +126,40 @@ class Flux:
 
         return Transient(values, bin_ns, start_ns=start_ns).flux(system, **level)
 
+    def detected(self, system: System) -> Flux:
+        """The photons that avalanches follow: times `Detector.detection_efficiency`, plus `Detector.dark_count_hz`.
+
+        Poisson photons that are each detected with a probability are Poisson photons of the thinned rate, and dark
+        counts are background: what a pixel registers of this flux is exactly what one without these two effects
+        (`System.detected`) registers of the flux returned. This flux itself where neither is on.
+        """
+        share, dark = system.detector.detection_efficiency, _dark_photons(system.detector.dark_count_hz, system)
+        if share == 1.0 and dark == 0.0:
+            return self
+        return self._scaled(share, dark)
+
+    def with_dark_counts(self, rate_hz: ArrayLike, system: System) -> Flux:
+        """This flux with dark counts at `rate_hz`, counts/s: scalar or (H, W), such as `dark_count_map` draws.
+
+        They are background that the detection efficiency of the system does not reduce (hence divided by it here, for
+        `detected` multiplies), uniform in time; a gated pixel has them in its gate only.
+        """
+        rate = _map("rate_hz", rate_hz, photons=False)
+        if not (rate >= 0.0).all():
+            raise ValueError(f"rate_hz must be counts/s >= 0, got {rate.min():g}")
+        _common_shape(("flux", "rate_hz"), [self.shape, rate.shape])
+        if np.broadcast_shapes(self.shape, rate.shape) != self.shape:
+            raise ValueError(f"rate_hz must be a scalar or {self.shape}, got {rate.shape}")
+        return self._scaled(1.0, _dark_photons(rate, system) / system.detector.detection_efficiency)
+
+    def _scaled(self, share: float, more: float | FloatArray) -> Flux:
+        """Signal and background times `share`, and more background."""
+        background = self.background * share + more
+        _check_photons("background with dark counts", background)
+        flux, wave = Flux.__new__(Flux), None if self.waveform is None else self.waveform * share
+        _fill(flux, self.returns_signal * share, self.returns_delay_ns, background, wave, self.info)
+        return flux
+
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W)."""
@@ -167,6 +205,51 @@ class Flux:
             f"Flux({h} x {w} pixels, {what}, mean signal {self.signal.mean():.4g}, "
             f"mean background {self.background.mean():.4g} photons per period)"
         )
+
+
+def dark_count_map(
+    shape: tuple[int, int],
+    *,
+    median_hz: float,
+    spread: float = 0.5,
+    hot_fraction: float = 0.02,
+    hot_factor: float = 100.0,
+    seed: int = 0,
+) -> FloatArray:
+    """A realistic map (H, W) of dark count rates, counts/s, for `Flux.with_dark_counts`.
+
+    Rates of the pixels of an array are log-normal, with a population of "hot" pixels far above the rest.
+
+    Parameters
+    ----------
+    shape
+        (H, W).
+    median_hz
+        Median of the pixels that are not hot, counts/s.
+    spread
+        Standard deviation of the logarithm of the rate.
+    hot_fraction
+        Probability that a pixel is hot, in [0, 1].
+    hot_factor
+        Median of the hot pixels over that of the others; their logarithms spread alike.
+    seed
+        Integer in [0, 2**64).
+    """
+    if len(shape) != 2:
+        raise ValueError(f"shape must be (H, W), got {shape!r}")
+    size = tuple(_validate.integer("shape", n, low=1, high=2**20) for n in shape)
+    median = _validate.real("median_hz", median_hz, low=0.0)
+    sigma = _validate.real("spread", spread, low=0.0, high=10.0)
+    share = _validate.real("hot_fraction", hot_fraction, low=0.0, high=1.0)
+    factor = _validate.real("hot_factor", hot_factor, low=1.0)
+    random = np.random.Generator(np.random.PCG64(_validate.integer("seed", seed, low=0, high=2**64 - 1)))
+    hot = random.random(size) < share
+    return np.asarray(median * np.exp(sigma * random.standard_normal(size)) * np.where(hot, factor, 1.0))
+
+
+def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatArray:
+    """Dark counts per period."""
+    return rate_hz * (system.period_ns * 1e-9)
 
 
 def _map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:

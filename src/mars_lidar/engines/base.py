@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.detector import MODES, Mode
+from mars_lidar.effects import LIGHT_EFFECTS, require_effects
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
 
@@ -25,6 +26,9 @@ Progress = Callable[[int, int], object]
 @dataclass(frozen=True, eq=False)
 class Task:
     """One checked request: which pixels of which realizations of which flux, seen by which system.
+
+    `flux` and `system` become those of detected photons (`Flux.detected`, `System.detected`), so that no engine needs
+    to know of efficiencies and dark counts.
 
     `pixel_index` (H * W,) uint32 names the random stream of each pixel, so that any part of an image can be
     made alone with the bits that it has in the whole. `report` is where an engine writes what it has to tell
@@ -40,6 +44,11 @@ class Task:
     threads: int
     progress: Progress | None
     report: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        flux, system = self.flux.detected(self.system), self.system.detected()
+        object.__setattr__(self, "flux", flux)
+        object.__setattr__(self, "system", system)
 
     @property
     def items(self) -> int:
@@ -111,6 +120,7 @@ class Engine(ABC):
     name: ClassVar[str]
     description: ClassVar[str]
     modes: ClassVar[tuple[Mode, ...]] = ("nonparalyzable",)  # of the detector, that the engine reproduces
+    effects: ClassVar[tuple[str, ...]] = LIGHT_EFFECTS  # likewise
     options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
 
     @property
@@ -132,6 +142,15 @@ class Engine(ABC):
                 f"engine {self.name!r} does not do mode {mode!r} of the detector, only "
                 f"{', '.join(map(repr, self.modes))}; use {able}"
             )
+
+    def check_effects(self, system: System) -> None:
+        """Raise ValueError, naming the effect and the engines to use, where one of the detector is not in `effects`."""
+        from mars_lidar.engines import ENGINES
+
+        def instead(effect: str) -> str:
+            return "; use " + " or ".join(repr(name) for name, engine in ENGINES.items() if effect in engine.effects)
+
+        require_effects(f"engine {self.name!r}", system.detector, self.effects, instead)
 
     @abstractmethod
     def histogram(self, task: Task, out: NDArray[Any]) -> None:

@@ -1,6 +1,8 @@
 """mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
 
 from mars_lidar._version import __version__
+from mars_lidar.dark_counts import dark_count_map
+from mars_lidar.effects import Jitter, SampledJitter
 from mars_lidar.estimate import Calibration, Validation, calibrate, validate
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
@@ -24,10 +26,12 @@ __all__ = [
     "Detector",
     "Flux",
     "GaussianPulse",
+    "Jitter",
     "JointLaw",
     "Lookup",
     "Pulse",
     "QuantisationError",
+    "SampledJitter",
     "SampledPulse",
     "Scene",
     "System",
@@ -37,6 +41,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "count_law",
+    "dark_count_map",
     "holding_time_covariance",
     "joint_law",
     "registration_pdf",

@@ -1,4 +1,4 @@
-"""The detector pixel: dead time, when an arrival is registered, gate. Definitions: docs/detectors.md."""
+"""The detector pixel: dead time, when an arrival is registered, gate, effects. Definitions: docs/detectors.md."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from mars_lidar import _validate
+from mars_lidar import _validate, effects
+from mars_lidar.effects import Jitter, SampledJitter
 
 Mode = Literal["nonparalyzable", "paralyzable", "synchronous", "gated"]
 MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "synchronous", "gated")
@@ -43,6 +44,27 @@ class Detector:
     gate_cycles
         ... every so many periods, for a gate that is moved during the exposure. Default: 0 and 1, a gate that
         stays.
+
+    Effects, in the order in which they act (docs/detectors.md); all are off by default:
+
+    detection_efficiency
+        Probability, fill factor included, that a photon of the `Flux` triggers an avalanche; in (0, 1]. 1: the flux
+        is given in detectable photons.
+    dark_count_hz
+        Rate of avalanches without a photon, counts/s: uniform in time, in the gate of a gated pixel only. Rates pixel
+        by pixel: `Flux.with_dark_counts`.
+    electronics_dead_time_ns
+        An avalanche is recorded only where none was within this time before it, t_e, ns, beside the dead time of the
+        pixel itself; without effect unless longer. The electronics are ready at the start of an exposure.
+    max_events_per_period, max_events_per_exposure
+        The electronics record no more events than this of a laser period, and of an exposure: the first ones.
+    jitter
+        `Jitter` or `SampledJitter`: what a record's time is off from that of its avalanche. It decides nothing: dead
+        times, gate, limits and exposure go by the avalanche.
+    code_density
+        Non-linearity of the time-to-digital converter: relative widths (n,) of n neighbouring codes, as a code-density
+        test finds them. n divides the number of bins, and the pattern repeats (the taps of a delay line in each cycle
+        of the clock); n = bins gives every bin its own.
     """
 
     dead_time_ns: float
@@ -51,9 +73,19 @@ class Detector:
     gate_width_ns: float | None = None
     gate_step_ns: float | None = None
     gate_cycles: int | None = None
+    detection_efficiency: float = 1.0
+    dark_count_hz: float = 0.0
+    electronics_dead_time_ns: float = 0.0
+    max_events_per_period: int | None = None
+    max_events_per_exposure: int | None = None
+    jitter: Jitter | SampledJitter | None = None
+    code_density: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__
+        for name, field in effects.FIELDS.items():
+            if getattr(self, name) is not None or field.off is not None:
+                set_field(self, name, field.checked(getattr(self, name)))
         set_field(self, "dead_time_ns", _validate.real("dead_time_ns", self.dead_time_ns, low=0.0))
         _validate.choice("mode", self.mode, MODES)
         if self.mode != "gated":
@@ -88,6 +120,18 @@ class Detector:
             )
 
     @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that are on and change anything, in the order in which they act."""
+        on = [name for name, field in effects.FIELDS.items() if getattr(self, name) != field.off]
+        if self.electronics_dead_time_ns <= self.dead_time_ns:  # registrations are that far apart in every mode
+            on = [name for name in on if name != "electronics_dead_time_ns"]
+        return tuple(on)
+
+    def without(self, *names: str) -> Detector:
+        """This detector with some effects switched off."""
+        return dataclasses.replace(self, **{name: effects.FIELDS[name].off for name in names})
+
+    @property
     def gate_moves(self) -> bool:
         """Whether the gate is moved during the exposure."""
         return bool(self.gate_step_ns)
@@ -99,8 +143,15 @@ class Detector:
         start, step = self.gate_start_ns % period_ns / period_ns, self.gate_step_ns % period_ns / period_ns
         return start % 1.0, step % 1.0, min(self.gate_width_ns / period_ns, 1.0)
 
-    def check(self, period_ns: float, start: str) -> None:
-        """Raise ValueError, naming the field, for what makes no sense at this laser period and start."""
+    def check(self, period_ns: float, bins: int, start: str) -> None:
+        """Raise ValueError, naming the field, for what makes no sense at this laser period, binning and start."""
+        if self.jitter is not None:
+            self.jitter.check(period_ns)
+        if self.code_density is not None and bins % len(self.code_density):
+            raise ValueError(
+                f"code_density must have a number of codes that divides the {bins} bins of the histogram, "
+                f"got {len(self.code_density)}"
+            )
         least, most = _MIN_GATE_PERIODS * period_ns, period_ns * (1 + 1e-12)
         if self.gate_width_ns is not None and not least <= self.gate_width_ns <= most:
             raise ValueError(
@@ -114,11 +165,21 @@ class Detector:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data from which `Detector.from_dict` makes an equal detector; gate fields only where used."""
-        return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+        """Plain data from which `Detector.from_dict` makes an equal detector; gate and effects only where used."""
+        told = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            off = effects.FIELDS[field.name].off if field.name in effects.FIELDS else None
+            if value != off:
+                told[field.name] = effects.plain(value)
+        return told
 
     @classmethod
     def from_dict(cls, data: Any) -> Detector:
         """The detector that `to_dict` described."""
         names = tuple(field.name for field in dataclasses.fields(cls))
-        return cls(**_validate.known_keys("detector", data, names))
+        known = dict(_validate.known_keys("detector", data, names))
+        for name, field in effects.FIELDS.items():
+            if field.read is not None and known.get(name) is not None:
+                known[name] = field.read(known[name])
+        return cls(**known)

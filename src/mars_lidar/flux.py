@@ -20,6 +20,8 @@ FloatArray = NDArray[np.float64]
 class Flux:
     """Expected *detectable* photons per laser period at each pixel (photon detection efficiency included).
 
+    For a detector with a `Detector.detection_efficiency` below 1: photons on the pixel, of which it detects that share.
+
     The arrival rate at a pixel is periodic: ``lambda(t) = S s(t - tau) + B / t_r`` with the pulse s of the
     `System`, or any non-negative waveform.
 
@@ -122,6 +124,40 @@ class Flux:
 
         return Transient(values, bin_ns, start_ns=start_ns).flux(system, **level)
 
+    def detected(self, system: System) -> Flux:
+        """The photons that avalanches follow: times `Detector.detection_efficiency`, plus `Detector.dark_count_hz`.
+
+        Poisson photons that are each detected with a probability are Poisson photons of the thinned rate, and dark
+        counts are background: what a pixel registers of this flux is exactly what one without these two effects
+        (`System.detected`) registers of the flux returned. This flux itself where neither is on.
+        """
+        share, dark = system.detector.detection_efficiency, _dark_photons(system.detector.dark_count_hz, system)
+        if share == 1.0 and dark == 0.0:
+            return self
+        return self._scaled(share, dark)
+
+    def with_dark_counts(self, rate_hz: ArrayLike, system: System) -> Flux:
+        """This flux with dark counts at `rate_hz`, counts/s: scalar or (H, W), such as `dark_count_map` draws.
+
+        They are background that the detection efficiency of the system does not reduce (hence divided by it here, for
+        `detected` multiplies), uniform in time; a gated pixel has them in its gate only.
+        """
+        rate = _map("rate_hz", rate_hz, photons=False)
+        if not (rate >= 0.0).all():
+            raise ValueError(f"rate_hz must be counts/s >= 0, got {rate.min():g}")
+        _common_shape(("flux", "rate_hz"), [self.shape, rate.shape])
+        if np.broadcast_shapes(self.shape, rate.shape) != self.shape:
+            raise ValueError(f"rate_hz must be a scalar or {self.shape}, got {rate.shape}")
+        return self._scaled(1.0, _dark_photons(rate, system) / system.detector.detection_efficiency)
+
+    def _scaled(self, share: float, more: float | FloatArray) -> Flux:
+        """Signal and background times `share`, and more background."""
+        background = self.background * share + more
+        _check_photons("background with dark counts", background)
+        flux, wave = Flux.__new__(Flux), None if self.waveform is None else self.waveform * share
+        _fill(flux, self.returns_signal * share, self.returns_delay_ns, background, wave, self.info)
+        return flux
+
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W)."""
@@ -167,6 +203,11 @@ class Flux:
             f"Flux({h} x {w} pixels, {what}, mean signal {self.signal.mean():.4g}, "
             f"mean background {self.background.mean():.4g} photons per period)"
         )
+
+
+def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatArray:
+    """Dark counts per period."""
+    return rate_hz * (system.period_ns * 1e-9)
 
 
 def _map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:

@@ -168,8 +168,9 @@ def _task(
         raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
     if len(flux.returns_signal) > 16:
         raise ValueError(f"flux must have at most 16 returns, got {len(flux.returns_signal)}; use a waveform")
-    _check_registrations(flux, system)
+    _check_registrations(flux.detected(system), system)
     drawn_by.check_mode(system)
+    drawn_by.check_effects(system)
     drawn_by.check(flux, system)
     index = _pixel_index(pixel_index, flux.shape)
     return Task(flux, system, number, first, index, seed, team, progress)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar.detector import Detector as Detector
+from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.pulse import Pulse, pulse_from_dict
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
@@ -36,9 +37,9 @@ class System:
     bins
         Histogram bins over one period n_b.
     pulse
-        Shape of the returned pulse, detector response included.
+        Shape of the returned pulse, detector response included; without it where the detector has a jitter.
     detector
-        Dead time, mode and gate of the pixel.
+        Dead time, mode and gate of the pixel, and what else it does.
     start
         State of the pixel at the start of the exposure: ``"armed"`` (ready at t = 0) or ``"stationary"``
         (warmed up). The two differ by up to half a count in the mean.
@@ -67,7 +68,12 @@ class System:
                 f"dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
                 f"got {self.detector.dead_time_ns:g} ns"
             )
-        self.detector.check(self.period_ns, self.start)
+        self.detector.check(self.period_ns, self.bins, self.start)
+        if self.electronics_dead_time_periods > _MAX_DEAD_PERIODS:
+            raise ValueError(
+                f"electronics_dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
+                f"got {self.detector.electronics_dead_time_ns:g} ns"
+            )
 
     @property
     def bin_ns(self) -> float:
@@ -83,6 +89,16 @@ class System:
     def dead_time_periods(self) -> float:
         """Dead time in laser periods, t_d / t_r."""
         return self.detector.dead_time_ns / self.period_ns
+
+    @property
+    def electronics_dead_time_periods(self) -> float:
+        """Dead time of the electronics in laser periods, t_e / t_r."""
+        return self.detector.electronics_dead_time_ns / self.period_ns
+
+    def detected(self) -> System:
+        """This system for a flux of detected photons, `Flux.detected`: efficiency and dark counts are in that flux."""
+        bare = self.detector.without(*LIGHT_EFFECTS)
+        return self if bare == self.detector else self.replace(detector=bare)
 
     @property
     def unambiguous_range_m(self) -> float:
@@ -107,15 +123,18 @@ class System:
         """Most registrations that one bin can hold: inf for a dead time of 0.
 
         A bin is open for one bin width per period, which fits floor(width / t_d) + 1 registrations, and an
-        exposure fits floor(exposure / t_d) + 1 in all. A synchronous pixel registers once in
-        max(1, ceil(t_d / t_r)) periods.
+        exposure fits floor(exposure / t_d) + 1 in all; only the latter where records are moved into the bin. A
+        synchronous pixel registers once in max(1, ceil(t_d / t_r)) periods.
         """
         dead = self.detector.dead_time_ns
         if self.detector.mode == "synchronous":
             return math.ceil(self.cycles / max(1, math.ceil(self.dead_time_periods - 1e-9)))
         if dead == 0.0:
             return math.inf
-        return min(self.cycles * (self.bin_ns // dead + 1), self.exposure_ns // dead + 1)
+        most = self.exposure_ns // dead + 1
+        if set(TIMING_EFFECTS) & set(self.detector.effects):
+            return most
+        return min(self.cycles * (self.bin_ns // dead + 1), most)
 
     @property
     def histogram_dtype(self) -> np.dtype[Any]:

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.detector import MODES, Mode
+from mars_lidar.detector import MODES, Detector, Mode
+from mars_lidar.effects import LIGHT_EFFECTS, Jitter, code_edges, require_effects
 from mars_lidar.flux import Flux
+from mars_lidar.pulse import GaussianPulse, Pulse
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
     from mars_lidar import _core
-    from mars_lidar.pulse import Pulse
 
 Progress = Callable[[int, int], object]
 
@@ -25,6 +26,9 @@ Progress = Callable[[int, int], object]
 @dataclass(frozen=True, eq=False)
 class Task:
     """One checked request: which pixels of which realizations of which flux, seen by which system.
+
+    `flux` and `system` become those of detected photons (`Flux.detected`, `System.detected`), so that no engine needs
+    to know of efficiencies and dark counts.
 
     `pixel_index` (H * W,) uint32 names the random stream of each pixel, so that any part of an image can be
     made alone with the bits that it has in the whole. `report` is where an engine writes what it has to tell
@@ -40,6 +44,11 @@ class Task:
     threads: int
     progress: Progress | None
     report: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        flux, system = self.flux.detected(self.system), self.system.detected()
+        object.__setattr__(self, "flux", flux)
+        object.__setattr__(self, "system", system)
 
     @property
     def items(self) -> int:
@@ -81,6 +90,7 @@ class Task:
             gate_width=width,
             gate_step=step,
             gate_cycles=detector.gate_cycles or 1,
+            recording=_recording(detector, self.system.period_ns) if detector.effects else None,
         )
 
 
@@ -100,6 +110,15 @@ class Records:
         n = int(offsets[-1])
         return cls(offsets, np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32))
 
+    def sort(self) -> None:
+        """Put the registrations of each item in order of time, which jitter may have changed."""
+        item = np.repeat(np.arange(self.offsets.size - 1), np.diff(self.offsets))
+        if not ((np.diff(self.times) < 0.0) & (np.diff(item) == 0)).any():
+            return
+        order = np.lexsort((self.times, item))
+        for array in (self.times, self.cycle, self.bin):
+            array[:] = array[order]
+
 
 class Engine(ABC):
     """A way to draw histograms. Engines never see files or scenes.
@@ -111,6 +130,7 @@ class Engine(ABC):
     name: ClassVar[str]
     description: ClassVar[str]
     modes: ClassVar[tuple[Mode, ...]] = ("nonparalyzable",)  # of the detector, that the engine reproduces
+    effects: ClassVar[tuple[str, ...]] = LIGHT_EFFECTS  # likewise
     options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
 
     @property
@@ -133,6 +153,15 @@ class Engine(ABC):
                 f"{', '.join(map(repr, self.modes))}; use {able}"
             )
 
+    def check_effects(self, system: System) -> None:
+        """Raise ValueError, naming the effect and the engines to use, where one of the detector is not in `effects`."""
+        from mars_lidar.engines import ENGINES
+
+        def instead(effect: str) -> str:
+            return "; use " + " or ".join(repr(name) for name, engine in ENGINES.items() if effect in engine.effects)
+
+        require_effects(f"engine {self.name!r}", system.detector, self.effects, instead)
+
     @abstractmethod
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Fill `out` (items, bins), C-contiguous, of the system's histogram dtype."""
@@ -144,6 +173,28 @@ class Engine(ABC):
     def timestamps(self, task: Task, records: Records) -> None:
         """Fill `records`, allocated from `counts`, with the draws of `histogram`."""
         raise ValueError(f"engine {self.name!r} draws histograms only, not timestamps; use 'exact'")
+
+
+@lru_cache(maxsize=16)
+def _recording(detector: Detector, period_ns: float) -> _core.Recording:
+    from mars_lidar import _core
+
+    jitter, no_limit = detector.jitter, 2**31 - 1
+    shape: Pulse | None = None
+    tail = tail_fraction = 0.0
+    if isinstance(jitter, Jitter):
+        shape, tail, tail_fraction = GaussianPulse(sigma_ns=jitter.sigma_ns), jitter.tail_ns, jitter.tail_fraction
+    elif jitter is not None:
+        shape = jitter.shape
+    return _core.Recording(
+        electronics_dead_time=detector.electronics_dead_time_ns / period_ns,
+        most_per_period=detector.max_events_per_period or no_limit,
+        most_per_exposure=detector.max_events_per_exposure or no_limit,
+        jitter=None if shape is None else _pulse_table(shape, period_ns),
+        tail=tail / period_ns,
+        tail_fraction=tail_fraction,
+        code_edges=None if detector.code_density is None else code_edges(detector.code_density),
+    )
 
 
 @lru_cache(maxsize=16)

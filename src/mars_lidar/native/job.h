@@ -14,6 +14,8 @@ struct Gate {
     int32_t cycles = 1;
 };
 
+struct Recording;
+
 struct Job {
     int64_t pixels = 0;
     int64_t returns = 0;       // 0 with a waveform
@@ -26,6 +28,7 @@ struct Job {
     bool stationary = false;   // warmed up at t = 0, else armed
     DetectorMode mode = DetectorMode::kNonparalyzable;
     Gate gate;                 // of kGated
+    const Recording* recording = nullptr;  // of the registrations, or null: as they are
     const double* signal = nullptr;       // (returns, pixels)
     const double* delay = nullptr;        // (returns, pixels), finite, any number of periods
     const double* background = nullptr;   // (pixels)

@@ -1,10 +1,33 @@
 // The native core `mars_lidar._core`: thin bindings, no checks beyond shapes; Python validates.
 #include "bindings.h"
+#include "pulse_table.h"
 
 #include <nanobind/stl/optional.h>
 
 namespace mars {
 namespace {
+
+void bind_recording(nb::module_& module) {
+    nb::class_<BoundRecording>(module, "Recording", "What happens to registrations; times in laser periods.")
+        .def(
+            "__init__",
+            [](BoundRecording* self, double electronics_dead_time, int32_t most_per_period, int32_t most_per_exposure,
+               const PulseTable* jitter, double tail, double tail_fraction,
+               std::optional<Vector<const double>> code_edges) {
+                new (self) BoundRecording();
+                self->electronics_dead_time = electronics_dead_time;
+                self->most_per_period = most_per_period;
+                self->most_per_exposure = most_per_exposure;
+                self->jitter = jitter;
+                self->tail = tail;
+                self->tail_fraction = tail_fraction;
+                if (code_edges) self->codes.set({code_edges->data(), code_edges->data() + code_edges->shape(0)});
+                self->tables = nb::cast(jitter);
+            },
+            nb::kw_only(), nb::arg("electronics_dead_time"), nb::arg("most_per_period"),
+            nb::arg("most_per_exposure"), nb::arg("jitter").none(), nb::arg("tail"), nb::arg("tail_fraction"),
+            nb::arg("code_edges").none());
+}
 
 void bind_job(nb::module_& module) {
     nb::class_<BoundJob>(module, "Job", "Flux and system of one call, in laser periods.")
@@ -14,7 +37,8 @@ void bind_job(nb::module_& module) {
                Vector<const double> background, std::optional<Matrix<const double>> waveform,
                Vector<const uint32_t> pixel_index, int64_t realizations, uint32_t first_realization,
                uint64_t seed, int32_t cycles, int32_t bins, double dead_time, bool stationary, int32_t mode,
-               double gate_start, double gate_width, double gate_step, int32_t gate_cycles) {
+               double gate_start, double gate_width, double gate_step, int32_t gate_cycles,
+               const BoundRecording* recording) {
                 const size_t pixels = background.shape(0);
                 if (signal.shape(1) != pixels || delay.shape(0) != signal.shape(0) || delay.shape(1) != pixels ||
                     pixel_index.shape(0) != pixels || (waveform && waveform->shape(0) != pixels))
@@ -37,13 +61,15 @@ void bind_job(nb::module_& module) {
                 self->waveform = waveform ? waveform->data() : nullptr;
                 self->samples = waveform ? static_cast<int64_t>(waveform->shape(1)) : 0;
                 self->pixel_index = pixel_index.data();
-                self->arrays = nb::make_tuple(signal, delay, background, waveform, pixel_index);
+                self->recording = recording;
+                self->arrays = nb::make_tuple(signal, delay, background, waveform, pixel_index, recording);
             },
             nb::kw_only(), nb::arg("signal"), nb::arg("delay"), nb::arg("background"),
             nb::arg("waveform").none(), nb::arg("pixel_index"), nb::arg("realizations"),
             nb::arg("first_realization"), nb::arg("seed"), nb::arg("cycles"), nb::arg("bins"),
             nb::arg("dead_time"), nb::arg("stationary"), nb::arg("mode") = 0, nb::arg("gate_start") = 0.0,
-            nb::arg("gate_width") = 1.0, nb::arg("gate_step") = 0.0, nb::arg("gate_cycles") = 1)
+            nb::arg("gate_width") = 1.0, nb::arg("gate_step") = 0.0, nb::arg("gate_cycles") = 1,
+            nb::arg("recording").none() = nb::none())
         .def_prop_ro("items", [](const BoundJob& self) { return self.items(); });
 }
 
@@ -52,8 +78,9 @@ void bind_job(nb::module_& module) {
 
 NB_MODULE(_core, module) {
     module.doc() = "Native core of mars_lidar.";
-    mars::bind_job(module);
     mars::bind_pulse(module);
+    mars::bind_recording(module);
+    mars::bind_job(module);
     mars::bind_exact(module);
     mars::bind_waveform(module);
     mars::bind_sequential(module);

@@ -3,6 +3,7 @@
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewal_moments, renewal_pmf
 from mars_lidar.statistics.chain import PhaseChain, Stationary
+from mars_lidar.statistics.electronics import ElectronicsMoments, electronics_moments
 from mars_lidar.statistics.exposure import Exposure, exposure_moments
 from mars_lidar.statistics.grid import photons_per_bin
 from mars_lidar.statistics.histogram import mean_histogram
@@ -21,6 +22,7 @@ from mars_lidar.statistics.spectral import HoldingTimeCovariance, holding_time_c
 __all__ = [
     "ConvergenceError",
     "CountLaw",
+    "ElectronicsMoments",
     "Exposure",
     "HoldingTimeCovariance",
     "HoldingTimes",
@@ -30,6 +32,7 @@ __all__ = [
     "PhaseChain",
     "Stationary",
     "count_law",
+    "electronics_moments",
     "exposure_moments",
     "holding_time_covariance",
     "holding_times",

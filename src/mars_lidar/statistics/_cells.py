@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar.detector import Mode
+from mars_lidar.effects import LIGHT_EFFECTS
 from mars_lidar.statistics._gate import PLAIN, photons_before, require_mode
 from mars_lidar.system import System
 
@@ -57,19 +58,24 @@ class Cells:
         waveform: ArrayLike | None = None,
         what: str = "this statistic",
         modes: tuple[Mode, ...] = PLAIN,
+        effects: tuple[str, ...] = LIGHT_EFFECTS,
     ) -> Cells:
         """Check the arguments and broadcast them; `waveform` (..., T) broadcasts over its leading axes.
 
-        `what` is computed from the cells, and treats `modes` of the detector.
+        `what` is computed from the cells, and treats `modes` and `effects` of the detector. The cells have the flux
+        of detected photons, and the system for that.
         """
         if not isinstance(system, System):
             raise TypeError(f"system must be a System, got {type(system).__name__}")
-        require_mode(what, system, modes)
+        require_mode(what, system, modes, effects)
+        share, dark = system.detector.detection_efficiency, system.detector.dark_count_hz * system.period_ns * 1e-9
         back = _photons("background", background)
+        if share != 1.0 or dark > 0.0:
+            system, back = system.detected(), _photons("background with dark counts", back * share + dark)
         if waveform is not None:
             if signal is not None or delay_ns is not None:
                 raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
-            wave = _photons("waveform", waveform)
+            wave = _photons("waveform", waveform) * share
             if wave.ndim == 0 or wave.shape[-1] == 0:
                 raise ValueError(f"waveform must be (..., T) with T >= 1, got shape {wave.shape}")
             total = _photons("waveform summed over a period", wave.sum(-1))
@@ -83,7 +89,7 @@ class Cells:
             )  # fmt: skip
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-        total = _photons("signal", signal)
+        total = _photons("signal", signal) * share
         given = _reals("delay_ns", 0.5 * system.period_ns if delay_ns is None else delay_ns)
         total, back, delay = _broadcast(("signal", "background", "delay_ns"), total, back, given)
         bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (total == 0))
@@ -136,14 +142,23 @@ class Cells:
             f"t_d = {self.system.dead_time_periods:g} periods, {self.system.cycles} cycles{place}"
         )
 
+    @property
+    def _sharpness(self) -> float:
+        """Integral of the squared shape of the signal over the period: 1 / width, the narrowest of all cells."""
+        if self.waveform is not None:
+            return float(self.waveform.shape[-1] * np.max(np.sum(self.waveform**2, -1)))
+        probe = 2**14
+        energy = self.system.pulse.bin_energy(0.5 * self.system.period_ns, self.system.period_ns, probe)
+        return float(probe * np.sum(energy**2))
+
+    @property
+    def finest(self) -> float:
+        """Standard deviation, in periods, of a Gaussian as narrow as the signal."""
+        return float(1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0)))
+
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: even, a multiple of `out_bins`, a bin at most half a sigma of the pulse."""
-        if self.waveform is None:
-            probe = 2**14
-            energy = self.system.pulse.bin_energy(0.5 * self.system.period_ns, self.system.period_ns, probe)
-            sharpness = probe * float(np.sum(energy**2))
-        else:
-            sharpness = self.waveform.shape[-1] * float(np.max(np.sum(self.waveform**2, -1)))
+        sharpness = self._sharpness
         gate_width = self.system.detector.gate_periods(self.system.period_ns)[2]
         sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / _MAX_FIRST_BINS))
         wanted = min(max(_MIN_BINS, _BINS_PER_WIDTH * sharpness), _MAX_FIRST_BINS)

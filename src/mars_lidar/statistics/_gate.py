@@ -1,4 +1,4 @@
-"""Which statistics treat which mode of the detector, and the flux behind a gate.
+"""Which statistics treat which mode and effects of the detector, and the flux behind a gate.
 
 A gate that repeats every period makes a gated pixel a free-running one that sees the flux inside of the gate, so that
 the exposure recursion holds for it with that flux: docs/detectors.md.
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.detector import Mode
+from mars_lidar.effects import LIGHT_EFFECTS, require_effects
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
@@ -28,8 +29,11 @@ _INSTEAD = {
 }
 
 
-def require_mode(what: str, system: System, modes: tuple[Mode, ...] = PLAIN) -> None:
-    """Raise ValueError, naming the mode and what to use, where `what` does not treat the detector's mode."""
+def require_mode(
+    what: str, system: System, modes: tuple[Mode, ...] = PLAIN, effects: tuple[str, ...] = LIGHT_EFFECTS
+) -> None:
+    """Raise ValueError, naming what to use, where `what` does not treat the detector's mode, or one of its effects."""
+    require_effects(what, system.detector, effects, _simulated)
     mode = system.detector.mode
     if mode not in modes:
         told = " and ".join(map(repr, modes))
@@ -41,6 +45,13 @@ def require_mode(what: str, system: System, modes: tuple[Mode, ...] = PLAIN) -> 
             f"{what} needs a gate that repeats every period, got gate_step_ns={system.detector.gate_step_ns:g}; "
             "a moving gate can be simulated"
         )
+
+
+def _simulated(effect: str) -> str:
+    from mars_lidar.engines import ENGINES
+
+    able = " or ".join(repr(name) for name, engine in ENGINES.items() if effect in engine.effects)
+    return f"; simulate it with engine {able}"
 
 
 def open_parts(system: System) -> tuple[tuple[float, float], ...]:

@@ -29,7 +29,7 @@ def poisson_moments(
     have the broadcast shape.
     """
     require_mode("poisson_moments", system, _WITHOUT_GATE)
-    mean = system.cycles * _total(signal, background)
+    mean = system.cycles * _total(signal, background, system)
     return mean, mean.copy()
 
 
@@ -39,7 +39,7 @@ def poisson_pmf(signal: ArrayLike, background: ArrayLike, system: System, suppor
 
     require_mode("poisson_pmf", system, _WITHOUT_GATE)
     counts = _counts(support)
-    mean = system.cycles * _total(signal, background)[..., None]
+    mean = system.cycles * _total(signal, background, system)[..., None]
     return np.asarray(np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), dtype=np.float64)
 
 
@@ -63,7 +63,7 @@ def renewal_moments(
         mean, variance: arrays of the broadcast shape.
     """
     require_mode("renewal_moments", system)
-    total = _total(signal, background)
+    total = _total(signal, background, system)
     x = total * system.dead_time_periods
     mean = system.cycles * total / (1.0 + x)
     variance = system.cycles * total / (1.0 + x) ** 3
@@ -92,7 +92,7 @@ def renewal_pmf(signal: ArrayLike, background: ArrayLike, system: System, suppor
     """
     require_mode("renewal_pmf", system)
     counts = _counts(support)
-    rate = _total(signal, background)[..., None]
+    rate = _total(signal, background, system)[..., None]
     below = _survival(counts, rate, system) - _survival(counts + 1.0, rate, system)
     return np.asarray(np.maximum(below, 0.0), dtype=np.float64)
 
@@ -119,7 +119,8 @@ def _survival(counts: FloatArray, rate: FloatArray, system: System) -> FloatArra
     return np.asarray(np.where(counts == 0.0, 1.0, at_least), dtype=np.float64)
 
 
-def _total(signal: ArrayLike, background: ArrayLike) -> FloatArray:
+def _total(signal: ArrayLike, background: ArrayLike, system: System) -> FloatArray:
+    """Detected photons per period, dark counts included."""
     arrays = []
     for name, value in (("signal", signal), ("background", background)):
         array: NDArray[Any] = np.asarray(value)
@@ -129,7 +130,8 @@ def _total(signal: ArrayLike, background: ArrayLike) -> FloatArray:
         if bad.any():
             raise ValueError(f"{name} must be finite and >= 0 photons per period, got {array[bad].flat[0]}")
         arrays.append(array.astype(np.float64))
-    return np.asarray(arrays[0] + arrays[1], dtype=np.float64)
+    dark = system.detector.dark_count_hz * system.period_ns * 1e-9
+    return np.asarray((arrays[0] + arrays[1]) * system.detector.detection_efficiency + dark, dtype=np.float64)
 
 
 def _counts(support: ArrayLike) -> FloatArray:

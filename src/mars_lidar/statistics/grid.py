@@ -58,14 +58,20 @@ def photons_per_bin(
         cumulative = np.concatenate([[0.0], np.cumsum(wave)])
         edges = np.arange(n + 1) * (wave.size / n)
         energy = np.diff(np.interp(edges, np.arange(wave.size + 1), cumulative))
-        return np.asarray(np.maximum(energy, 0.0) + back / n, dtype=np.float64)
+        return _detected(np.maximum(energy, 0.0) + back / n, system)
     if signal is None:
         raise ValueError("signal must be given (photons per period), or a waveform instead of it")
     total = _validate.real("signal", signal, low=0.0, high=_MAX_PHOTONS)
     delay = 0.5 * system.period_ns if delay_ns is None else _validate.real("delay_ns", delay_ns)
     n = bins or default_bins(system)
     energy = system.pulse.bin_energy(delay, system.period_ns, n)
-    return np.asarray(total * np.maximum(energy, 0.0) + back / n, dtype=np.float64)
+    return _detected(total * np.maximum(energy, 0.0) + back / n, system)
+
+
+def _detected(photons: FloatArray, system: System) -> FloatArray:
+    """`Flux.detected` on a grid (bins,)."""
+    dark = system.detector.dark_count_hz * system.period_ns * 1e-9
+    return np.asarray(photons * system.detector.detection_efficiency + dark / photons.size, dtype=np.float64)
 
 
 def default_bins(system: System) -> int:

@@ -70,6 +70,7 @@ def build(
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     require_mode("a table", system)
+    system = system.detected()  # its axes are detected photons
     axes = axis_values("signal", signal), axis_values("background", background)
     _validate.choice("method", method, _METHODS)
     _validate.choice("rearm", rearm, _REARMS)

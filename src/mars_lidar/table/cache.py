@@ -77,6 +77,7 @@ def cached_path(system: System, signal: Grid, background: Grid, **options: Any) 
 
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
+    system = system.detected()
     chosen = {"method": "exposure", "rearm": "centre", "refine": None, "tolerance": 1e-4} | options
     unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "check_law", "threads", "progress"}
     if unknown:

@@ -50,6 +50,7 @@ def load(path: Path, system: System) -> Table:
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     header, arrays = _read(path)
+    system = system.detected()
     made_for = System.from_json(header["system"])
     _compare(path, made_for, system)
     entries = Entries(

@@ -81,10 +81,11 @@ class Table:
         Parameters
         ----------
         system
-            Laser, detector and histogram.
+            Laser, detector and histogram. Its detection efficiency and dark counts are left out (`System.detected`).
         signal, background
-            Axes, photons per period: ``(low, high, points)`` for 0 and `points` log-spaced values, or an array
-            of values taken as it is. Between 0 and the next value everything is interpolated linearly.
+            Axes, detected photons per period (`Flux.detected`): ``(low, high, points)`` for 0 and `points` log-spaced
+            values, or an array of values taken as it is. Between 0 and the next value everything is interpolated
+            linearly.
         method
             ``"exposure"``: exact statistics of the finite exposure. ``"mars"``: the paper's, Markov chain and
             Gaussian of the Markov-renewal law, asymptotic in the exposure.

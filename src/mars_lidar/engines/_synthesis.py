@@ -30,7 +30,8 @@ class Batch:
     """Some pixels of a task.
 
     `pixels` (P,) their places in the image; `shapes` (rows, bins) float32, each summing to 1, of which pixel p mixes
-    `rows` (P, 4) by `weights` (P, 4); `alignment` None where the rows are at the pixels' own delays.
+    `rows` (P, 4) by `weights` (P, 4); `alignment` None where the rows are at the pixels' own delays. `guides`
+    (rows, 64) float32, at first zeros, takes what the sampler finds out about rows of canonical delay, for later use.
     """
 
     pixels: IndexArray
@@ -39,6 +40,7 @@ class Batch:
     weights: FloatArray
     laws: CountLaws
     alignment: Alignment | None = None
+    guides: NDArray[np.float32] | None = None
 
     @classmethod
     def unmixed(
@@ -63,6 +65,7 @@ class Batch:
             self.weights[some],
             self.laws.part(some),
             None if self.alignment is None else self.alignment.part(some),
+            self.guides,
         )
 
 
@@ -135,6 +138,8 @@ class Run:
                     cells=frame.cells,
                     energy=frame.energy,
                 )
+                if batch.guides is not None:
+                    job.guide(guides=batch.guides, threads=task.threads)
             out = self.out[first * image : (first + number) * image]
             _core.shape_histogram(job, counts, out, task.threads, self.level, self._sampling(counts.size))
         self._done += counts.size

@@ -41,13 +41,14 @@ class Entries:
     background: FloatArray
     cumulants: FloatArray
     shapes: NDArray[np.float32]
+    guides: NDArray[np.float32]
     rows: IndexArray
     weights: FloatArray
     alignment: Alignment
 
     def batch(self, laws: CountLaws) -> Batch:
         """With counts from `laws`."""
-        return Batch(self.pixels, self.shapes, self.rows, self.weights, laws, self.alignment)
+        return Batch(self.pixels, self.shapes, self.rows, self.weights, laws, self.alignment, self.guides)
 
 
 class TableReader:
@@ -93,7 +94,7 @@ class TableReader:
             threads=task.threads,
         )
         order = np.flatnonzero(~look.outside)
-        order = order[np.argsort(look.rows[order, 0], kind="stable")]
+        order = order[np.argsort(look.rows[order, 0])]
         signal, background, cumulants = signal[order], background[order], look.cumulants[order]
         alignment = Alignment.of(system, signal, background, delay[order], cumulants[:, 0] / system.cycles)
         entries = Entries(
@@ -101,7 +102,7 @@ class TableReader:
             signal,
             background,
             cumulants,
-            _shapes(self.table, system.cycles),
+            *_shapes(self.table, system.cycles),
             look.rows[order],
             look.weights[order],
             alignment,
@@ -110,15 +111,17 @@ class TableReader:
 
 
 # A table computes its shapes for other cycles than it was built for at each call, which takes longer than a cube: those
-# of the last cycles asked for stay as long as the table lives.
-_last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32]]] = WeakKeyDictionary()
+# of the last cycles asked for stay as long as the table lives, and with them what the sampler finds out about them.
+_last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32], NDArray[np.float32]]] = WeakKeyDictionary()
 
 
-def _shapes(table: Table, cycles: int) -> NDArray[np.float32]:
+def _shapes(table: Table, cycles: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Shapes, and the sampler's guides to them."""
     kept = _last_shapes.get(table)
     if kept is None or kept[0] != cycles:
-        kept = _last_shapes[table] = cycles, table.shapes(cycles)
-    return kept[1]
+        shapes = table.shapes(cycles)
+        kept = _last_shapes[table] = cycles, shapes, np.zeros((len(shapes), 64), np.float32)
+    return kept[1:]
 
 
 def table_record(table: Table) -> dict[str, Any]:

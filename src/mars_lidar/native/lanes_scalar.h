@@ -60,6 +60,19 @@ MARS_INLINE void gather_pair(const float* table, Int index, Float& first, Float&
     second = table[2 * index + 1];
 }
 
+// Entry `index` of a table of 32, aligned to 64 bytes.
+MARS_INLINE Float of_thirty_two(const float* table, Int index) { return table[index]; }
+
+// The 64 bits of x * factor.
+MARS_INLINE void multiply(UInt x, uint32_t factor, UInt& high, UInt& low) {
+    const uint64_t product = static_cast<uint64_t>(x) * factor;
+    high = static_cast<uint32_t>(product >> 32);
+    low = static_cast<uint32_t>(product);
+}
+
+// Bit k is lane k's.
+MARS_INLINE uint64_t lane_bits(Mask m) { return m ? 1u : 0u; }
+
 template <class Vector, class Scalar>
 MARS_INLINE Vector load(const Scalar* from) {
     return *from;

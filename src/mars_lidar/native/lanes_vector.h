@@ -44,6 +44,7 @@ MARS_INLINE UInt splat(uint32_t x) { return {HardUInt{} + x, HardUInt{} + x}; }
 MARS_BINARY(Float, float, +)
 MARS_BINARY(Float, float, -)
 MARS_BINARY(Float, float, *)
+MARS_BINARY(Float, float, /)
 MARS_BINARY(Int, int32_t, +)
 MARS_BINARY(Int, int32_t, -)
 MARS_BINARY(UInt, uint32_t, +)
@@ -252,6 +253,65 @@ MARS_INLINE void gather_pair(const float* table, Int index, Float& first, Float&
     gather_pair(table, k, first.low, second.low);
     gather_pair(table, k + kHardwareLanes, first.high, second.high);
 }
+
+// Entry `index` of a table of 32, aligned to 64 bytes.
+MARS_INLINE Float of_thirty_two(const float* table, Int index) {
+#if defined(MARS_LEVEL_avx512)
+    const __m512 first = _mm512_load_ps(table), second = _mm512_load_ps(table + 16);
+    return {(HardFloat)_mm512_permutex2var_ps(first, (__m512i)index.low, second),
+            (HardFloat)_mm512_permutex2var_ps(first, (__m512i)index.high, second)};
+#else
+    return gather(table, index);
+#endif
+}
+
+// The 64 bits of x * factor.
+MARS_INLINE void multiply(HardUInt x, uint32_t factor, HardUInt& high, HardUInt& low) {
+#if defined(MARS_LEVEL_avx512)
+    const __m512i by = _mm512_set1_epi64(factor), a = (__m512i)x;
+    const __m512i even = _mm512_mul_epu32(a, by), odd = _mm512_mul_epu32(_mm512_srli_epi64(a, 32), by);
+    high = (HardUInt)_mm512_mask_blend_epi32(0xaaaa, _mm512_srli_epi64(even, 32), odd);
+    low = (HardUInt)_mm512_mask_blend_epi32(0xaaaa, even, _mm512_slli_epi64(odd, 32));
+#elif defined(MARS_LEVEL_avx2)
+    const __m256i by = _mm256_set1_epi64x(factor), a = (__m256i)x;
+    const __m256i even = _mm256_mul_epu32(a, by), odd = _mm256_mul_epu32(_mm256_srli_epi64(a, 32), by);
+    high = (HardUInt)_mm256_blend_epi32(_mm256_srli_epi64(even, 32), odd, 0xaa);
+    low = (HardUInt)_mm256_blend_epi32(even, _mm256_slli_epi64(odd, 32), 0xaa);
+#elif defined(MARS_X86)
+    const __m128i by = _mm_set1_epi64x(factor), a = (__m128i)x, upper = _mm_set_epi32(-1, 0, -1, 0);
+    const __m128i even = _mm_mul_epu32(a, by), odd = _mm_mul_epu32(_mm_srli_epi64(a, 32), by);
+    high = (HardUInt)_mm_or_si128(_mm_srli_epi64(even, 32), _mm_and_si128(odd, upper));
+    low = (HardUInt)_mm_or_si128(_mm_andnot_si128(upper, even), _mm_slli_epi64(odd, 32));
+#else
+    for (int k = 0; k < kHardwareLanes; ++k) {
+        const uint64_t product = static_cast<uint64_t>(x[k]) * factor;
+        high[k] = static_cast<uint32_t>(product >> 32);
+        low[k] = static_cast<uint32_t>(product);
+    }
+#endif
+}
+MARS_INLINE void multiply(UInt x, uint32_t factor, UInt& high, UInt& low) {
+    multiply(x.low, factor, high.low, low.low);
+    multiply(x.high, factor, high.high, low.high);
+}
+
+// Bit k is lane k's.
+#if defined(MARS_LEVEL_avx512)
+MARS_INLINE uint64_t lane_bits(Mask m) { return m.low | static_cast<uint64_t>(m.high) << 16; }
+#else
+MARS_INLINE uint64_t lane_bits(HardMask m) {
+#if defined(MARS_LEVEL_avx2)
+    return static_cast<uint64_t>(_mm256_movemask_ps((__m256)m));
+#elif defined(MARS_X86)
+    return static_cast<uint64_t>(_mm_movemask_ps((__m128)m));
+#else
+    uint64_t found = 0;
+    for (int k = 0; k < kHardwareLanes; ++k) found |= static_cast<uint64_t>(m[k] & 1) << k;
+    return found;
+#endif
+}
+MARS_INLINE uint64_t lane_bits(Mask m) { return lane_bits(m.low) | lane_bits(m.high) << kHardwareLanes; }
+#endif
 
 }  // namespace MARS_LEVEL
 }  // namespace mars

@@ -9,7 +9,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "lanes.h"
+#include "lane_math.h"
 #include "shape_kernel.h"
 
 namespace mars {
@@ -17,6 +17,7 @@ inline namespace MARS_LEVEL {
 namespace {
 
 constexpr double kLeastArmed = 1e-9;  // of a saturated pixel, where the difference leaves nothing but rounding
+constexpr float kFewPhotons = 0.01f;    // in a bin, below which A is as good as straight in it
 constexpr double kBright = 2.0;       // photons per period from which the slope inside a bin shows
 constexpr int kSweeps = 12;           // of the fixed point where registrations re-arm inside the pulse
 
@@ -38,8 +39,12 @@ public:
         shape = memory.take<float>(padded_bins(n_));
         for (int64_t j = n_; j < padded_bins(n_); ++j) shape[j] = 0.0f;
         const PulseFrame& frame = job.frame;
-        armed_ = memory.take<double>(frame.size + 1);
-        moved_ = memory.take<double>(frame.size + 1);
+        const int64_t wide = (frame.size + kLanes) / kLanes * kLanes + 1;  // whole lanes, and one more
+        here_ = memory.take<float>(wide);
+        old_ = memory.take<float>(wide);
+        armed_ = memory.take<float>(wide);
+        moved_ = memory.take<float>(wide);
+        for (int64_t i = 0; i < wide; ++i) here_[i] = armed_[i] = 0.0f;
         const double whole = std::floor(job.dead_time), back = (job.dead_time - whole) * n_;
         whole_ = whole;
         back_ = static_cast<int64_t>(back);
@@ -58,17 +63,14 @@ public:
     float* shape;  // (padded_bins), zeros behind the last bin; sums to what the rows do
 
     void set(int64_t pixel) {
-        const double shift = job_.shift ? job_.shift[pixel] * n_ : 0.0;
-        int64_t whole = static_cast<int64_t>(shift);
-        double part = shift - static_cast<double>(whole);
-        if (part > 1.0 - 1e-9) ++whole, part = 0.0;
-        if (part < 1e-9) part = 0.0;
-        if (whole >= n_) whole -= n_;
+        const Move move_by = moved_by(pixel);
+        const int64_t whole = move_by.whole;
+        const double part = move_by.part;
         if (whole == 0 && part == 0.0) {
-            mix(pixel, shape);
+            mix(pixel, 0, n_, shape);
             return;
         }
-        mix(pixel, mixture_);
+        mix(pixel, 0, n_, mixture_);
         mixture_[-1] = mixture_[n_ - 1];
         mixture_[n_] = mixture_[0];
         const float late = static_cast<float>(part);
@@ -79,11 +81,55 @@ public:
         past_[-1] = past_[n_ - 1];
         move(0, shape + whole, n_ - whole);
         move(n_ - whole, shape, whole);
-        if (part > 0.0 && job_.frame.size > 0 && job_.signal[pixel] > 0.0 && job_.rate[pixel] > 0.0)
-            correct(pixel, whole, part);
+        if (part > 0.0 && has_pulse(pixel)) correct(pixel, whole, part);
+    }
+
+    // The bin a dead time, less whole periods, before the frame; and less part of a bin.
+    int64_t first_old() const { return wrap(job_.frame.first - back_ - 1); }
+
+    // How far a pixel's shape moves: whole bins, and a part of one.
+    struct Move {
+        int64_t whole;
+        double part;
+    };
+    Move moved_by(int64_t pixel) const {
+        const double shift = job_.shift ? job_.shift[pixel] * n_ : 0.0;
+        int64_t whole = static_cast<int64_t>(shift);
+        double part = shift - static_cast<double>(whole);
+        if (part > 1.0 - 1e-9) ++whole, part = 0.0;
+        if (part < 1e-9) part = 0.0;
+        if (whole >= n_) whole -= n_;
+        return {whole, part};
+    }
+
+    // The frame alone, for a pixel that `set` would spread evenly and cut by bins: out (size + 1), what moves into
+    // each of its bins, and at last into the one behind; their sum. `blind`: the mixture's sum over the dead time
+    // before the frame.
+    double set_frame(int64_t pixel, double part, double blind, double* out) {
+        const PulseFrame& frame = job_.frame;
+        mix_cyclic(pixel, frame.first, frame.size, here_);
+        if (part > 0.0 && has_pulse(pixel)) {
+            mix_cyclic(pixel, first_old(), frame.size + 1, old_);
+            arm(job_.rate[pixel], blind);
+            cut_bins(pixel, part);
+        } else {
+            for (int32_t i = 0; i < frame.size; ++i) moved_[i] = static_cast<float>(part) * here_[i];
+        }
+        double before = 0.0, total = 0.0;
+        for (int32_t i = 0; i < frame.size; ++i) {
+            out[i] = static_cast<double>(here_[i] - moved_[i]) + before;
+            before = static_cast<double>(moved_[i]);
+            total += out[i];
+        }
+        out[frame.size] = before;
+        return total + before;
     }
 
 private:
+    bool has_pulse(int64_t pixel) const {
+        return job_.frame.size > 0 && job_.signal[pixel] > 0.0 && job_.rate[pixel] > 0.0;
+    }
+
     // What leaves each bin for the next, if its registrations are spread evenly,
     void past_even(float part) {
         for (int64_t j = 0; j < n_; ++j) past_[j] = part * mixture_[j];
@@ -107,22 +153,35 @@ private:
         for (int64_t j = 0; j < n; ++j) to[j] = (mixture[j] - past[j]) + past[j - 1];
     }
 
-    void mix(int64_t pixel, float* to) const {
+    void mix_cyclic(int64_t pixel, int64_t first, int64_t count, float* to) const {
+        const int64_t here = count < n_ - first ? count : n_ - first;
+        mix(pixel, first, here, to);
+        if (here < count) mix(pixel, 0, count - here, to + here);
+    }
+
+    void copy_cyclic(int64_t first, int64_t count, float* to) const {
+        for (int64_t i = 0; i < count; ++i) {
+            to[i] = mixture_[first];
+            if (++first == n_) first = 0;
+        }
+    }
+
+    void mix(int64_t pixel, int64_t first, int64_t count, float* to) const {
         const float* row[4];
         float weight[4];
         int used = 0;
         for (int k = 0; k < 4; ++k) {
             const double w = job_.weights[4 * pixel + k];
             if (!(w > 0.0)) continue;
-            row[used] = job_.shapes + job_.rows[4 * pixel + k] * n_;
+            row[used] = job_.shapes + job_.rows[4 * pixel + k] * n_ + first;
             weight[used++] = static_cast<float>(w);
         }
         for (; used < 4; ++used) row[used] = row[0], weight[used] = 0.0f;
         const float *a = row[0], *b = row[1], *c = row[2], *d = row[3];
         if (weight[1] == 0.0f) {
-            for (int64_t j = 0; j < n_; ++j) to[j] = weight[0] * a[j];
+            for (int64_t j = 0; j < count; ++j) to[j] = weight[0] * a[j];
         } else {
-            for (int64_t j = 0; j < n_; ++j)
+            for (int64_t j = 0; j < count; ++j)
                 to[j] = (weight[0] * a[j] + weight[1] * b[j]) + (weight[2] * c[j] + weight[3] * d[j]);
         }
     }
@@ -154,35 +213,33 @@ private:
     void correct(int64_t pixel, int64_t whole, double part) {
         const PulseFrame& frame = job_.frame;
         const double rate = job_.rate[pixel];
-        arm(rate);
+        copy_cyclic(frame.first, frame.size, here_);
+        copy_cyclic(first_old(), frame.size + 1, old_);
+        arm(rate, sum(wrap(frame.first - back_), back_) + part_ * old_[0]);
         if (frame.cells > 1)
             cut_cells(pixel, part, rate);
         else
             cut_bins(pixel, part);
-        int64_t bin = frame.first, to = wrap(frame.first + whole);
-        double before = frame.size == n_ ? moved_[n_ - 1] : past_[frame.first - 1];
+        int64_t to = wrap(frame.first + whole);
+        float before = frame.size == n_ ? moved_[n_ - 1] : past_[frame.first - 1];
         for (int32_t i = 0; i < frame.size; ++i) {
-            shape[to] = static_cast<float>(mixture_[bin] - moved_[i] + before);
+            shape[to] = here_[i] - moved_[i] + before;
             before = moved_[i];
-            if (++bin == n_) bin = 0;
             if (++to == n_) to = 0;
         }
-        if (frame.size < n_) shape[to] = static_cast<float>(mixture_[bin] - past_[bin] + before);
+        const int64_t behind = wrap(frame.first + frame.size);
+        if (frame.size < n_) shape[to] = mixture_[behind] - past_[behind] + before;
     }
 
-    // Mean armed fraction at the frame's edges.
-    void arm(double rate) {
-        const PulseFrame& frame = job_.frame;
-        int64_t bin = frame.first, old = wrap(frame.first - back_);
-        double blind = sum(old, back_) + part_ * mixture_[old - 1];
+    // Mean armed fraction at the frame's edges, from the mixture's sum over the dead time before it.
+    void arm(double rate, double blind) {
+        const int32_t size = job_.frame.size;
         for (int32_t i = 0;; ++i) {
             const double armed = 1.0 - rate * (whole_ + blind);
-            armed_[i] = armed > kLeastArmed ? armed : kLeastArmed;
-            if (i == frame.size) return;
-            const double leaving = mixture_[old], next = mixture_[old - 1];
-            blind += mixture_[bin] - leaving + part_ * (leaving - next);
-            if (++bin == n_) bin = 0;
-            if (++old == n_) old = 0;
+            armed_[i] = static_cast<float>(armed > kLeastArmed ? armed : kLeastArmed);
+            if (i == size) return;
+            const double leaving = old_[i + 1], next = old_[i];
+            blind += static_cast<double>(here_[i]) - leaving + part_ * (leaving - next);
         }
     }
 
@@ -192,25 +249,37 @@ private:
         const PulseFrame& frame = job_.frame;
         const double place = (1.0 - part) * frame.parts;
         const int32_t p = place < frame.parts ? static_cast<int32_t>(place) : frame.parts - 1;
-        const double between = place - p, signal = job_.signal[pixel], dark = job_.background[pixel] / n_;
+        const float between = static_cast<float>(place - p), first = static_cast<float>(1.0 - part);
+        const float signal = static_cast<float>(job_.signal[pixel]);
+        const float dark = static_cast<float>(job_.background[pixel] / n_), early = first * dark;
         const float* low = frame.energy + static_cast<int64_t>(p) * frame.size;
         const float* high = low + frame.size;
         const float* all = frame.energy + static_cast<int64_t>(frame.parts) * frame.size;
-        for (int32_t i = 0; i < frame.size; ++i) {
-            const double photons = signal * all[i] + dark;
-            const double until = signal * (low[i] + between * (high[i] - low[i])) + dark * (1.0 - part);
-            const double from = armed_[i], to = armed_[i + 1], u = photons > 0.0 ? until / photons : 1.0 - part;
-            const double slope = (from - to) / (1.0 - exp_minus(photons)), end = from - slope;
-            const double depleted = (slope * (1.0 - exp_minus(until)) + end * until) / (from - to + end * photons);
-            const double few = u * (from + 0.5 * u * (to - from)) / (0.5 * (from + to));  // A straight
-            moved_[i] = photons > 1e-3 ? depleted : few;
+        for (int32_t i = 0; i < frame.size; i += kLanes) {
+            const int32_t left = frame.size - i;
+            const Float head = load_some(low + i, left);
+            const Float photons = load_some(all + i, left) * signal + dark;
+            const Float until = (head + (load_some(high + i, left) - head) * between) * signal + early;
+            const Float from = load<Float>(armed_ + i), to = load<Float>(armed_ + i + 1), drop = from - to;
+            const Float here = load<Float>(here_ + i);
+            const Float x = minimum(maximum(photons, splat(kFewPhotons)), splat(80.0f)), u = minimum(until, x);
+            const Float slope = drop / one_minus_exp(x, exp_minus(x));
+            const Float depleted =
+                (slope * one_minus_exp(u, exp_minus(u)) + (from - slope) * u) / (drop + (from - slope) * x);
+            const Float share = until / maximum(photons, splat(1e-30f));
+            const Float straight = share * (from - 0.5f * (share * drop)) / (from - 0.5f * drop);
+            const Float ahead = select(photons < kFewPhotons, straight, depleted);
+            const Float kept = minimum(maximum(ahead, splat(0.0f)), splat(1.0f));
+            store(moved_ + i, here - here * kept);
         }
-        int64_t bin = frame.first;
-        for (int32_t i = 0; i < frame.size; ++i) {
-            const double behind = 1.0 - moved_[i];
-            moved_[i] = mixture_[bin] * (behind < 0.0 ? 0.0 : behind > 1.0 ? 1.0 : behind);
-            if (++bin == n_) bin = 0;
-        }
+    }
+
+    // The first of them, and zeros.
+    static MARS_INLINE Float load_some(const float* from, int32_t left) {
+        if (left >= kLanes) return load<Float>(from);
+        alignas(64) float part[kLanes] = {};
+        for (int32_t k = 0; k < left; ++k) part[k] = from[k];
+        return load<Float>(part);
     }
 
     // The same where registrations of the pulse re-arm inside the pulse, and A changes within a bin by more than
@@ -227,7 +296,8 @@ private:
             for (int64_t c = 0; c < k; ++c) mass_[b * k + c] = each;
         }
         for (int64_t c = 0; c <= inside; ++c)
-            fine_[c] = armed_[c / k] + (c < inside ? (armed_[c / k + 1] - armed_[c / k]) * (c % k) / k : 0.0);
+            fine_[c] = armed_[c / k] +
+                       (c < inside ? static_cast<double>(armed_[c / k + 1] - armed_[c / k]) * (c % k) / k : 0.0);
         for (int sweep = 0;; ++sweep) {
             int64_t bin = frame.first;
             for (int32_t i = 0; i < frame.size; ++i) {
@@ -264,33 +334,8 @@ private:
             double behind = mass[cut] * (1.0 - (place - static_cast<double>(cut)));
             for (int64_t c = cut + 1; c < k; ++c) behind += mass[c];
             const double most = mixture_[wrap(frame.first + i)];
-            moved_[i] = behind / rate < most ? behind / rate : most;
+            moved_[i] = static_cast<float>(behind / rate < most ? behind / rate : most);
         }
-    }
-
-    // e^-x for x in [0, 700], to 1e-11 of 1: without libm, so that loops of it use vectors.
-    static MARS_INLINE double exp_minus(double x) {
-        const double limited = x < 700.0 ? x : 700.0;
-        const double shifted = limited * 1.4426950408889634 + 6755399441055744.0;  // 1.5 x 2^52: rounds to integers
-        const double whole = shifted - 6755399441055744.0;
-        const double r = (limited - whole * 0.693147180369123816490) - whole * 1.90821492927058770002e-10;
-        double p = 1.0 / 3628800.0;
-        p = 1.0 / 362880.0 - r * p;
-        p = 1.0 / 40320.0 - r * p;
-        p = 1.0 / 5040.0 - r * p;
-        p = 1.0 / 720.0 - r * p;
-        p = 1.0 / 120.0 - r * p;
-        p = 1.0 / 24.0 - r * p;
-        p = 1.0 / 6.0 - r * p;
-        p = 0.5 - r * p;
-        p = 1.0 - r * p;
-        p = 1.0 - r * p;
-        uint64_t bits;
-        memcpy(&bits, &shifted, sizeof bits);
-        bits = (0x3ffull - bits) << 52;  // the integer is in the lowest bits
-        double power;
-        memcpy(&power, &bits, sizeof power);
-        return p * power;
     }
 
     // Mean of an exponential that goes from a to b.
@@ -303,7 +348,8 @@ private:
     const ShapeJob& job_;
     const int64_t n_;
     float *mixture_, *past_;  // (-1 .. bins]; what leaves each bin for the next
-    double *armed_, *moved_;                                   // the frame: A at its edges; moved to the next bin
+    float *here_, *old_;     // the mixture in the frame; a dead time before it
+    float *armed_, *moved_;  // A at its edges; moved to the next bin
     double *mass_ = nullptr, *below_ = nullptr, *fine_ = nullptr;  // its cells, with `reach_` bins on either side
     double whole_, part_ = 0.0, nearest_ = 0.0, offset_ = 0.0;  // of the dead time: periods; bins
     int64_t back_ = 0, reach_ = 0;

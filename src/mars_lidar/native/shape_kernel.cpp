@@ -9,7 +9,7 @@
 #include <cmath>
 
 #include "poisson_lanes.h"
-#include "shape_alignment.h"
+#include "shape_photons.h"
 
 #define MARS_JOIN2(a, b) a##b
 #define MARS_JOIN(a, b) MARS_JOIN2(a, b)
@@ -25,14 +25,6 @@ constexpr uint32_t kPlaceStep = 0xffffffffu, kRemoveStep = 0xfffffffeu;
 constexpr double kPhotonsPerBin = 0.15;
 // Standard deviations by which the total of a round stays short: of one that another follows, of the last.
 constexpr double kShort = 4.0, kLastShort = 1.25;
-
-struct Lanes32 {
-    alignas(64) uint32_t value[kLanes];
-    constexpr Lanes32() : value() {
-        for (int k = 0; k < kLanes; ++k) value[k] = static_cast<uint32_t>(k);
-    }
-};
-constexpr Lanes32 kLane{};
 
 class Sampler {
 public:
@@ -232,20 +224,38 @@ MARS_NOINLINE void shape_block(ShapeBlock& block) {
     Bump memory{static_cast<char*>(block.memory)};
     Alignment alignment(job, memory);
     Sampler sampler(block, memory);
+    Photons photons(job, alignment, memory);
+    const bool serve = Photons::serve(job);
     for (int64_t p = block.pixel; p < block.pixel + block.pixels; ++p) {
-        alignment.set(p);
         if (block.aligned) {
+            alignment.set(p);
             for (int64_t j = 0; j < job.bins; ++j) block.aligned[p * job.bins + j] = alignment.shape[j];
             continue;
         }
-        sampler.set(alignment.shape);
+        if (serve && p + 1 < block.pixel + block.pixels) photons.expect(p + 1);
+        const bool short_way = serve && photons.set(p);
+        bool formed = false;
         for (int64_t r = block.realization; r < block.realization + block.realizations; ++r) {
             if (*block.stop || block.full) return;
             const uint32_t number = job.first_realization + static_cast<uint32_t>(r);
             const Pair<uint32_t> key = stream_key(job.seed ^ kShapeDomain, number, job.pixel_index[p]);
-            sampler.draw(job.counts[r * job.pixels + p], key, r * job.image + job.place[p]);
+            const int64_t count = job.counts[r * job.pixels + p], at = (r * job.image + job.place[p]) * job.bins;
+            if (short_way && photons.pays(count)) {
+                if (block.wide)
+                    photons.draw(count, key, static_cast<uint32_t*>(block.out) + at);
+                else
+                    photons.draw(count, key, static_cast<uint16_t*>(block.out) + at);
+                continue;
+            }
+            if (!formed) {
+                alignment.set(p);
+                sampler.set(alignment.shape);
+                formed = true;
+            }
+            sampler.draw(count, key, r * job.image + job.place[p]);
         }
     }
+    Photons::written();
 }
 
 }  // namespace MARS_LEVEL

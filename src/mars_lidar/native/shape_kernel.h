@@ -17,6 +17,14 @@ struct PulseFrame {
     const float* energy = nullptr;   // (parts + 1, size): of the pulse, from a bin's start to part p of it
 };
 
+// What the photons drawn one by one need of a row: its bins outside of the frame, in cyclic order from the frame's end,
+// are cut into `kParts` parts of a power of two of bins.
+constexpr int kParts = 31;
+struct RowGuide {
+    float low[kParts + 1];   // least value within a part; at last the sum over the dead time before the frame
+    float high[kParts + 1];  // largest value; at last 1 where the row has been looked at
+};
+
 struct ShapeJob {
     int64_t pixels = 0, realizations = 1;
     uint32_t first_realization = 0;
@@ -34,6 +42,7 @@ struct ShapeJob {
     const double* background = nullptr;
     const double* rate = nullptr;            // (pixels) mean registrations per period
     PulseFrame frame;
+    const RowGuide* guides = nullptr;        // (rows); null: no photons one by one
     const int64_t* counts = nullptr;         // (realizations, pixels)
 };
 
@@ -69,6 +78,13 @@ static inline constexpr int64_t padded_bins(int64_t bins) {
     return (bins + classes - 1) / classes * classes;
 }
 
+// Bins outside of the frame in a part of a guide, as a power of two.
+static inline constexpr int guide_shift(int64_t outside) {
+    int shift = 0;
+    while (static_cast<int64_t>(kParts) << shift < outside) ++shift;
+    return shift;
+}
+
 // Bins on either side of the frame that a dead time of `offset` bins, whole periods apart, reaches.
 static inline int64_t frame_reach(double offset) { return static_cast<int64_t>(offset < 0 ? -offset : offset) + 2; }
 
@@ -87,7 +103,7 @@ void shape_kernel_avx2(ShapeBlock& block);
 void shape_kernel_avx512(ShapeBlock& block);
 #endif
 
-// Work area of one thread: five arrays of the bins, the classes, and the frame.
+// Work area of one thread: six arrays of the bins, the classes, the frame, and photons on their way.
 int64_t shape_memory(const ShapeJob& job);
 
 }  // namespace mars

@@ -23,7 +23,7 @@ namespace mars {
 int64_t shape_memory(const ShapeJob& job) {
     const double offset = (job.dead_time - std::floor(job.dead_time + 0.5)) * job.bins;
     const int64_t cells = job.frame.cells > 1 ? (job.frame.size + 2 * frame_reach(offset)) * job.frame.cells : 0;
-    return padded_bins(job.bins) * 20 + shape_classes(job.bins) * 8 + job.frame.size * 16 + cells * 24 + 4096;
+    return padded_bins(job.bins) * 24 + shape_classes(job.bins) * 8 + job.frame.size * 48 + cells * 24 + 16384;
 }
 
 namespace {
@@ -79,6 +79,7 @@ private:
 
 // A shape job together with the arrays that it points into.
 struct BoundShapeJob : ShapeJob {
+    size_t row_count = 0;
     nb::object arrays;
 };
 
@@ -127,6 +128,64 @@ void sample(const BoundShapeJob& job, Matrix<const int64_t> counts, Matrix<Count
     });
 }
 
+// Least and largest value in the parts of a row outside of the frame, and its sum over the dead time before it.
+void look_at(const ShapeJob& job, int64_t row, RowGuide& guide) {
+    const float* shape = job.shapes + row * job.bins;
+    const int64_t n = job.bins, outside = n - job.frame.size, part = int64_t{1} << guide_shift(outside);
+    int64_t bin = (job.frame.first + job.frame.size) % n;
+    for (int64_t s = 0; s < kParts; ++s) {
+        float low = shape[bin], high = low;
+        int64_t left = std::clamp<int64_t>(outside - s * part, 0, part);
+        guide.low[s] = guide.high[s] = 0.0f;
+        if (left == 0) continue;
+        while (left > 0) {
+            const int64_t here = std::min(left, n - bin);
+            for (int64_t j = bin; j < bin + here; ++j) {
+                low = std::min(low, shape[j]);
+                high = std::max(high, shape[j]);
+            }
+            left -= here;
+            bin = bin + here == n ? 0 : bin + here;
+        }
+        guide.low[s] = low;
+        guide.high[s] = high;
+    }
+    const double whole = std::floor(job.dead_time), back = (job.dead_time - whole) * static_cast<double>(n);
+    int64_t count = static_cast<int64_t>(back);
+    bin = ((job.frame.first - count) % n + n) % n;
+    double blind = (back - static_cast<double>(count)) * static_cast<double>(shape[bin == 0 ? n - 1 : bin - 1]);
+    for (; count > 0; --count) {
+        blind += static_cast<double>(shape[bin]);
+        if (++bin == n) bin = 0;
+    }
+    guide.low[kParts] = static_cast<float>(blind);
+    guide.high[kParts] = 1.0f;
+}
+
+// Guides of the rows that a job's pixels use, where they are missing.
+void guide(BoundShapeJob& job, Matrix<float> guides, size_t rows, int threads) {
+    if (guides.shape(0) != rows || guides.shape(1) != sizeof(RowGuide) / sizeof(float))
+        throw nb::value_error("guides must be (rows, 64)");
+    if (job.shift == nullptr || job.frame.size >= job.bins) return;
+    RowGuide* const all = reinterpret_cast<RowGuide*>(guides.data());
+    std::vector<int64_t> missing;
+    std::vector<bool> seen(rows);
+    for (int64_t k = 0; k < 4 * job.pixels; ++k) {
+        const int64_t row = job.rows[k];
+        if (!(job.weights[k] > 0.0) || all[row].high[kParts] != 0.0f || seen[static_cast<size_t>(row)]) continue;
+        seen[static_cast<size_t>(row)] = true;
+        missing.push_back(row);
+    }
+    run_chunks((static_cast<int64_t>(missing.size()) + 63) / 64, threads, nb::none(),
+               [&](int64_t chunk, const std::atomic<bool>&) {
+                   const size_t last = std::min(missing.size(), static_cast<size_t>(chunk + 1) * 64);
+                   for (size_t k = static_cast<size_t>(chunk) * 64; k < last; ++k)
+                       look_at(job, missing[k], all[missing[k]]);
+               });
+    job.guides = all;
+    job.arrays = nb::make_tuple(job.arrays, guides);
+}
+
 void aligned(const BoundShapeJob& job, Matrix<double> out, const std::string& level) {
     if (static_cast<int64_t>(out.shape(0)) != job.pixels || static_cast<int64_t>(out.shape(1)) != job.bins)
         throw nb::value_error("out must be (pixels, bins)");
@@ -164,6 +223,7 @@ void bind_shape_sampler(nb::module_& module) {
                 self->place = place.data();
                 self->image = image;
                 self->shapes = shapes.data();
+                self->row_count = shapes.shape(0);
                 self->rows = rows.data();
                 self->weights = weights.data();
                 check(*self, shapes.shape(0));
@@ -194,7 +254,12 @@ void bind_shape_sampler(nb::module_& module) {
             },
             nb::kw_only(), nb::arg("shift"), nb::arg("signal"), nb::arg("background"), nb::arg("rate"),
             nb::arg("dead_time"), nb::arg("first"), nb::arg("cells"), nb::arg("energy"),
-            "Move the rows by `shift`, in [0, 1), to the pixels' own delays.");
+            "Move the rows by `shift`, in [0, 1), to the pixels' own delays.")
+        .def(
+            "guide",
+            [](BoundShapeJob& self, Matrix<float> guides, int threads) { guide(self, guides, self.row_count, threads); },
+            nb::kw_only(), nb::arg("guides").noconvert(), nb::arg("threads"),
+            "Let moderate counts be drawn photon by photon: `guides` (rows, 64), zeros at first, are filled as needed.");
     module.def("shape_aligned", &aligned, nb::arg("job"), nb::arg("out").noconvert(), nb::arg("level"),
                "Shapes out (pixels, bins) from which a job's histograms are drawn: for its tests.");
     const char* about = "Histograms out (realizations * image, bins) of counts (realizations, pixels).";

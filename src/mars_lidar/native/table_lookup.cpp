@@ -14,15 +14,60 @@ namespace {
 constexpr int64_t kBlock = 512;  // pixels per chunk
 constexpr int kCumulants = 4;
 
+// Photons per period and their logarithm, which every axis needs.
+struct Flux {
+    double value, log;
+    explicit Flux(double photons) : value(photons), log(photons > 0.0 ? std::log(photons) : 0.0) {}
+};
+
+// 1 / product over i != k of (at[k] - at[i]), of `count` <= 4 coordinates.
+void lagrange_scales(const double* at, int count, double* scale) {
+    for (int k = 0; k < count; ++k) {
+        double product = 1.0;
+        for (int i = 0; i < count; ++i)
+            if (i != k) product *= at[k] - at[i];
+        scale[k] = 1.0 / product;
+    }
+}
+
 // Ascending photons per period; the first may be 0.
 struct Axis {
     const double* value;
     int64_t size;
     std::vector<double> log;
+    int64_t lowest;             // the first that has a logarithm
+    int count;                  // nodes of a cubic in the logarithm
+    std::vector<double> scale;  // (size, 4) of the cubic that begins there
+    std::vector<int64_t> start;  // last node at or below a cell of equal steps in the logarithm, or a later cell's
+    double cells_per_log = 0.0;
 
     explicit Axis(const Vector<const double>& values)
-        : value(values.data()), size(static_cast<int64_t>(values.shape(0))) {
+        : value(values.data()), size(static_cast<int64_t>(values.shape(0))), lowest(size > 1 && value[0] <= 0.0) {
         for (int64_t k = 0; k < size; ++k) log.push_back(value[k] > 0.0 ? std::log(value[k]) : 0.0);
+        count = static_cast<int>(std::min<int64_t>(4, size - lowest));
+        scale.resize(static_cast<size_t>(4 * size));
+        for (int64_t first = lowest; first + count <= size; ++first)
+            lagrange_scales(log.data() + first, count, scale.data() + 4 * first);
+        const int64_t cells = 2 * size;
+        const double range = size > 0 ? log.back() - log[static_cast<size_t>(lowest)] : 0.0;
+        if (!(range > 0.0)) return;
+        cells_per_log = static_cast<double>(cells) / range;
+        int64_t at = lowest;
+        for (int64_t c = 0; c <= cells; ++c) {
+            while (at + 1 < size && (log[at + 1] - log[lowest]) * cells_per_log <= static_cast<double>(c)) ++at;
+            start.push_back(at);
+        }
+    }
+
+    // The last node at or below x; the first for what is below that.
+    int64_t below(const Flux& x) const {
+        if (start.empty() || x.value < value[lowest]) return 0;
+        const int64_t last = static_cast<int64_t>(start.size()) - 1;
+        const double cell = (x.log - log[lowest]) * cells_per_log;
+        int64_t at = start[cell < static_cast<double>(last) ? std::max<int64_t>(0, static_cast<int64_t>(cell)) : last];
+        while (at > lowest && value[at] > x.value) --at;  // rounding
+        while (at + 1 < size && value[at + 1] <= x.value) ++at;
+        return at;
     }
 };
 
@@ -36,46 +81,44 @@ struct Stencil {
 };
 
 // Cubic through up to four nodes at coordinates `at`.
-void lagrange(Stencil& out, const double* at, double x) {
-    for (int k = 0; k < out.count; ++k) {
-        double w = 1.0;
-        for (int i = 0; i < out.count; ++i)
-            if (i != k) w *= (x - at[i]) / (at[k] - at[i]);
-        out.weight[k] = w;
+void lagrange(Stencil& out, const double* at, const double* scale, double x) {
+    double before[5] = {1.0}, behind = 1.0;
+    for (int k = 0; k < out.count; ++k) before[k + 1] = before[k] * (x - at[k]);
+    for (int k = out.count - 1; k >= 0; --k) {
+        out.weight[k] = before[k] * behind * scale[k];
+        behind *= x - at[k];
     }
 }
 
-Stencil stencil(const Axis& axis, double x, bool nearest) {
+Stencil stencil(const Axis& axis, const Flux& x, bool nearest) {
     Stencil out{};
-    const double* end = axis.value + axis.size;
-    const int64_t above = std::upper_bound(axis.value, end, x) - axis.value;
-    out.low = std::clamp<int64_t>(above - 1, 0, axis.size - 1);
+    out.low = axis.below(x);
     out.high = std::min(out.low + 1, axis.size - 1);
     const double left = axis.value[out.low], right = axis.value[out.high];
-    out.fraction = out.high > out.low ? std::clamp((x - left) / (right - left), 0.0, 1.0) : 0.0;
+    out.fraction = out.high > out.low ? std::clamp((x.value - left) / (right - left), 0.0, 1.0) : 0.0;
     if (nearest && out.high > out.low) {
-        const bool up = left > 0.0 ? x * x > left * right : 2.0 * x > right;
+        const bool up = left > 0.0 ? x.value * x.value > left * right : 2.0 * x.value > right;
         out.low = out.high = up ? out.high : out.low;
         out.fraction = 0.0;
     }
-    double at[4];
     if (out.high == out.low || out.fraction == 0.0) {
         out.count = 1;
         out.node[0] = out.low;
         out.weight[0] = 1.0;
     } else if (left == 0.0) {  // no logarithm: cubic in the photons, through nodes of about equal distances
+        double at[4], scale[4];
         for (int64_t k = 0; k < axis.size && out.count < 4; ++k)
             if (axis.value[k] >= out.count * right) {
                 at[out.count] = axis.value[k];
                 out.node[out.count++] = k;
             }
-        lagrange(out, at, x);
+        lagrange_scales(at, out.count, scale);
+        lagrange(out, at, scale, x.value);
     } else {
-        const int64_t lowest = axis.value[0] > 0.0 ? 0 : 1;
-        out.count = static_cast<int>(std::min<int64_t>(4, axis.size - lowest));
-        const int64_t first = std::clamp(out.low - 1, lowest, axis.size - out.count);
+        out.count = axis.count;
+        const int64_t first = std::clamp(out.low - 1, axis.lowest, axis.size - out.count);
         for (int k = 0; k < out.count; ++k) out.node[k] = first + k;
-        lagrange(out, axis.log.data() + first, std::log(x));
+        lagrange(out, axis.log.data() + first, axis.scale.data() + 4 * first, x.log);
     }
     return out;
 }
@@ -119,7 +162,7 @@ struct Lookup {
         }
     }
 
-    void correct(double s, double b, double at, double* out) const {
+    void correct(const Flux& s, const Flux& b, double at, double* out) const {
         const Stencil x = stencil(sub_signal, s, false), y = stencil(sub_background, b, false);
         const int64_t next = std::clamp<int64_t>(std::upper_bound(phase, phase + phases, at) - phase, 1, phases - 1);
         const double t = std::clamp((at - phase[next - 1]) / (phase[next] - phase[next - 1]), 0.0, 1.0);
@@ -132,7 +175,9 @@ struct Lookup {
             }
     }
 
-    void pixel(double s, double b, double at, int64_t* row, double* weight, double* out) const {
+    void pixel(double signal_photons, double background_photons, double at, int64_t* row, double* weight,
+               double* out) const {
+        const Flux s(signal_photons), b(background_photons);
         const Stencil x = stencil(signal, s, nearest), y = stencil(background, b, nearest);
         rows(x, y, row, weight);
         std::fill(out, out + kCumulants, 0.0);
@@ -143,7 +188,7 @@ struct Lookup {
         }
         if (phases > 0 && at > 0.0) {
             if (nearest)
-                correct(signal.value[x.low], background.value[y.low], at, out);
+                correct(Flux(signal.value[x.low]), Flux(background.value[y.low]), at, out);
             else
                 correct(s, b, at, out);
         }

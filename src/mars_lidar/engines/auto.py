@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.engines._feedback_grid import internal_cells
 from mars_lidar.engines.base import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine, internal_bins
+from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
@@ -29,7 +30,7 @@ class AutoEngine(Engine):
 
     Feedback costs the same whatever the exposure, exact the same for every registration. The rule knows the pixel
     and the system only, so that any part of an image has the bits of the whole: more than 4 expected registrations
-    for every internal bin (`internal_bins`) go to feedback, the rest, and what feedback refuses, to exact.
+    for every internal cell (`internal_cells`) go to feedback, the rest, and what feedback refuses, to exact.
 
     Reports ``pixels drawn by exact`` and ``pixels drawn by feedback``. Draws histograms only: of its pixels'
     registrations the feedback engine knows the bins, not the times.
@@ -43,7 +44,7 @@ class AutoEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Feedback where it pays, exact for the rest."""
-        cost = BREAK_EVEN * internal_bins(task.flux, task.system)
+        cost = BREAK_EVEN * internal_cells(task.flux, task.system)
         many = (expected_registrations(task.flux, task.system) > cost).reshape(-1)
         share = float(many.mean())
         first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import mars_lidar as ml
-from harness import PERIOD_NS, Case, require, task_of, two_lobes
+from harness import PERIOD_NS, Case, flux_of, require, task_of, two_lobes
 from mars_lidar import Detector, System, _core
+from mars_lidar.engines._feedback_grid import MOST_CELLS, cell_cuts, internal_cells, near_pulse
 from mars_lidar.engines.auto import AutoEngine, expected_registrations
 from mars_lidar.engines.base import Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import MOST_BINS, FeedbackEngine, internal_bins
+from mars_lidar.engines.feedback import FeedbackEngine
 
 # What is given to other engines
 
@@ -71,17 +72,35 @@ def test_no_dead_time_is_poisson_at_any_length():
     require({"bins": float(stats.chi2.sf(z @ z, z.size))}, "feedback, no dead time")
 
 
-def test_internal_bins():
+def cuts(request: Case) -> tuple[int, int]:
+    merge, parts = cell_cuts(request.flux, request.system)
+    return int(merge[0, 0]), int(parts[0, 0])
+
+
+def test_cells_are_narrow_near_the_pulse_alone():
     fine = case(1.0, 1.0, 0.6375, 1000)
-    assert internal_bins(fine.flux, fine.system)[0, 0] == 384  # 0.26 sigma
-    bright = case(8.0, 1.0, 0.6375, 1000)
-    assert internal_bins(bright.flux, bright.system)[0, 0] == 768
+    assert cuts(fine) == (1, 3)  # 0.26 sigma there, 0.78 sigma elsewhere
+    assert cuts(case(8.0, 1.0, 0.6375, 1000)) == (1, 6)
     longer = fine.system.replace(cycles=100_000_000)
-    assert internal_bins(fine.flux, longer)[0, 0] > 2 * 384
-    dark = case(0.0, 1.0, 0.6375, 1000)
-    assert internal_bins(dark.flux, dark.system)[0, 0] == 128
+    assert cuts(case(1.0, 1.0, 0.6375, 100_000_000)) == (2, 9)
+    near = near_pulse(longer, 2)
+    for centre in (64.0, (0.5 + 0.6375) % 1 * 128):  # 4.75 sigma about the return, and one dead time later
+        assert near[np.arange(int(2 * (centre - 6.08)), int(2 * (centre + 6.08)) + 1)].all()
+    assert near.sum() < 80
+    assert internal_cells(fine.flux, longer)[0, 0] == 256 + 8 * near.sum()
+
+
+def test_cells_are_narrow_everywhere_where_a_pulse_meets_another():
+    assert cuts(case(1.0, 0.5, 0.996, 1500)) == (6, 1)  # its own echo
+    assert cuts(case(0.0, 1.0, 0.6375, 1000)) == (1, 1)
+    returns = Case("two", flux_of([1.0, 0.5], 0.3, [0.2, 0.4]), fine_system(), 1)
+    assert cuts(returns) == (3, 1)
     short = case(0.0, 1.0, 1e-6, 1000)
-    assert internal_bins(short.flux, short.system)[0, 0] > MOST_BINS
+    assert internal_cells(short.flux, short.system)[0, 0] > MOST_CELLS
+
+
+def fine_system() -> System:
+    return case(0, 0, 0.6375, 1000).system
 
 
 # Bits

@@ -46,6 +46,21 @@ def test_constant_rate(rate: float, dead: float, cycles: int, start: str):
     assert law.count_variance == pytest.approx(variance, rel=2e-6)
 
 
+@pytest.mark.parametrize("dead", [0.97, 0.999])
+def test_a_resonance_just_below_the_period_settles_in_any_long_exposure(dead: float):
+    """One pulse blinds until just before the next: locked, but forgotten within a hundred periods; a million here."""
+    at = system(dead, cycles=1_000_000, sigma=0.00375)
+    law = joint_law(10.0, 0.01, at)
+    assert 0 <= law.settled < 200
+    counts = ml.simulate(ml.Flux(10.0, 0.01, 0.5 * PERIOD), at, realizations=150, seed=4).reshape(150, -1).sum(1)
+    square = (counts - law.count_mean) ** 2
+    p = {
+        "mean": float(2 * stats.norm.sf(abs(counts.mean() - law.count_mean) / np.sqrt(law.count_variance / 150))),
+        "variance": float(2 * stats.norm.sf(abs(square.mean() - law.count_variance) / (square.std() / np.sqrt(150)))),
+    }
+    require(p, f"joint law, S 10, B 0.01, t_d {dead}, 1e6 cycles")
+
+
 def test_no_dead_time_is_poisson():
     law = joint_law(1.5, 0.5, system(0.0, cycles=70))
     expected = 70 * photons(1.5, 0.5, system(0.0), 64)

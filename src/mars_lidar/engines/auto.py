@@ -8,19 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.engines._feedback_grid import internal_cells
 from mars_lidar.engines.base import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine, internal_bins
+from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
 
 BREAK_EVEN = 4.0
-"""Registrations per internal bin above which feedback is the faster engine.
+"""Registrations per internal cell above which feedback is the faster engine.
 
-Measured on one core of an AMD EPYC (1024 bins, N_r = 1e3 to 3e4, 0.6 to 32 registrations per bin; processor time, other
-work on the machine): feedback 11-15 ns per internal bin at fluxes up to 1 photon and 22-26 ns up to 5, exact 4.4-5.1 ns
-per registration; they break even at 2.4-3.5 and 4.9-6.1 registrations (AVX2: 2.2-3.3 and 4.2-5.0).
+Measured on one core of an AMD EPYC (1024 bins, N_r = 2e3 to 1.6e4, 1 to 16 registrations per cell; processor time, other
+work on the machine): feedback 10-11 ns per internal cell at fluxes up to 1 photon and 15-17 ns up to 5, exact 3.2-3.8 ns
+per registration; they break even at 2.7-3.2 and 4.7-4.8 registrations (AVX2: 2.2-2.7 and 3.3-3.9).
 """
 
 
@@ -29,7 +30,7 @@ class AutoEngine(Engine):
 
     Feedback costs the same whatever the exposure, exact the same for every registration. The rule knows the pixel
     and the system only, so that any part of an image has the bits of the whole: more than 4 expected registrations
-    for every internal bin (`internal_bins`) go to feedback, the rest, and what feedback refuses, to exact.
+    for every internal cell (`internal_cells`) go to feedback, the rest, and what feedback refuses, to exact.
 
     Reports ``pixels drawn by exact`` and ``pixels drawn by feedback``. Draws histograms only: of its pixels'
     registrations the feedback engine knows the bins, not the times.
@@ -43,7 +44,7 @@ class AutoEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Feedback where it pays, exact for the rest."""
-        cost = BREAK_EVEN * internal_bins(task.flux, task.system)
+        cost = BREAK_EVEN * internal_cells(task.flux, task.system)
         many = (expected_registrations(task.flux, task.system) > cost).reshape(-1)
         share = float(many.mean())
         first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))

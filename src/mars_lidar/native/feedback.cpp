@@ -8,7 +8,7 @@
 #include <nanobind/stl/string.h>
 
 #include "bindings.h"
-#include "feedback_kernel.h"
+#include "feedback_grid.h"
 #include "feedback_photons.h"
 #include "histogram_output.h"
 #include "parallel.h"
@@ -37,38 +37,20 @@ Kernel kernel_of(const std::string& name) {
     throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
 }
 
-FeedbackGrid make_grid(const Job& job, int32_t merge) {
-    FeedbackGrid grid;
-    grid.bins = job.bins * merge;
-    grid.merge = merge;
-    grid.dead_time = job.dead_time;
-    grid.cycles = job.cycles;
-    grid.stationary = job.stationary;
-    grid.whole = static_cast<int32_t>(job.dead_time);
-    const double rest = (job.dead_time - grid.whole) * grid.bins;
-    grid.shift = static_cast<int32_t>(rest + 1e-9);
-    grid.fraction = std::max(0.0, rest - grid.shift);
-    if (grid.fraction < 1e-9) grid.fraction = 0.0;
-    if (grid.shift == 0 && grid.whole > 0) {  // re-armed in the bin of the registration: count a period in bins
-        grid.whole -= 1;
-        grid.shift = grid.bins;
-    }
-    if (grid.shift < 1) throw nb::value_error("merge must make the bins shorter than the dead time");
-    return grid;
-}
-
 template <class Count>
 void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, Vector<const int64_t> pixels,
-               Vector<uint8_t> status, int32_t merge, int threads, const std::string& level,
-               const nb::object& progress) {
+               Vector<uint8_t> status, int32_t merge, int32_t parts, Vector<const uint8_t> narrow, int threads,
+               const std::string& level, const nb::object& progress) {
     check_histogram(job, out);
     if (status.shape(0) != pixels.shape(0)) throw nb::value_error("status must be as long as pixels");
+    if (merge < 1 || parts < 1 || static_cast<int64_t>(narrow.shape(0)) != int64_t{job.bins} * merge)
+        throw nb::value_error("narrow must be (bins * merge)");
     const int64_t number = static_cast<int64_t>(pixels.shape(0));
     for (int64_t k = 0; k < number; ++k)
         if (pixels.data()[k] < 0 || pixels.data()[k] >= job.pixels) throw nb::value_error("pixels must be of the job");
     if (number == 0) return;
     const Kernel kernel = kernel_of(level);
-    const FeedbackGrid grid = make_grid(job, merge);
+    const CellGrid cells(job, merge, parts, narrow.data());
     const PulseEnergy energy(pulse.shape);
     Count* const cube = out.data();
 
@@ -93,9 +75,9 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
             realization[i] = job.first_realization + static_cast<uint32_t>(part);
             rows[i] = cube + (part * job.pixels + pixel) * job.bins;
         }
-        const LanePhotons photons(job, energy, grid, lane_pixel);
+        const LanePhotons photons(job, energy, cells, lane_pixel);
         FeedbackBatch batch{};
-        batch.grid = &grid;
+        batch.grid = &cells.grid;
         batch.first_bin = photons.first_bin;
         batch.dark_photons = photons.dark;
         batch.lit_begin = photons.lit_begin;
@@ -124,14 +106,17 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
 
 void bind_feedback(nb::module_& module) {
     const char* about =
-        "Histograms out (realizations * pixels, bins) of some pixels by cyclic feedback on bins * merge internal bins; "
-        "status (pixels) tells which were refused (not 0: their rows are not written).";
+        "Histograms out (realizations * pixels, bins) of some pixels by cyclic feedback on bins * merge internal "
+        "cells, cut into parts again where narrow (bins * merge) is not 0 (counted from half a period before the "
+        "pixel's strongest return on); status (pixels) tells which were refused (not 0: their rows are not written).";
     module.def("feedback_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("threads"),
-               nb::arg("level") = "", nb::arg("progress").none() = nb::none(), about);
+               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("parts"),
+               nb::arg("narrow"), nb::arg("threads"), nb::arg("level") = "",
+               nb::arg("progress").none() = nb::none(), about);
     module.def("feedback_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("threads"),
-               nb::arg("level") = "", nb::arg("progress").none() = nb::none(), about);
+               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("parts"),
+               nb::arg("narrow"), nb::arg("threads"), nb::arg("level") = "",
+               nb::arg("progress").none() = nb::none(), about);
 }
 
 }  // namespace mars

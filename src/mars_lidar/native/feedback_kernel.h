@@ -9,16 +9,28 @@ namespace mars {
 
 constexpr int kTeam = 32;  // lanes of a batch at every level: two vectors of AVX-512
 
-// One laser period on n internal bins of width 1/n; dead time K + (d + f)/n periods.
+// What lies one dead time (without whole periods) before an edge of the internal grid: the cell from edge `early` to
+// edge `late`, `turns` periods ago, and the share f of it that comes after that instant. RA = C_late - f (C_late -
+// C_early).
+struct FeedbackEdge {
+    int32_t late, early, turns;
+    float part;  // f, 0 <= f < 1
+};
+
+// One laser period on n internal cells; dead time K periods and a rest of at least two cells, at most one period and
+// a cell. All lanes share the grid; theirs is the period from the lane's first bin on. Made by feedback_grid.h.
 struct FeedbackGrid {
-    int32_t bins = 1;        // n
-    int32_t merge = 1;       // internal bins in a bin of the histogram
-    int32_t whole = 0;       // K
-    int32_t shift = 1;       // d, 1 <= d <= n
-    double fraction = 0.0;   // f, 0 <= f < 1
-    double dead_time = 0.0;  // in periods
-    int32_t cycles = 1;
-    bool stationary = false;
+    int32_t cells;             // n
+    int32_t bins;              // of the histogram
+    int32_t whole;             // K
+    int32_t watch;             // cells from here on are within one dead time of the period's end
+    const FeedbackEdge* edge;  // (n + 1)
+    const double* place;       // (n + 1) of the edges, in periods
+    const int32_t* bin_cell;   // (bins + 1) cell that each bin of the histogram begins with
+    const uint8_t* narrow;     // (n) 1: a cell of the finer kind
+    double dead_time;          // in periods
+    int32_t cycles;
+    bool stationary;
 };
 
 enum class FeedbackStatus : uint8_t {
@@ -27,13 +39,13 @@ enum class FeedbackStatus : uint8_t {
     kLocked = 2,  // a count law narrower than whole blind periods resolve
 };
 
-// One batch: kTeam exposures at a time, each lane its own pixel. A lane counts internal bins from a first bin of its
-// own, so that the pulses of different pixels lie in the same bins.
+// One batch: kTeam exposures at a time, each lane its own pixel. A lane counts cells from a first bin of its own, so
+// that the pulses of different pixels lie in the same cells.
 struct FeedbackBatch {
     const FeedbackGrid* grid;
-    const int32_t* first_bin;     // (kTeam): place in the period of the lane's bin 0, a multiple of `merge`
-    const double* dark_photons;   // (kTeam): per period in a bin without signal
-    int32_t lit_begin, lit_end;   // bins that may have signal ...
+    const int32_t* first_bin;     // (kTeam): bin of the histogram that the lane's period begins with
+    const double* dark_photons;   // (2, kTeam): per period in a cell without signal, of the wide and the narrow kind
+    int32_t lit_begin, lit_end;   // cells that may have signal ...
     const double* lit_photons;    // ... (lit_end - lit_begin, kTeam): theirs, background included
     const uint32_t* pixel_index;  // (kTeam)
     const uint32_t* realization;  // (kTeam): of the first draw

@@ -11,14 +11,14 @@ template <class Count>
 MARS_NOINLINE bool write_counts(const FeedbackBatch& batch, const int32_t* sums, const bool* drawing, int32_t draw) {
     constexpr int32_t kBlock = 32;
     const FeedbackGrid& grid = *batch.grid;
-    const int32_t bins = grid.bins / grid.merge;
+    const int32_t bins = grid.bins;
     uint32_t largest = 0;
     alignas(64) Count block[kTeam][kBlock];
     for (int32_t first = 0; first < bins; first += kBlock) {
         const int32_t count = bins - first < kBlock ? bins - first : kBlock;
         for (int32_t b = 0; b < count; ++b) {
-            const int32_t* from = sums + static_cast<int64_t>(first + b) * grid.merge * kTeam;
-            const int32_t* to = from + static_cast<int64_t>(grid.merge) * kTeam;
+            const int32_t* from = sums + static_cast<int64_t>(grid.bin_cell[first + b]) * kTeam;
+            const int32_t* to = sums + static_cast<int64_t>(grid.bin_cell[first + b + 1]) * kTeam;
             for (int i = 0; i < kTeam; ++i) {
                 const uint32_t counts = static_cast<uint32_t>(to[i]) - static_cast<uint32_t>(from[i]);
                 largest = drawing[i] && counts > largest ? counts : largest;
@@ -28,7 +28,7 @@ MARS_NOINLINE bool write_counts(const FeedbackBatch& batch, const int32_t* sums,
         for (int i = 0; i < kTeam; ++i) {
             if (!drawing[i]) continue;
             Count* out = static_cast<Count*>(batch.rows[i]) + static_cast<int64_t>(draw) * batch.row_step;
-            int32_t to = first + batch.first_bin[i] / grid.merge;
+            int32_t to = first + batch.first_bin[i];
             if (to >= bins) to -= bins;
             const int32_t straight = bins - to < count ? bins - to : count;
             memcpy(out + to, block[i], sizeof(Count) * static_cast<size_t>(straight));

@@ -1,10 +1,10 @@
-// Expected photons per period in the internal bins of a batch's pixels.
+// Expected photons per period in the internal cells of a batch's pixels.
 #pragma once
 #include <algorithm>
 #include <cmath>
 #include <vector>
 
-#include "feedback_kernel.h"
+#include "feedback_grid.h"
 #include "job.h"
 #include "pulse.h"
 
@@ -70,19 +70,22 @@ private:
 class LanePhotons {
 public:
     int32_t first_bin[kTeam];
-    double dark[kTeam];
+    double dark[2 * kTeam];
     int32_t lit_begin, lit_end;
     std::vector<double> lit;  // (lit_end - lit_begin, kTeam)
 
-    LanePhotons(const Job& job, const PulseEnergy& energy, const FeedbackGrid& grid, const int64_t* pixels)
-        : n_(grid.bins), reach_low_(energy.low() * n_), reach_high_(energy.high() * n_) {
+    LanePhotons(const Job& job, const PulseEnergy& energy, const CellGrid& cells, const int64_t* pixels)
+        : grid_(cells.grid), low_(energy.low()), high_(energy.high()) {
         for (int i = 0; i < kTeam; ++i) {
-            first_bin[i] = place(job, grid, pixels[i]);
-            dark[i] = job.background[pixels[i]] / n_;
+            first_bin[i] = place(job, pixels[i]);
+            dark[i] = job.background[pixels[i]] * cells.widths[0];
+            dark[kTeam + i] = job.background[pixels[i]] * cells.widths[1];
         }
         set_range(job, pixels);
-        lit.resize(static_cast<size_t>(lit_end - lit_begin) * kTeam);
-        for (size_t at = 0; at < lit.size(); ++at) lit[at] = dark[at % kTeam];
+        for (int32_t j = lit_begin; j < lit_end; ++j) {
+            const double* level = dark + kTeam * grid_.narrow[j];
+            lit.insert(lit.end(), level, level + kTeam);
+        }
         for (int i = 0; i < kTeam; ++i) {
             for (int64_t k = 0; k < job.returns; ++k) {
                 const double photons = job.signal[k * job.pixels + pixels[i]];
@@ -95,71 +98,84 @@ public:
 private:
     static double phase(double periods) { return periods - std::floor(periods); }
 
-    static int32_t place(const Job& job, const FeedbackGrid& grid, int64_t pixel) {
+    static int32_t place(const Job& job, int64_t pixel) {
         if (job.returns == 0) return 0;
         int64_t strongest = 0;
         for (int64_t k = 1; k < job.returns; ++k)
             if (job.signal[k * job.pixels + pixel] > job.signal[strongest * job.pixels + pixel]) strongest = k;
         const int32_t bin = static_cast<int32_t>(phase(job.delay[strongest * job.pixels + pixel]) * job.bins);
         const int32_t begin = bin - job.bins / 2;
-        return (begin < 0 ? begin + job.bins : begin) % job.bins * grid.merge;
+        return (begin < 0 ? begin + job.bins : begin) % job.bins;
     }
 
-    // Delay of a return in internal bins after the lane's first one.
+    // Delay of a return in periods after the lane's begin.
     double offset(const Job& job, int64_t k, int64_t pixel, int lane) const {
-        const double at = phase(job.delay[k * job.pixels + pixel]) * n_ - first_bin[lane];
-        return at < 0.0 ? at + n_ : at;
+        const double at = phase(job.delay[k * job.pixels + pixel]) - static_cast<double>(first_bin[lane]) / job.bins;
+        return at < 0.0 ? at + 1.0 : at;
+    }
+
+    // The cell that holds an instant of [0, 1).
+    int32_t cell(double at) const {
+        const int32_t bin = std::min(static_cast<int32_t>(at * grid_.bins), grid_.bins - 1);
+        int32_t j = grid_.bin_cell[bin];
+        while (j + 1 < grid_.cells && grid_.place[j + 1] <= at) ++j;
+        while (grid_.place[j] > at) --j;
+        return j;
     }
 
     void set_range(const Job& job, const int64_t* pixels) {
-        lit_begin = job.waveform ? 0 : n_;
-        lit_end = job.waveform ? n_ : 0;
+        lit_begin = job.waveform ? 0 : grid_.cells;
+        lit_end = job.waveform ? grid_.cells : 0;
+        bool round = false;  // a pulse goes on at the other end
         for (int i = 0; i < kTeam; ++i)
             for (int64_t k = 0; k < job.returns; ++k) {
                 if (!(job.signal[k * job.pixels + pixels[i]] > 0.0)) continue;
                 const double at = offset(job, k, pixels[i], i);
-                const double low = std::floor(at + reach_low_), high = std::floor(at + reach_high_) + 1.0;
-                lit_begin = std::min(lit_begin, static_cast<int32_t>(std::max(-1.0, low)));
-                lit_end = std::max(lit_end, static_cast<int32_t>(std::min(n_ + 1.0, high)));
+                round = round || at + low_ < 0.0 || at + high_ >= 1.0;
+                if (round) break;
+                lit_begin = std::min(lit_begin, cell(at + low_));
+                lit_end = std::max(lit_end, cell(at + high_) + 1);
             }
-        if (lit_begin < 0 || lit_end > n_) {  // a pulse goes on at the other end
+        if (round) {
             lit_begin = 0;
-            lit_end = n_;
+            lit_end = grid_.cells;
         }
         if (lit_end <= lit_begin) lit_begin = lit_end = 0;
     }
 
     void add_return(const PulseEnergy& energy, double photons, double at, int lane) {
-        const int64_t first = static_cast<int64_t>(std::floor(at + reach_low_));
-        const int64_t last = static_cast<int64_t>(std::floor(at + reach_high_));
-        const double width = 1.0 / n_;
-        int64_t bin = (first % n_ + n_) % n_;
-        double from = (static_cast<double>(first) - at) * width, below = energy.below(from);
-        for (int64_t edge = first; edge <= last; ++edge) {
-            const double to = (static_cast<double>(edge + 1) - at) * width, next = energy.below(to);
+        const double begin = at + low_, end = at + high_;
+        double turn = std::floor(begin);  // periods of the edge to come
+        int32_t j = cell(begin - turn);
+        double from = turn + grid_.place[j] - at, below = energy.below(from);
+        while (turn + grid_.place[j] < end) {
+            const double to = turn + grid_.place[j + 1] - at, next = energy.below(to);
             const double more = photons * energy.between(from, to, below, next);
-            if (more > 0.0) lit[static_cast<size_t>((bin - lit_begin) * kTeam + lane)] += more;
+            if (more > 0.0) lit[static_cast<size_t>((j - lit_begin) * kTeam + lane)] += more;
             from = to;
             below = next;
-            if (++bin == n_) bin = 0;
+            if (++j == grid_.cells) {
+                j = 0;
+                turn += 1.0;
+            }
         }
     }
 
-    // A rate that is constant on samples: photons before a bin's edge, differenced.
+    // A rate that is constant on samples: photons before a cell's edge, differenced.
     void add_waveform(const Job& job, int64_t pixel, int lane) {
         const double* photons = job.waveform + pixel * job.samples;
-        const double scale = static_cast<double>(job.samples) / n_;
-        for (int32_t bin = 0; bin < n_; ++bin) {
-            const double from = bin * scale, to = (bin + 1) * scale;
+        const double scale = static_cast<double>(job.samples);
+        for (int32_t j = 0; j < grid_.cells; ++j) {
+            const double from = grid_.place[j] * scale, to = grid_.place[j + 1] * scale;
             double sum = 0.0;
             for (int64_t k = static_cast<int64_t>(from); k < job.samples && static_cast<double>(k) < to; ++k)
                 sum += photons[k] * (std::min(to, k + 1.0) - std::max(from, static_cast<double>(k)));
-            lit[static_cast<size_t>(bin) * kTeam + lane] += std::max(0.0, sum);
+            lit[static_cast<size_t>(j) * kTeam + lane] += std::max(0.0, sum);
         }
     }
 
-    const int32_t n_;
-    const double reach_low_, reach_high_;
+    const FeedbackGrid& grid_;
+    const double low_, high_;  // extent of the pulse
 };
 
 }  // namespace mars

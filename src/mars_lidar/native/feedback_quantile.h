@@ -1,4 +1,4 @@
-// The count of a bin as a function of its mean, for one uniform number: H = max(0, ceil(alpha mu + beta)).
+// The count of a cell as a function of its mean, for one uniform number: H = max(0, ceil(alpha mu + beta)).
 //
 // The law is a binomial's of mean mu and variance s^2, that is, of p' = 1 - s^2 / mu and mu / p' trials. Below a mean
 // of 6 its quantile comes from the sums of its terms, above from the Cornish-Fisher expansion. Between sweeps mu moves
@@ -13,7 +13,7 @@ inline namespace MARS_LEVEL {
 constexpr float kInversionBelow = 6.0f;
 constexpr int kMostTerms = 48;  // a mean of 6 exceeds it with a probability of 1e-26
 
-// The uniform numbers of a bin, one per lane.
+// The uniform numbers of a cell, one per lane.
 struct Uniforms {
     alignas(64) float above[kTeam];   // P(quantile exceeded): uniform on (0, 1), fine near 0
     alignas(64) float normal[kTeam];  // the normal number of the same probability
@@ -29,15 +29,14 @@ struct Uniforms {
     }
 };
 
-// Cornish-Fisher to the third cumulant and the kurtosis of a binomial; the "- 2" holds the lattice's 1/12. `slope`: its
-// derivative with respect to the mean, variance / mean kept.
-template <class Real>
-MARS_INLINE Real expansion(Real mean, Real variance, Real z, Real& slope) {
-    const Real s = root(variance), per_mean = Real(1) / mean, per_s = Real(1) / s;
-    const Real keep = variance * per_mean, p = Real(1) - keep, pq = p * keep, square = z * z;
-    slope = Real(1) + Real(0.5) * z * s * per_mean;
-    return mean + s * z + (Real(1) - Real(2) * p) * (square - Real(1)) * Real(1.0 / 6) +
-           z * ((Real(14) * pq - Real(2)) - square * (Real(1) + Real(2) * pq)) * (per_s * Real(1.0 / 72)) - Real(0.5);
+// Quantile less mean: Cornish-Fisher to the third cumulant and the kurtosis of a binomial; the "- 2" holds the
+// lattice's 1/12, the 1/2 makes it what is to be rounded up. `growth`: what it gains as the mean grows by itself,
+// variance / mean kept.
+MARS_INLINE float excess(float mean, float variance, float z, float& growth) {
+    const float s = root(variance), keep = variance / mean, p = 1.0f - keep, pq = p * keep, square = z * z;
+    growth = 0.5f * z * s;
+    return s * z + (1.0f - 2.0f * p) * (square - 1.0f) * (1.0f / 6.0f) +
+           z * ((14.0f * pq - 2.0f) - square * (1.0f + 2.0f * pq)) * ((1.0f / 72.0f) / s) - 0.5f;
 }
 
 // Terms of the binomial up to the one that the uniform number falls into.
@@ -46,16 +45,15 @@ struct Terms {
     alignas(64) float beyond[kTeam], above[kTeam];   // P(H > k), P(H > k - 1)
     alignas(64) float count[kTeam];                  // k
 
-    template <class Real>
-    MARS_INLINE void sum(const Real* mean, const Real* variance, const float* uniform) {
+        MARS_INLINE void sum(const float* mean, const float* variance, const float* uniform) {
         alignas(64) float trials[kTeam], odds[kTeam], limit[kTeam], chance[kTeam], exponent[kTeam];
         int32_t large = 0;
         for (int i = 0; i < kTeam; ++i) {
-            const bool few = mean[i] < Real(kInversionBelow), dark = !(mean[i] > Real(1e-25));
-            const float mu = few ? (dark ? 1e-25f : static_cast<float>(mean[i])) : 1.0f;
+            const bool few = mean[i] < kInversionBelow, dark = !(mean[i] > 1e-25f);
+            const float mu = few ? (dark ? 1e-25f : mean[i]) : 1.0f;
             const float per_mean = 1.0f / mu;
-            const float keep = few && !dark ? static_cast<float>(variance[i]) * per_mean : 1.0f;
-            const float spare = few && !dark ? static_cast<float>(mean[i] - variance[i]) * per_mean : 0.0f;
+            const float keep = few && !dark ? variance[i] * per_mean : 1.0f;
+            const float spare = few && !dark ? (mean[i] - variance[i]) * per_mean : 0.0f;
             const float p = spare > 1e-9f ? spare : 1e-9f;
             trials[i] = mu / p;
             odds[i] = p / (keep > 1e-7f ? keep : 1e-7f);
@@ -105,25 +103,22 @@ private:
     }
 };
 
-template <class Real>
-MARS_INLINE bool any_few(const Real* mean) {
+MARS_INLINE bool any_few(const float* mean) {
     int32_t some = 0;
-    for (int i = 0; i < kTeam; ++i) some |= mean[i] < Real(kInversionBelow) ? 1 : 0;
+    for (int i = 0; i < kTeam; ++i) some |= mean[i] < kInversionBelow ? 1 : 0;
     return some != 0;
 }
 
-// alpha and beta of a bin, for all lanes.
-template <class Real>
-MARS_INLINE void follow_quantile(const Real* mean, const Real* variance, const Uniforms& uniforms, Real* alpha,
-                                 Real* beta) {
+// alpha and beta of a cell, for all lanes.
+MARS_INLINE void follow_quantile(const float* mean, const float* variance, const Uniforms& uniforms, float* alpha,
+                                 float* beta) {
     for (int i = 0; i < kTeam; ++i) {
-        const Real mu = mean[i] > Real(1) ? mean[i] : Real(1), least = mu * Real(1e-7);
-        const Real var = variance[i] > least ? variance[i] : least;
-        const Real z = static_cast<Real>(uniforms.normal[i]);
-        Real slope;
-        const Real x = expansion(mu, var, z, slope);
-        alpha[i] = slope;
-        beta[i] = x - slope * mu;
+        const float mu = mean[i] > 1.0f ? mean[i] : 1.0f, least = mu * 1e-7f;
+        const float var = variance[i] > least ? variance[i] : least;
+        float growth;
+        const float more = excess(mu, var, uniforms.normal[i], growth);
+        alpha[i] = 1.0f + growth / mu;
+        beta[i] = more - growth;
     }
     if (!any_few(mean)) return;
     Terms terms;
@@ -132,35 +127,37 @@ MARS_INLINE void follow_quantile(const Real* mean, const Real* variance, const U
         const bool none = terms.count[i] == 0.0f;
         const float term = terms.term[i] > 1e-12f ? terms.term[i] : 1e-12f;
         const float before = none ? 1.0f : (terms.before[i] > 1e-12f ? terms.before[i] : 1e-12f);
-        // how far the mean is below the next count's threshold and above this one's: d P(H > k) / d mu = P(H = k)
-        float up = (uniforms.above[i] - terms.beyond[i]) / term;
+        // How far the mean is below the next count's threshold, and above this one's: d P(H > k) / d mu = P(H = k), and
+        // its derivative P(H = k - 1) - P(H = k). Without the second order E H^2 would lack the variance of mu.
+        const float past = (uniforms.above[i] - terms.beyond[i]) / term, ratio = none ? 0.0f : before / term;
+        const float short_of = (terms.above[i] - uniforms.above[i]) / before, k = terms.count[i];
+        float up = past / (1.0f + 0.5f * (ratio - 1.0f) * past);
         up = up > 1e-6f ? (up < 1e3f ? up : 1e3f) : 1e-6f;
-        float down = (terms.above[i] - uniforms.above[i]) / before;
+        float down = short_of / (1.0f - 0.5f * ((k - 1.0f) / (mean[i] > 1e-3f ? mean[i] : 1e-3f) - 1.0f) * short_of);
         down = down > 0.0f ? (down < 1e3f ? down : 1e3f) : 0.0f;
         const float slope = none ? 1.0f : 1.0f / (up + down);
-        const bool few = mean[i] < Real(kInversionBelow);
-        alpha[i] = few ? static_cast<Real>(slope) : alpha[i];
-        beta[i] = few ? static_cast<Real>(terms.count[i] - slope * (static_cast<float>(mean[i]) + up)) : beta[i];
+        const bool few = mean[i] < kInversionBelow;
+        alpha[i] = few ? slope : alpha[i];
+        beta[i] = few ? k - slope * (mean[i] + up) : beta[i];
     }
 }
 
 // The count itself, for all lanes.
-template <class Real>
-MARS_INLINE void quantile(const Real* mean, const Real* variance, const Uniforms& uniforms, int32_t* count) {
+MARS_INLINE void quantile(const float* mean, const float* variance, const Uniforms& uniforms, int32_t* count) {
     for (int i = 0; i < kTeam; ++i) {
-        const Real mu = mean[i] > Real(1) ? mean[i] : Real(1), least = mu * Real(1e-7);
-        const Real var = variance[i] > least ? variance[i] : least;
-        Real slope;
-        const Real x = expansion(mu, var, static_cast<Real>(uniforms.normal[i]), slope);
+        const float mu = mean[i] > 1.0f ? mean[i] : 1.0f, least = mu * 1e-7f;
+        const float var = variance[i] > least ? variance[i] : least;
+        float growth;
+        const float x = mu + excess(mu, var, uniforms.normal[i], growth);
         const int32_t down = static_cast<int32_t>(x);
-        const int32_t up = down + (x > static_cast<Real>(down) ? 1 : 0);
+        const int32_t up = down + (x > static_cast<float>(down) ? 1 : 0);
         count[i] = up > 0 ? up : 0;
     }
     if (!any_few(mean)) return;
     Terms terms;
     terms.sum(mean, variance, uniforms.above);
     for (int i = 0; i < kTeam; ++i)
-        count[i] = mean[i] < Real(kInversionBelow) ? static_cast<int32_t>(terms.count[i]) : count[i];
+        count[i] = mean[i] < kInversionBelow ? static_cast<int32_t>(terms.count[i]) : count[i];
 }
 
 }  // namespace MARS_LEVEL

@@ -75,6 +75,12 @@ def _joint_covariance(request: Request) -> list[Path]:
     return run(request)
 
 
+def _long_exposures(request: Request) -> list[Path]:
+    from mars_lidar.studies.long_exposures import run
+
+    return run(request)
+
+
 def _count_law(request: Request) -> list[Path]:
     from mars_lidar.studies.count_law_report import run
 
@@ -118,6 +124,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
         "the histogram's covariance in closed form against simulation; --data adds reference cases",
         _joint_covariance,
     ),
+    "long-exposures": ("the feedback engine at a million cycles and more against the closed form", _long_exposures),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "detectors": ("what each mode of a detector does to the same flux, simulated and in closed form", _detectors),
     "matched": ("a law of the count from four cumulants: total variation to the exact law", _matched),

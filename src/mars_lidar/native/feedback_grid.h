@@ -1,0 +1,82 @@
+// The internal grid of the feedback engine: the histogram's bins cut into base cells, some of them cut again.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "bindings.h"
+#include "feedback_kernel.h"
+
+namespace mars {
+
+class CellGrid {
+public:
+    FeedbackGrid grid;
+    double widths[2];  // of the wide and the narrow cells, in periods
+
+    // `narrow` (bins * merge): base cells that are cut into `parts`.
+    CellGrid(const Job& job, int32_t merge, int32_t parts, const uint8_t* narrow) {
+        const int32_t base = job.bins * merge;
+        widths[0] = 1.0 / base;
+        widths[1] = widths[0] / parts;
+        for (int32_t b = 0; b < base; ++b) {
+            if (b % merge == 0) bin_cell_.push_back(static_cast<int32_t>(place_.size()));
+            first_.push_back(static_cast<int32_t>(place_.size()));
+            const int32_t cuts = narrow[b] ? parts : 1;
+            for (int32_t s = 0; s < cuts; ++s) {
+                place_.push_back((b + static_cast<double>(s) / cuts) / base);
+                narrow_.push_back(narrow[b] ? 1 : 0);
+            }
+        }
+        grid.cells = static_cast<int32_t>(place_.size());
+        bin_cell_.push_back(grid.cells);
+        first_.push_back(grid.cells);
+        place_.push_back(1.0);
+
+        grid.bins = job.bins;
+        grid.dead_time = job.dead_time;
+        grid.cycles = job.cycles;
+        grid.stationary = job.stationary;
+        grid.whole = static_cast<int32_t>(job.dead_time);
+        double rest = (job.dead_time - grid.whole) * base;  // in base cells
+        if (rest < 1.0 - 1e-9 && grid.whole > 0) {  // re-armed in the cell of the registration: count a period in cells
+            grid.whole -= 1;
+            rest += base;
+        }
+        set_edges(base, rest);
+        grid.edge = edge_.data();
+        grid.place = place_.data();
+        grid.bin_cell = bin_cell_.data();
+        grid.narrow = narrow_.data();
+    }
+    CellGrid(const CellGrid&) = delete;
+    CellGrid& operator=(const CellGrid&) = delete;
+
+private:
+    void set_edges(int32_t base, double rest) {
+        grid.watch = grid.cells;
+        for (int32_t e = 0; e <= grid.cells; ++e) {
+            const double back = place_[static_cast<size_t>(e)] * base - rest;
+            // the base cell that ends at this instant or contains it, then the part of it
+            int32_t b = static_cast<int32_t>(std::ceil(back - 1e-9)) - 1, turns = 0;
+            const double inside = back - b;
+            for (; b < 0; b += base) ++turns;
+            const int32_t first = first_[static_cast<size_t>(b)];
+            const int32_t cuts = first_[static_cast<size_t>(b) + 1] - first;
+            const int32_t s = std::max(0, static_cast<int32_t>(std::ceil(inside * cuts - 1e-9)) - 1);
+            const double part = s + 1 - inside * cuts;
+            const FeedbackEdge edge{first + s + 1, first + s, turns, part > 1e-9 ? static_cast<float>(part) : 0.0f};
+            if (turns == 0 && edge.late >= e)
+                throw nb::value_error("merge must make the cells shorter than the dead time");
+            if (turns > 0 && edge.early < grid.watch) grid.watch = edge.early;
+            edge_.push_back(edge);
+        }
+    }
+
+    std::vector<int32_t> bin_cell_, first_;
+    std::vector<double> place_;
+    std::vector<uint8_t> narrow_;
+    std::vector<FeedbackEdge> edge_;
+};
+
+}  // namespace mars

@@ -161,6 +161,7 @@ def test_commands(tmp_path, times):
         ("validate", source, "--cycles", 300, "--free", "--pulse-sigma-ns", 1),
         ("validate", source, "--cycles", 30_000),
         ("inspect", source, "--pixel", "a"),
+        ("inspect", source, "--pixel", "0,1"),
         ("inspect", tmp_path / "none.ptu"),
         ("calibrate", source, "--free", "-o", tmp_path / "other.yaml"),
         ("calibrate", source, "--hold-off-ns", 3),

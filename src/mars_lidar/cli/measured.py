@@ -271,6 +271,8 @@ def _loaded(
         y, x = (int(k) for k in np.unravel_index(int(times.counts.argmax()), times.shape))
     else:
         y, x = asked
+        if not (0 <= y < height and 0 <= x < width):
+            raise ValueError(f"--pixel must lie in y 0 to {height - 1}, x 0 to {width - 1}, got ({y}, {x})")
     one = times.pixel(y, x)
     if height * width > 1:
         how = ", the brightest" if asked is None else ""

@@ -96,4 +96,6 @@ def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
 
 
 def _short(name: str) -> str:
-    return name.replace(", drawn photon by photon", "").replace("electronics dead", "electronics")
+    for long, short in ((", drawn photon by photon", ""), ("electronics dead 85 ns,", "electronics 85,")):
+        name = name.replace(long, short)
+    return name

@@ -1,6 +1,7 @@
 """mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
 
 from mars_lidar._version import __version__
+from mars_lidar.dataset.run import Generated, generate
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.scene import Scene
@@ -22,6 +23,7 @@ __all__ = [
     "Detector",
     "Flux",
     "GaussianPulse",
+    "Generated",
     "JointLaw",
     "Lookup",
     "Pulse",
@@ -33,6 +35,7 @@ __all__ = [
     "Timestamps",
     "__version__",
     "count_law",
+    "generate",
     "holding_time_covariance",
     "joint_law",
     "registration_pdf",

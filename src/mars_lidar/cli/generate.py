@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -160,6 +161,37 @@ def verify(
         for line in told.different:
             say(line)
         raise typer.Exit(FAILED)
+
+
+def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
+    """What `mars-lidar info` tells of a dataset; None for anything else."""
+    from mars_lidar.dataset.store import is_dataset, open_dataset
+
+    if not is_dataset(path):
+        return None
+    stored = open_dataset(path, allow_incomplete=True)
+    rows = [("file", f"{path} (mars-lidar {stored.attrs['version']})")]
+    if not stored.planned:
+        return [*rows, ("complete", "NO: stopped before its scenes were in; generate it again with --resume")]
+    left = [] if stored.complete else stored.missing()
+    total = sum(1 for _ in stored.items())
+    array, recipe = stored.histogram, stored.recipe
+    levels = ", ".join(f"{s:g}/{b:g}" for s, b in recipe.light.levels[:8])
+    problems = len(stored.problems)
+    return [
+        *rows,
+        ("complete", f"NO: {total - len(left)} of {total} parts are there; continue with --resume" if left else "yes"),
+        ("counts", f"{_shape(array.shape)} {array.dtype}, {recipe.layout}"),
+        ("size", f"{_bytes(math.prod(array.shape) * array.dtype.itemsize)} dense, {_bytes(_on_disk(path))} on disk"),
+        ("chunk", f"{_shape(array.chunks)} of a shard of {_shape(array.shards)}"),
+        ("engine", f"{recipe.engine}, seed {recipe.seed}"),
+        *((f"system {k}", one.to_json()) for k, one in enumerate(recipe.systems)),
+        ("light", f"signal/sbr {levels}{', ...' if len(recipe.light.levels) > 8 else ''}"),
+        ("scenes", ", ".join(json.dumps(one) for one in recipe.scenes)),
+        ("left out", f"{problems} files" if problems else "nothing"),
+        *(("", str(problem)) for problem in stored.problems[:20]),
+        ("open with", f"xarray.open_zarr({str(path)!r})"),
+    ]
 
 
 def _recipe(

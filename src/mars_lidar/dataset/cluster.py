@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mars_lidar.dataset.write import Made, Maker
 
 _AHEAD = 3  # parts given out per worker thread: none waits for the scheduler, and a million are not queued at once
+TIMEOUT_S = 20.0  # for a scheduler to answer
 _local = threading.local()
 
 
@@ -74,7 +75,7 @@ def make_part(path: str, run: str, item: Item, threads: int) -> Made:
 
 def _client(distributed: Any, address: str) -> Any:
     try:
-        return distributed.Client(address, timeout=20)
+        return distributed.Client(address, timeout=TIMEOUT_S)
     except (OSError, TimeoutError, ValueError) as error:
         raise ValueError(f"scheduler must be the address of a dask scheduler, got {address!r}: {error}") from error
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +41,10 @@ def read_yaml(path: Path) -> tuple[Any, dict[Key, int]]:
 
 def line_of(key: Key, message: str, lines: dict[Key, int]) -> int | None:
     """Line of a key, or of what stands nearest above it; a key below it that `message` names comes first."""
-    below = [k for k in lines if k[:-1] == key and isinstance(k[-1], str)]
-    named = [k for k in below if k[-1] in message.replace("'", " ").replace(":", " ").split()]
-    if named:
-        return lines[named[0]]
+    unknown = re.search(r"unknown key '(.*?)'", message)
+    for word in [unknown[1]] if unknown else re.findall(r"\w+", message):
+        if (*key, word) in lines:
+            return lines[(*key, word)]
     while key and key not in lines:
         key = key[:-1]
     return lines.get(key)

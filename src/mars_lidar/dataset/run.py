@@ -139,6 +139,9 @@ def generate(
                 dataset = open_dataset(target, allow_incomplete=True)
             dataset.tidy()
             todo = [] if dataset.complete else dataset.missing()
+            for item in todo:
+                for damaged in dataset.files(item):  # else Zarr would read it before it is replaced
+                    damaged.unlink(missing_ok=True)
             before = sum(1 for _ in dataset.items()) - len(todo)
             totals = _Totals(before, before + len(todo), progress)
             if workers is not None or scheduler is not None:

@@ -165,6 +165,15 @@ def _whole(file: Path, chunks: int) -> bool:
     return int(google_crc32c.value(index[:-4])) == int.from_bytes(index[-4:], "little")
 
 
+def is_dataset(path: str | Path) -> bool:
+    """Whether a folder is a dataset, complete or not."""
+    try:
+        root = json.loads((Path(path) / "zarr.json").read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(root, dict) and root.get("attributes", {}).get("format") == FORMAT
+
+
 def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset:
     """Open a dataset that `mars_lidar.generate` wrote.
 

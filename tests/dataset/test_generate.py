@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
-from dataset.conftest import SYSTEM, files
 from typer.testing import CliRunner
 
 import mars_lidar as ml
+from dataset.conftest import SYSTEM, files
 from mars_lidar import io
 from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, read_sparse, verify
@@ -99,12 +99,15 @@ def test_bad_files_are_told_and_left_out(tmp_path, recipe):
     assert done.shape[0] == 2 * 4
     assert [one.path.name[0] for one in done.problems] == ["b", "d", "e", "f", "g"]
     told = [one.reason for one in done.problems]
-    assert "cannot be read" in told[0] and "24 × 10 pixels" in told[3] and "zero at every pixel" in told[4]
+    assert "cannot be read" in told[0]
+    assert "24 × 10 pixels" in told[3]
+    assert "zero at every pixel" in told[4]
     assert [Path(name).name for name in open_dataset(tmp_path / "set.zarr").scene_names()] == [
         "a_depth.png", "c_depth.png",
     ]  # fmt: skip
     ran = CliRunner().invoke(app, ["info", str(tmp_path / "set.zarr")])
-    assert ran.exit_code == 0 and "f_depth.png" in ran.stdout
+    assert ran.exit_code == 0
+    assert "f_depth.png" in ran.stdout
     for name in ("a", "c", "f"):
         (folder / f"{name}_depth.png").unlink()
     with pytest.raises(ValueError, match=r"none of the scenes can be used:\s+.*b_depth"):
@@ -138,14 +141,16 @@ def test_damage_is_found(tmp_path, recipe):
     stored.histogram[5, 1] = counts
     told = verify(tmp_path / "set.zarr", chunks=None)
     assert not told.good
-    assert told.different[0].startswith("histogram[5:6, 1:2, ") and "differs in 1 bins" in told.different[0]
+    assert told.different[0].startswith("histogram[5:6, 1:2, ")
+    assert "differs in 1 bins" in told.different[0]
     shard = max((tmp_path / "set.zarr/histogram/c").rglob("*"), key=lambda one: one.stat().st_size * one.is_file())
     content = bytearray(shard.read_bytes())
     content[30] ^= 4
     shard.write_bytes(content)
     assert "cannot be read" in " ".join(verify(tmp_path / "set.zarr", chunks=None).different)
     ran = CliRunner().invoke(app, ["verify", str(tmp_path / "set.zarr"), "--all"])
-    assert ran.exit_code == 1 and "NO: " in ran.stdout
+    assert ran.exit_code == 1
+    assert "NO: " in ran.stdout
 
 
 def test_the_command(tmp_path):
@@ -153,7 +158,8 @@ def test_the_command(tmp_path):
     options = ["--size", "12,10", "--scene-seeds", "2", "--cycles", "20", "--bins", "16", "--signal", "1"]
     ran = CliRunner().invoke(app, ["generate", "room", *options, "--sbr", "2", "-o", name, "--dry-run"])
     assert ran.exit_code == 0, ran.output
-    assert "2 × 1 × 12 × 10 × 16" in ran.stdout and not Path(name).exists()
+    assert "2 × 1 × 12 × 10 × 16" in ran.stdout
+    assert not Path(name).exists()
     ran = CliRunner().invoke(app, ["generate", "room", *options, "--sbr", "2", "-o", name])
     assert ran.exit_code == 0, ran.output
     assert CliRunner().invoke(app, ["verify", name]).exit_code == 0
@@ -165,7 +171,8 @@ def test_the_command(tmp_path):
         ([], "SOURCE is missing"),
     ):
         ran = CliRunner().invoke(app, ["generate", *bad, "-o", str(tmp_path / "b.zarr"), "--layout", "dense"])
-        assert ran.exit_code == 2 and told in ran.output, ran.output
+        assert ran.exit_code == 2, ran.output
+        assert told in ran.output
     assert not (tmp_path / "b.zarr").exists()
 
 

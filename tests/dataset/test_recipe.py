@@ -6,8 +6,8 @@ import math
 
 import pytest
 import yaml
-from dataset.conftest import SYSTEM
 
+from dataset.conftest import SYSTEM
 from mars_lidar.dataset import DatasetRecipe
 from mars_lidar.dataset.samples import count_samples, fitting, sample_parts
 
@@ -88,7 +88,8 @@ def test_errors_point_at_the_line(write, old, new, line, told):
 
 
 def test_errors_inside_of_a_system(write):
-    inline = TEXT.replace("  file: system.yaml\n", "".join(f"  {t}\n" for t in yaml.safe_dump(SYSTEM.to_dict()).splitlines()))
+    lines = yaml.safe_dump(SYSTEM.to_dict()).splitlines()
+    inline = TEXT.replace("  file: system.yaml\n", "".join(f"  {line}\n" for line in lines))
     assert DatasetRecipe.load(write(inline)).systems == (SYSTEM,)
     bad = inline.replace("cycles: 50", "cycles: 0")
     line = bad.splitlines().index("  cycles: 0") + 1

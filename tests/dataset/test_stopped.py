@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from dataset.conftest import files
 
 import mars_lidar as ml
+from dataset.conftest import files
 from mars_lidar import io
 from mars_lidar.dataset import DatasetRecipe, open_dataset
 
@@ -58,7 +58,8 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, recipe, whole, how, number):
     ran = _run(recipe, out, how, number)
     if how == "int":
         assert ran.stdout.startswith("Interrupted interrupted; "), ran.stderr
-        assert "parts of" in ran.stdout and "continue with --resume" in ran.stdout
+        assert "parts of" in ran.stdout
+        assert "continue with --resume" in ran.stdout
     else:
         assert ran.returncode == -signal.SIGKILL, ran.stderr
     with pytest.raises(io.IncompleteFileError, match="generation did not finish"):
@@ -98,7 +99,8 @@ def test_a_full_disk_is_told_and_the_run_goes_on_afterwards(tmp_path, recipe, wh
     ran = _run(recipe, out, "disk", limit)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.startswith("WriteError File too large; "), ran.stdout
-    assert "marked incomplete" in ran.stdout and "GB free" in ran.stdout
+    assert "marked incomplete" in ran.stdout
+    assert "GB free" in ran.stdout
     assert not list(out.rglob("*.partial"))
     with pytest.raises(io.IncompleteFileError):
         open_dataset(out)

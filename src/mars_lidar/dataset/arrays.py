@@ -49,7 +49,7 @@ def create_histogram(group: Any, recipe: DatasetRecipe, number: int, shape: tupl
         shards=shard,
         dimension_names=DIMS,
         attributes={"long_name": "registrations per bin", "units": "count", "coordinates": _COORDINATES},
-        **_packing(recipe.layout, dtype),
+        **packing(recipe.layout, dtype),
     )
 
 
@@ -62,12 +62,13 @@ def histogram_array(
     kept: dict[str, Any] = {}
     array = zarr.create_array(
         zarr.storage.MemoryStore(kept), shape=(1, *shape), dtype=dtype, chunks=(1, *shape),
-        **_packing(recipe.layout, dtype),
+        **packing(recipe.layout, dtype),
     )  # fmt: skip
     return with_zeros(array), lambda: sum(len(value) for name, value in kept.items() if not name.endswith(".json"))
 
 
-def _packing(layout: str, dtype: np.dtype[Any]) -> dict[str, Any]:
+def packing(layout: str, dtype: np.dtype[Any]) -> dict[str, Any]:
+    """Codecs of the histogram; `mars_lidar.dataset.shard` writes what they would."""
     from zarr.codecs import Crc32cCodec
 
     from mars_lidar.dataset.codec import SparseCodec

@@ -51,7 +51,7 @@ def make_all(
         with _client(distributed, scheduler) as client:
             _share_out(distributed, client, dataset, todo, add, threads)
         return
-    # one part at a time in a worker: its memory is one shard's
+    # one part at a time in a worker: its memory is that of a chunk
     with (
         distributed.LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0

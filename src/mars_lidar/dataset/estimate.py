@@ -93,9 +93,9 @@ def estimate(
     pixels = math.prod(image)
     maps = 4 * len(MAPS) * pixels * total + 16 * pixels * number
     team = threads or _default_threads()
-    block = math.prod(min(a, b) for a, b in zip(shard, shape, strict=True)) * dtype.itemsize
+    block = math.prod(chunk) * dtype.itemsize
     shards = math.prod(math.ceil(a / b) for a, b in zip(shape, shard, strict=True))
-    teams = max(1, min(team, shards, BUFFER_BYTES // (math.prod(shard) * dtype.itemsize)))
+    teams = max(1, min(team, shards, BUFFER_BYTES // block))
     return Estimate(
         scenes=number,
         shape=shape,
@@ -104,7 +104,7 @@ def estimate(
         free_bytes=None if out is None else shutil.disk_usage(Path(out).absolute().parent).free,
         seconds=seconds * math.prod(shape[1:4]) * total / team + each_s * len(found),
         threads=team,
-        memory_bytes=_BASE_BYTES + teams * 2 * block + 16 * pixels * 64,
+        memory_bytes=_BASE_BYTES + teams * (2 * block + 5 * 2**24) + 16 * pixels * 64,  # chunks, and shards of maps
         shards=shards,
         chunk=chunk,
         problems=tuple(problems),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import shutil
 import threading
 import time
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from mars_lidar.io.scan import Problem
 
 Progress = Callable[[int, int], object]
-BUFFER_BYTES = 512 * 2**20  # of all shards that are made at the same time on one machine
+BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ class _Totals:
 def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None], threads: int | None) -> None:
     """Make parts on threads, each of which simulates, packs and writes parts of its own.
 
-    Simulator and compressors run without Python's lock. Where so many shards would not fit in `BUFFER_BYTES`, fewer
+    Simulator and compressors run without Python's lock. Where so many chunks would not fit in `BUFFER_BYTES`, fewer
     parts are made at a time, each on several threads.
     """
     from mars_lidar.dataset.write import Maker, Stopped
@@ -199,8 +200,8 @@ def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None
 
     team = threads or _default_threads()
     array = dataset.histogram
-    shard = _size(array.shards) * array.dtype.itemsize
-    teams = max(1, min(team, len(todo), BUFFER_BYTES // shard))
+    chunk = math.prod(array.chunks) * array.dtype.itemsize
+    teams = max(1, min(team, len(todo), BUFFER_BYTES // chunk))
     stop = threading.Event()
     makers = [Maker(dataset, max(1, team // teams), stop) for _ in range(teams)]
     idle = list(makers)
@@ -228,13 +229,6 @@ def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None
                 with contextlib.suppress(Stopped, Exception):
                     future.result()
             raise
-
-
-def _size(shape: Sequence[int]) -> int:
-    size = 1
-    for n in shape:
-        size *= n
-    return size
 
 
 def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) -> None:

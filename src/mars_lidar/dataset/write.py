@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.dataset.samples import flux_of, sample_parts
+from mars_lidar.dataset.shard import chunks_of, packer, write_shard
 from mars_lidar.dataset.store import Dataset, Item
 from mars_lidar.flux import Flux
 from mars_lidar.scene import Scene
@@ -35,13 +37,14 @@ class Made:
 
 
 class Maker:
-    """Makes parts of one dataset; of use to one thread at a time. Keeps a buffer of one shard."""
+    """Makes parts of one dataset; of use to one thread at a time. Keeps a buffer of one chunk."""
 
     def __init__(self, dataset: Dataset, threads: int = 1, stop: threading.Event | None = None) -> None:
         self.dataset = dataset
         self._threads = threads
         self._stop = stop
         self._buffer: NDArray[Any] | None = None
+        self._simulate_s = 0.0
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._fluxes: OrderedDict[int, Flux] = OrderedDict()
 
@@ -52,11 +55,27 @@ class Maker:
             for name, values in self.maps(item.region[0]).items():
                 self.dataset.maps[name][item.region] = values
             return Made(0, 0.0, time.perf_counter() - began)
-        counts = self.counts(item.region)
-        simulated = time.perf_counter()
-        self.dataset.histogram[item.region] = counts
-        written = time.perf_counter()
-        return Made(counts.size // counts.shape[-1], simulated - began, written - simulated)
+        self._simulate_s = 0.0
+        (path,) = self.dataset.files(item)
+        write_shard(path, self._packed(item))
+        exposures = math.prod(part.stop - part.start for part in item.region[:4])
+        return Made(exposures, self._simulate_s, time.perf_counter() - began - self._simulate_s)
+
+    def _packed(self, item: Item) -> Iterator[bytes | None]:
+        """The chunks of a shard, one after the other."""
+        array = self.dataset.histogram
+        pack = packer(self.dataset.recipe.layout, array.dtype)
+        for region in chunks_of(item.region, array.chunks, array.shards):
+            if region is None:
+                yield None
+                continue
+            began = time.perf_counter()
+            counts = self.counts(region)
+            self._simulate_s += time.perf_counter() - began
+            if counts.shape != array.chunks:  # at the edge of the array: chunks are stored whole
+                ends = [(0, whole - have) for whole, have in zip(array.chunks, counts.shape, strict=True)]
+                counts = np.pad(counts, ends)
+            yield pack(counts)
 
     def maps(self, some: slice) -> dict[str, NDArray[np.float32]]:
         """Maps of some samples (samples, H, W)."""

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks import effects, engines, exposures, laws, memory, numpy_mars, paths, startup, sweeps
+from benchmarks import effects, engines, exposures, laws, memory, numpy_mars, paths, startup, storage, sweeps
 from benchmarks.config import DEFAULT, FULL, QUICK, Config
 from benchmarks.floor import Bandwidth, measure_bandwidth
 from benchmarks.machine import Interference, describe_machine
@@ -28,6 +28,8 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "effects": effects.detector_effects,
     "exposure": laws.exposure_laws,
     "stationary": laws.stationary_distribution,
+    "codecs": storage.codecs,
+    "datasets": storage.datasets,
     "memory": memory.peak_memory,
     "import": startup.import_time,
     "cli": startup.command_line,

@@ -2,6 +2,7 @@
 
 from mars_lidar._version import __version__
 from mars_lidar.dark_counts import dark_count_map
+from mars_lidar.dataset.run import Generated, generate
 from mars_lidar.effects import Jitter, SampledJitter
 from mars_lidar.estimate import Calibration, Validation, calibrate, validate
 from mars_lidar.flux import Flux
@@ -26,6 +27,7 @@ __all__ = [
     "Detector",
     "Flux",
     "GaussianPulse",
+    "Generated",
     "Jitter",
     "JointLaw",
     "Lookup",
@@ -42,6 +44,7 @@ __all__ = [
     "calibrate",
     "count_law",
     "dark_count_map",
+    "generate",
     "holding_time_covariance",
     "joint_law",
     "registration_pdf",

@@ -11,6 +11,7 @@ import typer
 
 from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
+from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
 from mars_lidar.cli.init import init
 from mars_lidar.cli.inspect import info, view
 from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
@@ -27,6 +28,8 @@ app = typer.Typer(
 )
 app.command(no_args_is_help=True, epilog=EPILOG)(simulate)
 app.command(no_args_is_help=True, epilog=COMPARE_EPILOG)(compare)
+app.command(no_args_is_help=True, epilog=GENERATE_EPILOG)(generate)
+app.command(no_args_is_help=True)(verify)
 app.command(no_args_is_help=True)(info)
 app.command(no_args_is_help=True)(view)
 app.command(no_args_is_help=True, epilog=CONVERT_EPILOG)(convert)

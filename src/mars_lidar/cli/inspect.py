@@ -22,11 +22,19 @@ def info(
         typer.Option("--verify", help="Simulate again and compare every count; exit code 1 if they differ."),
     ] = False,
 ) -> None:
-    """Say what is in a cube: system, flux, engine, size, whether it is complete, and how to open it."""
+    """Say what is in a cube or a dataset: system, flux, engine, size, whether it is complete, how to open it."""
     from mars_lidar.io import IncompleteFileError, load
     from mars_lidar.io import verify as same_again
 
     with reported():
+        from mars_lidar.cli.generate import dataset_rows
+
+        rows = dataset_rows(file)
+        if rows is not None:
+            if verify:
+                raise ValueError(f"{file} is a dataset: mars-lidar verify {file} makes its chunks again")
+            table(rows)
+            return
         try:
             cube = load(file, allow_incomplete=True)
         except IncompleteFileError as error:  # nothing in it can be read

@@ -39,5 +39,6 @@ void bind_count_draws(nb::module_& module);
 void bind_matched(nb::module_& module);
 void bind_table(nb::module_& module);
 void bind_feedback(nb::module_& module);
+void bind_packing(nb::module_& module);
 
 }  // namespace mars

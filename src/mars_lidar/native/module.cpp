@@ -93,4 +93,5 @@ NB_MODULE(_core, module) {
     mars::bind_matched(module);
     mars::bind_table(module);
     mars::bind_feedback(module);
+    mars::bind_packing(module);
 }

@@ -1,0 +1,159 @@
+"""Storage of counts: codecs beside each other, and whole datasets beside the engine alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numcodecs import Blosc, Zstd
+
+import mars_lidar as ml
+from benchmarks.config import Config
+from benchmarks.floor import Bandwidth
+from benchmarks.report import Goal, Row, Section
+from benchmarks.subprocesses import run_python
+from benchmarks.timing import in_turn
+from mars_lidar import _core
+
+SIDE = 64
+LEVELS = (10.0, 1.0, 0.1, 0.01)  # mean signal photons per period; SBR 1
+GOAL_SHARE, GOAL_SIZE, GOAL_MEMORY_GIB, GOAL_WORKERS = 0.6, 0.2, 1.5, 1.7
+_CODECS: dict[str, Any] = {
+    "blosc lz4-5 bitshuffle": Blosc("lz4", 5, Blosc.BITSHUFFLE),
+    "blosc lz4-1 bitshuffle": Blosc("lz4", 1, Blosc.BITSHUFFLE),
+    "blosc zstd-1 bitshuffle": Blosc("zstd", 1, Blosc.BITSHUFFLE),
+    "blosc zstd-3 bitshuffle": Blosc("zstd", 3, Blosc.BITSHUFFLE),
+    "blosc zstd-1 shuffle": Blosc("zstd", 1, Blosc.SHUFFLE),
+    "blosc blosclz-1 bitshuffle": Blosc("blosclz", 1, Blosc.BITSHUFFLE),
+    "zstd-1": Zstd(1),
+    "zstd-3": Zstd(3),
+}
+
+
+class _Packed:
+    """The codec of the sparse layout."""
+
+    def encode(self, counts: Any) -> bytes:
+        return _core.pack_counts(counts)
+
+    def decode(self, packed: bytes, size: int) -> Any:
+        out = np.empty(size, np.uint16)
+        _core.unpack_counts(np.frombuffer(packed, np.uint8), out)
+        return out
+
+
+def codecs(config: Config, bandwidth: Bandwidth) -> Section:
+    """One thread: pack and unpack an exposure, beside the time that the engine takes to simulate it."""
+    del bandwidth
+    from numcodecs import blosc
+
+    blosc.use_threads = False
+    section, mine = Section("Codecs of counts, one thread", notes=[_CODEC_NOTE]), _Packed()
+    for level in LEVELS:
+        system = _system(config)
+        flux = ml.Scene.example("room", size=SIDE).flux(system, signal=level, sbr=1.0)
+        out = np.empty((1, *flux.shape, system.bins), np.uint16)
+        counts = out.reshape(-1)
+        ml.simulate(flux, system, seed=0, threads=1, out=out)
+        packed = {name: codec.encode(counts) for name, codec in _CODECS.items()}
+        packed_here = mine.encode(counts)
+        cases = {"engine": lambda f=flux, s=system, o=out: ml.simulate(f, s, seed=0, threads=1, out=o)}
+        for name, codec in _CODECS.items():
+            cases[f"pack {name}"] = lambda c=codec, x=counts: c.encode(x)
+            cases[f"unpack {name}"] = lambda c=codec, x=packed[name]: c.decode(x)
+        cases["pack sparse"] = lambda x=counts: mine.encode(x)
+        cases["unpack sparse"] = lambda x=packed_here, n=counts.size: mine.decode(x, n)
+        timings = in_turn(cases, config)
+        engine = min(timings["engine"].cpu)
+        for name, size in [("sparse", len(packed_here)), *((name, len(data)) for name, data in packed.items())]:
+            pack, unpack = (min(timings[f"{what} {name}"].cpu) for what in ("pack", "unpack"))
+            row: Row = {
+                "S": level,
+                "bins not zero": f"{100 * np.count_nonzero(counts) / counts.size:.1f} %",
+                "codec": name,
+                "engine ms": 1e3 * engine,
+                "pack ms": 1e3 * pack,
+                "unpack ms": 1e3 * unpack,
+                "bytes per pixel": size / SIDE**2,
+                "of dense": size / counts.nbytes,
+                "of engine speed": engine / (engine + pack),
+            }
+            section.rows.append(row)
+            if name == "sparse" and level == 1.0:
+                section.goals.append(Goal("sparse counts over dense uint16, S = 1, 1000 cycles", row["of dense"],
+                                          GOAL_SIZE, ""))  # fmt: skip
+    return section
+
+
+def datasets(config: Config, bandwidth: Bandwidth) -> Section:
+    """`mars_lidar.generate` in fresh interpreters, beside the engine into one buffer."""
+    del bandwidth
+    section = Section("Datasets", notes=[_DATASET_NOTE])
+    scenes = max(2, config.side // 2)
+    threads = config.threads
+    for level in (1.0, 0.1):
+        alone = _child(config, "engine", level, scenes, threads)
+        shares = {}
+        for layout in ("sparse", "dense"):
+            found = _child(config, layout, level, scenes, threads)
+            shares[layout] = alone["cpu"] / found["cpu"]
+            section.rows.append(_dataset_row(f"{layout}, {threads} threads", level, found, alone))
+            if level == 1.0 and layout == "sparse":
+                section.goals += [
+                    Goal("generate, share of the engine's speed (CPU)", shares[layout], GOAL_SHARE, "", True),
+                    Goal("generate, peak memory", found["peak"] / 2**30, GOAL_MEMORY_GIB, "GiB"),
+                ]
+        section.rows.append(_dataset_row(f"engine alone, {threads} threads", level, alone, alone))
+    rates = {}
+    for workers in (1, 2):
+        found = _child(config, "workers", 1.0, scenes, workers)
+        rates[workers] = found["rate"]
+        section.rows.append(_dataset_row(f"sparse, {workers} worker{'s' * (workers > 1)}", 1.0, found, None))
+    section.goals.append(Goal("2 workers over 1, rate", rates[2] / rates[1], GOAL_WORKERS, "", True))
+    return section
+
+
+def _dataset_row(case: str, level: float, found: dict[str, float], alone: dict[str, float] | None) -> Row:
+    return {
+        "case": case,
+        "S": level,
+        "pixel exposures": int(found["exposures"]),
+        "s": found["wall"],
+        "CPU s": found["cpu"] if alone else None,
+        "of engine speed, CPU": alone["cpu"] / found["cpu"] if alone else None,
+        "of engine speed, wall": alone["wall"] / found["wall"] if alone else None,
+        "exposures per s": found["rate"],
+        "MB on disk": found["bytes"] / 1e6,
+        "peak MiB": found["peak"] / 2**20,
+    }
+
+
+def _system(config: Config) -> ml.System:
+    return ml.System(
+        period_ns=1e3 / 7.5, cycles=config.cycles, bins=config.bins, pulse=ml.GaussianPulse(sigma_ns=0.5),
+        detector=ml.Detector(dead_time_ns=75.0),
+    )  # fmt: skip
+
+
+def _child(config: Config, what: str, level: float, scenes: int, threads: int) -> dict[str, float]:
+    with tempfile.TemporaryDirectory(dir=os.environ.get("MARS_BENCH_TMP")) as folder:
+        arguments = [what, level, scenes, threads, config.cycles, config.bins, Path(folder) / "set.zarr"]
+        told = run_python("-m", "benchmarks.storage_child", *map(str, arguments))
+    found: dict[str, float] = json.loads(told.splitlines()[-1])
+    return found
+
+
+_CODEC_NOTE = (
+    f"One exposure of the built-in room, {SIDE} × {SIDE} pixels; processor time, the best turn. Of engine speed: "
+    "engine / (engine + pack), what is left where a thread packs what it simulates. The sparse layout uses `sparse`, "
+    "the dense one `blosc lz4-5 bitshuffle`: the smallest of those that keep 60 % at S = 1."
+)
+_DATASET_NOTE = (
+    "Rooms of 64 × 64 pixels, 8 realizations each, 8 MiB a chunk, 64 MiB a shard. CPU s: of all threads of the "
+    "process, without its imports; scenes are ray-cast and stored in that time. The engine alone simulates the same "
+    "exposures into one buffer. Workers: rate between the first and the last part, without the start of the cluster."
+)

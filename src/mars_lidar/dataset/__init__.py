@@ -1,0 +1,51 @@
+"""Datasets: from scenes to a training set on disk, and back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from mars_lidar.dataset.run import Generated, generate
+
+if TYPE_CHECKING:
+    from mars_lidar.dataset.estimate import Estimate, estimate
+    from mars_lidar.dataset.read import read_sparse
+    from mars_lidar.dataset.recipe import DatasetRecipe, Light
+    from mars_lidar.dataset.store import Dataset, open_dataset
+    from mars_lidar.dataset.verify import Verified, verify
+
+_MODULES = {
+    "Dataset": "store",
+    "DatasetRecipe": "recipe",
+    "Estimate": "estimate",
+    "Light": "recipe",
+    "Verified": "verify",
+    "estimate": "estimate",
+    "open_dataset": "store",
+    "read_sparse": "read",
+    "verify": "verify",
+}
+
+
+def __getattr__(name: str) -> Any:  # `import mars_lidar` loads no Zarr
+    if name in _MODULES:
+        from importlib import import_module
+
+        value = getattr(import_module(f"mars_lidar.dataset.{_MODULES[name]}"), name)
+        globals()[name] = value  # not the module of the same name
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+__all__ = [
+    "Dataset",
+    "DatasetRecipe",
+    "Estimate",
+    "Generated",
+    "Light",
+    "Verified",
+    "estimate",
+    "generate",
+    "open_dataset",
+    "read_sparse",
+    "verify",
+]

@@ -1,0 +1,132 @@
+"""The arrays of a dataset: names, units, chunks, shards and codecs."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.dataset import samples
+from mars_lidar.dataset.recipe import DatasetRecipe
+
+FORMAT = "mars-lidar dataset"
+FORMAT_VERSION = 1
+DIMS = ("sample", "realization", "y", "x", "time")
+PHOTONS = "photons per laser period"
+MAPS = {
+    "depth": ("depth", "m"),
+    "reflectivity": ("reflectivity", "1"),
+    "signal": ("signal", PHOTONS),
+    "background": ("background", PHOTONS),
+    "delay": ("delay of the return", "ns"),
+}
+_SHARD_BYTES = 16 * 2**20  # of one map
+_COORDINATES = "scene system signal_level sbr period_ns seed"  # for xarray, as CF has it
+
+
+def histogram_blocks(
+    recipe: DatasetRecipe, number: int, shape: tuple[int, int]
+) -> tuple[tuple[int, ...], np.dtype[Any], tuple[int, ...], tuple[int, ...]]:
+    """Shape, type, chunk and shard of the histogram."""
+    dtype = np.result_type(*(one.histogram_dtype for one in recipe.systems))
+    whole = (number, recipe.realizations, *shape, recipe.systems[0].bins)
+    chunk = samples.fitting(whole, (1, 1, 1, 1, whole[-1]), dtype.itemsize, recipe.chunk_mib * 2**20)
+    shard = samples.fitting(whole, chunk, dtype.itemsize, recipe.shard_mib * 2**20)
+    return whole, dtype, chunk, shard
+
+
+def create_histogram(group: Any, recipe: DatasetRecipe, number: int, shape: tuple[int, int]) -> None:
+    """Create the array of counts."""
+    whole, dtype, chunk, shard = histogram_blocks(recipe, number, shape)
+    group.create_array(
+        "histogram",
+        shape=whole,
+        dtype=dtype,
+        chunks=chunk,
+        shards=shard,
+        dimension_names=DIMS,
+        attributes={"long_name": "registrations per bin", "units": "count", "coordinates": _COORDINATES},
+        **packing(recipe.layout, dtype),
+    )
+
+
+def histogram_array(
+    recipe: DatasetRecipe, shape: tuple[int, ...], dtype: np.dtype[Any]
+) -> tuple[Any, Callable[[], int]]:
+    """An array (1, realizations, H, W, bins) in memory, one chunk packed as on disk; and a function for its bytes."""
+    import zarr
+
+    kept: dict[str, Any] = {}
+    array = zarr.create_array(
+        zarr.storage.MemoryStore(kept), shape=(1, *shape), dtype=dtype, chunks=(1, *shape),
+        **packing(recipe.layout, dtype),
+    )  # fmt: skip
+    return with_zeros(array), lambda: sum(len(value) for name, value in kept.items() if not name.endswith(".json"))
+
+
+def packing(layout: str, dtype: np.dtype[Any]) -> dict[str, Any]:
+    """Codecs of the histogram; `mars_lidar.dataset.shard` writes what they would."""
+    from zarr.codecs import Crc32cCodec
+
+    from mars_lidar.dataset.codec import SparseCodec
+
+    if layout == "sparse":
+        return {"serializer": SparseCodec(), "compressors": (Crc32cCodec(),)}
+    return {"compressors": (blosc(dtype, "lz4", 5, "bitshuffle"), Crc32cCodec())}
+
+
+def blosc(dtype: np.dtype[Any], name: Any, level: int, shuffle: Any) -> Any:
+    """A Blosc compressor for elements of this type; benchmarks/storage.py tells why which one."""
+    from zarr.codecs import BloscCodec
+
+    return BloscCodec(cname=name, clevel=level, shuffle=shuffle, typesize=dtype.itemsize)
+
+
+def create_maps(
+    group: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], dims: tuple[str, ...], told: str, unit: str
+) -> Any:
+    """Create an array of maps: one of them is a chunk."""
+    chunk = (1, *shape[1:])
+    return group.create_array(
+        name,
+        shape=shape,
+        dtype=dtype,
+        chunks=chunk,
+        shards=samples.fitting(shape, chunk, dtype.itemsize, _SHARD_BYTES),
+        compressors=(blosc(dtype, "zstd", 1, "shuffle"),),
+        fill_value=np.nan,
+        dimension_names=dims,
+        attributes={"long_name": told, "units": unit},
+    )
+
+
+def create_list(group: Any, name: str, values: NDArray[Any], dims: tuple[str, ...], told: str, unit: str) -> None:
+    """Create and write a small array."""
+    array = group.create_array(
+        name,
+        shape=values.shape,
+        dtype=values.dtype,
+        chunks=values.shape,
+        compressors=(blosc(values.dtype, "zstd", 1, "shuffle"),),
+        dimension_names=dims,
+        attributes={"long_name": told, "units": unit},
+    )
+    array[...] = values
+
+
+def with_zeros(array: Any) -> Any:
+    """The array, so that a part without counts is written too: a missing file means "not made yet"."""
+    return array.with_config({"write_empty_chunks": True})
+
+
+def mark(group: Any, attrs: dict[str, Any]) -> None:
+    """Put attributes into the root document, with a copy of all others (consolidated, for quick opening)."""
+    import zarr
+
+    group.update_attributes(attrs)
+    with warnings.catch_warnings():  # that other Zarr libraries may ignore the copy
+        warnings.filterwarnings("ignore", "Consolidated metadata", category=UserWarning)
+        zarr.consolidate_metadata(group.store)

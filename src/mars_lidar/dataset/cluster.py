@@ -1,0 +1,103 @@
+"""Parts of a dataset made by the workers of dask.distributed: on this machine, or on any cluster that dask runs on.
+
+A worker needs this package and the store under the same path. It returns how long a part took and nothing else, so
+the scheduler is no bottleneck. A part that a killed worker had begun is given to another one: its files appear by a
+rename, so half a part does not exist.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import uuid
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from mars_lidar.io.optional import MissingLibraryError
+
+if TYPE_CHECKING:
+    from mars_lidar.dataset.store import Dataset, Item
+    from mars_lidar.dataset.write import Made, Maker
+
+_AHEAD = 3  # parts given out per worker thread: none waits for the scheduler, and a million are not queued at once
+TIMEOUT_S = 20.0  # for a scheduler to answer
+_local = threading.local()
+
+
+def needed() -> Any:
+    """The library, or an error that says how to install it."""
+    try:
+        import distributed
+    except ImportError as error:
+        raise MissingLibraryError(
+            f"workers and scheduler need dask.distributed: pip install 'mars-lidar[cluster]' ({error})"
+        ) from error
+    return distributed
+
+
+def make_all(
+    dataset: Dataset,
+    todo: Sequence[Item],
+    add: Callable[[Made], None],
+    workers: int | None,
+    threads: int,
+    scheduler: str | None,
+) -> None:
+    """Make parts on `workers` processes of this machine, or on the workers of the `scheduler` at that address."""
+    distributed = needed()
+    if not todo:
+        return
+    if scheduler is not None:
+        with _client(distributed, scheduler) as client:
+            _share_out(distributed, client, dataset, todo, add, threads)
+        return
+    # one part at a time in a worker: its memory is that of a chunk
+    with (
+        distributed.LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        _share_out(distributed, client, dataset, todo, add, threads)
+
+
+def make_part(path: str, run: str, item: Item, threads: int) -> Made:
+    """Make one part; runs on a worker."""
+    maker: Maker | None = getattr(_local, "maker", None)
+    if maker is None or _local.run != run:
+        from mars_lidar.dataset.store import open_dataset
+        from mars_lidar.dataset.write import Maker
+
+        maker = Maker(open_dataset(path, allow_incomplete=True), threads)
+        _local.maker, _local.run = maker, run
+    return maker.make(item)
+
+
+def _client(distributed: Any, address: str) -> Any:
+    try:
+        return distributed.Client(address, timeout=TIMEOUT_S)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ValueError(f"scheduler must be the address of a dask scheduler, got {address!r}: {error}") from error
+
+
+def _share_out(
+    distributed: Any, client: Any, dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None], threads: int
+) -> None:
+    path, run = str(dataset.path.resolve()), uuid.uuid4().hex
+    team = max(1, sum(client.nthreads().values()))
+    waiting = iter(todo)
+
+    def given(item: Item) -> Any:
+        return client.submit(make_part, path, run, item, threads, pure=False)
+
+    running = distributed.as_completed([given(item) for item in itertools.islice(waiting, _AHEAD * team)])
+    try:
+        for future in running:
+            made = future.result()
+            future.release()
+            add(made)
+            for item in itertools.islice(waiting, 1):
+                running.add(given(item))
+    except BaseException:
+        client.cancel(list(running.futures), force=True)
+        raise

@@ -1,0 +1,156 @@
+"""Before the work: how large a dataset will be, how long it takes, how much memory; from a few parts made in memory."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mars_lidar.dataset import samples
+from mars_lidar.dataset.arrays import MAPS, histogram_array, histogram_blocks
+from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.run import BUFFER_BYTES, read_recipe
+from mars_lidar.dataset.sources import Candidate, Named, candidates, scenes
+from mars_lidar.io.scan import Problem
+from mars_lidar.scene import Scene
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_SCENES, _PROBES = 4, 8
+_BASE_BYTES = 220 * 2**20  # of the interpreter with NumPy, SciPy and Zarr
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What `estimate` expects.
+
+    Attributes
+    ----------
+    scenes
+        Scenes, or crops, if none that was not looked at is bad.
+    shape
+        (samples, realizations, H, W, bins) of the histogram.
+    dense_bytes, bytes
+        Of the counts as they are, and on disk with maps and scenes.
+    free_bytes
+        On the disk of the target; None without a target.
+    seconds
+        Wall clock on `threads` processors of this machine.
+    threads
+        As given, or all.
+    memory_bytes
+        At most, at any time.
+    shards, chunk
+        Number of files of the histogram, and the shape of what is read at once.
+    problems
+        Bad files among those that were looked at.
+    """
+
+    scenes: int
+    shape: tuple[int, ...]
+    dense_bytes: int
+    bytes: int
+    free_bytes: int | None
+    seconds: float
+    threads: int
+    memory_bytes: int
+    shards: int
+    chunk: tuple[int, ...]
+    problems: tuple[Problem, ...]
+
+
+def estimate(
+    recipe: DatasetRecipe | dict[str, Any] | str | Path,
+    out: str | Path | None = None,
+    *,
+    threads: int | None = None,
+) -> Estimate:
+    """Size, time and memory of a dataset, without writing anything.
+
+    Up to four scenes, spread over the list, are read, and up to eight chunks of them simulated and packed in memory.
+    Arguments are those of `mars_lidar.generate`.
+    """
+    from mars_lidar.simulate import _default_threads
+
+    plan, folder = read_recipe(recipe)
+    assert plan is not None
+    found, problems = candidates(plan, folder)
+    looked, each_s = _looked_at(found, plan, problems)
+    if not looked:
+        raise ValueError("none of the scenes looked at can be used:\n" + "\n".join(f"  {one}" for one in problems[:5]))
+    number = len(found) * (plan.crops if plan.crop else 1)
+    total = samples.count_samples(plan, number)
+    image = looked[0].shape
+    shape, dtype, chunk, shard = histogram_blocks(plan, total, image)
+    seconds, ratio = _probe(plan, looked, chunk, dtype)
+    dense = math.prod(shape) * dtype.itemsize
+    pixels = math.prod(image)
+    maps = 4 * len(MAPS) * pixels * total + 16 * pixels * number
+    team = threads or _default_threads()
+    block = math.prod(chunk) * dtype.itemsize
+    shards = math.prod(math.ceil(a / b) for a, b in zip(shape, shard, strict=True))
+    teams = max(1, min(team, shards, BUFFER_BYTES // block))
+    return Estimate(
+        scenes=number,
+        shape=shape,
+        dense_bytes=dense,
+        bytes=int(dense * ratio) + maps,
+        free_bytes=None if out is None else shutil.disk_usage(Path(out).absolute().parent).free,
+        seconds=seconds * math.prod(shape[1:4]) * total / team + each_s * len(found),
+        threads=team,
+        memory_bytes=_BASE_BYTES + teams * (2 * block + 5 * 2**24) + 16 * pixels * 64,  # chunks, and shards of maps
+        shards=shards,
+        chunk=chunk,
+        problems=tuple(problems),
+    )
+
+
+def _looked_at(
+    found: list[Candidate], plan: DatasetRecipe, problems: list[Problem]
+) -> tuple[list[Scene], float]:
+    """Some scenes of one size, and the seconds that reading one took."""
+    began = time.perf_counter()
+    chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, _SCENES)})
+    good: list[Scene] = []
+    for k in chosen:
+        for one in scenes(found[k], plan, good[0].shape if good else None):
+            if isinstance(one, Named):
+                good.append(one.scene)
+            else:
+                problems.append(one)
+    return good, (time.perf_counter() - began) / max(1, len(chosen))
+
+
+def _probe(
+    plan: DatasetRecipe, looked: list[Scene], chunk: tuple[int, ...], dtype: np.dtype[Any]
+) -> tuple[float, float]:
+    """Seconds of one thread per exposure of a pixel, and bytes on disk over dense bytes."""
+    from mars_lidar.simulate import simulate
+
+    random = np.random.default_rng(0)
+    every = samples.count_samples(plan, len(looked))
+    rows, columns = chunk[2], chunk[3]
+    seconds, packed, dense, exposures = 0.0, 0, 0, 0
+    for k, sample in enumerate(random.choice(every, min(every, _PROBES), replace=False)):
+        scene, system, signal, sbr = samples.sample_parts(plan, int(sample))
+        flux = samples.flux_of(looked[scene], plan.systems[system], plan.light, signal, sbr)
+        y, x = (int(random.integers(n - m + 1)) for n, m in zip(looked[0].shape, (rows, columns), strict=True))
+        part = flux[y : y + rows, x : x + columns]
+
+        def once(part: Any = part, system: int = system, seed: int = k) -> tuple[float, NDArray[Any], int]:
+            began = time.perf_counter()
+            counts = simulate(part, plan.systems[system], engine=plan.engine, seed=seed, threads=1).astype(dtype)
+            array, size = histogram_array(plan, counts.shape, dtype)
+            array[...] = counts[None]
+            return time.perf_counter() - began, counts, size()
+
+        spent, counts, size = min((once() for _ in range(2)), key=lambda told: told[0])
+        seconds, packed, dense = seconds + spent, packed + size, dense + counts.nbytes
+        exposures += rows * columns
+    return seconds / exposures, packed / dense

@@ -1,0 +1,164 @@
+"""The first step of a dataset: all its scenes are read once and put into the store."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mars_lidar.dataset import samples
+from mars_lidar.dataset.arrays import (
+    FORMAT,
+    FORMAT_VERSION,
+    MAPS,
+    PHOTONS,
+    create_histogram,
+    create_list,
+    create_maps,
+    mark,
+)
+from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.sources import candidates, scenes, seed_of
+from mars_lidar.io.scan import Problem
+from mars_lidar.scene import Scene
+
+
+def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
+    """Begin a store: every scene read, checked, and written; every array laid out.
+
+    Raises
+    ------
+    ValueError
+        No scene can be used; the text says why. Nothing is left at `path` then.
+    """
+    found, problems = candidates(recipe, folder)
+    group = writer = None
+    for candidate in found:
+        for one in scenes(candidate, recipe, None if writer is None else writer.shape):
+            if isinstance(one, Problem):
+                problems.append(one)
+                continue
+            if writer is None:  # nothing on the disk is touched before there is something to put on it
+                group = begin(path, recipe)
+                writer = SceneWriter(group, len(found) * (recipe.crops if recipe.crop else 1))
+            writer.add(one.name, one.scene)
+    if writer is None:
+        told = "\n".join(f"  {problem}" for problem in problems[:5])
+        more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""
+        raise ValueError(f"none of the scenes can be used:\n{told}{more}")
+    shape = writer.shape
+    assert shape is not None
+    writer.finish()
+    lay_out(group, recipe, writer.names, shape, problems)
+
+
+def begin(path: Path, recipe: DatasetRecipe) -> Any:
+    """A new store without arrays, marked incomplete; what was there is removed."""
+    import zarr
+
+    from mars_lidar import __version__
+
+    if path.exists():
+        (path / "zarr.json").unlink(missing_ok=True)  # from now on it is no store
+        shutil.rmtree(path)
+    attrs = {
+        "complete": False,
+        "stage": "scenes",
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "version": __version__,
+        "recipe": recipe.to_json(),
+    }
+    return zarr.create_group(path, zarr_format=3, attributes=attrs)
+
+
+class SceneWriter:
+    """Takes scenes one by one into the group ``scenes`` of a new store; memory for one shard."""
+
+    def __init__(self, group: Any, most: int) -> None:
+        self._group = group.create_group("scenes")
+        self._most = most
+        self._arrays: dict[str, Any] = {}
+        self._held: list[Scene] = []
+        self.names: list[str] = []
+        self._written = 0
+
+    @property
+    def shape(self) -> tuple[int, int] | None:
+        """(H, W) of all scenes, None before the first."""
+        return tuple(self._arrays["depth"].shape[1:]) if self._arrays else None
+
+    def add(self, name: str, scene: Scene) -> None:
+        """One more scene."""
+        if not self._arrays:
+            shape = (self._most, *scene.shape)
+            for array, unit in (("depth", "m"), ("reflectivity", "1"), ("background", "relative")):
+                self._arrays[array] = create_maps(
+                    self._group, array, shape, np.dtype(np.float64), ("scene", "y", "x"), array, unit
+                )
+        self.names.append(name)
+        self._held.append(scene)
+        if len(self._held) == self._arrays["depth"].shards[0]:
+            self._flush()
+
+    def finish(self) -> int:
+        """Write the rest and cut the arrays to their length; returns it."""
+        self._flush()
+        for array in self._arrays.values():
+            array.resize((self._written, *array.shape[1:]))
+        rows = [name.encode() for name in self.names]
+        table = np.zeros((len(rows), max(map(len, rows))), np.uint8)
+        for row, text in zip(table, rows, strict=True):
+            row[: len(text)] = np.frombuffer(text, np.uint8)
+        create_list(self._group, "name", table, ("scene", "letter"), "name of the scene, UTF-8", "1")
+        return self._written
+
+    def _flush(self) -> None:
+        part = slice(self._written, self._written + len(self._held))
+        if self._held:
+            self._arrays["depth"][part] = np.stack([one.depth_m for one in self._held])
+            self._arrays["reflectivity"][part] = np.stack([one.reflectivity for one in self._held])
+            if any(one.background is not None for one in self._held):
+                nothing = np.full(self._held[0].shape, np.nan)
+                light = [nothing if one.background is None else one.background for one in self._held]
+                self._arrays["background"][part] = np.stack(light)
+        self._written = part.stop
+        self._held.clear()
+
+
+def lay_out(
+    group: Any, recipe: DatasetRecipe, names: list[str], shape: tuple[int, int], problems: list[Problem]
+) -> None:
+    """Create all arrays of the samples, write the small ones, and mark the store as planned."""
+    number = samples.count_samples(recipe, len(names))
+    parts = [samples.sample_parts(recipe, k) for k in range(number)]
+    texts = [one.to_json() for one in recipe.systems]
+    seeds = [seed_of(recipe, names[scene], texts[system], s, b) for scene, system, s, b in parts]
+    scene, system, signal, sbr = (np.array(column) for column in zip(*parts, strict=True))
+    periods = np.array([one.period_ns for one in recipe.systems])
+    lists = (
+        ("sample", np.arange(number), ("sample",), "sample", "1"),
+        ("realization", np.arange(recipe.realizations), ("realization",), "realization number", "1"),
+        ("y", np.arange(shape[0]), ("y",), "image row", "pixel"),
+        ("x", np.arange(shape[1]), ("x",), "image column", "pixel"),
+        ("scene", scene.astype(np.int32), ("sample",), "number of the scene in the group scenes", "1"),
+        ("system", system.astype(np.int32), ("sample",), "number of the system in the attribute systems", "1"),
+        ("signal_level", signal, ("sample",), "mean signal over the pixels with a return", PHOTONS),
+        ("sbr", sbr, ("sample",), "mean signal / mean ambient photons", "1"),
+        ("period_ns", periods[system], ("sample",), "laser period", "ns"),
+        ("seed", np.array(seeds, np.uint64), ("sample",), "seed of the sample", "1"),
+    )
+    for name, values, dims, told, unit in lists:
+        create_list(group, name, values, dims, told, unit)
+    if np.ptp(periods) == 0.0:
+        times = recipe.systems[0].time_ns
+        create_list(group, "time", times, ("time",), "time in the period, bin centre", "ns")
+    for name, (told, unit) in MAPS.items():
+        create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), told, unit)
+    create_histogram(group, recipe, number, shape)
+    plain = [[str(one.path), one.reason] for one in problems]
+    systems = [one.to_dict() for one in recipe.systems]
+    mark(group, {"stage": "counts", "systems": json.dumps(systems), "problems": plain})

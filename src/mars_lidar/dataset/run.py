@@ -1,0 +1,289 @@
+"""The verb `generate`: from a recipe to a dataset on disk, on one machine or on many, in one go or in several."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mars_lidar import _validate
+
+if TYPE_CHECKING:
+    from mars_lidar.dataset.recipe import DatasetRecipe
+    from mars_lidar.dataset.store import Dataset, Item
+    from mars_lidar.dataset.write import Made
+    from mars_lidar.io.scan import Problem
+
+Progress = Callable[[int, int], object]
+BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
+
+
+@dataclass(frozen=True)
+class Generated:
+    """What `generate` did.
+
+    Attributes
+    ----------
+    path
+        The dataset.
+    shape
+        (samples, realizations, H, W, bins) of its histogram.
+    problems
+        Files that were left out, and why.
+    parts, parts_before
+        Parts that were made now, and that were there already.
+    simulate_s, write_s
+        Seconds spent simulating, and packing and writing, all threads added.
+    seconds
+        Wall clock.
+    """
+
+    path: Path
+    shape: tuple[int, ...]
+    problems: tuple[Problem, ...]
+    parts: int
+    parts_before: int
+    simulate_s: float
+    write_s: float
+    seconds: float
+
+
+def generate(
+    recipe: DatasetRecipe | dict[str, Any] | str | Path | None,
+    out: str | Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    threads: int | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Generated:
+    """Simulate a dataset, scenes x systems x levels of light x realizations, into a Zarr store.
+
+    The store does not depend on threads, workers, or interruptions: the same recipe gives the same files, byte for
+    byte. Read it with ``xarray.open_zarr(out)`` or, as training examples, with `mars_lidar.learn.StoredDataset`.
+
+    Parameters
+    ----------
+    recipe
+        A YAML file, or its content as a dictionary (paths are then relative to the working directory), or a
+        `mars_lidar.dataset.DatasetRecipe`. docs/generate.md explains the keys. None, with `resume`: the one in the
+        store.
+    out
+        The store, ``NAME.zarr``.
+    resume
+        Continue what was interrupted; of a complete store nothing is made. The recipe must be the same.
+    overwrite
+        Replace an existing store.
+    threads
+        Threads of this process; default: all processors it may use. With `workers`: of each worker, default 1.
+    workers
+        Run on so many worker processes (dask.distributed; extra ``cluster``).
+    scheduler
+        Address of a running dask scheduler, whose workers see `out` under the same path.
+    progress
+        Called with (parts done, in all).
+
+    Raises
+    ------
+    ValueError, TypeError
+        A bad recipe or argument; nothing was written.
+    FileExistsError
+        `out` exists, and neither `resume` nor `overwrite` is given.
+    mars_lidar.io.WriteError, mars_lidar.io.Interrupted
+        Stopped half way (a full disk, Ctrl-C); the text says how to go on.
+    """
+    from mars_lidar.dataset.ingest import create
+    from mars_lidar.dataset.store import open_dataset
+    from mars_lidar.io import Interrupted, WriteError
+    from mars_lidar.io.store import check_target
+
+    began = time.perf_counter()
+    target = Path(out)
+    if target.suffix != ".zarr":
+        raise ValueError(f"out must end in .zarr, got {str(target)!r}")
+    if resume and overwrite:
+        raise ValueError("resume and overwrite exclude each other")
+    if workers is not None and scheduler is not None:
+        raise ValueError("workers start a cluster and scheduler joins one: give one of them")
+    for name, value in (("threads", threads), ("workers", workers)):
+        if value is not None:
+            _validate.integer(name, value, low=1, high=1024)
+    wanted, folder = read_recipe(recipe)
+    there = target.exists() and resume
+    if there:
+        dataset = open_dataset(target, allow_incomplete=True)
+        _check_same(target, dataset, wanted)
+    elif wanted is None:
+        raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
+    else:
+        check_target(target, folder=True, overwrite=overwrite)
+    if workers is not None or scheduler is not None:
+        from mars_lidar.dataset import cluster
+
+        cluster.needed()
+    with _alone(target):
+        try:
+            if not there or not dataset.planned:
+                if wanted is None:
+                    raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
+                create(target, wanted, folder)
+                dataset = open_dataset(target, allow_incomplete=True)
+            dataset.tidy()
+            todo = [] if dataset.complete else dataset.missing()
+            for item in todo:
+                for damaged in dataset.files(item):  # else Zarr would read it before it is replaced
+                    damaged.unlink(missing_ok=True)
+            before = sum(1 for _ in dataset.items()) - len(todo)
+            totals = _Totals(before, before + len(todo), progress)
+            if workers is not None or scheduler is not None:
+                cluster.make_all(dataset, todo, totals.add, workers, threads or 1, scheduler)
+            else:
+                _make_all(dataset, todo, totals.add, threads)
+            if not dataset.complete:
+                dataset.finish()
+        except KeyboardInterrupt:
+            raise Interrupted(f"interrupted; {_left(target)}") from None
+        except OSError as error:
+            if isinstance(error, FileNotFoundError | FileExistsError) and not target.exists():
+                raise
+            raise WriteError(error.errno, f"{error.strerror or error}; {_left(target)}") from error
+    problems = tuple(dataset.problems)
+    shape = tuple(dataset.histogram.shape)
+    seconds = time.perf_counter() - began
+    return Generated(target, shape, problems, len(todo), before, totals.simulate_s, totals.write_s, seconds)
+
+
+def read_recipe(recipe: DatasetRecipe | dict[str, Any] | str | Path | None) -> tuple[DatasetRecipe | None, Path]:
+    """The recipe in any of its forms, and the folder that its paths are relative to."""
+    from mars_lidar.dataset.recipe import DatasetRecipe
+
+    if recipe is None or isinstance(recipe, DatasetRecipe):
+        return recipe, Path()
+    if isinstance(recipe, dict):
+        return DatasetRecipe.from_dict(recipe), Path()
+    return DatasetRecipe.load(recipe), Path(recipe).parent
+
+
+class _Totals:
+    """Adds up what the parts took, and tells how many are there."""
+
+    def __init__(self, done: int, total: int, progress: Progress | None) -> None:
+        self._done, self._total, self._progress = done, total, progress
+        self.simulate_s = self.write_s = 0.0
+
+    def add(self, made: Made) -> None:
+        self._done += 1
+        self.simulate_s += made.simulate_s
+        self.write_s += made.write_s
+        if self._progress is not None:
+            self._progress(self._done, self._total)
+
+
+def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None], threads: int | None) -> None:
+    """Make parts on threads, each of which simulates, packs and writes parts of its own.
+
+    Simulator and compressors run without Python's lock. Where so many chunks would not fit in `BUFFER_BYTES`, fewer
+    parts are made at a time, each on several threads.
+    """
+    from mars_lidar.dataset.write import Maker, Stopped
+    from mars_lidar.simulate import _default_threads
+
+    team = threads or _default_threads()
+    array = dataset.histogram
+    chunk = math.prod(array.chunks) * array.dtype.itemsize
+    teams = max(1, min(team, len(todo), BUFFER_BYTES // chunk))
+    stop = threading.Event()
+    makers = [Maker(dataset, max(1, team // teams), stop) for _ in range(teams)]
+    idle = list(makers)
+
+    def one(maker: Maker, item: Item) -> tuple[Maker, Made]:
+        return maker, maker.make(item)
+
+    waiting: Iterator[Item] = iter(todo)
+    with ThreadPoolExecutor(teams) as pool:
+        running: set[Future[tuple[Maker, Made]]] = set()
+        try:
+            while True:
+                while idle and (item := next(waiting, None)) is not None:
+                    running.add(pool.submit(one, idle.pop(), item))
+                if not running:
+                    return
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    maker, made = future.result()
+                    idle.append(maker)
+                    add(made)
+        except BaseException:
+            stop.set()  # the simulator looks at it every 50 ms
+            for future in running:
+                with contextlib.suppress(Stopped, Exception):
+                    future.result()
+            raise
+
+
+def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) -> None:
+    from mars_lidar import __version__
+
+    if dataset.attrs.get("version") != __version__:
+        raise ValueError(
+            f"{target} was begun by mars-lidar {dataset.attrs.get('version')} and this is {__version__}: "
+            "their counts may differ; use that version or start again with overwrite"
+        )
+    if wanted is None:
+        return
+    old, new = json.loads(dataset.recipe.to_json()), json.loads(wanted.to_json())
+    for name in new:
+        if old.get(name) != new[name]:
+            raise ValueError(
+                f"{target} was begun with another recipe: {name} was {json.dumps(old.get(name))}, "
+                f"now {json.dumps(new[name])}; start again with overwrite, or choose another name"
+            )
+
+
+def _left(target: Path) -> str:
+    """What is on the disk, for the text of an error."""
+    from mars_lidar.dataset.store import Dataset
+
+    free = shutil.disk_usage(target.parent).free
+    try:
+        dataset = Dataset(target)
+        if not dataset.planned:
+            raise ValueError
+        dataset.tidy()
+        total, missing = sum(1 for _ in dataset.items()), len(dataset.missing())
+        told = f"{total - missing} of {total} parts of {target} are written, marked incomplete"
+    except (OSError, ValueError, KeyError):
+        told = f"{target} is left behind without counts, marked incomplete"
+    return f"{told} ({free / 1e9:.3g} GB free there): continue with --resume (resume=True)"
+
+
+@contextlib.contextmanager
+def _alone(target: Path) -> Iterator[None]:
+    """Hold a lock beside the store while it is written; a lock of a process that was killed holds nobody up."""
+    lock = target.with_name(target.name + ".lock")
+    with open(lock, "w") as held:
+        try:
+            import fcntl
+        except ImportError:  # Windows
+            yield
+            return
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"{target} is being written by another process (its lock is {lock})") from None
+        except OSError:  # a file system without locks
+            pass
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)

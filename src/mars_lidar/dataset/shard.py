@@ -1,0 +1,76 @@
+"""Writing a shard of counts chunk by chunk (Zarr v3, sharding codec, index at the end).
+
+zarr-python takes a whole shard at once: it copies every chunk into a fresh array before it packs it, which cost as much
+as the packing. Here a chunk is packed while it is still in the processor's cache, and a shard is never in memory.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import _core
+
+_NONE = 2**64 - 1  # offset and length of a chunk that is not there
+Region = tuple[slice, ...]
+
+
+def chunks_of(region: Region, chunk: tuple[int, ...], shard: tuple[int, ...]) -> Iterator[Region | None]:
+    """Parts of a region that are the chunks of a shard, in C order; None for those beyond the array."""
+    steps = [range(0, whole, step) for whole, step in zip(shard, chunk, strict=True)]
+    for corner in itertools.product(*steps):
+        part = tuple(
+            slice(area.start + first, min(area.start + first + step, area.stop))
+            for area, first, step in zip(region, corner, chunk, strict=True)
+        )
+        yield part if all(one.start < one.stop for one in part) else None
+
+
+def packer(layout: str, dtype: np.dtype[Any]) -> Callable[[NDArray[Any]], bytes]:
+    """From a chunk to its bytes: what the codecs of `mars_lidar.dataset.arrays.packing` do."""
+    from google_crc32c import value as crc32c
+
+    if layout == "sparse":
+        pack: Callable[[NDArray[Any]], bytes] = _core.pack_counts
+    else:
+        from numcodecs import Blosc
+
+        pack = Blosc("lz4", 5, Blosc.BITSHUFFLE).encode
+
+    def packed(counts: NDArray[Any]) -> bytes:
+        data = pack(np.ascontiguousarray(counts, dtype).reshape(-1))
+        return data + int(crc32c(data)).to_bytes(4, "little")
+
+    return packed
+
+
+def write_shard(path: Path, chunks: Iterator[bytes | None]) -> None:
+    """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename."""
+    from google_crc32c import value as crc32c
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.partial")
+    places: list[int] = []
+    offset = 0
+    try:
+        with open(unfinished, "wb") as stream:
+            for data in chunks:
+                if data is None:
+                    places += [_NONE, _NONE]
+                    continue
+                stream.write(data)
+                places += [offset, len(data)]
+                offset += len(data)
+            index = np.array(places, "<u8").tobytes()
+            stream.write(index + int(crc32c(index)).to_bytes(4, "little"))
+        os.replace(unfinished, path)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise

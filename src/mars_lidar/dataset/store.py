@@ -1,0 +1,190 @@
+"""The Zarr store of a dataset: its arrays, which of its parts are there, and when it is whole.
+
+::
+
+    histogram   (sample, realization, y, x, time)  counts
+    depth, reflectivity, signal, background, delay  (sample, y, x) float32: m, 1, photons per period, ns
+    scene, system, signal_level, sbr, seed, ...     (sample)
+    scenes/     what the samples are made of, as it was read: depth, reflectivity, background (scene, y, x) float64
+
+The store alone is enough to make any part of it, so that workers and `verify` need no source files. Every part is a
+file of its own that appears by a rename: what is there is whole, and what is missing is known from the names.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, mark, with_zeros
+from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.io.scan import Problem
+from mars_lidar.io.store import IncompleteFileError
+from mars_lidar.scene import Scene
+
+
+@dataclass(frozen=True)
+class Item:
+    """A part of the store that is made and written at once: a shard of the histogram, or of all maps."""
+
+    kind: str  # "maps" or "histogram"
+    shard: tuple[int, ...]  # its place in the grid of shards
+    region: tuple[slice, ...]  # of the array
+
+
+class Dataset:
+    """An opened store; `path` is its folder."""
+
+    def __init__(self, path: Path) -> None:
+        import zarr
+
+        from mars_lidar.dataset import codec  # noqa: F401  (registers it)
+
+        self.path = path
+        if not (path / "zarr.json").is_file():
+            raise FileNotFoundError(f"{path} is not a Zarr v3 store (it has no zarr.json)")
+        self.group = zarr.open_group(path, mode="r+", use_consolidated=False)
+        self.attrs: dict[str, Any] = dict(self.group.attrs)
+        if self.attrs.get("format") != FORMAT:
+            raise ValueError(f"{path} is not a dataset written by mars-lidar (no attribute format = {FORMAT!r})")
+        if self.attrs.get("format_version") != FORMAT_VERSION:
+            told = self.attrs.get("format_version")
+            raise ValueError(f"{path} has layout version {told}; version {FORMAT_VERSION} can be read")
+        self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
+
+    @property
+    def planned(self) -> bool:
+        """Whether all scenes are in, so that the parts of the store are known."""
+        return self.attrs.get("stage") != "scenes"
+
+    @property
+    def complete(self) -> bool:
+        """Whether all parts are there."""
+        return self.attrs.get("complete") is True
+
+    @cached_property
+    def histogram(self) -> Any:
+        """The counts, read when indexed."""
+        return with_zeros(self.group["histogram"])
+
+    @cached_property
+    def maps(self) -> dict[str, Any]:
+        """The arrays (sample, y, x)."""
+        return {name: with_zeros(self.group[name]) for name in MAPS}
+
+    @cached_property
+    def seeds(self) -> NDArray[np.uint64]:
+        """Seed of each sample."""
+        array: Any = self.group["seed"]
+        return np.asarray(array[...])
+
+    @cached_property
+    def problems(self) -> list[Problem]:
+        """What was left out, and why."""
+        return [Problem(Path(path), reason) for path, reason in self.attrs.get("problems", [])]
+
+    def scene(self, number: int) -> Scene:
+        """A scene as it was read."""
+        group: Any = self.group["scenes"]
+        depth, reflectivity, background = (
+            np.asarray(group[name][number]) for name in ("depth", "reflectivity", "background")
+        )
+        return Scene(depth, reflectivity, None if np.isnan(background).all() else background)
+
+    def scene_names(self) -> list[str]:
+        """Names of all scenes."""
+        rows: Any = self.group["scenes/name"]
+        return [bytes(row).rstrip(b"\0").decode() for row in np.asarray(rows[...])]
+
+    def items(self) -> Iterator[Item]:
+        """All parts, in the order in which they are made."""
+        yield from self._grid("maps", self.maps["depth"])
+        yield from self._grid("histogram", self.histogram)
+
+    def _grid(self, kind: str, array: Any) -> Iterator[Item]:
+        steps = array.shards
+        counts = [math.ceil(n / step) for n, step in zip(array.shape, steps, strict=True)]
+        for place in np.ndindex(*counts):
+            region = tuple(
+                slice(k * step, min((k + 1) * step, n)) for k, step, n in zip(place, steps, array.shape, strict=True)
+            )
+            yield Item(kind, place, region)
+
+    def files(self, item: Item) -> list[Path]:
+        """The files of a part."""
+        names = ("histogram",) if item.kind == "histogram" else tuple(MAPS)
+        return [self.path.joinpath(name, "c", *map(str, item.shard)) for name in names]
+
+    def missing(self) -> list[Item]:
+        """Parts that are not there, or whose files were cut short."""
+        written: dict[Path, set[str]] = {}
+
+        def there(file: Path) -> bool:
+            if file.parent not in written:
+                entries = file.parent.iterdir() if file.parent.is_dir() else ()
+                written[file.parent] = {one.name for one in entries}
+            return file.name in written[file.parent]
+
+        def whole(item: Item) -> bool:
+            array = self.histogram if item.kind == "histogram" else self.maps["depth"]
+            chunks = math.prod(n // step for n, step in zip(array.shards, array.chunks, strict=True))
+            return all(there(file) and _whole(file, chunks) for file in self.files(item))
+
+        return [item for item in self.items() if not whole(item)]
+
+    def tidy(self) -> None:
+        """Remove what a writer that was killed left behind: files that were not renamed yet."""
+        for name in ("", "histogram", *MAPS):
+            for leftover in (self.path / name).rglob("*.partial") if name else self.path.glob("*.partial"):
+                leftover.unlink(missing_ok=True)
+
+    def finish(self) -> None:
+        """Mark the store complete, with one replacement of its root document."""
+        mark(self.group, {"stage": "done", "complete": True})
+        self.attrs = dict(self.group.attrs)
+
+
+def _whole(file: Path, chunks: int) -> bool:
+    """Whether a shard ends in a good index: 16 bytes a chunk and their CRC-32C (Zarr v3, sharding codec)."""
+    import google_crc32c
+
+    length = 16 * chunks + 4
+    with open(file, "rb") as stream:
+        if stream.seek(0, 2) < length:
+            return False
+        stream.seek(-length, 2)
+        index = stream.read(length)
+    return int(google_crc32c.value(index[:-4])) == int.from_bytes(index[-4:], "little")
+
+
+def is_dataset(path: str | Path) -> bool:
+    """Whether a folder is a dataset, complete or not."""
+    try:
+        root = json.loads((Path(path) / "zarr.json").read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(root, dict) and root.get("attributes", {}).get("format") == FORMAT
+
+
+def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset:
+    """Open a dataset that `mars_lidar.generate` wrote.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        Nothing there, or no dataset.
+    IncompleteFileError
+        Its generation did not finish (a ValueError).
+    """
+    dataset = Dataset(Path(path))
+    if not (dataset.complete or allow_incomplete):
+        raise IncompleteFileError(f"{path} is incomplete: its generation did not finish; continue it with --resume")
+    return dataset

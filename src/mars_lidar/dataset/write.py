@@ -1,0 +1,157 @@
+"""Making one part of a dataset: simulate, pack, write. A part depends on the store's scenes and on nothing else."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.dataset.samples import flux_of, sample_parts
+from mars_lidar.dataset.shard import chunks_of, packer, write_shard
+from mars_lidar.dataset.store import Dataset, Item
+from mars_lidar.flux import Flux
+from mars_lidar.scene import Scene
+
+_T = TypeVar("_T")
+_KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
+
+
+class Stopped(Exception):
+    """The run ends: nothing was written."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What making a part took."""
+
+    exposures: int  # of pixels
+    simulate_s: float
+    write_s: float
+
+
+class Maker:
+    """Makes parts of one dataset; of use to one thread at a time. Keeps a buffer of one chunk."""
+
+    def __init__(self, dataset: Dataset, threads: int = 1, stop: threading.Event | None = None) -> None:
+        self.dataset = dataset
+        self._threads = threads
+        self._stop = stop
+        self._buffer: NDArray[Any] | None = None
+        self._simulate_s = 0.0
+        self._scenes: OrderedDict[int, Scene] = OrderedDict()
+        self._fluxes: OrderedDict[int, Flux] = OrderedDict()
+
+    def make(self, item: Item) -> Made:
+        """Make a part and write it."""
+        began = time.perf_counter()
+        if item.kind == "maps":
+            for name, values in self.maps(item.region[0]).items():
+                self.dataset.maps[name][item.region] = values
+            return Made(0, 0.0, time.perf_counter() - began)
+        self._simulate_s = 0.0
+        (path,) = self.dataset.files(item)
+        write_shard(path, self._packed(item))
+        exposures = math.prod(part.stop - part.start for part in item.region[:4])
+        return Made(exposures, self._simulate_s, time.perf_counter() - began - self._simulate_s)
+
+    def _packed(self, item: Item) -> Iterator[bytes | None]:
+        """The chunks of a shard, one after the other."""
+        array = self.dataset.histogram
+        pack = packer(self.dataset.recipe.layout, array.dtype)
+        for region in chunks_of(item.region, array.chunks, array.shards):
+            if region is None:
+                yield None
+                continue
+            began = time.perf_counter()
+            counts = self.counts(region)
+            self._simulate_s += time.perf_counter() - began
+            if counts.shape != array.chunks:  # at the edge of the array: chunks are stored whole
+                ends = [(0, whole - have) for whole, have in zip(array.chunks, counts.shape, strict=True)]
+                counts = np.pad(counts, ends)
+            yield pack(counts)
+
+    def maps(self, some: slice) -> dict[str, NDArray[np.float32]]:
+        """Maps of some samples (samples, H, W)."""
+        stacks: dict[str, list[Any]] = {"depth": [], "reflectivity": [], "signal": [], "background": [], "delay": []}
+        for sample in range(some.start, some.stop):
+            self._check()
+            scene, flux = self.scene(sample), self.flux(sample)
+            stacks["depth"].append(scene.depth_m)
+            stacks["reflectivity"].append(scene.reflectivity)
+            stacks["signal"].append(flux.signal)
+            stacks["background"].append(flux.background)
+            stacks["delay"].append(flux.delay_ns)
+        return {name: np.stack(values).astype(np.float32) for name, values in stacks.items()}
+
+    def counts(self, region: tuple[slice, ...]) -> NDArray[Any]:
+        """Counts of a region (samples, realizations, rows, columns, all bins); good until the next call."""
+        from mars_lidar.simulate import simulate
+
+        samples, realizations, rows, columns, _ = region
+        recipe = self.dataset.recipe
+        dtype, width = self.dataset.histogram.dtype, self.dataset.histogram.shape[3]
+        out = self._room(tuple(part.stop - part.start for part in region), dtype)
+        pixels = np.arange(rows.start, rows.stop)[:, None] * width + np.arange(columns.start, columns.stop)
+        for k, sample in enumerate(range(samples.start, samples.stop)):
+            self._check()
+            system = recipe.systems[sample_parts(recipe, sample)[1]]
+            direct = system.histogram_dtype == dtype
+            drawn = simulate(
+                self.flux(sample)[rows, columns],
+                system,
+                engine=recipe.engine,
+                realizations=realizations.stop - realizations.start,
+                first_realization=realizations.start,
+                pixel_index=pixels,
+                seed=int(self.dataset.seeds[sample]),
+                threads=self._threads,
+                out=out[k] if direct else None,
+                progress=self._progress,
+            )
+            if not direct:
+                out[k] = drawn
+        return out
+
+    def flux(self, sample: int) -> Flux:
+        """Photons of a sample."""
+        recipe = self.dataset.recipe
+        _, system, signal, sbr = sample_parts(recipe, sample)
+        return _remembered(
+            self._fluxes,
+            sample,
+            lambda: flux_of(self.scene(sample), recipe.systems[system], recipe.light, signal, sbr),
+        )
+
+    def scene(self, sample: int) -> Scene:
+        """Scene of a sample."""
+        number = sample_parts(self.dataset.recipe, sample)[0]
+        return _remembered(self._scenes, number, lambda: self.dataset.scene(number))
+
+    def _room(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """An array of this shape in the buffer, whose pages need not be asked for again."""
+        size = int(np.prod(shape))
+        if self._buffer is None or self._buffer.size < size:
+            self._buffer = np.empty(size, dtype)
+        return self._buffer[:size].reshape(shape)
+
+    def _check(self) -> None:
+        if self._stop is not None and self._stop.is_set():
+            raise Stopped
+
+    def _progress(self, done: int, total: int) -> None:
+        self._check()
+
+
+def _remembered(kept: OrderedDict[int, _T], key: int, make: Callable[[], _T]) -> _T:
+    if key not in kept:
+        kept[key] = make()
+        while len(kept) > _KEPT:
+            kept.popitem(last=False)
+    return kept[key]

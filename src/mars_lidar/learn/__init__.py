@@ -1,0 +1,21 @@
+"""Training: datasets for PyTorch. Needs the extra ``learn``: pip install 'mars-lidar[learn]'."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mars_lidar.learn.stored import StoredDataset
+
+_MODULES = {"StoredDataset": "stored"}
+
+
+def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"mars_lidar.learn.{_MODULES[name]}"), name)
+
+
+__all__ = ["StoredDataset"]

@@ -1,0 +1,32 @@
+"""A small recipe that every test of datasets begins with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mars_lidar import Detector, GaussianPulse, System
+
+SYSTEM = System(
+    period_ns=100.0, cycles=50, bins=32, pulse=GaussianPulse(sigma_ns=1.0), detector=Detector(dead_time_ns=30.0)
+)
+
+
+@pytest.fixture
+def recipe() -> dict[str, Any]:
+    """2 scenes x 2 systems x 2 levels, 3 realizations of 12 x 10 pixels; several chunks and shards."""
+    return {
+        "seed": 5,
+        "scenes": [{"example": "room", "size": [12, 10], "seeds": [0, 3]}],
+        "systems": [SYSTEM, SYSTEM.replace(cycles=80)],
+        "light": {"signal": [0.2, 1.0], "sbr": "inf", "dark_counts_per_s": 1e5},
+        "realizations": 3,
+        "store": {"chunk_mib": 0.004, "shard_mib": 0.016},
+    }
+
+
+def files(store: Path) -> dict[str, bytes]:
+    """Every file of a store, by its path."""
+    return {str(one.relative_to(store)): one.read_bytes() for one in sorted(store.rglob("*")) if one.is_file()}

@@ -1,0 +1,65 @@
+"""dask workers make the same store, byte for byte, and one of them may die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import warnings
+
+import distributed
+import pytest
+
+import mars_lidar as ml
+from dataset.conftest import files
+from mars_lidar import io
+
+pytestmark = pytest.mark.filterwarnings("default")  # what dask warns of when its workers die is its own
+
+
+@pytest.fixture
+def cluster():
+    """Two worker processes."""
+    with (
+        warnings.catch_warnings(),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0, silence_logs=50
+        ) as started,
+    ):
+        yield started
+
+
+def test_a_killed_worker_loses_nothing(tmp_path, recipe, cluster):
+    ml.generate(recipe, tmp_path / "one.zarr")
+    killed = []
+
+    def progress(done: int, total: int) -> None:
+        if done >= 4 and not killed:
+            killed.append(next(iter(cluster.workers.values())).pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    done = ml.generate(recipe, tmp_path / "two.zarr", scheduler=cluster.scheduler_address, progress=progress)
+    assert killed
+    assert done.parts == sum(1 for _ in ml.dataset.open_dataset(tmp_path / "two.zarr").items())
+    assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
+    ml.generate(recipe | {"seed": 6}, tmp_path / "two.zarr", scheduler=cluster.scheduler_address, overwrite=True)
+    ml.generate(recipe | {"seed": 6}, tmp_path / "one.zarr", overwrite=True)  # workers forget the store of before
+    assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
+
+
+def test_workers_of_this_machine(tmp_path, recipe):
+    ml.generate(recipe, tmp_path / "one.zarr")
+    ml.generate(recipe, tmp_path / "two.zarr", workers=1)
+    assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
+
+
+def test_an_address_without_a_scheduler(tmp_path, recipe, monkeypatch):
+    monkeypatch.setattr("mars_lidar.dataset.cluster.TIMEOUT_S", 0.2)
+    with pytest.raises(ValueError, match="scheduler must be the address of a dask scheduler"):
+        ml.generate(recipe, tmp_path / "set.zarr", scheduler="tcp://127.0.0.1:9")
+
+
+def test_without_the_library(tmp_path, recipe, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    with pytest.raises(io.MissingLibraryError, match=r"pip install 'mars-lidar\[cluster\]'"):
+        ml.generate(recipe, tmp_path / "set.zarr", workers=2)
+    assert not list(tmp_path.iterdir())

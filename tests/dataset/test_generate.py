@@ -1,0 +1,214 @@
+"""Datasets: the counts are those of `simulate`, and a store is the same however it was made."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from typer.testing import CliRunner
+
+import mars_lidar as ml
+from dataset.conftest import SYSTEM, files
+from mars_lidar import io
+from mars_lidar.cli import app
+from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, read_sparse, verify
+
+
+@pytest.mark.parametrize("layout", ["sparse", "dense"])
+def test_every_sample_is_what_simulate_makes(tmp_path, recipe, layout):
+    recipe["store"]["layout"] = layout
+    done = ml.generate(recipe, tmp_path / "set.zarr")
+    assert done.shape == (8, 3, 12, 10, 32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = xarray.open_zarr(tmp_path / "set.zarr", chunks=None)
+    assert data.attrs["complete"] is True
+    assert data.histogram.dims == ("sample", "realization", "y", "x", "time")
+    systems = [ml.System.from_dict(one) for one in json.loads(data.attrs["systems"])]
+    for k in range(8):
+        one = data.isel(sample=k)
+        scene = ml.Scene.example("room", (12, 10), (0, 3)[int(one.scene)])
+        system = systems[int(one.system)]
+        flux = scene.flux(system, signal=float(one.signal_level), sbr=float(one.sbr), dark_counts_per_s=1e5)
+        cube = ml.simulate(flux, system, realizations=3, seed=int(one.seed))
+        np.testing.assert_array_equal(one.histogram, cube)
+        for name, there in (
+            ("depth", scene.depth_m), ("reflectivity", scene.reflectivity), ("signal", flux.signal),
+            ("background", flux.background), ("delay", flux.delay_ns),
+        ):  # fmt: skip
+            np.testing.assert_array_equal(one[name], there.astype(np.float32))
+        sparse = read_sparse(tmp_path / "set.zarr", k, 2)
+        np.testing.assert_array_equal(sparse.toarray().reshape(12, 10, 32), cube[2])
+        assert sparse.has_canonical_format or np.all(np.diff(sparse.row * 32 + sparse.col) > 0)
+    assert len(set(data.seed.values.tolist())) == 8
+    assert verify(tmp_path / "set.zarr", chunks=None).good
+
+
+def test_chunks_of_part_of_a_row_and_wide_counts(tmp_path, recipe):
+    recipe["store"] = {"chunk_mib": 0.001, "shard_mib": 0.002}
+    busy = SYSTEM.replace(cycles=100_000, detector=ml.Detector(dead_time_ns=0.0))
+    recipe |= {"systems": [SYSTEM, busy], "scenes": {"example": "room", "size": [3, 40]}, "realizations": 2}
+    recipe["light"] = {"signal": 0.1, "sbr": 1}
+    ml.generate(recipe, tmp_path / "set.zarr")
+    stored = open_dataset(tmp_path / "set.zarr")
+    assert stored.histogram.dtype == np.uint32
+    assert stored.histogram.chunks[2:4] == (1, 8)
+    assert verify(tmp_path / "set.zarr", chunks=None).good
+    for k in range(2):
+        np.testing.assert_array_equal(
+            read_sparse(stored, k, 1).toarray().reshape(3, 40, 32), np.asarray(stored.histogram[k, 1])
+        )
+
+
+def test_a_sample_keeps_its_seed_whatever_else_is_made(tmp_path, recipe):
+    ml.generate(recipe, tmp_path / "all.zarr")
+    recipe["scenes"][0]["seeds"] = [3]
+    recipe["light"]["signal"] = [1.0]
+    ml.generate(recipe, tmp_path / "few.zarr")
+    every, few = (open_dataset(tmp_path / f"{name}.zarr") for name in ("all", "few"))
+    assert set(few.seeds.tolist()) < set(every.seeds.tolist())
+    np.testing.assert_array_equal(few.histogram[1], every.histogram[7])
+
+
+def test_the_store_does_not_depend_on_threads(tmp_path, recipe):
+    for threads in (1, 3):
+        ml.generate(recipe, tmp_path / f"{threads}.zarr", threads=threads)
+    assert files(tmp_path / "1.zarr") == files(tmp_path / "3.zarr")
+
+
+def test_bad_files_are_told_and_left_out(tmp_path, recipe):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    good = np.linspace(1000, 9000, 120).reshape(12, 10).astype(np.uint16)
+    import imageio.v3 as iio
+
+    for name in ("a", "c", "g"):
+        iio.imwrite(folder / f"{name}_depth.png", good)
+    (folder / "b_depth.png").write_bytes(b"not a picture")
+    whole = (folder / "a_depth.png").read_bytes()
+    (folder / "d_depth.png").write_bytes(whole[: len(whole) // 2])
+    iio.imwrite(folder / "e_depth.png", np.zeros_like(good))
+    iio.imwrite(folder / "f_depth.png", np.vstack([good, good]))
+    iio.imwrite(folder / "g_rgb.png", np.zeros((12, 10, 3), np.uint8))  # black: no level can be reached
+    recipe["scenes"] = [{"path": str(folder)}]
+    done = ml.generate(recipe, tmp_path / "set.zarr")
+    assert done.shape[0] == 2 * 4
+    assert [one.path.name[0] for one in done.problems] == ["b", "d", "e", "f", "g"]
+    told = [one.reason for one in done.problems]
+    assert "cannot be read" in told[0]
+    assert "24 × 10 pixels" in told[3]
+    assert "zero at every pixel" in told[4]
+    assert [Path(name).name for name in open_dataset(tmp_path / "set.zarr").scene_names()] == [
+        "a_depth.png", "c_depth.png",
+    ]  # fmt: skip
+    ran = CliRunner().invoke(app, ["info", str(tmp_path / "set.zarr")])
+    assert ran.exit_code == 0
+    assert "f_depth.png" in ran.stdout
+    for name in ("a", "c", "f"):
+        (folder / f"{name}_depth.png").unlink()
+    with pytest.raises(ValueError, match=r"none of the scenes can be used:\s+.*b_depth"):
+        ml.generate(recipe, tmp_path / "other.zarr")
+    assert not (tmp_path / "other.zarr").exists()
+
+
+def test_crops_have_returns_and_do_not_depend_on_the_other_scenes(tmp_path, recipe):
+    depth = np.full((30, 30), np.nan)
+    depth[10:20, 10:20] = 2.0
+    np.save(tmp_path / "hole_depth.npy", depth)
+    recipe["scenes"] = [{"path": str(tmp_path / "hole_depth.npy")}, *recipe["scenes"]]
+    recipe["scenes"][1]["size"] = 30
+    recipe["crop"] = {"size": [12, 10], "count": 3}
+    done = ml.generate(recipe, tmp_path / "set.zarr")
+    assert done.shape == (3 * 3 * 4, 3, 12, 10, 32)
+    stored = open_dataset(tmp_path / "set.zarr")
+    assert len({stored.scene(k).depth_m.tobytes() for k in range(9)}) == 9
+    assert all(stored.scene(k).valid.any() for k in range(9))
+    assert verify(tmp_path / "set.zarr").good
+    recipe["scenes"].pop(0)
+    ml.generate(recipe, tmp_path / "less.zarr")
+    np.testing.assert_array_equal(open_dataset(tmp_path / "less.zarr").scene(4).depth_m, stored.scene(7).depth_m)
+
+
+def test_damage_is_found(tmp_path, recipe):
+    ml.generate(recipe, tmp_path / "set.zarr")
+    stored = open_dataset(tmp_path / "set.zarr")
+    counts = np.asarray(stored.histogram[5, 1])
+    counts[3, 4, 5] += 1
+    stored.histogram[5, 1] = counts
+    told = verify(tmp_path / "set.zarr", chunks=None)
+    assert not told.good
+    assert told.different[0].startswith("histogram[5:6, 1:2, ")
+    assert "differs in 1 bins" in told.different[0]
+    shard = max((tmp_path / "set.zarr/histogram/c").rglob("*"), key=lambda one: one.stat().st_size * one.is_file())
+    content = bytearray(shard.read_bytes())
+    content[30] ^= 4
+    shard.write_bytes(content)
+    assert "cannot be read" in " ".join(verify(tmp_path / "set.zarr", chunks=None).different)
+    ran = CliRunner().invoke(app, ["verify", str(tmp_path / "set.zarr"), "--all"])
+    assert ran.exit_code == 1
+    assert "NO: " in ran.stdout
+
+
+def test_the_command(tmp_path):
+    name = str(tmp_path / "set.zarr")
+    options = ["--size", "12,10", "--scene-seeds", "2", "--cycles", "20", "--bins", "16", "--signal", "1"]
+    ran = CliRunner().invoke(app, ["generate", "room", *options, "--sbr", "2", "-o", name, "--dry-run"])
+    assert ran.exit_code == 0, ran.output
+    assert "2 × 1 × 12 × 10 × 16" in ran.stdout
+    assert not Path(name).exists()
+    ran = CliRunner().invoke(app, ["generate", "room", *options, "--sbr", "2", "-o", name])
+    assert ran.exit_code == 0, ran.output
+    assert CliRunner().invoke(app, ["verify", name]).exit_code == 0
+    for bad, told in (
+        (["room", "--crop", "x"], "--crop must be one integer"),
+        (["room", "--focal-px", "3"], "belong to RGB-D"),
+        ([str(tmp_path / "none")], "no such file"),
+        (["--resume", "--seed", "3"], "takes the recipe of the store"),
+        ([], "SOURCE is missing"),
+    ):
+        ran = CliRunner().invoke(app, ["generate", *bad, "-o", str(tmp_path / "b.zarr"), "--layout", "dense"])
+        assert ran.exit_code == 2, ran.output
+        assert told in ran.output
+    assert not (tmp_path / "b.zarr").exists()
+
+
+def test_estimates_come_near(tmp_path, recipe):
+    recipe["scenes"][0]["size"] = 48
+    recipe["store"] = {"chunk_mib": 0.1, "shard_mib": 1}
+    told = estimate(recipe, tmp_path / "set.zarr")
+    ml.generate(recipe, tmp_path / "set.zarr")
+    found = sum(len(one) for name, one in files(tmp_path / "set.zarr").items() if "histogram" in name)
+    maps = told.shape[0] * 48 * 48 * 20 + told.scenes * 48 * 48 * 16
+    assert told.shape == (8, 3, 48, 48, 32)
+    assert told.bytes - maps == pytest.approx(found, rel=0.25)
+    assert told.memory_bytes < 1.5 * 2**30
+
+
+def test_bad_arguments(tmp_path, recipe):
+    out = tmp_path / "set.zarr"
+    for options, told in (
+        ({"threads": 0}, "threads must be"),
+        ({"workers": 1, "scheduler": "x"}, "give one of them"),
+        ({"resume": True, "overwrite": True}, "exclude each other"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            ml.generate(recipe, out, **options)
+    with pytest.raises(ValueError, match=r"out must end in \.zarr"):
+        ml.generate(recipe, tmp_path / "set.h5")
+    with pytest.raises(ValueError, match="there is nothing to resume"):
+        ml.generate(None, out, resume=True)
+    with pytest.raises(ValueError, match="no scene found"):
+        ml.generate(recipe | {"scenes": {"path": str(tmp_path)}}, out)
+    assert not out.exists()
+    ml.generate(recipe, out)
+    with pytest.raises(FileExistsError, match="exists already"):
+        ml.generate(recipe, out)
+    with pytest.raises(ValueError, match="another recipe: seed was 5, now 6"):
+        ml.generate(recipe | {"seed": 6}, out, resume=True)
+    assert ml.generate(DatasetRecipe.from_dict(recipe), out, resume=True).parts == 0
+    with pytest.raises(ValueError, match="not a cube"):
+        io.load(out)

@@ -1,0 +1,119 @@
+"""What is not finished never looks complete, and what is resumed is byte for byte what would have been."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mars_lidar as ml
+from dataset.conftest import files
+from mars_lidar import io
+from mars_lidar.dataset import DatasetRecipe, open_dataset
+
+_SCRIPT = """
+import json, os, resource, signal, sys
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.dataset import DatasetRecipe, ingest
+recipe, out, how, number = sys.argv[1:]
+def progress(done, total):
+    if done >= int(number):
+        os.kill(os.getpid(), signal.SIGKILL if how == "kill" else signal.SIGINT)
+if how == "disk":
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(number), int(number)))
+if how == "scenes":
+    ingest.lay_out = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+try:
+    ml.generate(DatasetRecipe.from_dict(json.loads(recipe)), out, progress=None if how == "disk" else progress)
+except (io.Interrupted, io.WriteError) as error:
+    print(type(error).__name__, getattr(error, "strerror", None) or error)
+"""
+
+
+def _run(recipe: dict, out: Path, how: str, number: int) -> subprocess.CompletedProcess[str]:
+    text = DatasetRecipe.from_dict(recipe).to_json()
+    return subprocess.run(
+        [sys.executable, "-c", _SCRIPT, text, str(out), how, str(number)], capture_output=True, text=True
+    )
+
+
+@pytest.fixture
+def whole(tmp_path, recipe) -> dict[str, bytes]:
+    """The files of a run that nothing stopped."""
+    ml.generate(recipe, tmp_path / "whole.zarr")
+    return files(tmp_path / "whole.zarr")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+@pytest.mark.parametrize(("how", "number"), [("kill", 1), ("kill", 11), ("int", 5), ("scenes", 0)])
+def test_a_run_that_was_stopped_goes_on(tmp_path, recipe, whole, how, number):
+    out = tmp_path / "set.zarr"
+    ran = _run(recipe, out, how, number)
+    if how == "int":
+        assert ran.stdout.startswith("Interrupted interrupted; "), ran.stderr
+        assert "parts of" in ran.stdout
+        assert "continue with --resume" in ran.stdout
+    else:
+        assert ran.returncode == -signal.SIGKILL, ran.stderr
+    with pytest.raises(io.IncompleteFileError, match="generation did not finish"):
+        open_dataset(out)
+    assert json.loads((out / "zarr.json").read_text())["attributes"]["complete"] is False
+    if how == "kill":  # and what a killed writer leaves between its write and its rename
+        (out / "histogram/c/0").mkdir(parents=True, exist_ok=True)
+        (out / "histogram/c/0/1.0123.partial").write_bytes(b"half")
+    done = ml.generate(None if how != "scenes" else recipe, out, resume=True)
+    assert done.parts + done.parts_before == sum(1 for _ in open_dataset(out).items())
+    assert how == "scenes" or done.parts_before >= min(number, 1)
+    assert files(out) == whole
+    assert not (tmp_path / "set.zarr.lock").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+def test_without_its_scenes_a_store_needs_its_recipe(tmp_path, recipe):
+    _run(recipe, tmp_path / "set.zarr", "scenes", 0)
+    with pytest.raises(ValueError, match="give the recipe again"):
+        ml.generate(None, tmp_path / "set.zarr", resume=True)
+
+
+def test_a_shard_that_was_cut_short_is_made_again(tmp_path, recipe, whole):
+    out = tmp_path / "whole.zarr"
+    shard = next(one for one in sorted((out / "histogram/c").rglob("*")) if one.is_file())
+    document = out / "zarr.json"
+    document.write_text(document.read_text().replace('"complete": true', '"complete": false'))
+    shard.write_bytes(shard.read_bytes()[:-30])  # as after a loss of power
+    assert ml.generate(recipe, out, resume=True).parts == 1
+    assert files(out) == whole
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
+def test_a_full_disk_is_told_and_the_run_goes_on_afterwards(tmp_path, recipe, whole):
+    out = tmp_path / "set.zarr"
+    limit = max(len(one) for name, one in whole.items() if name.startswith("histogram/c")) - 20
+    ran = _run(recipe, out, "disk", limit)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.startswith("WriteError File too large; "), ran.stdout
+    assert "marked incomplete" in ran.stdout
+    assert "GB free" in ran.stdout
+    assert not list(out.rglob("*.partial"))
+    with pytest.raises(io.IncompleteFileError):
+        open_dataset(out)
+    ml.generate(recipe, out, resume=True)
+    assert files(out) == whole
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs flock")
+def test_two_runs_do_not_write_one_store(tmp_path, recipe):
+    import fcntl
+
+    with open(tmp_path / "set.zarr.lock", "w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(ValueError, match="being written by another process"):
+            ml.generate(recipe, tmp_path / "set.zarr")
+    ml.generate(recipe, tmp_path / "set.zarr")

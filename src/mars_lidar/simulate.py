@@ -39,6 +39,7 @@ def simulate(
     table: Table | None = None,
     count: Literal["exact", "gaussian"] | None = None,
     interpolation: Literal["bilinear", "nearest"] | None = None,
+    outside: Literal["error", "exact"] | None = None,
 ) -> NDArray[Any]:
     """Histogram cubes of an image.
 
@@ -77,13 +78,15 @@ def simulate(
         For ``"mars"``: the law of the count, ``"exact"`` (default) or ``"gaussian"`` (the paper's).
     interpolation
         For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
+    outside
+        For a table, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
 
     Returns
     -------
     NDArray
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given).
     """
-    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation)
+    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside)
     task = _task(
         flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress
     )

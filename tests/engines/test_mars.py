@@ -120,7 +120,7 @@ def test_pixels_beyond_the_table_are_evaluated_and_counted():
     bright[0, 1], bright[1, 2] = 20.0, 5.0
     flux = ml.Flux(bright, 0.5, 30.0)
     report: dict[str, float] = {}
-    cube = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=4, report=report)
+    cube = ml.simulate(flux, SYSTEM, engine="mars", table=table(), outside="exact", realizations=4, report=report)
     assert report["pixels_evaluated"] == 2
     assert {"lookup_s", "evaluation_s", "counts_s", "sampling_s"} <= set(report)
     assert min(report.values()) >= 0.0
@@ -153,6 +153,32 @@ def test_a_masked_image_works():
     assert not cube[:, 2, 0].any()
 
 
+@pytest.mark.parametrize("engine", ["mars", "renewal"])
+def test_pixels_beyond_the_table_are_an_error_unless_asked_for(engine: str):
+    signal, background = np.full((2, 3), 1.0), np.full((2, 3), 0.5)
+    signal[0, 1], signal[1, 2], background[1, 2] = 20.0, 5.0, 7.5
+    flux = ml.Flux(signal, background, 30.0)
+    with pytest.raises(ValueError, match="table must reach every pixel, but 2 of 6 lie outside") as error:
+        ml.simulate(flux, SYSTEM, engine=engine, table=table())
+    for told in ("signal 5 to 20", "(the table: 0 to 3)", "background 7.5 to 7.5", "outside='exact'"):
+        assert told in str(error.value)
+    assert ml.simulate(flux, SYSTEM, engine=engine, table=table(), outside="exact").sum(-1).min() > 0
+
+
+def test_masked_pixels_need_no_zero_in_the_table():
+    """S = 0 is evaluated where the grid has none; S between 0 and the grid is not."""
+    bare = Table.build(SYSTEM, np.array([0.5, 1.0]), np.array([0.2, 0.4]))
+    signal, delay = np.full((2, 2), 0.7), np.full((2, 2), 20.0)
+    signal[1], delay[1] = 0.0, np.nan
+    flux, report = ml.Flux(signal, 0.3, delay), {}
+    cube = ml.simulate(flux, SYSTEM, engine="mars", table=bare, report=report, realizations=3)
+    assert report["pixels_evaluated"] == 2
+    direct = ml.simulate(flux, SYSTEM, engine="mars", realizations=3)
+    assert np.array_equal(cube[:, 1], direct[:, 1])
+    with pytest.raises(ValueError, match=r"signal 0\.1 to 0\.1"):
+        ml.simulate(ml.Flux(np.full((2, 2), 0.1), 0.3, 20.0), SYSTEM, engine="mars", table=bare)
+
+
 def test_memory_is_the_output_and_a_bounded_work_area():
     """2^17 pixels, all different: what is held beside the cube and the table stays far below 256 MiB."""
     system = SYSTEM.replace(bins=16)
@@ -181,6 +207,16 @@ def test_memory_is_the_output_and_a_bounded_work_area():
             lambda f: ml.simulate(f, SYSTEM, engine="mars", interpolation="nearest"),
             ValueError,
             ["interpolation", "without a table"],
+        ),
+        (
+            lambda f: ml.simulate(f, SYSTEM, engine="mars", table=table(), outside="clip"),
+            ValueError,
+            ["outside", "'clip'", "'error'"],
+        ),
+        (
+            lambda f: ml.simulate(f, SYSTEM, engine="mars", outside="exact"),
+            ValueError,
+            ["outside", "without a table"],
         ),
         (lambda f: ml.simulate(f, SYSTEM, engine="exact", table=table()), TypeError, ["table", "'exact'"]),
         (lambda f: ml.simulate(f, SYSTEM, engine="renewal", count="exact"), TypeError, ["count", "'renewal'"]),

@@ -59,8 +59,14 @@ def test_reports_add_up_over_blocks(tmp_path, table: Table, monkeypatch: pytest.
 
     monkeypatch.setattr(recipe, "BLOCK_BYTES", 5 * 64 * 2)
     bright = ml.Flux(np.full((6, 5), 3.0), 0.4, 20.0)
-    written = io.simulate_to(tmp_path / "a.h5", bright, SYSTEM, engine="mars", table=table)
+    some = ml.Flux(np.where(np.eye(6, 5) > 0, 3.0, 1.0), 0.4, 20.0)
+    with pytest.raises(ValueError, match="5 of 30 lie outside"):  # of all pixels, before any block is drawn
+        io.simulate_to(tmp_path / "a.h5", some, SYSTEM, engine="mars", table=table)
+    assert not list(tmp_path.iterdir())
+    written = io.simulate_to(tmp_path / "a.h5", bright, SYSTEM, engine="mars", table=table, outside="exact")
     assert written.report["pixels_evaluated"] == 30
+    with io.load(tmp_path / "a.h5") as cube:
+        assert io.verify(cube, table=table)
 
 
 def test_command_line(tmp_path, table: Table):

@@ -254,6 +254,13 @@ Interpolation = Annotated[
     str | None,
     _option("--interpolation", panel=_RUN, default="bilinear", help="Of --table: bilinear or nearest."),
 ]
+TableOutside = Annotated[
+    str | None,
+    _option(
+        "--table-outside", panel=_RUN, default="error",
+        help="Of --table, for pixels beyond its range: error, or exact (each is evaluated by itself, some ms).",
+    ),
+]
 Realizations = Annotated[
     int,
     _option("--realizations", panel=_RUN, help="Independent exposures of the image.", default="1"),

@@ -81,6 +81,7 @@ def simulate(
     table: options.Table = None,
     count: options.Count = None,
     interpolation: options.Interpolation = None,
+    table_outside: options.TableOutside = None,
     realizations: options.Realizations = 1,
     seed: options.Seed = 0,
     threads: options.Threads = None,
@@ -159,6 +160,7 @@ def simulate(
                 table=_table(table, instrument),
                 count=count,  # type: ignore[arg-type]  # checked there
                 interpolation=interpolation,  # type: ignore[arg-type]
+                outside=table_outside,  # type: ignore[arg-type]
             )
         if picture:
             _draw(out, png)

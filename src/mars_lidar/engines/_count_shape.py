@@ -25,10 +25,11 @@ IndexArray = NDArray[np.int64]
 class CountTimesShape(Engine):
     """Draws N from a law of the count, and its registrations from a shape; both from a table or evaluated."""
 
-    def __init__(self, table: Table | None, interpolation: str | None, level: str) -> None:
-        if table is None and interpolation is not None:
-            raise ValueError(f"interpolation must be None without a table, got {interpolation!r}")
-        self.reader = None if table is None else TableReader(table, interpolation)
+    def __init__(self, table: Table | None, interpolation: str | None, outside: str | None, level: str) -> None:
+        for name, value in (("interpolation", interpolation), ("outside", outside)):
+            if table is None and value is not None:
+                raise ValueError(f"{name} must be None without a table, got {value!r}")
+        self.reader = None if table is None else TableReader(table, interpolation, outside)
         self.level = level
 
     @property
@@ -37,7 +38,7 @@ class CountTimesShape(Engine):
         return self.reader.settings if self.reader else {}
 
     def check(self, flux: Flux, system: System) -> None:
-        """A table must be of the system, and knows one return a pixel."""
+        """A table must be of the system, reach the pixels unless they may lie outside, and knows one return each."""
         if self.reader:
             self.reader.check(flux, system)
 

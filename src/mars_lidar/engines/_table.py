@@ -27,6 +27,7 @@ IndexArray = NDArray[np.int64]
 
 PIXELS = 2**17  # looked up at a time: 14 MiB
 _INTERPOLATIONS = ("bilinear", "nearest")
+_OUTSIDE = ("error", "exact")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +53,15 @@ class Entries:
 
 
 class TableReader:
-    """A table as an engine reads it: which, and how between its grid points."""
+    """A table as an engine reads it: which, how between its grid points, and whether pixels may lie beyond them."""
 
-    def __init__(self, table: Table, interpolation: str | None) -> None:
+    def __init__(self, table: Table, interpolation: str | None, outside: str | None) -> None:
         if not (callable(getattr(table, "lookup", None)) and callable(getattr(table, "shapes", None))):
             raise TypeError(f"table must be a mars_lidar.Table, got {table!r}")
         self.table = table
         given = "bilinear" if interpolation is None else interpolation
         nearest = _validate.choice("interpolation", given, _INTERPOLATIONS) == "nearest"
+        self.refuses = _validate.choice("outside", "error" if outside is None else outside, _OUTSIDE) == "error"
         self.interpolation: Literal["bilinear", "nearest"] = "nearest" if nearest else "bilinear"
 
     @property
@@ -68,14 +70,38 @@ class TableReader:
         return {"interpolation": self.interpolation, "table": table_record(self.table)}
 
     def check(self, flux: Flux, system: System) -> None:
-        """The table is of this system but for the number of cycles, and every pixel has one return."""
+        """The table is of this system but for the number of cycles, and every pixel has one return, on its grid."""
         ours, theirs = system.detected().to_dict(), self.table.system.to_dict()
         for name in ours:
             if name != "cycles" and ours[name] != theirs[name]:
                 raise ValueError(f"table must be of this system: {name} is {ours[name]}, the table's {theirs[name]}")
-        if single_return(flux) is None:
+        flux = flux.detected(system)
+        single = single_return(flux)
+        if single is None:
             what = "a waveform" if flux.waveform is not None else "several returns in a pixel"
             raise ValueError(f"flux must have one return a pixel with a table, got {what}; leave the table out")
+        if self.refuses:
+            self._check_range(single[0], flux.background.reshape(-1))
+
+    def _check_range(self, signal: FloatArray, background: FloatArray) -> None:
+        """Every pixel lies on the grid, or has no return, of which nothing but its background has to be known."""
+        beyond, told = np.zeros(signal.size, dtype=bool), []
+        for name, photons, axis in (
+            ("signal", signal, self.table.signal), ("background", background, self.table.background)
+        ):  # fmt: skip
+            out = (photons < axis[0]) | (photons > axis[-1])
+            if name == "signal":
+                out &= photons > 0.0
+            if out.any():
+                low, high = photons[out].min(), photons[out].max()
+                told.append(f"{name} {low:.4g} to {high:.4g} (the table: {axis[0]:g} to {axis[-1]:g})")
+            beyond |= out
+        if told:
+            raise ValueError(
+                f"table must reach every pixel, but {int(beyond.sum())} of {beyond.size} lie outside of it: "
+                f"{', '.join(told)} photons per period; build it over that range, or give outside='exact' "
+                "(--table-outside exact) to evaluate each of those by itself, which takes some ms"
+            )
 
     def read(self, task: Task, pixels: IndexArray) -> tuple[Entries, IndexArray]:
         """Entries of those of the pixels that lie on the grid; the others."""

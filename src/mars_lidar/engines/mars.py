@@ -36,9 +36,8 @@ class MarsEngine(CountTimesShape):
     ----------
     table
         `mars_lidar.Table` of this system (any number of cycles): cumulants and shapes are interpolated in (S, B),
-        the shape is moved to the pixel's delay to a fraction of a bin. Pixels outside of its grid are evaluated
-        as without a table, and counted in the report. None: every distinct (S, B, delay), or waveform, is
-        evaluated by itself, exactly, which takes from a millisecond to some ten of them each.
+        the shape is moved to the pixel's delay to a fraction of a bin. None: every distinct (S, B, delay), or waveform,
+        is evaluated by itself, exactly, which takes from a millisecond to some ten of them each.
     count
         ``"exact"``: the exact law without a table; with one the discrete law of the table's four cumulants.
         ``"gaussian"``: the paper's, a rounded normal number of the right mean and variance, at least 0. Rounding
@@ -46,6 +45,10 @@ class MarsEngine(CountTimesShape):
         to the laser, whose variances go down to 0.04.
     interpolation
         For a table: ``"bilinear"`` in (log S, log B), the default, or ``"nearest"`` grid point, the paper's.
+    outside
+        For a table, of pixels beyond its grid: ``"error"``, the default, or ``"exact"``, to evaluate them as without
+        a table, and count them in the report. Pixels without a return (S = 0) are no error: where the grid has no
+        S = 0 they are evaluated.
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
 
@@ -58,7 +61,7 @@ class MarsEngine(CountTimesShape):
     name = "mars"
     description = "count law x mean histogram: cost flat in the exposure, bins not correlated as they should be"
     effects = LIGHT_EFFECTS + TIMING_EFFECTS
-    options: ClassVar[tuple[str, ...]] = ("table", "count", "interpolation")
+    options: ClassVar[tuple[str, ...]] = ("table", "count", "interpolation", "outside")
 
     def __init__(
         self,
@@ -66,10 +69,11 @@ class MarsEngine(CountTimesShape):
         *,
         count: Literal["exact", "gaussian"] = "exact",
         interpolation: Literal["bilinear", "nearest"] | None = None,
+        outside: Literal["error", "exact"] | None = None,
         level: str = "",
     ) -> None:
         self.count = _validate.choice("count", count, _COUNTS)
-        super().__init__(table, interpolation, level)
+        super().__init__(table, interpolation, outside, level)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -35,24 +35,25 @@ class RenewalEngine(CountTimesShape):
     table
         `mars_lidar.Table` of this system: its shapes (of either method) in place of the chain's, and see
         `MarsEngine`. None: the chain is solved for every distinct (S, B), some milliseconds each.
-    interpolation
-        As for `MarsEngine`.
+    interpolation, outside
+        As for `MarsEngine`; pixels beyond the grid get their own chain.
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
     """
 
     name = "renewal"
     description = "constant-rate renewal count law x the chain's shape: a baseline"
-    options: ClassVar[tuple[str, ...]] = ("table", "interpolation")
+    options: ClassVar[tuple[str, ...]] = ("table", "interpolation", "outside")
 
     def __init__(
         self,
         table: Table | None = None,
         *,
         interpolation: Literal["bilinear", "nearest"] | None = None,
+        outside: Literal["error", "exact"] | None = None,
         level: str = "",
     ) -> None:
-        super().__init__(table, interpolation, level)
+        super().__init__(table, interpolation, outside, level)
 
     def _laws_of(self, system: System, entries: Entries) -> CountLaws:
         return _laws(system, entries.signal, entries.background)

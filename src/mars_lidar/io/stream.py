@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar.engines import find_engine
 from mars_lidar.flux import Flux
 from mars_lidar.io.cube import Cube, check_output, create
 from mars_lidar.io.recipe import Recipe
@@ -78,6 +79,7 @@ def simulate_to(
     table: Table | None = None,
     count: Literal["exact", "gaussian"] | None = None,
     interpolation: Literal["bilinear", "nearest"] | None = None,
+    outside: Literal["error", "exact"] | None = None,
 ) -> Written:
     """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
 
@@ -88,7 +90,9 @@ def simulate_to(
     ----------
     path
         The file; its suffix chooses the format.
-    flux, system, engine, realizations, first_realization, pixel_index, seed, threads, table, count, interpolation
+    flux, system, engine, realizations, first_realization, pixel_index, seed, threads
+        As for `mars_lidar.simulate`.
+    table, count, interpolation, outside
         As for `mars_lidar.simulate`; the file keeps the name of the engine, its settings, and a hash of the table.
     depth_m, reflectivity
         Maps (H, W) of the scene to store beside the counts; depth is c tau / 2 by default.
@@ -110,7 +114,7 @@ def simulate_to(
     WriteError, Interrupted
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
-    options = _given(table=table, count=count, interpolation=interpolation)
+    options = _given(table=table, count=count, interpolation=interpolation, outside=outside)
     recipe = Recipe(
         system=system,
         flux=flux,
@@ -127,6 +131,8 @@ def simulate_to(
     )
     target = Path(path)
     check_output(target, recipe, overwrite=overwrite)
+    if isinstance(engine, str):  # every pixel, before the blocks one by one
+        find_engine(engine, **options).check(flux, system)
     _try_brightest_pixel(recipe, threads)
     try:
         writer = create(target, recipe, overwrite=overwrite)
@@ -231,8 +237,6 @@ def _given(**options: Any) -> dict[str, Any]:
 
 def _settings(engine: str, options: dict[str, Any]) -> dict[str, Any]:
     """What a cube of this engine depends on, as plain data; checks the options on the way."""
-    from mars_lidar.engines import find_engine
-
     return find_engine(engine, **options).settings if isinstance(engine, str) else {}
 
 
@@ -243,7 +247,10 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
     if table is None and "table" in recorded:
         raise ValueError(f"table must be the one that the cube was made with, got None: {_grid(recorded['table'])}")
     options = _given(
-        table=table, count=recorded.get("count"), interpolation=recorded.get("interpolation")
+        table=table,
+        count=recorded.get("count"),
+        interpolation=recorded.get("interpolation"),
+        outside=None if table is None else "exact",  # no count depends on it
     )
     settings = _settings(recipe.engine, options)
     if table is not None and settings.get("table") != recorded.get("table"):

@@ -95,7 +95,7 @@ def _tabled(tables: Tables) -> Callable[[Flux, System, int], Run]:
     make: Callable[..., Engine] = type(ENGINES["mars"])
 
     def prepare(flux: Flux, system: System, realizations: int) -> Run:
-        return _engine(make(tables.get(system)))(flux, system, realizations)
+        return _engine(make(tables.get(system), outside="exact"))(flux, system, realizations)
 
     return prepare
 

@@ -19,9 +19,9 @@ from mars_lidar.system import System
 BREAK_EVEN = 4.0
 """Registrations per internal cell above which feedback is the faster engine.
 
-Measured on one core of an AMD EPYC (1024 bins, N_r = 2e3 to 1.6e4, 1 to 16 registrations per cell; processor time, other
-work on the machine): feedback 10-11 ns per internal cell at fluxes up to 1 photon and 15-17 ns up to 5, exact 3.2-3.8 ns
-per registration; they break even at 2.7-3.2 and 4.7-4.8 registrations (AVX2: 2.2-2.7 and 3.3-3.9).
+Measured on one core of an AMD EPYC (1024 bins, N_r = 2e3 to 1.6e4, 1 to 16 registrations per cell; processor time,
+other work on the machine): feedback 10-11 ns per internal cell at fluxes up to 1 photon and 15-17 ns up to 5, exact
+3.2-3.8 ns per registration; they break even at 2.7-3.2 and 4.7-4.8 registrations (AVX2: 2.2-2.7 and 3.3-3.9).
 """
 
 

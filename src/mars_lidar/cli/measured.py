@@ -10,6 +10,7 @@ import typer
 from mars_lidar.cli import options
 from mars_lidar.cli.console import FAILED, check_picture, reported, save_picture, say, table
 from mars_lidar.cli.inspect import parsed_pixel
+from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
 from mars_lidar.cli.options import _OUTPUT, _SYSTEM, _option
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ def inspect(
 
         times, rows = _loaded(stream, pixel, period_ns, bins, unit_ns, variable)
         found = look(times, dead_time_ns=dead_time_ns)
-        rows += _clock_rows(times, found.calibration) + _interval_rows(found.calibration, dead_time_ns is None)
+        rows += clock_rows(found.calibration) + interval_rows(found.calibration, dead_time_ns is None)
         light = found.calibration
         told = f"{light.total:.5g} ± {light.total_error:.2g} photons per period reach the pixel, armed or not"
         rows.append(("light", told))
@@ -174,7 +175,7 @@ def calibrate(
             times, system, dead_time_ns, hold_off_ns, free, returns,
             (pulse_sigma_ns, pulse_fwhm_ns, pulse_file, pulse_bin_ns, pulse_origin),
         )  # fmt: skip
-        rows += _clock_rows(times, found) + _light_rows(found)
+        rows += clock_rows(found) + light_rows(found)
         if out is not None:
             found.system(max(times.cycles, 1), times.bins if times.bins <= 2**20 else 1024, "armed").save(out)
             rows.append(("wrote", str(out)))
@@ -217,7 +218,7 @@ def validate(
             (pulse_sigma_ns, pulse_fwhm_ns, pulse_file, pulse_bin_ns, pulse_origin),
         )  # fmt: skip
         found = compared(times, light, cycles=cycles)
-        rows += _clock_rows(times, light) + _light_rows(light)
+        rows += clock_rows(light) + light_rows(light)
         mean, high = found.total_variation_floor
         rows += [
             ("realizations", f"{found.realizations:,} of {cycles:,} cycles, {found.counts.mean():,.6g} counts each"),
@@ -305,61 +306,6 @@ def _calibrated(
     if not found.converged:
         say("warning: the likelihood was not maximised; what is printed is where it stopped")
     return found
-
-
-def _clock_rows(times: Timestamps, found: Calibration) -> list[tuple[str, str]]:
-    counted = found.summary
-    seconds = 1e-9 * counted.period_ns * counted.cycles
-    unit = f", clock unit {1e3 * counted.unit_ns:.5g} ps" if counted.unit_ns else ""
-    return [
-        ("laser", f"period {counted.period_ns:.7g} ns ({1e3 / counted.period_ns:.5g} MHz), {counted.cycles:,} periods, "
-         f"{seconds:.4g} s{unit}"),
-        ("rate", f"{counted.rate_per_s:,.6g} counts/s, {counted.per_period:.5g} a period"),
-    ]  # fmt: skip
-
-
-def _interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
-    counted = found.summary
-    low, middle, high = counted.quantiles_ns
-    dead = f"{found.dead_time_ns:.6g} ns"
-    if estimated:
-        dead += f" ± {found.dead_time_error_ns:.2g}, by the smallest interval"
-    return [
-        ("intervals", f"smallest {counted.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),
-        ("dead time", dead),
-    ]
-
-
-def _light_rows(found: Calibration) -> list[tuple[str, str]]:
-    """What was calibrated."""
-    from mars_lidar.system import SPEED_OF_LIGHT_M_PER_NS
-
-    rows = _interval_rows(found, found.dead_time_error_ns > 0)
-    if found.hold_off_ns > found.dead_time_ns + found.dead_time_error_ns:
-        rows.append(("hold-off", f"{found.hold_off_ns:.5g} ns: {found.armed.left_out:,} photons not used"))
-    if found.too_short:
-        rows.append(
-            ("does not fit", f"{found.too_short:,} intervals shorter than the dead time, the smallest "
-             f"{found.summary.smallest_ns[0]:.5g} ns")
-        )  # fmt: skip
-    errors = found.errors
-    if found.waveform is not None:
-        rows.append(("light", f"{found.total:.6g} ± {found.total_error:.2g} photons per period, any shape"))
-    else:
-        rows.append(("background B", f"{found.background:.6g} ± {errors['background']:.2g} photons per period"))
-        many = found.returns_signal.size > 1
-        for k, (signal, delay) in enumerate(zip(found.returns_signal, found.returns_delay_ns, strict=True), start=1):
-            tail, which = (f"_{k}", f" {k}") if many else ("", "")
-            depth = 0.5 * SPEED_OF_LIGHT_M_PER_NS * delay
-            rows.append((f"signal S{which}", f"{signal:.6g} ± {errors[f'signal{tail}']:.2g} photons per period"))
-            rows.append((f"delay{which}", f"{delay:.7g} ± {errors[f'delay_ns{tail}']:.2g} ns, {depth:.6g} m"))
-        width = f", sigma ± {errors['sigma_ns']:.2g} ns (fitted)" if "sigma_ns" in errors else ""
-        rows.append(("pulse", f"{found.pulse!r}{width}"))
-    rapp = found.rapp
-    split = "" if rapp.signal != rapp.signal else f"; by shape B {rapp.background:.5g}, S {rapp.signal:.5g}"
-    rows.append(("by Rapp", f"Lambda {rapp.total:.6g} ± {rapp.total_error:.2g}, above {found.total:.6g} ± "
-                 f"{found.total_error:.2g}{split}"))  # fmt: skip
-    return rows
 
 
 def _check_system_out(out: Path | None, free: bool, overwrite: bool) -> None:

@@ -1,0 +1,65 @@
+"""What the commands for measured streams print, row by row."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mars_lidar.estimate import Calibration
+
+
+def clock_rows(found: Calibration) -> list[tuple[str, str]]:
+    """Laser, duration and rate."""
+    counted = found.summary
+    seconds = 1e-9 * counted.period_ns * counted.cycles
+    unit = f", clock unit {1e3 * counted.unit_ns:.5g} ps" if counted.unit_ns else ""
+    return [
+        ("laser", f"period {counted.period_ns:.7g} ns ({1e3 / counted.period_ns:.5g} MHz), {counted.cycles:,} periods, "
+         f"{seconds:.4g} s{unit}"),
+        ("rate", f"{counted.rate_per_s:,.6g} counts/s, {counted.per_period:.5g} a period"),
+    ]  # fmt: skip
+
+
+def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
+    """Intervals and dead time."""
+    counted = found.summary
+    low, middle, high = counted.quantiles_ns
+    dead = f"{found.dead_time_ns:.6g} ns"
+    if estimated:
+        dead += f" ± {found.dead_time_error_ns:.2g}, by the smallest interval"
+    return [
+        ("intervals", f"smallest {counted.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),
+        ("dead time", dead),
+    ]
+
+
+def light_rows(found: Calibration) -> list[tuple[str, str]]:
+    """What was calibrated."""
+    from mars_lidar.system import SPEED_OF_LIGHT_M_PER_NS
+
+    rows = interval_rows(found, found.dead_time_error_ns > 0)
+    if found.hold_off_ns > found.dead_time_ns + found.dead_time_error_ns:
+        rows.append(("hold-off", f"{found.hold_off_ns:.5g} ns: {found.armed.left_out:,} photons not used"))
+    if found.too_short:
+        rows.append(
+            ("does not fit", f"{found.too_short:,} intervals shorter than the dead time, the smallest "
+             f"{found.summary.smallest_ns[0]:.5g} ns")
+        )  # fmt: skip
+    errors = found.errors
+    if found.waveform is not None:
+        rows.append(("light", f"{found.total:.6g} ± {found.total_error:.2g} photons per period, any shape"))
+    else:
+        rows.append(("background B", f"{found.background:.6g} ± {errors['background']:.2g} photons per period"))
+        many = found.returns_signal.size > 1
+        for k, (signal, delay) in enumerate(zip(found.returns_signal, found.returns_delay_ns, strict=True), start=1):
+            tail, which = (f"_{k}", f" {k}") if many else ("", "")
+            depth = 0.5 * SPEED_OF_LIGHT_M_PER_NS * delay
+            rows.append((f"signal S{which}", f"{signal:.6g} ± {errors[f'signal{tail}']:.2g} photons per period"))
+            rows.append((f"delay{which}", f"{delay:.7g} ± {errors[f'delay_ns{tail}']:.2g} ns, {depth:.6g} m"))
+        width = f", sigma ± {errors['sigma_ns']:.2g} ns (fitted)" if "sigma_ns" in errors else ""
+        rows.append(("pulse", f"{found.pulse!r}{width}"))
+    rapp = found.rapp
+    split = "" if rapp.signal != rapp.signal else f"; by shape B {rapp.background:.5g}, S {rapp.signal:.5g}"
+    rows.append(("by Rapp", f"Lambda {rapp.total:.6g} ± {rapp.total_error:.2g}, above {found.total:.6g} ± "
+                 f"{found.total_error:.2g}{split}"))  # fmt: skip
+    return rows

@@ -154,6 +154,6 @@ _CODEC_NOTE = (
 )
 _DATASET_NOTE = (
     "Rooms of 64 × 64 pixels, 8 realizations each, 8 MiB a chunk, 64 MiB a shard. CPU s: of all threads of the "
-    "process, without its imports; scenes are ray-cast and stored in that time. The engine alone simulates the same "
+    "process, without its imports; scenes are read (.npz) and stored in that time. The engine alone simulates the same "
     "exposures into one buffer. Workers: rate between the first and the last part, without the start of the cluster."
 )

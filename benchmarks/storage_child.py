@@ -27,12 +27,16 @@ def main(what: str, level: float, scenes: int, threads: int, cycles: int, bins: 
     system = _system(Config(mode="child", cycles=cycles, bins=bins))
     told: list[tuple[float, int]] = []
     recipe = {
-        "scenes": {"example": "room", "size": SIDE, "seeds": {"count": scenes}}, "systems": [system],
+        "scenes": {"path": str(out.parent / "scenes")}, "systems": [system],
         "light": {"signal": level}, "realizations": REALIZATIONS,
         "store": {"layout": "dense" if what == "dense" else "sparse"},
     }  # fmt: skip
     exposures = scenes * REALIZATIONS * SIDE**2
-    fluxes = [ml.Scene.example("room", SIDE, k).flux(system, signal=level, sbr=1.0) for k in range(scenes)]
+    rooms = [ml.Scene.example("room", SIDE, k) for k in range(scenes)]
+    (out.parent / "scenes").mkdir()
+    for k, room in enumerate(rooms):
+        np.savez(out.parent / f"scenes/{k:04d}.npz", depth=room.depth_m, reflectivity=room.reflectivity)
+    fluxes = [room.flux(system, signal=level, sbr=1.0) for room in rooms]
     ml.simulate(fluxes[0][:1], system, threads=threads)
     wall, cpu = time.perf_counter(), time.process_time()
     if what == "engine":

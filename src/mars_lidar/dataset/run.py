@@ -150,6 +150,7 @@ def generate(
             else:
                 _make_all(dataset, todo, totals.add, threads)
             if not dataset.complete:
+                dataset.tidy()  # of workers that were killed while others went on
                 dataset.finish()
         except KeyboardInterrupt:
             raise Interrupted(f"interrupted; {_left(target)}") from None

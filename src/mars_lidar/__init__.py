@@ -1,6 +1,7 @@
 """mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
 
 from mars_lidar._version import __version__
+from mars_lidar.estimate import Reconstruction, cramer_rao, reconstruct
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.scene import Scene
@@ -26,6 +27,7 @@ __all__ = [
     "Lookup",
     "Pulse",
     "QuantisationError",
+    "Reconstruction",
     "SampledPulse",
     "Scene",
     "System",
@@ -33,8 +35,10 @@ __all__ = [
     "Timestamps",
     "__version__",
     "count_law",
+    "cramer_rao",
     "holding_time_covariance",
     "joint_law",
+    "reconstruct",
     "registration_pdf",
     "simulate",
     "simulate_timestamps",

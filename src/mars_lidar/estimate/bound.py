@@ -37,9 +37,9 @@ def cramer_rao(
 ) -> Bound:
     """Least standard deviations of S, B and depth from a histogram, whatever the method.
 
-    The information of a registration process of rate l_j in the armed time of bin j is that of a Poisson process,
-    ``I = sum_j E[D_j] (dl_j)(dl_j)' / l_j``, with E[D_j] = E[h_j] / l_j the mean armed time (R18). It is exact up to
-    the width of a bin: what a bin hides of the times inside of it costs a share l_j^2 / 12 of that bin's information.
+    The information of registrations at the rate l_j in the armed time of bin j is that of a Poisson process,
+    ``I = sum_j E[D_j] (dl_j)(dl_j)' / l_j``, with E[D_j] = E[h_j] / l_j the mean armed time; a bin that hides the times
+    inside of it keeps the share (x / sinh x)^2 of that, x = l_j / 2 (R18).
 
     Parameters
     ----------
@@ -67,9 +67,13 @@ def cramer_rao(
     rate = s[..., None] * energy + b[..., None] * flat
     gradient = np.stack([energy, np.broadcast_to(flat, energy.shape), s[..., None] * slope], axis=-1)
     weight = np.where(rate > 0, mean / np.where(rate > 0, rate, 1.0) ** 2, 0.0)  # E[D] / l = E[h] / l^2
+    if system.detector.mode == "synchronous" or system.detector.dead_time_ns >= system.bin_ns:
+        x = np.clip(0.5 * rate, 1e-6, 300.0)
+        weight = weight * (x / np.sinh(x)) ** 2
     information = np.einsum("...j,...ja,...jb->...ab", weight, gradient, gradient)
     deviation = np.sqrt(_inverse_diagonal(information))
-    return Bound(information, deviation[..., 0], deviation[..., 1], deviation[..., 2], system.depth_m(deviation[..., 2]))
+    of_signal, of_background, of_delay = np.moveaxis(deviation, -1, 0)
+    return Bound(information, of_signal, of_background, of_delay, system.depth_m(of_delay))
 
 
 def window_error(
@@ -97,7 +101,8 @@ def window_weights(system: System, delay_ns: float) -> FloatArray:
     inside &= share > 0
     outside = ~inside & (share > 0)
     ratio = share[inside].sum() / share[outside].sum()
-    return np.where(inside, 1.0, np.where(outside, -ratio, 0.0)) / (energy[inside].sum() * system.cycles)
+    weights = np.where(inside, 1.0, np.where(outside, -ratio, 0.0))
+    return np.asarray(weights / (energy[inside].sum() * system.cycles), dtype=np.float64)
 
 
 def _pulse_bins(system: System, delay_ns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -1,7 +1,7 @@
 """Generalised Coates: each bin's registrations over the periods in which the pixel was armed there.
 
-Gupta, Ingle, Gupta, Asynchronous single-photon 3D imaging, ICCV 2019; here for bins of any brightness, dead times of any
-length, and both ends of the exposure (docs/reconstruction.md).
+Gupta, Ingle, Gupta, Asynchronous single-photon 3D imaging, ICCV 2019; here for bins of any brightness, dead times of
+any length, and both ends of the exposure (docs/reconstruction.md).
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def checked(
     counts = np.asarray(cube)
     if counts.ndim == 0 or counts.shape[-1] != system.bins or counts.size == 0:
         raise ValueError(
-            f"cube must be (..., {system.bins}), the system's bins last and at least one pixel, got shape {counts.shape}"
+            f"cube must be (..., {system.bins}), the system's bins last and not empty, got shape {counts.shape}"
         )
     shape = counts.shape[:-1]
     flat = np.ascontiguousarray(_typed(counts).reshape(-1, system.bins))

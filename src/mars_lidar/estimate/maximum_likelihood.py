@@ -35,6 +35,7 @@ class MaximumLikelihood(Method):
     name = "maximum_likelihood"
     modes = ("nonparalyzable", "synchronous", "gated")
     assumes = "one return of the known pulse over uniform background"
+    windows = False
 
     def __post_init__(self) -> None:
         _validate.integer("starts", self.starts, low=1, high=8)

@@ -1,9 +1,10 @@
-"""Markov-chain histogram correction. Rapp, Ma, Dawson, Goyal, Dead time compensation for high-flux ranging, IEEE TSP 2019."""
+"""Markov-chain histogram correction: Rapp et al., Dead time compensation for high-flux ranging, IEEE TSP 2019."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
@@ -81,8 +82,6 @@ def mchc_rates(
     `total`: photons per period in all, a scalar or (...), where they are known, from the times between registrations
     for instance.
     """
-    import numpy as np
-
     method = ChainCorrection(iterations=iterations, tolerance=tolerance)
     given, shape = checked(cube, system, threads)
     method.check(system)

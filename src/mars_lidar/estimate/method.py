@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.detector import Mode
-from mars_lidar.estimate.recording import recording_of
+from mars_lidar.estimate.recording import check_window, recording_of
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
@@ -57,7 +57,10 @@ class Histograms:
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """What a method found, each (pixels,); None for what it does not give. Delay in periods, rest photons per period."""
+    """What a method found, each (pixels,); None for what it does not give.
+
+    Delay in periods, the rest in photons per period.
+    """
 
     signal: FloatArray
     background: FloatArray
@@ -75,6 +78,7 @@ class Method(ABC):
     name: ClassVar[str]
     modes: ClassVar[tuple[Mode, ...]]  # of the detector, that the method holds for
     assumes: ClassVar[str]  # in words, for tables
+    windows: ClassVar[bool] = True  # signal and background come from inside and outside of a window
 
     def check(self, system: System) -> None:
         """Raise ValueError, naming mode and method, for a system that this method does not hold for."""
@@ -92,6 +96,8 @@ class Method(ABC):
                 f"method {self.name!r} needs a gate that repeats every period, got "
                 f"gate_step_ns={system.detector.gate_step_ns:g}"
             )
+        if self.windows:
+            check_window(self.name, system)
         recording_of(system)
 
     @abstractmethod

@@ -60,7 +60,7 @@ class Reconstruction:
     @property
     def seen(self) -> NDArray[np.bool_]:
         """(...) whether a return was seen: a depth, and a signal above the background."""
-        return np.isfinite(self.depth_m) & (self.flags & (Flags.EMPTY | Flags.NO_SIGNAL) == 0)
+        return _seen(self.depth_m, self.flags)
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """The maps that this method gives, by name."""
@@ -137,9 +137,8 @@ def assembled(
     returned = signal * depth**2 if attenuation == "inverse_square" else signal
     flags = found.flags.reshape(shape)
     if level is None:
-        seen = np.isfinite(returned) & (flags & (Flags.EMPTY | Flags.NO_SIGNAL) == 0)
-        level = float(returned[seen].mean()) if seen.any() else 1.0
-        level = level or 1.0
+        seen = _seen(depth, flags)
+        level = (float(returned[seen].mean()) if seen.any() else 0.0) or 1.0
     return Reconstruction(
         method=name,
         system=system,
@@ -156,3 +155,8 @@ def assembled(
         significance=mapped(found.significance),
         flags=flags,
     )
+
+
+def _seen(depth: FloatArray, flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    lacking = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL)
+    return np.asarray(np.isfinite(depth) & ((flags & lacking) == 0), dtype=np.bool_)

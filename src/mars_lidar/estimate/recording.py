@@ -28,7 +28,7 @@ def recording_of(system: System) -> _core.Recording:
     from mars_lidar import _core
 
     low, cell, energy, slope = _curve(system.pulse, system.period_ns)
-    knots = low + cell * np.arange(energy.size)
+    knots = low + cell * np.arange(energy.size, dtype=np.float64)
     core = core_ns(system)
     sharpness = float(np.sum(np.diff(energy) ** 2)) / cell  # integral of s^2
     whole, shift, fraction = _dead_time(system)
@@ -59,6 +59,17 @@ def pulse_width(sharpness: float) -> float:
     return 1.0 / (2.0 * math.sqrt(math.pi) * sharpness)
 
 
+def check_window(what: str, system: System) -> None:
+    """Raise ValueError where no background could be seen beside the window of the signal."""
+    low, high = core_ns(system)
+    most = 0.75 * system.detector.gate_periods(system.period_ns)[2] * system.period_ns
+    if high - low > most:
+        raise ValueError(
+            f"method {what!r} takes the background from outside of the pulse, which lasts {high - low:.4g} ns, more "
+            f"than {most:.4g} ns (three quarters of the period or the gate); use 'maximum_likelihood'"
+        )
+
+
 def relative_width(system: System) -> float:
     """Width of the pulse, `pulse_width`, in laser periods."""
     _, cell, energy, _ = _curve(system.pulse, system.period_ns)
@@ -67,9 +78,9 @@ def relative_width(system: System) -> float:
 
 def core_ns(system: System) -> tuple[float, float]:
     """The part of the pulse, around the delay, in which a signal is counted: all but 0.15 % of it on either side."""
-    low, cell, energy, _ = _curve(system.pulse, system.period_ns)
-    knots = low + cell * np.arange(energy.size)
-    ends = np.interp([_OUTSIDE_CORE, 1.0 - _OUTSIDE_CORE], energy, knots) * system.period_ns
+    low, high = system.pulse.support_ns()
+    x = np.linspace(low, high, _CELLS_PER_PERIOD + 1)
+    ends = np.interp([_OUTSIDE_CORE, 1.0 - _OUTSIDE_CORE], system.pulse.cumulative(x), x)
     return float(ends[0]), float(ends[1])
 
 

@@ -9,6 +9,8 @@ namespace mars {
 
 class ChainCorrection {
  public:
+    static constexpr double kMostPhotons = 1e4;  // a period; reached where the histogram does not bound the flux
+
     ChainCorrection(const Recording& recording, int steps, double tolerance)
         : r_(recording), steps_(steps), tolerance_(tolerance), rearmed_(recording.bins), armed_(recording.bins) {}
 
@@ -38,7 +40,7 @@ class ChainCorrection {
                 armed_[j] = next;
                 sum += next;
             }
-            if (!known) total *= std::clamp(model / wait, 0.5, 2.0);  // (R15)
+            if (!known) total = std::min(total * std::clamp(model / wait, 0.5, 2.0), kMostPhotons);  // (R15)
             const double scale = total / sum;
             double moved = 0.0;
             for (int64_t j = 0; j < n; ++j) {

@@ -13,6 +13,7 @@ from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
 from mars_lidar.cli.init import init
 from mars_lidar.cli.inspect import info, view
+from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
 from mars_lidar.cli.simulate import EPILOG, simulate
 from mars_lidar.cli.table import app as table_app
 
@@ -30,6 +31,7 @@ app.command(no_args_is_help=True)(info)
 app.command(no_args_is_help=True)(view)
 app.command(no_args_is_help=True, epilog=CONVERT_EPILOG)(convert)
 app.command(no_args_is_help=True, epilog=TIMESTAMPS_EPILOG)(timestamps)
+app.command(no_args_is_help=True, epilog=RECONSTRUCT_EPILOG)(reconstruct)
 app.command()(init)
 app.add_typer(table_app, name="table")
 

@@ -1,8 +1,8 @@
 """Estimation: from measured or simulated histograms back to depth, signal and background."""
 
-from mars_lidar.estimate.bound import Bound, cramer_rao, window_error, window_weights
 from mars_lidar.estimate.coates import Coates, coates_rates
 from mars_lidar.estimate.generalised_coates import GeneralisedCoates, generalised_coates_rates
+from mars_lidar.estimate.histogram_bound import HistogramBound, cramer_rao, window_error, window_weights
 from mars_lidar.estimate.matched_filter import MatchedFilter
 from mars_lidar.estimate.maximum_likelihood import MaximumLikelihood, log_likelihood
 from mars_lidar.estimate.mchc import ChainCorrection, mchc_rates
@@ -17,11 +17,11 @@ METHODS: dict[str, Method] = {
 
 __all__ = [
     "METHODS",
-    "Bound",
     "ChainCorrection",
     "Coates",
     "Flags",
     "GeneralisedCoates",
+    "HistogramBound",
     "MatchedFilter",
     "MaximumLikelihood",
     "Method",

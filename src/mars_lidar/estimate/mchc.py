@@ -28,8 +28,9 @@ class ChainCorrection(Method):
     """Rates whose Markov chain of phases has the histogram f as its stationary distribution.
 
     ``l <- f; repeat s = (f P(l)) / l, l <- f / s``, scaled to the total flux (R14, R15). The paper takes the total from
-    the times between registrations, which a histogram does not have; here it is the one that explains the number of
-    registrations. The histogram is taken as stationary: the start and the end of the exposure are neglected.
+    the times between registrations, which a histogram does not have; here it is that of `GeneralisedCoates` (the
+    number of registrations alone hardly tells it of a bright pixel). Phases are taken as stationary: the start and
+    the end of the exposure are neglected.
 
     Parameters
     ----------
@@ -40,8 +41,8 @@ class ChainCorrection(Method):
     """
 
     filter: Filter = "log"
-    iterations: int = 200
-    tolerance: float = 1e-6
+    iterations: int = 60
+    tolerance: float = 1e-5
 
     name = "mchc"
     modes = ("nonparalyzable", "gated")
@@ -73,8 +74,8 @@ def mchc_rates(
     system: System,
     *,
     total: ArrayLike | None = None,
-    iterations: int = 200,
-    tolerance: float = 1e-6,
+    iterations: int = 60,
+    tolerance: float = 1e-5,
     threads: int | None = None,
 ) -> FloatArray:
     """Photons per period in each bin (..., bins) behind the histograms (..., bins), by `ChainCorrection`.

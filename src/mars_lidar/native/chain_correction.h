@@ -9,39 +9,30 @@ namespace mars {
 
 class ChainCorrection {
  public:
-    static constexpr double kMostPhotons = 1e4;  // a period; reached where the histogram does not bound the flux
 
     ChainCorrection(const Recording& recording, int steps, double tolerance)
         : r_(recording), steps_(steps), tolerance_(tolerance), rearmed_(recording.bins), armed_(recording.bins) {}
 
-    // Rates `l` (bins) of a histogram; `total` photons per period in all, or 0: the total that explains the number of
-    // registrations. Returns whether the steps came to rest.
+    // Rates `l` (bins) of a histogram, of `total` > 0 photons per period in all. Returns whether the steps came to rest.
     bool operator()(const ArmedPasses& passes, double total, std::vector<double>& l) {
         const int64_t n = r_.bins;
         l.assign(n, 0.0);
         if (!(passes.total > 0.0)) return true;
-        double wait = 0.0;  // armed time for each registration, in periods
-        for (int64_t j = 0; j < n; ++j) wait += passes.time(r_, j);
-        wait /= passes.total * static_cast<double>(n);
-        if (!(wait > 0.0)) return false;
         for (int64_t j = 0; j < n; ++j) {  // where registrations re-arm the pixel, each with its bin's share
             const int64_t q = j - r_.shift + (j < r_.shift ? n : 0);
             const double mass = (1.0 - r_.fraction) * passes.count[q] + r_.fraction * passes.count[q == 0 ? n - 1 : q - 1];
             rearmed_[j] = mass / passes.total;
         }
-        const bool known = total > 0.0;
-        if (!known) total = std::min(1.0 / wait, 1e3);
         for (int64_t j = 0; j < n; ++j) l[j] = total * passes.count[j] / passes.total;
         for (int step = 0; step < steps_; ++step) {
-            const double model = arm(l) / static_cast<double>(n);
+            arm(l);
             double sum = 0.0;
             for (int64_t j = 0; j < n; ++j) {
                 const double next = passes.count[j] > 0.0 ? passes.count[j] / passes.total / armed_[j] : 0.0;  // f / s (R14)
                 armed_[j] = next;
                 sum += next;
             }
-            if (!known) total = std::min(total * std::clamp(model / wait, 0.5, 2.0), kMostPhotons);  // (R15)
-            const double scale = total / sum;
+            const double scale = total / sum;  // (R15)
             double moved = 0.0;
             for (int64_t j = 0; j < n; ++j) {
                 moved += std::fabs(scale * armed_[j] - l[j]);
@@ -54,9 +45,8 @@ class ChainCorrection {
     }
 
  private:
-    // s = (f P(l)) / l: armed time of each bin in one wait, in bins, by one turn of the first-arrival recursion
-    // (theory.md, 2.4); returns its sum.
-    double arm(const std::vector<double>& l) {
+    // s = (f P(l)) / l: armed time of each bin in one wait, in bins, by the first-arrival recursion (theory.md, 2.4).
+    void arm(const std::vector<double>& l) {
         const int64_t n = r_.bins;
         double at = 0.0, all = 0.0;
         for (int64_t j = 0; j < n; ++j) {
@@ -66,15 +56,12 @@ class ChainCorrection {
             armed_[j] = mean;  // kept for the second turn
         }
         at /= -std::expm1(-all);
-        double sum = 0.0;
         for (int64_t j = 0; j < n; ++j) {
             const double mean = armed_[j], quiet = 1.0 - mean * l[j];
             const double half = l[j] > 1e-4 ? (1.0 - mean) / l[j] : 0.5 - l[j] / 6.0;
             armed_[j] = at * mean + rearmed_[j] * half;
-            sum += armed_[j];
             at = at * quiet + rearmed_[j] * mean;
         }
-        return sum;
     }
 
     const Recording& r_;

@@ -31,20 +31,18 @@ class Corrector {
 
     std::vector<double> rate, variance;
 
-    // `finite`: a bin that registered in every pass gets the rate of half a registration less.
+    // `finite`: no rate is infinite.
     template <class Count>
     uint8_t operator()(const Count* histogram, int64_t pixel, bool finite) {
         passes_.set(r_, histogram);
         rate.resize(r_.bins);
         variance.assign(r_.bins, 0.0);
+        std::fill(rate.begin(), rate.end(), 0.0);
         uint8_t flag = passes_.total > 0.0 ? 0 : kEmpty;
         if (settings_.correction == Correction::kChain) {
-            if (!chain_(passes_, settings_.total ? settings_.total[pixel] : 0.0, rate)) flag |= kUnconverged;
-            for (double& each : rate)
-                if (!std::isfinite(each)) {
-                    flag |= kSaturated;
-                    if (finite) each = 0.0;
-                }
+            double total = settings_.total ? settings_.total[pixel] : 0.0;
+            for (int64_t j = 0; j < r_.bins && !settings_.total; ++j) total += finite_rate(j, &flag);  // (R15)
+            if (total > 0.0 && !chain_(passes_, total, rate)) flag |= kUnconverged;
             return flag;
         }
         for (int64_t j = 0; j < r_.bins; ++j) {
@@ -53,18 +51,24 @@ class Corrector {
                 rate[j] = h / static_cast<double>(r_.cycles);
                 continue;
             }
-            rate[j] = corrected_rate(r_, passes_, j, h);
-            if (!std::isfinite(rate[j])) {
-                flag |= kSaturated;
-                if (finite) rate[j] = corrected_rate(r_, passes_, j, h - 0.5);
-                if (finite && !std::isfinite(rate[j])) rate[j] = 0.0;
-            }
+            rate[j] = finite_rate(j, &flag);
+            if (!finite && (flag & kSaturated) && !std::isfinite(corrected_rate(r_, passes_, j, h))) rate[j] = HUGE_VAL;
             variance[j] = h > 0.0 ? rate[j] * rate[j] / h : 0.0;  // (R13)
         }
         return flag;
     }
 
  private:
+    // A bin that registered whenever it could gets the rate of half a registration less, and the pixel a flag.
+    double finite_rate(int64_t j, uint8_t* flag) const {
+        const double h = passes_.count[j];
+        double found = corrected_rate(r_, passes_, j, h);
+        if (std::isfinite(found)) return found;
+        *flag |= kSaturated;
+        found = corrected_rate(r_, passes_, j, h - 0.5);
+        return std::isfinite(found) ? found : 0.0;
+    }
+
     const Recording& r_;
     const Settings settings_;
     ArmedPasses passes_;

@@ -14,7 +14,7 @@ from mars_lidar.system import System
 
 
 @dataclass(frozen=True, eq=False)
-class Bound:
+class HistogramBound:
     """Cramer-Rao bound of (S, B, delay) for pixels of shape (...).
 
     Attributes
@@ -34,7 +34,7 @@ class Bound:
 
 def cramer_rao(
     signal: ArrayLike, background: ArrayLike, system: System, *, delay_ns: ArrayLike, threads: int | None = None
-) -> Bound:
+) -> HistogramBound:
     """Least standard deviations of S, B and depth from a histogram, whatever the method.
 
     The information of registrations at the rate l_j in the armed time of bin j is that of a Poisson process,
@@ -73,7 +73,7 @@ def cramer_rao(
     information = np.einsum("...j,...ja,...jb->...ab", weight, gradient, gradient)
     deviation = np.sqrt(_inverse_diagonal(information))
     of_signal, of_background, of_delay = np.moveaxis(deviation, -1, 0)
-    return Bound(information, of_signal, of_background, of_delay, system.depth_m(of_delay))
+    return HistogramBound(information, of_signal, of_background, of_delay, system.depth_m(of_delay))
 
 
 def window_error(

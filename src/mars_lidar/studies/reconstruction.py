@@ -44,7 +44,7 @@ class Settings:
     repeats: int
 
 
-FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 96, 3)
+FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 48, 2)
 QUICK = Settings((0.03, 0.3, 3.0), 100, 24, 1)
 
 
@@ -69,7 +69,9 @@ def run(request: Request) -> list[Path]:
         rows += sweep(PLAIN, signal, settings.pixels)
         rows += sweep(SYNCHRONOUS, signal, settings.pixels)
     request.tell("reconstruction: picture")
-    return write(request.out, settings, rows, picture(settings), timings(settings))
+    shown = picture(settings)
+    request.tell("reconstruction: time")
+    return write(request.out, settings, rows, shown, timings(settings))
 
 
 def sweep(system: System, signal: float, pixels: int) -> list[dict[str, Any]]:

@@ -32,13 +32,13 @@ class ChainCorrection {
                 armed_[j] = next;
                 sum += next;
             }
+            if (!std::isfinite(sum)) return false;  // no armed time is left for a bin that registered: keep `l`
             const double scale = total / sum;  // (R15)
             double moved = 0.0;
             for (int64_t j = 0; j < n; ++j) {
                 moved += std::fabs(scale * armed_[j] - l[j]);
                 l[j] = scale * armed_[j];
             }
-            if (!std::isfinite(moved)) return false;
             if (moved <= tolerance_ * total) return true;
         }
         return false;

@@ -50,7 +50,7 @@ class Histograms:
     progress: Progress | None = None
 
     @property
-    def recording(self) -> _core.Recording:
+    def recording(self) -> _core.HistogramRecord:
         """The native form of the system."""
         return recording_of(self.system)
 

@@ -23,7 +23,7 @@ _OUTSIDE_CORE = 0.0015  # of the energy on either side of the window in which th
 
 
 @lru_cache(maxsize=16)
-def recording_of(system: System) -> _core.Recording:
+def recording_of(system: System) -> _core.HistogramRecord:
     """The native form of a system whose gate, if any, does not move; times in laser periods."""
     from mars_lidar import _core
 
@@ -33,7 +33,7 @@ def recording_of(system: System) -> _core.Recording:
     sharpness = float(np.sum(np.diff(energy) ** 2)) / cell  # integral of s^2
     whole, shift, fraction = _dead_time(system)
     open_low, open_high = open_bins(system)
-    return _core.Recording(
+    return _core.HistogramRecord(
         bins=system.bins,
         cycles=system.cycles,
         whole=whole,

@@ -5,7 +5,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "recording.h"
+#include "histogram_record.h"
 
 namespace mars {
 
@@ -19,13 +19,13 @@ struct ArmedPasses {
     explicit ArmedPasses(int64_t bins) : count(bins), before(bins + 1), armed(bins), rearmed(bins) {}
 
     // Armed time of bin j, in periods, where the registrations of the bin came in its middle (R5).
-    double time(const Recording& r, int64_t j) const {
+    double time(const HistogramRecord& r, int64_t j) const {
         if (r.below_bin()) return armed[j];
         return std::max(armed[j] + 0.5 * rearmed[j] - 0.5 * count[j], 0.0);
     }
 
     template <class Count>
-    void set(const Recording& r, const Count* histogram) {
+    void set(const HistogramRecord& r, const Count* histogram) {
         const int64_t n = r.bins;
         before[0] = 0.0;
         for (int64_t j = 0; j < n; ++j) {
@@ -44,19 +44,19 @@ struct ArmedPasses {
  private:
     // Share of the registrations whose effect `p` period edges later still lies within the exposure (R3). From a
     // stationary start those before the exposure make up for the rest.
-    static double within(const Recording& r, int64_t p) {
+    static double within(const HistogramRecord& r, int64_t p) {
         return r.stationary ? 1.0 : std::max(0.0, 1.0 - static_cast<double>(p) / static_cast<double>(r.cycles));
     }
 
     // Sum of `within` over p = 1 .. k.
-    static double within_sum(const Recording& r, int64_t k) {
+    static double within_sum(const HistogramRecord& r, int64_t k) {
         if (k <= 0) return 0.0;
         if (r.stationary) return static_cast<double>(k);
         const double m = static_cast<double>(std::min(k, r.cycles));
         return m - m * (m + 1.0) / (2.0 * static_cast<double>(r.cycles));
     }
 
-    void set_free(const Recording& r) {
+    void set_free(const HistogramRecord& r) {
         const int64_t n = r.bins;
         const double periods = static_cast<double>(r.cycles), f = r.fraction;
         const double early = (1.0 - f) * (1.0 - f), late = f * (2.0 - f);  // (R2)
@@ -83,7 +83,7 @@ struct ArmedPasses {
         }
     }
 
-    void set_below_bin(const Recording& r) {
+    void set_below_bin(const HistogramRecord& r) {
         const double f = r.fraction, same = f * (1.0 - 0.5 * f), next = 0.5 * f * f;  // (R6)
         for (int64_t j = 0; j < r.bins; ++j) {
             const int64_t q = j == 0 ? r.bins - 1 : j - 1;
@@ -94,7 +94,7 @@ struct ArmedPasses {
         }
     }
 
-    void set_synchronous(const Recording& r) {
+    void set_synchronous(const HistogramRecord& r) {
         const int64_t n = r.bins;
         // A registration is followed by `whole` lost periods, by one more in the last `shift + fraction` bins (R4).
         const bool dead = r.whole > 0 || r.shift > 0 || r.fraction > 0.0;
@@ -137,7 +137,7 @@ struct Expected {
 };
 
 // Photons per period of a bin with which it registers as often as it did (R8); infinite where it always did.
-inline double corrected_rate(const Recording& r, const ArmedPasses& passes, int64_t j, double count) {
+inline double corrected_rate(const HistogramRecord& r, const ArmedPasses& passes, int64_t j, double count) {
     if (!(count > 0.0)) return 0.0;
     const double armed = passes.armed[j], rearmed = passes.rearmed[j];
     if (r.below_bin()) return armed > 0.0 ? count / armed : HUGE_VAL;

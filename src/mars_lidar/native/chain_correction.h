@@ -10,7 +10,7 @@ namespace mars {
 class ChainCorrection {
  public:
 
-    ChainCorrection(const Recording& recording, int steps, double tolerance)
+    ChainCorrection(const HistogramRecord& recording, int steps, double tolerance)
         : r_(recording), steps_(steps), tolerance_(tolerance), rearmed_(recording.bins), armed_(recording.bins) {}
 
     // Rates `l` (bins) of a histogram, of `total` > 0 photons per period in all. Returns whether the steps came to rest.
@@ -64,7 +64,7 @@ class ChainCorrection {
         }
     }
 
-    const Recording& r_;
+    const HistogramRecord& r_;
     int steps_;
     double tolerance_;
     std::vector<double> rearmed_, armed_;

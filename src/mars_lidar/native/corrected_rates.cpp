@@ -25,7 +25,7 @@ struct Settings {
 // Rates of one histogram after another.
 class Corrector {
  public:
-    Corrector(const Recording& recording, const Settings& settings)
+    Corrector(const HistogramRecord& recording, const Settings& settings)
         : r_(recording), settings_(settings), passes_(recording.bins),
           chain_(recording, settings.steps, settings.tolerance) {}
 
@@ -69,7 +69,7 @@ class Corrector {
         return std::isfinite(found) ? found : 0.0;
     }
 
-    const Recording& r_;
+    const HistogramRecord& r_;
     const Settings settings_;
     ArmedPasses passes_;
     ChainCorrection chain_;
@@ -82,7 +82,7 @@ Settings settings_of(int correction, int steps, double tolerance, const std::opt
 }
 
 template <class Count>
-void rates(const Recording& recording, Matrix<const Count> histogram, int correction, int steps, double tolerance,
+void rates(const HistogramRecord& recording, Matrix<const Count> histogram, int correction, int steps, double tolerance,
            std::optional<Vector<const double>> total, Matrix<double> out, Vector<uint8_t> flags, int threads) {
     const size_t pixels = histogram.shape(0), bins = static_cast<size_t>(recording.bins);
     if (histogram.shape(1) != bins || out.shape(0) != pixels || out.shape(1) != bins || flags.shape(0) != pixels)
@@ -100,7 +100,7 @@ void rates(const Recording& recording, Matrix<const Count> histogram, int correc
 }
 
 template <class Count>
-void windows(const Recording& recording, Matrix<const Count> histogram, int correction, int locator, int steps,
+void windows(const HistogramRecord& recording, Matrix<const Count> histogram, int correction, int locator, int steps,
              double tolerance, std::optional<Vector<const double>> total, Matrix<double> out, Vector<uint8_t> flags,
              int threads, nb::object progress) {
     const size_t pixels = histogram.shape(0);
@@ -136,10 +136,10 @@ std::vector<double> copied(const Vector<const double>& values) {
 }  // namespace
 
 void bind_corrected_rates(nb::module_& module) {
-    nb::class_<Recording>(module, "Recording", "How histograms were recorded; times in laser periods.")
+    nb::class_<HistogramRecord>(module, "HistogramRecord", "How histograms were recorded; times in laser periods.")
         .def(
             "__init__",
-            [](Recording* self, int64_t bins, int64_t cycles, int64_t whole, int64_t shift, double fraction,
+            [](HistogramRecord* self, int64_t bins, int64_t cycles, int64_t whole, int64_t shift, double fraction,
                bool stationary, bool synchronous, double pulse_low, double pulse_cell, Vector<const double> energy,
                Vector<const double> slope, double peak, double width, double core_low, double core_high,
                Vector<const double> open_low, Vector<const double> open_high) {
@@ -150,7 +150,7 @@ void bind_corrected_rates(nb::module_& module) {
                     throw nb::value_error("open_low and open_high must be (bins) or empty");
                 if (bins < 1 || cycles < 1 || whole < 0 || shift < 0 || shift >= bins)
                     throw nb::value_error("bins, cycles, whole or shift out of range");
-                new (self) Recording();
+                new (self) HistogramRecord();
                 self->bins = bins;
                 self->cycles = cycles;
                 self->whole = whole;

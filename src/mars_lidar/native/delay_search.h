@@ -15,9 +15,9 @@ struct Start {
 
 class DelaySearch {
  public:
-    explicit DelaySearch(const Recording& recording) : r_(recording) {
+    explicit DelaySearch(const HistogramRecord& recording) : r_(recording) {
         // the template: bins of a pulse whose delay is the centre of bin 0, without the gate, which differs by delay
-        Recording plain = recording;
+        HistogramRecord plain = recording;
         plain.open.clear();
         const double n = static_cast<double>(r_.bins), at = 0.5 / n;
         first_ = static_cast<int64_t>(std::floor((at + r_.pulse.low) * n));
@@ -120,7 +120,7 @@ class DelaySearch {
         }
     }
 
-    const Recording& r_;
+    const HistogramRecord& r_;
     int64_t first_ = 0, step_ = 1, points_ = 1, shift_ = 0;
     std::vector<float> energy_, gain_, score_, score2_, count_, time_;
 };

@@ -5,7 +5,7 @@
 #include <nanobind/stl/optional.h>
 
 #include "bindings.h"
-#include "recording.h"
+#include "histogram_record.h"
 
 namespace mars {
 

@@ -113,7 +113,7 @@ Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, c
 template <class Count>
 class Maximizer {
  public:
-    Maximizer(const Recording& recording, const ReconstructionJob& job)
+    Maximizer(const HistogramRecord& recording, const ReconstructionJob& job)
         : r_(recording), job_(job), passes_(recording.bins), search_(recording) {}
 
     // Signal, background, delay, their standard errors, twice the gain of the log likelihood by the signal, and its value.
@@ -170,14 +170,14 @@ class Maximizer {
         }
     }
 
-    const Recording& r_;
+    const HistogramRecord& r_;
     const ReconstructionJob& job_;
     ArmedPasses passes_;
     DelaySearch search_;
 };
 
 template <class Count>
-void maximum_likelihood(const Recording& recording, Matrix<const Count> histogram, int starts, double least_gain,
+void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> histogram, int starts, double least_gain,
                         Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
     const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
     if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
@@ -194,7 +194,7 @@ void maximum_likelihood(const Recording& recording, Matrix<const Count> histogra
     });
 }
 
-void log_likelihood(const Recording& recording, Vector<const double> histogram, Matrix<const double> at,
+void log_likelihood(const HistogramRecord& recording, Vector<const double> histogram, Matrix<const double> at,
                     Matrix<double> out) {
     if (static_cast<int64_t>(histogram.shape(0)) != recording.bins || at.shape(1) != 3 || out.shape(1) != 13 ||
         out.shape(0) != at.shape(0))

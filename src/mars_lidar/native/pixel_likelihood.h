@@ -26,7 +26,7 @@ class PixelLikelihood {
     // pulse are: the sums neglect l^2 / 12.
     static constexpr double kDim = 0.02;
 
-    PixelLikelihood(const Recording& recording, const ArmedPasses& passes) : r_(recording), passes_(passes) {
+    PixelLikelihood(const HistogramRecord& recording, const ArmedPasses& passes) : r_(recording), passes_(passes) {
         for (int64_t j = 0; j < r_.bins; ++j) {
             const double share = r_.share(j);
             if (share <= 0.0) continue;
@@ -81,7 +81,7 @@ class PixelLikelihood {
         out.add(e.slope * (h / e.mean - quiet / e.silent), e.slope * e.slope * passes / (e.mean * e.silent), dl);
     }
 
-    const Recording& r_;
+    const HistogramRecord& r_;
     const ArmedPasses& passes_;
     double count_ = 0.0, time_ = 0.0, shares_ = 0.0;
 };

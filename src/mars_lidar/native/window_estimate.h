@@ -5,7 +5,7 @@
 #include <cmath>
 #include <vector>
 
-#include "recording.h"
+#include "histogram_record.h"
 
 namespace mars {
 
@@ -17,9 +17,9 @@ struct WindowResult {
 
 class WindowEstimate {
  public:
-    WindowEstimate(const Recording& recording, Locator locator) : r_(recording), locator_(locator) {
+    WindowEstimate(const HistogramRecord& recording, Locator locator) : r_(recording), locator_(locator) {
         const double n = static_cast<double>(r_.bins);
-        Recording plain = recording;
+        HistogramRecord plain = recording;
         plain.open.clear();
         first_ = static_cast<int64_t>(std::floor((0.5 / n + r_.pulse.low) * n));
         for_pulse_bins(plain, 0.5 / n, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
@@ -136,7 +136,7 @@ class WindowEstimate {
         return out;
     }
 
-    const Recording& r_;
+    const HistogramRecord& r_;
     Locator locator_;
     int64_t first_ = 0, step_ = 1;
     std::vector<double> energy_, weight_, round_;

@@ -32,7 +32,7 @@ struct PulseCurve {
     }
 };
 
-struct Recording {
+struct HistogramRecord {
     int64_t bins = 1, cycles = 1;
     int64_t whole = 0, shift = 0;  // t_d = whole + (shift + fraction) / bins
     double fraction = 0.0;
@@ -53,7 +53,7 @@ struct Recording {
 // Calls each(k, j, s, ds) for the bins that a pulse at `delay` reaches: k = 0, 1, .. along the pulse, j the bin of the
 // period, s the energy of the pulse in the open part of that bin, ds its derivative with respect to the delay.
 template <class Each>
-void for_pulse_bins(const Recording& r, double delay, double low, double high, const Each& each) {
+void for_pulse_bins(const HistogramRecord& r, double delay, double low, double high, const Each& each) {
     const double n = static_cast<double>(r.bins);
     const int64_t first = static_cast<int64_t>(std::floor((delay + low) * n));
     const int64_t end = static_cast<int64_t>(std::ceil((delay + high) * n));

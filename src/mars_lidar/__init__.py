@@ -4,7 +4,7 @@ from mars_lidar._version import __version__
 from mars_lidar.dark_counts import dark_count_map
 from mars_lidar.dataset.run import Generated, generate
 from mars_lidar.effects import Jitter, SampledJitter
-from mars_lidar.estimate import Calibration, Validation, calibrate, validate
+from mars_lidar.estimate import Calibration, Reconstruction, Validation, calibrate, cramer_rao, reconstruct, validate
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.scene import Scene
@@ -33,6 +33,7 @@ __all__ = [
     "Lookup",
     "Pulse",
     "QuantisationError",
+    "Reconstruction",
     "SampledJitter",
     "SampledPulse",
     "Scene",
@@ -43,10 +44,12 @@ __all__ = [
     "__version__",
     "calibrate",
     "count_law",
+    "cramer_rao",
     "dark_count_map",
     "generate",
     "holding_time_covariance",
     "joint_law",
+    "reconstruct",
     "registration_pdf",
     "simulate",
     "simulate_timestamps",

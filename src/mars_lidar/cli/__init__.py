@@ -15,6 +15,7 @@ from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
 from mars_lidar.cli.init import init
 from mars_lidar.cli.inspect import info, view
 from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
+from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
 from mars_lidar.cli.simulate import EPILOG, simulate
 from mars_lidar.cli.table import app as table_app
 
@@ -37,6 +38,7 @@ app.command(no_args_is_help=True, epilog=TIMESTAMPS_EPILOG)(timestamps)
 app.command(no_args_is_help=True, epilog=INSPECT_EPILOG)(inspect)
 app.command(no_args_is_help=True, epilog=CALIBRATE_EPILOG)(calibrate)
 app.command(no_args_is_help=True, epilog=VALIDATE_EPILOG)(validate)
+app.command(no_args_is_help=True, epilog=RECONSTRUCT_EPILOG)(reconstruct)
 app.command()(init)
 app.add_typer(table_app, name="table")
 

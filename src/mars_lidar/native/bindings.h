@@ -40,5 +40,7 @@ void bind_matched(nb::module_& module);
 void bind_table(nb::module_& module);
 void bind_feedback(nb::module_& module);
 void bind_packing(nb::module_& module);
+void bind_corrected_rates(nb::module_& module);
+void bind_maximum_likelihood(nb::module_& module);
 
 }  // namespace mars

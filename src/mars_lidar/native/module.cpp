@@ -94,4 +94,6 @@ NB_MODULE(_core, module) {
     mars::bind_table(module);
     mars::bind_feedback(module);
     mars::bind_packing(module);
+    mars::bind_corrected_rates(module);
+    mars::bind_maximum_likelihood(module);
 }

@@ -111,6 +111,12 @@ def _hardware(request: Request) -> list[Path]:
     return run(request)
 
 
+def _reconstruction(request: Request) -> list[Path]:
+    from mars_lidar.studies.reconstruction import run
+
+    return run(request)
+
+
 def _table(request: Request) -> list[Path]:
     from mars_lidar.studies.table import run
 
@@ -134,6 +140,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "quantisation": ("what a table's lookup costs, nearest and interpolated, over its size", _quantisation),
     "hardware": ("T6: streams calibrated and validated, faulty detectors; --stream adds a measured one", _hardware),
     "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
+    "reconstruction": ("bias and error of depth and signal over flux, every method, beside the bound", _reconstruction),
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
 }
 

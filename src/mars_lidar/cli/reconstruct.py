@@ -1,0 +1,187 @@
+"""`mars-lidar reconstruct`: histogram cube to maps of depth and reflectivity, with errors where the truth is known."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mars_lidar.cli.console import progress_bar, reported, say, table
+
+if TYPE_CHECKING:
+    from mars_lidar.estimate import Reconstruction
+    from mars_lidar.estimate.stored import Timed
+    from mars_lidar.io import Cube
+
+RECONSTRUCT_EPILOG = "\n\n".join(
+    (
+        "[bold]Examples[/bold]",
+        "mars-lidar reconstruct room.zarr -o maps.zarr",
+        "mars-lidar reconstruct room.zarr --method all -o maps.h5",
+        "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
+        "Methods: maximum_likelihood, generalised_coates, mchc (free-running detectors), coates (synchronous), "
+        "matched_filter, peak (little light). docs/reconstruction.md says what each assumes.",
+    )
+)
+
+
+def reconstruct(
+    cube: Annotated[
+        Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="The maps: .zarr, .h5, .hdf5 or .npz.", show_default=False)
+    ],
+    method: Annotated[
+        str,
+        typer.Option("--method", help="One or more methods, separated by commas, or all that suit the detector."),
+    ] = "maximum_likelihood",
+    level: Annotated[
+        float | None,
+        typer.Option(
+            "--level",
+            help="Signal photons per period of a surface of reflectivity 1. "
+            "[dim]Default: that of the cube's scene, or mean reflectivity 1.[/dim]",
+            show_default=False,
+        ),
+    ] = None,
+    attenuation: Annotated[
+        str | None,
+        typer.Option(
+            "--attenuation",
+            help="none or inverse_square: reflectivity is signal times depth squared. "
+            "[dim]Default: as the cube was simulated.[/dim]",
+            show_default=False,
+        ),
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option("--threads", min=1, help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
+    ] = None,
+    picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Draw the maps beside OUT, as .png.")] = True,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
+) -> None:
+    """Reconstruct depth and reflectivity of every pixel of a cube, and compare them with the truth where it is known.
+
+    The counts are read in parts, so a .zarr or .h5 of any size will do.
+    """
+    with reported():
+        began = time.perf_counter()
+        from mars_lidar import _validate
+        from mars_lidar.estimate.reconstruct import ATTENUATIONS
+        from mars_lidar.estimate.stored import reconstruct_stored
+        from mars_lidar.io import load
+        from mars_lidar.io.maps import check_maps_output, save_maps
+
+        png = out.with_suffix(".png")
+        check_maps_output(out, overwrite=overwrite)
+        if picture and png.exists() and not overwrite:
+            raise FileExistsError(f"{png} exists already; give --overwrite, --no-picture or another --out")
+        if out.resolve() == cube.resolve():
+            raise ValueError(f"--out must not be the cube itself, got {str(out)!r}")
+        if attenuation is not None:
+            _validate.choice("--attenuation", attenuation, ATTENUATIONS)
+        with load(cube) as stored:
+            names = _methods(method, stored)
+            with progress_bar("reconstructing") as progress:
+                found = reconstruct_stored(
+                    stored, names, level=level, attenuation=attenuation, threads=threads, progress=progress
+                )
+            results = {name: each.found for name, each in found.items()}
+            save_maps(out, results, source=str(cube), overwrite=overwrite)
+            _show(stored, found)
+            rows = [("maps", str(out))]
+            if picture:
+                _draw(stored, results, png)
+                rows.append(("picture", str(png)))
+        table([*rows, ("time", f"{time.perf_counter() - began:.3g} s in all")])
+
+
+def _methods(text: str, cube: Cube) -> list[str]:
+    from mars_lidar import _validate
+    from mars_lidar.estimate import METHODS
+
+    if text == "all":
+        names = []
+        for name, each in METHODS.items():
+            try:
+                each.check(cube.system)
+            except ValueError as error:
+                if cube.system.detector.mode in each.modes:
+                    say(f"left out: {error}")
+                continue
+            names.append(name)
+        if not names:
+            raise ValueError("--method all: no method suits this detector; see docs/reconstruction.md")
+        return names
+    asked = [_validate.choice("--method", part.strip(), (*METHODS, "all")) for part in text.split(",")]
+    if "all" in asked:
+        raise ValueError("--method must be all alone, or names of methods")
+    return list(dict.fromkeys(asked))
+
+
+def _show(cube: Cube, found: dict[str, Timed]) -> None:
+    """One line a method on standard output."""
+    from mars_lidar.estimate import Flags
+    from mars_lidar.estimate.quality import MissingExtraError, errors_against
+
+    realizations, height, width, _ = cube.shape
+    head = ["method", "seconds", "seen %", "saturated %"]
+    lines: list[list[str]] = []
+    errors = {}
+    try:
+        errors = {name: errors_against(cube, each.found) for name, each in found.items()}
+    except MissingExtraError as error:
+        say(f"no errors against the truth: {error}")
+    kinds = list(next(iter(errors.values()), {}))
+    for kind in kinds:
+        unit, wide = ("mm", "depth") if kind == "depth" else ("", kind)
+        head += [f"{wide} RMSE {unit}".strip(), "median", "PSNR dB", "SSIM"]
+    for name, each in found.items():
+        flags = each.found.flags
+        line = [
+            name, f"{each.seconds:.3g}", f"{100.0 * each.found.seen.mean():.4g}",
+            f"{100.0 * ((flags & Flags.SATURATED) > 0).mean():.3g}",
+        ]  # fmt: skip
+        for kind in kinds:
+            off, scale = errors[name][kind], 1e3 if kind == "depth" else 1.0
+            values = (scale * off.rmse, scale * off.median, off.psnr, off.ssim)
+            line += ["-" if math.isnan(value) else f"{value:.4g}" for value in values]
+        lines.append(line)
+    told = ", errors against the cube's own truth" if kinds else ""
+    print(f"{realizations} × {height} × {width} pixels{told}")
+    _grid(head, lines)
+
+
+def _grid(head: list[str], lines: list[list[str]]) -> None:
+    if not sys.stdout.isatty():
+        widths = [max(len(row[k]) for row in (head, *lines)) for k in range(len(head))]
+        for row in (head, *lines):
+            first, *rest = (f"{text:>{n}}" for text, n in zip(row, widths, strict=True))
+            print("  ".join([f"{first.strip():<{widths[0]}}", *rest]))
+        return
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    grid = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for k, name in enumerate(head):
+        grid.add_column(name, justify="left" if k == 0 else "right", overflow="fold")
+    for row in lines:
+        grid.add_row(*row)
+    Console(highlight=False).print(grid)
+
+
+def _draw(cube: Cube, results: dict[str, Reconstruction], png: Path) -> None:
+    from mars_lidar.plot.reconstruction import reconstruction
+
+    unfinished = png.with_name(png.name + ".incomplete")
+    try:
+        reconstruction(cube, results).savefig(unfinished, format="png", pil_kwargs={"compress_level": 4})
+        os.replace(unfinished, png)
+    finally:
+        unfinished.unlink(missing_ok=True)

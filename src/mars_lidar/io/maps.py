@@ -1,0 +1,178 @@
+"""Files of reconstructed maps: .zarr, .h5 or .npz with named dimensions, units and what they were made of.
+
+Variables (method, realization, y, x): ``depth``, ``reflectivity``, ``signal``, ``background``, ``delay``, errors of the
+methods that give them (NaN for the others), ``significance`` and ``flags``. Attributes: ``format`` = "mars-lidar
+maps", ``format_version``, ``system`` (JSON), ``level``, ``source`` (the cube), ``version``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.io.store import TemporarySibling, check_target
+
+if TYPE_CHECKING:
+    from mars_lidar.estimate import Reconstruction
+
+FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
+SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")
+DIMS = ("method", "realization", "y", "x")
+_PHOTONS = "photons per laser period"
+_VARIABLES = {  # name in the file: attribute, unit, in words
+    "depth": ("depth_m", "m", "depth"),
+    "reflectivity": ("reflectivity", "1", "reflectivity, signal over level"),
+    "signal": ("signal", _PHOTONS, "signal"),
+    "background": ("background", _PHOTONS, "background"),
+    "delay": ("delay_ns", "ns", "delay of the return"),
+    "depth_error": ("depth_error_m", "m", "standard error of the depth"),
+    "delay_error": ("delay_error_ns", "ns", "standard error of the delay"),
+    "signal_error": ("signal_error", _PHOTONS, "standard error of the signal"),
+    "background_error": ("background_error", _PHOTONS, "standard error of the background"),
+    "significance": ("significance", "1", "significance of the signal, standard deviations"),
+    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged"),
+}
+
+
+def check_maps_output(path: str | Path, *, overwrite: bool = False) -> None:
+    """Raise what `save_maps` would raise for this path, without touching anything."""
+    target = Path(path)
+    if target.suffix not in SUFFIXES:
+        raise ValueError(f"out must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
+    check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
+
+
+def save_maps(
+    path: str | Path, results: Mapping[str, Reconstruction], *, source: str = "", overwrite: bool = False
+) -> Path:
+    """Write reconstructions (realizations, H, W) of one cube, by method; the file is whole or not there at all."""
+    target = Path(path)
+    check_maps_output(target, overwrite=overwrite)
+    variables, attrs = _contents(results, source)
+    sibling = TemporarySibling(target)
+    try:
+        if target.suffix == ".zarr":
+            shutil.rmtree(sibling.path, ignore_errors=True)
+            _write_zarr(sibling.path, variables, attrs)
+            if target.exists():
+                (target / "zarr.json").unlink(missing_ok=True)
+                shutil.rmtree(target)
+        elif target.suffix == ".npz":
+            _write_npz(sibling.path, variables, attrs)
+        else:
+            _write_hdf5(sibling.path, variables, attrs)
+        os.replace(sibling.path, target)
+    except BaseException:
+        if sibling.path.is_dir():
+            shutil.rmtree(sibling.path, ignore_errors=True)
+        else:
+            sibling.path.unlink(missing_ok=True)
+        raise
+    return target
+
+
+def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Variables by name, and attributes, of a file of `save_maps`. ``xarray.open_zarr`` opens a .zarr as well."""
+    source = Path(path)
+    if not source.exists():
+        raise FileNotFoundError(f"{source} does not exist")
+    if source.suffix == ".zarr":
+        import zarr
+
+        group: Any = zarr.open_group(source, mode="r")
+        attrs = dict(group.attrs)
+        found = {name: np.asarray(group[name][...]) for name in group.array_keys()}
+    elif source.suffix == ".npz":
+        with np.load(source, allow_pickle=False) as archive:
+            attrs = json.loads(archive["attributes"].item()) if "attributes" in archive.files else {}
+            found = {name: archive[name] for name in archive.files if name != "attributes"}
+    else:
+        import h5py
+
+        with h5py.File(source) as file:
+            attrs = dict(file.attrs)
+            found = {name: np.asarray(file[name][...]) for name in file}
+        found["method"] = found["method"].astype(str) if "method" in found else np.empty(0)
+    if attrs.get("format") != FORMAT:
+        raise ValueError(f"{source} is not a file of maps of mars-lidar (no attribute format = {FORMAT!r})")
+    return found, attrs
+
+
+def _contents(
+    results: Mapping[str, Reconstruction], source: str
+) -> tuple[dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, str]]], dict[str, Any]]:
+    from mars_lidar import __version__
+
+    first = next(iter(results.values()))
+    if first.depth_m.ndim != 3:
+        raise ValueError(f"maps must be (realizations, H, W), got shape {first.depth_m.shape}")
+    variables: dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, str]]] = {
+        "method": (("method",), np.array(list(results)), {"long_name": "reconstruction method"})
+    }
+    for dim, size in zip(DIMS[1:], first.depth_m.shape, strict=True):
+        variables[dim] = ((dim,), np.arange(size), {"units": "1" if dim == "realization" else "pixel"})
+    for name, (attribute, unit, words) in _VARIABLES.items():
+        given = [getattr(each, attribute) for each in results.values()]
+        if all(values is None for values in given):
+            continue
+        stack = np.stack([np.full(first.depth_m.shape, np.nan) if v is None else v for v in given])
+        variables[name] = (DIMS, stack, {"units": unit, "long_name": words})
+    attrs = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "system": first.system.to_json(),
+        "level": json.dumps({name: each.level for name, each in results.items()}),
+        "source": source,
+        "version": __version__,
+    }
+    return variables, attrs
+
+
+def _write_zarr(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
+    import warnings
+
+    import xarray
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Consolidated metadata", category=UserWarning)
+        warnings.filterwarnings("ignore", "The data type")  # of the methods' names: fixed-length text
+        xarray.Dataset(
+            {name: value for name, value in variables.items() if name not in DIMS},
+            coords={name: variables[name] for name in DIMS},
+            attrs=dict(attrs),
+        ).to_zarr(path, mode="w", zarr_format=3)
+
+
+def _write_npz(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
+    labels = {name: {"dims": dims, **more} for name, (dims, _, more) in variables.items()}
+    text = np.asarray(json.dumps({**attrs, "variables": labels}))
+    with path.open("wb") as file:
+        np.savez_compressed(file, attributes=text, **{name: data for name, (_, data, _) in variables.items()})
+
+
+def _write_hdf5(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        file.attrs.update(attrs)
+        for name, (dims, data, more) in variables.items():
+            if data.dtype.kind == "U":
+                data = np.char.encode(data)
+            packed = {"compression": "gzip", "shuffle": True} if data.ndim > 1 else {}
+            stored = file.create_dataset(name, data=data, **packed)
+            stored.attrs.update(more)
+            for k, dim in enumerate(dims):
+                stored.dims[k].label = dim
+        for dim in DIMS:
+            file[dim].make_scale(dim)
+        for name, (dims, _, _) in variables.items():
+            if name not in DIMS:
+                for k, dim in enumerate(dims):
+                    file[name].dims[k].attach_scale(file[dim])

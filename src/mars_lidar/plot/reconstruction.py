@@ -1,0 +1,82 @@
+"""The picture of a reconstruction: truth above, and a row of depth, its error, and reflectivity for each method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mars_lidar.plot.data import depth_error_m
+from mars_lidar.plot.figures import _draw_map, _limits, _metres
+from mars_lidar.plot.style import DPI, style
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from mars_lidar.estimate import Reconstruction
+    from mars_lidar.io import Cube
+
+_MAP_INCHES = 2.35
+
+
+def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realization: int = 0) -> Figure:
+    """Depth, error of depth and reflectivity of each method; errors only where the truth is known.
+
+    Parameters
+    ----------
+    cube
+        The cube, whose maps are the truth where it has a scene.
+    results
+        Reconstructions (realizations, H, W) by name of the method.
+    realization
+        Which one, counted from the start of the cube.
+    """
+    depth = cube.depth_m
+    known = bool(np.isfinite(depth).any())
+    truth = cube.reflectivity if cube.reflectivity is not None else cube.flux.signal
+    what = "reflectivity" if cube.reflectivity is not None else "signal"
+    unit = "reflectivity" if what == "reflectivity" else "photons per period"
+    pick = {name: _maps(each, what, realization) for name, each in results.items()}
+    first = next(iter(pick.values()))
+    depth_limits = _limits(depth if known else first["depth"])
+    share_limits = _limits(truth) if known else _limits(first["share"])
+    errors = {name: depth_error_m(cube, each["depth"]) for name, each in pick.items()}
+    scale = max((float(np.nanpercentile(np.abs(e), 90)) for e in errors.values() if np.isfinite(e).any()), default=1.0)
+    height, width = depth.shape
+    rows, columns = len(results) + known, 2 + known
+    image = _MAP_INCHES * height / width
+    with style():
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(columns * (_MAP_INCHES + 0.75) + 0.2, rows * (image + 0.32) + 0.1), dpi=DPI)
+        grid = figure.add_gridspec(
+            rows, columns, left=0.02, right=1.0 - 0.62 / figure.get_figwidth(), bottom=0.02,
+            top=1.0 - 0.26 / figure.get_figheight(), wspace=0.32, hspace=0.32 / image,
+        )  # fmt: skip
+        axes: Any = grid.subplots(squeeze=False)
+        if known:
+            _draw_map(axes[0, 0], depth, "depth (m)", "viridis", depth_limits, "Truth: depth")
+            axes[0, 1].set_axis_off()
+            _draw_map(axes[0, 2], truth, unit, "gray", share_limits, f"Truth: {what}")
+        for row, (name, each) in zip(axes[int(known) :], pick.items(), strict=True):
+            title = name.replace("_", " ")
+            _draw_map(row[0], each["depth"], "depth (m)", "viridis", depth_limits, title)
+            if known:
+                error = errors[name]
+                note = ""
+                if np.isfinite(error).any():
+                    rmse = _metres(float(np.sqrt(np.nanmean(error**2))))
+                    note = f"error: RMSE {rmse}, median {_metres(float(np.nanmedian(np.abs(error))))}"
+                _draw_map(row[1], 1e3 * error, "depth error (mm)", "RdBu_r", (-1e3 * scale, 1e3 * scale), note)
+            _draw_map(row[-1], each["share"], unit, "gray", share_limits, what)
+    return figure
+
+
+def _maps(found: Reconstruction, what: str, realization: int) -> dict[str, Any]:
+    count = len(found.depth_m)
+    if not 0 <= realization < count:
+        raise ValueError(f"realization must be an integer in [0, {count - 1}], got {realization}")
+    seen = found.seen[realization]
+    depth = np.where(seen, found.depth_m[realization], np.nan)
+    return {"depth": depth, "share": np.where(seen, getattr(found, what)[realization], 0.0)}

@@ -1,0 +1,214 @@
+"""Maximum likelihood: derivatives, bias, and variance at the bound, by simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import mars_lidar as ml
+from harness import require
+from mars_lidar import estimate
+
+PERIOD = 100.0
+PLAIN = ml.System(
+    period_ns=PERIOD, cycles=4000, bins=500, pulse=ml.GaussianPulse(sigma_ns=0.5),
+    detector=ml.Detector(dead_time_ns=75.3),
+)  # fmt: skip
+
+
+def with_dead(dead_ns: float, **more) -> ml.System:
+    detector = {k: more.pop(k) for k in list(more) if k.startswith("gate") or k == "mode"}
+    return PLAIN.replace(detector=ml.Detector(dead_time_ns=dead_ns, **detector), **more)
+
+
+SYSTEMS = {
+    "plain": (PLAIN, 1.0, 1.0, 37.013),
+    "no dead time": (with_dead(0.0), 2.0, 1.0, 37.013),
+    "below one bin": (with_dead(0.1), 1.0, 1.0, 37.013),
+    "several periods": (with_dead(253.3, cycles=10_000), 2.0, 0.5, 99.95),
+    "whole period": (with_dead(100.0), 5.0, 0.5, 37.0),
+    "stationary": (with_dead(85.0, start="stationary"), 1.0, 2.0, 37.0),
+    "coarse bins": (with_dead(75.0, bins=100), 3.0, 1.0, 37.03),
+    "synchronous": (with_dead(0.0, mode="synchronous"), 1.0, 1.0, 37.0),
+    "synchronous, dead": (with_dead(75.0, mode="synchronous"), 1.0, 1.0, 37.0),
+    "gated": (with_dead(45.0, mode="gated", gate_start_ns=80.03, gate_width_ns=40.0), 1.0, 1.0, 97.0),
+    "bright background": (with_dead(20.0, cycles=10_000), 2.0, 30.0, 37.0),
+    "two lobes": (
+        PLAIN.replace(pulse=ml.SampledPulse(np.r_[np.hanning(40), 0.4 * np.hanning(60)], 0.05)), 1.0, 1.0, 37.0,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_unbiased_and_at_the_bound(name):
+    """Means, variances and stated errors of 2000 exposures; the bound is computed from other code."""
+    system, signal, background, delay = SYSTEMS[name]
+    pixels = 2000
+    cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), background, delay), system, seed=7)[0, 0]
+    found = ml.reconstruct(cube, system)
+    assert not found.flags.any()
+    bound = ml.cramer_rao(signal, background, system, delay_ns=delay)
+    lag = (found.delay_ns - delay + 0.5 * PERIOD) % PERIOD - 0.5 * PERIOD
+    outcomes = {}
+    for what, error, stated, least in (
+        ("signal", found.signal - signal, found.signal_error, bound.signal),
+        ("background", found.background - background, found.background_error, bound.background),
+        ("delay", lag, found.delay_error_ns, bound.delay_ns),
+    ):
+        # estimates from some thousand counts have a bias of the order of their variance: 0.1 sd is allowed for
+        z = max(abs(error.mean()) / least - 0.1, 0.0) * np.sqrt(pixels)
+        outcomes[f"{what}, bias"] = 2 * stats.norm.sf(z)
+        assert np.median(stated) == pytest.approx(least, rel=0.06)
+        # "within 10 % of the bound": the sample deviation, less than which the bound is exceeded by chance at most
+        square = (error.std() / (1.1 * least)) ** 2 * pixels
+        outcomes[f"{what}, above 1.1 bounds"] = float(stats.chi2.sf(square, pixels - 1))
+        square = (error.std() / (0.97 * least)) ** 2 * pixels
+        outcomes[f"{what}, below the bound"] = float(stats.chi2.cdf(square, pixels - 1))
+    require(outcomes, f"maximum likelihood, {name}")
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_derivatives(name):
+    """Gradient by finite differences; information as the variance of the gradient, and of other code's formula."""
+    system, signal, background, delay = SYSTEMS[name]
+    pixels = 600
+    cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), background, delay), system, seed=11)[0, 0]
+    at = np.array([1.1 * signal, 0.9 * background, delay + 0.07])
+    h = cube[0]
+    _, gradient, _ = estimate.log_likelihood(h, system, *at)
+    for k, step in enumerate(1e-4 * np.array([signal, background, system.bin_ns])):
+        move = np.eye(3)[k] * step
+        values = [estimate.log_likelihood(h, system, *(at + sign * move))[0] for sign in (1, -1)]
+        slope = (values[0] - values[1]) / (2 * step)
+        scale = np.sqrt(estimate.log_likelihood(h, system, *at)[2][k, k])
+        assert slope == pytest.approx(gradient[k], abs=2e-3 * scale, rel=1e-5)
+    scores = np.array([estimate.log_likelihood(h, system, signal, background, delay)[1] for h in cube])
+    information = np.mean(
+        [estimate.log_likelihood(h, system, signal, background, delay)[2] for h in cube[:50]], axis=0
+    )
+    unit = np.sqrt(np.diag(information))
+    whitened = np.linalg.solve(np.linalg.cholesky(information / np.outer(unit, unit)), (scores / unit).T)
+    outcomes = {}
+    for k in range(3):  # standard normal, were the information exact; 6 % is allowed for
+        square = float(whitened[k] @ whitened[k])
+        p = (stats.chi2.sf(square / 1.06, pixels), stats.chi2.cdf(square * 1.06, pixels))
+        outcomes[f"score {k}"] = min(1.0, 2 * float(min(p)))
+    require(outcomes, f"likelihood's gradient, {name}")
+
+
+def test_delay_wherever_the_pulse_is_narrow_or_wide():
+    for sigma, bins in ((0.05, 500), (20.0, 200), (0.5, 64)):
+        system = PLAIN.replace(pulse=ml.GaussianPulse(sigma_ns=sigma), bins=bins)
+        delays = np.linspace(0.0, 99.9, 64)[None]
+        found = ml.reconstruct(ml.simulate(ml.Flux(4.0, 0.5, delays), system, seed=2)[0], system)
+        lag = (found.delay_ns - delays + 50.0) % 100.0 - 50.0
+        # narrow pulses are lost inside of a bin: what is known of the delay is the bin
+        assert np.abs(lag).max() < max(6.0 * found.delay_error_ns[np.isfinite(found.delay_error_ns)].max(), 0.25)
+
+
+def test_pixels_without_signal_are_flagged():
+    flux = ml.Flux(np.zeros((1, 4000)), 0.5, 0.0)
+    cube = ml.simulate(flux, PLAIN.replace(cycles=400), seed=5)[0, 0]
+    found = ml.reconstruct(cube, PLAIN.replace(cycles=400))
+    missed = int((found.flags & estimate.Flags.NO_SIGNAL == 0).sum())
+    require({"false alarms": float(stats.binom.sf(missed - 1, 4000, 0.015))}, "signal seen where there is none")
+    assert (found.signal + found.background).mean() == pytest.approx(0.5, rel=0.01)  # the pulse takes what it can
+
+
+def test_empty_saturated_and_impossible_pixels():
+    system = PLAIN.replace(cycles=100)
+    cube = np.zeros((4, 500), np.uint16)
+    cube[1, 200] = 1
+    cube[2, 300] = 100  # fired in every period
+    cube[3] = 50_000  # no pixel with this dead time can
+    found = ml.reconstruct(cube, system)
+    flags = estimate.Flags
+    assert found.flags[0] == flags.EMPTY
+    assert np.isnan(found.depth_m[0])
+    assert found.signal[0] == 0.0
+    assert found.flags[2] & flags.SATURATED
+    assert found.flags[3] & flags.SATURATED
+    assert not found.seen[0]
+    for method in ("generalised_coates", "mchc", "matched_filter", "peak"):
+        other = ml.reconstruct(cube, system, method)
+        assert other.flags[0] & flags.EMPTY
+        assert np.isnan(other.depth_m[0])
+
+
+def test_threads_and_types_do_not_matter():
+    flux = ml.Flux(np.geomspace(0.01, 10, 300)[None], 1.0, 50.0)
+    cube = ml.simulate(flux, PLAIN, seed=1)[0]
+    for method in estimate.METHODS.values():
+        if PLAIN.detector.mode not in method.modes:
+            continue
+        one = ml.reconstruct(cube, PLAIN, method, threads=1)
+        for other in (
+            ml.reconstruct(cube, PLAIN, method, threads=3),
+            ml.reconstruct(cube.astype(np.int64), PLAIN, method),
+            ml.reconstruct(cube.astype(float), PLAIN, method),
+        ):
+            for name, values in one.maps().items():
+                assert np.array_equal(values, getattr(other, name), equal_nan=True), (method.name, name)
+
+
+def test_window_error_is_that_of_the_raw_estimate():
+    """The joint law gives mean and spread of the window estimate that `peak` and `matched_filter` make."""
+    system = PLAIN.replace(cycles=1000)
+    cube = ml.simulate(ml.Flux(np.full((1, 4000), 1.0), 1.0, 37.0), system, seed=9)[0, 0]
+    weights = estimate.window_weights(system, 37.0)
+    mean, deviation = estimate.window_error(weights, 1.0, 1.0, system, delay_ns=37.0)
+    sample = cube @ weights
+    z = (sample.mean() - mean) / deviation * np.sqrt(4000)
+    square = sample.var() / deviation**2 * 4000
+    require(
+        {
+            "mean": 2 * stats.norm.sf(abs(z)),
+            "deviation": 2 * min(stats.chi2.sf(square, 3999), stats.chi2.cdf(square, 3999)),
+        },
+        "window estimate",
+    )
+    independent = np.sqrt(weights**2 @ cube.mean(0))  # what Poisson bins would have
+    assert abs(independent / deviation - 1) > 0.02
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"method": "coates"}, "'coates' is not for detectors of mode 'nonparalyzable'"),
+        ({"method": "best"}, "method must be one of"),
+        ({"cube": np.zeros((3, 7), np.uint16)}, r"cube must be \(..., 500\)"),
+        ({"cube": np.full((1, 500), np.nan)}, "finite counts"),
+        ({"cube": np.full((1, 500), -1)}, "counts >= 0"),
+        ({"level": 0.0}, "level must be"),
+        ({"attenuation": "cubic"}, "attenuation must be one of"),
+        ({"threads": 0}, "threads must be"),
+        ({"system": with_dead(75.0, mode="paralyzable")}, "not for detectors of mode 'paralyzable'"),
+        (
+            {"system": with_dead(45.0, mode="gated", gate_start_ns=0.0, gate_width_ns=9.0, gate_step_ns=1.0)},
+            "needs a gate that repeats",
+        ),
+        (
+            {"system": PLAIN.replace(pulse=ml.GaussianPulse(sigma_ns=30.0)), "method": "matched_filter"},
+            "use 'maximum_likelihood'",
+        ),
+        ({"system": with_dead(0.1), "method": "mchc"}, "at least one bin"),
+    ],
+)
+def test_bad_input(change, message):
+    arguments = {"cube": np.ones((2, 500), np.uint16), "system": PLAIN, **change}
+    with pytest.raises((ValueError, TypeError), match=message):
+        ml.reconstruct(**arguments)
+
+
+def test_reflectivity_is_signal_over_level():
+    depth = np.array([[1.0, 2.0, 4.0]])
+    flux = ml.Flux([[4.0, 1.0, 0.25]], 0.1, PLAIN.delay_ns(depth))
+    cube = ml.simulate(flux, PLAIN.replace(cycles=100_000), seed=1)[0]
+    system = dataclasses.replace(PLAIN, cycles=100_000)
+    absolute = ml.reconstruct(cube, system, level=4.0, attenuation="inverse_square")
+    assert absolute.reflectivity == pytest.approx(np.ones((1, 3)), rel=0.05)
+    relative = ml.reconstruct(cube, system)
+    assert relative.reflectivity.mean() == pytest.approx(1.0)

@@ -1,0 +1,149 @@
+"""`mars-lidar reconstruct`, its files, its errors against the truth, and the study."""
+
+from __future__ import annotations
+
+import csv
+import sys
+
+import numpy as np
+import pytest
+import xarray
+from typer.testing import CliRunner
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.cli import app
+from mars_lidar.estimate import METHODS
+from mars_lidar.estimate import stored as stored_module
+from mars_lidar.estimate.quality import map_error
+from mars_lidar.estimate.stored import reconstruct_stored
+from mars_lidar.io import recipe as recipes
+from mars_lidar.io.maps import load_maps
+from mars_lidar.studies.__main__ import main
+from mars_lidar.studies.report import MAX_FIGURE_BYTES
+
+SMALL = ("--size", 12, "--cycles", 300, "--bins", 256, "--signal", 2)
+
+
+def run(*words):
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cube") / "room.zarr"
+    done = run("simulate", "--scene", "room", *SMALL, "--realizations", 2, "--no-picture", "-o", path)
+    assert done.exit_code == 0, done.output
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
+def test_maps_read_back(cube, tmp_path, suffix):
+    out = tmp_path / f"maps{suffix}"
+    picture = suffix == ".h5"
+    words = () if picture else ("--no-picture",)
+    done = run("reconstruct", cube, "--method", "maximum_likelihood,peak", *words, "-o", out)
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "maps.png").exists() == picture
+    assert not picture or (tmp_path / "maps.png").stat().st_size > 10_000
+    assert not list(tmp_path.glob("*.incomplete"))
+    found, attrs = load_maps(out)
+    assert list(found["method"]) == ["maximum_likelihood", "peak"]
+    with io.load(cube) as stored:
+        direct = ml.reconstruct(np.asarray(stored.histogram), stored.system)
+        assert np.array_equal(found["depth"][0], direct.depth_m, equal_nan=True)
+        assert np.array_equal(found["signal_error"][0], direct.signal_error, equal_nan=True)
+        assert ml.System.from_json(attrs["system"]) == stored.system
+    assert np.isnan(found["signal_error"][1]).all()  # peak gives none
+    if suffix == ".zarr":
+        opened = xarray.open_zarr(out)
+        assert opened.depth.dims == ("method", "realization", "y", "x")
+        assert opened.depth.attrs["units"] == "m"
+
+
+def test_all_methods_and_errors_in_the_table(cube, tmp_path):
+    done = run("reconstruct", cube, "--method", "all", "--no-picture", "-o", tmp_path / "m.npz")
+    assert done.exit_code == 0, done.output
+    lines = {line.split()[0]: line.split() for line in done.stdout.splitlines()}
+    free = [name for name, method in METHODS.items() if "nonparalyzable" in method.modes]
+    assert set(free) <= set(lines)
+    assert float(lines["maximum_likelihood"][4]) < 0.5 * float(lines["matched_filter"][4])  # depth RMSE, mm
+    assert not (tmp_path / "m.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--method", "coates", "-o", "m.npz"), "'coates' is not for detectors of mode 'nonparalyzable'"),
+        (("--method", "magic", "-o", "m.npz"), "--method must be one of"),
+        (("-o", "m.txt"), "out must end in one of"),
+        (("-o", "nowhere/m.npz"), "existing folder"),
+        (("--attenuation", "cubic", "-o", "m.npz"), "--attenuation must be one of"),
+        (("--level", "-1", "-o", "m.npz"), "level must be"),
+    ],
+)
+def test_bad_input(cube, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    done = run("reconstruct", cube, *words)
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_overwritten_unasked(cube, tmp_path):
+    out = tmp_path / "m.h5"
+    out.write_text("mine")
+    assert run("reconstruct", cube, "-o", out).exit_code == 2
+    assert out.read_text() == "mine"
+    assert run("reconstruct", cube, "--no-picture", "--overwrite", "-o", out).exit_code == 0
+    assert load_maps(out)[0]["depth"].shape == (1, 2, 12, 12)
+
+
+def test_without_scikit_image_the_maps_are_written_all_the_same(cube, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "skimage", None)
+    done = run("reconstruct", cube, "--no-picture", "-o", tmp_path / "m.npz")
+    assert done.exit_code == 0
+    assert "mars-lidar[estimate]" in done.stderr
+    assert (tmp_path / "m.npz").exists()
+
+
+def test_parts_make_the_whole(cube, monkeypatch):
+    with io.load(cube) as stored:
+        whole = reconstruct_stored(stored, ["generalised_coates"])["generalised_coates"].found
+        for module, name in ((recipes, "BLOCK_BYTES"), (stored_module, "_CHUNK_BYTES")):
+            monkeypatch.setattr(module, name, 3 * 12 * 256 * 2)  # three rows at a time
+        seen = []
+        parts = reconstruct_stored(stored, ["generalised_coates"], progress=lambda *at: seen.append(at))
+    for name, values in whole.maps().items():
+        assert np.array_equal(values, getattr(parts["generalised_coates"].found, name), equal_nan=True)
+    assert len(seen) == 8
+    assert seen[-1] == (288, 288)
+
+
+def test_errors_of_a_map():
+    truth = np.add.outer(np.arange(16.0), np.arange(16.0))
+    same = map_error(truth, truth)
+    assert (same.rmse, same.psnr, same.ssim, same.missing) == (0.0, np.inf, pytest.approx(1.0), 0.0)
+    off = truth.copy()
+    off[0, 0] = np.nan
+    off[1:] += 3.0
+    found = map_error(truth, off)
+    assert found.missing == pytest.approx(1 / 256)
+    assert found.rmse == pytest.approx(3.0 * np.sqrt(240 / 255))
+    assert found.psnr == pytest.approx(20 * np.log10(30.0 / found.rmse))
+    assert found.ssim < 0.99
+
+
+def test_study(tmp_path):
+    assert main(["reconstruction", "--quick", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "reconstruction.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["method"] for row in rows} == set(METHODS)
+    bright = {row["method"]: row for row in rows if float(row["signal"]) == 3.0 and row["detector"] != "synchronous"}
+    likely = bright["maximum_likelihood"]
+    assert float(likely["depth RMSE mm"]) < 1.3 * float(likely["depth bound mm"])
+    assert float(bright["matched_filter"]["depth bias mm"]) < -10 * float(likely["depth bound mm"])
+    text = (tmp_path / "reconstruction.md").read_text()
+    for figure in tmp_path.glob("*.png"):
+        assert figure.name in text
+        assert 5_000 < figure.stat().st_size <= MAX_FIGURE_BYTES

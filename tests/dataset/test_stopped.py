@@ -22,6 +22,7 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.dataset import DatasetRecipe, ingest
 recipe, out, how, number = sys.argv[1:]
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background of a shell
 def progress(done, total):
     if done >= int(number):
         os.kill(os.getpid(), signal.SIGKILL if how == "kill" else signal.SIGINT)

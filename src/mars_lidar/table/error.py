@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 # total variation between normal laws that differ a little: 0.399 per standard deviation of the mean, 0.242 per
 # relative change of the variance
-_TV_MEAN, _TV_VARIANCE = 1.0 / np.sqrt(2.0 * np.pi), 1.0 / np.sqrt(2.0 * np.pi * np.e)
+_TV_MEAN, _TV_VARIANCE = 1.0 / math.sqrt(2.0 * math.pi), 1.0 / math.sqrt(2.0 * math.pi * math.e)
 _LEAST_SPREAD = 0.5  # below it a count is a lottery between two integers, and errors matter in counts
 
 

@@ -1,39 +1,44 @@
 // The modes of a detector for waveforms, in double precision: detector_modes.h says what they do.
 #pragma once
-#include <algorithm>
-#include <cmath>
 #include <cstdint>
 
 #include "job.h"
+#include "lanes.h"
 
 namespace mars {
+inline namespace MARS_LEVEL {
 
+// A time: the period, and the position in it in parts of the waveform, 0 <= x < T.
 struct Instant {
     int64_t cycle;
-    double phase;  // in [0, 1)
+    double x;
 
-    bool before(Instant other) const {
-        return cycle < other.cycle || (cycle == other.cycle && phase < other.phase);
-    }
-    Instant plus(int64_t periods, double fraction) const {
-        const double sum = phase + fraction;
-        return sum >= 1.0 ? Instant{cycle + periods + 1, sum - 1.0} : Instant{cycle + periods, sum};
-    }
+    MARS_INLINE bool before(Instant other) const { return cycle < other.cycle || (cycle == other.cycle && x < other.x); }
 };
 
 // Each takes an arrival `hit`, moves `from` to where the search for the next one begins, and says whether the arrival
-// is registered. `from` is the arrival before, or the start.
+// is registered. `from` is the arrival before, or the start. `parts` is T.
 
 struct FreeRunning {
-    int64_t dead_whole;
-    double dead_fraction;
+    int64_t dead_whole = 0;   // the dead time: periods ...
+    double dead_parts = 0.0;  // ... and the rest, in parts
+    double turn[2] = {};      // 0 and T
 
-    explicit FreeRunning(const Job& job)
+    FreeRunning() = default;
+    FreeRunning(const Job& job, double parts)
         : dead_whole(static_cast<int64_t>(job.dead_time)),
-          dead_fraction(job.dead_time - static_cast<double>(dead_whole)) {}
+          dead_parts((job.dead_time - static_cast<double>(dead_whole)) * parts),
+          turn{0.0, parts} {}
 
-    bool operator()(Instant hit, Instant& from) const {
-        from = hit.plus(dead_whole, dead_fraction);
+    // The end of the dead time; the carry without a branch, which would be guessed wrong too often.
+    MARS_INLINE Instant dead_until(Instant hit) const {
+        const double sum = hit.x + dead_parts;
+        const int64_t carry = sum >= turn[1];
+        return {hit.cycle + dead_whole + carry, sum - turn[carry]};
+    }
+
+    MARS_INLINE bool operator()(Instant hit, Instant& from) const {
+        from = dead_until(hit);
         return true;
     }
 };
@@ -42,9 +47,9 @@ struct ParalyzableMode : FreeRunning {
     Instant ready{INT32_MIN, 0.0};  // the end of the dead time of the last arrival
 
     using FreeRunning::FreeRunning;
-    bool operator()(Instant hit, Instant& from) {
+    MARS_INLINE bool operator()(Instant hit, Instant& from) {
         const bool seen = !hit.before(ready);
-        ready = hit.plus(dead_whole, dead_fraction);
+        ready = dead_until(hit);
         from = hit;
         return seen;
     }
@@ -52,41 +57,45 @@ struct ParalyzableMode : FreeRunning {
 
 struct SynchronousMode : FreeRunning {
     using FreeRunning::FreeRunning;
-    bool operator()(Instant hit, Instant& from) const {
-        from = {hit.cycle + dead_whole + (hit.phase + dead_fraction > 1.0 ? 2 : 1), 0.0};
+    MARS_INLINE bool operator()(Instant hit, Instant& from) const {
+        from = {hit.cycle + dead_whole + (hit.x + dead_parts > turn[1] ? 2 : 1), 0.0};
         return true;
     }
 };
 
 struct GatedMode : FreeRunning {
-    const Gate& gate;
+    Gate gate;           // in periods
+    double width = 0.0;  // in parts
 
-    explicit GatedMode(const Job& job) : FreeRunning(job), gate(job.gate) {}
+    GatedMode() = default;
+    GatedMode(const Job& job, double parts)
+        : FreeRunning(job, parts), gate(job.gate), width(job.gate.width * parts) {}
 
-    // Phase at which the gate of a period opens.
+    // Where the gate of a period opens.
     double position(int64_t cycle) const {
-        if (gate.step == 0.0) return gate.start;
-        const double moved = gate.start + gate.step * static_cast<double>(std::max<int64_t>(cycle, 0) / gate.cycles);
-        return moved - std::floor(moved);
+        if (gate.step == 0.0) return gate.start * turn[1];
+        const double moved = gate.start + gate.step * static_cast<double>((cycle > 0 ? cycle : 0) / gate.cycles);
+        return (moved - static_cast<double>(static_cast<int64_t>(moved))) * turn[1];
     }
 
     bool open(Instant at) const {
-        const double apart = at.phase - position(at.cycle);
-        return (apart < 0.0 ? apart + 1.0 : apart) < gate.width || gate.width >= 1.0;
+        const double apart = at.x - position(at.cycle);
+        return (apart < 0.0 ? apart + turn[1] : apart) < width || width >= turn[1];
     }
 
     bool operator()(Instant hit, Instant& from) const {
         const bool seen = open(hit);
-        from = seen ? hit.plus(dead_whole, dead_fraction) : hit;
+        from = seen ? dead_until(hit) : hit;
         if (open(from)) return seen;
-        if (from.phase < position(from.cycle)) {
-            from.phase = position(from.cycle);
+        if (from.x < position(from.cycle)) {
+            from.x = position(from.cycle);
         } else {
             const double opening = position(++from.cycle);
-            from.phase = opening + gate.width > 1.0 ? 0.0 : opening;  // one that wraps is open at once
+            from.x = opening + width > turn[1] ? 0.0 : opening;  // one that wraps is open at once
         }
         return seen;
     }
 };
 
+}  // namespace MARS_LEVEL
 }  // namespace mars

@@ -1,0 +1,47 @@
+// The exact engine's inner loop for waveforms, one function per vector level (waveform_kernel.cpp is compiled once for
+// each).
+#pragma once
+#include <atomic>
+#include <cstdint>
+
+#include "exact_kernel.h"
+#include "job.h"
+
+namespace mars {
+
+constexpr int kWaveformTeam = 4;  // pixels, or realizations of one, that are worked on side by side
+
+// Pixels times realizations of a job.
+struct WaveformBlock {
+    const Job* job;
+    int64_t first_pixel, pixels;
+    int64_t first_realization, realizations;  // relative to the job's first
+    const int64_t* start_cycle;  // (pixels, realizations) where the search begins, or null: armed at 0
+    const double* start_phase;   // in periods, [0, 1)
+    Sink sink;
+    void* out;               // of the job: counts int64 (items); histograms (items, bins), not yet zeroed
+    const int64_t* offsets;  // timestamps: first record of each item
+    double* times;           // timestamps, in periods; likewise below
+    int32_t* cycles;
+    int32_t* bins;
+    double* edges;           // memory for the team's tables: waveform_table.h
+    uint32_t* guides;
+    const std::atomic<bool>* stop;
+};
+
+using WaveformKernel = void (*)(const WaveformBlock&);
+
+#ifdef MARS_HAS_scalar
+void waveform_kernel_scalar(const WaveformBlock& block);
+#endif
+#ifdef MARS_HAS_vector128
+void waveform_kernel_vector128(const WaveformBlock& block);
+#endif
+#ifdef MARS_HAS_avx2
+void waveform_kernel_avx2(const WaveformBlock& block);
+#endif
+#ifdef MARS_HAS_avx512
+void waveform_kernel_avx512(const WaveformBlock& block);
+#endif
+
+}  // namespace mars

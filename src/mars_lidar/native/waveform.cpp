@@ -38,7 +38,7 @@ WaveformKernel kernel_of(const std::string& level) {
 }
 
 // Where the items of a block begin that are warmed up at the start of the exposure.
-void draw_starts(const Job& job, const WaveformBlock& block, std::vector<int64_t>& cycle, std::vector<double>& phase) {
+void draw_starts(const Job& job, const WaveformBlock& block, std::vector<int32_t>& cycle, std::vector<double>& phase) {
     GapSearch search;
     cycle.resize(block.pixels * block.realizations);
     phase.resize(block.pixels * block.realizations);
@@ -54,10 +54,14 @@ void draw_starts(const Job& job, const WaveformBlock& block, std::vector<int64_t
 // Cuts a job into blocks, realizations of one pixel together because they share its table.
 void run_waveform(const BoundJob& job, WaveformBlock proto, int threads, const std::string& level,
                   const nb::object& progress) {
-    constexpr int64_t kMost = 256;  // items of a block
+    constexpr int64_t kMostLanes = 32, kTableBytes = int64_t{64} << 20;
     const WaveformKernel kernel = kernel_of(level);
+    const TableLayout layout(job.samples);
+    const int64_t table_bytes = 4 * layout.edges + 2 * layout.cells;
     proto.job = &job;
-    const int64_t items = std::max<int64_t>(1, std::min(kMost, job.items() / (4 * std::max(threads, 1))));
+    proto.team = std::max<int64_t>(1, std::min(kMostLanes, kTableBytes / table_bytes));
+    const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));
+    const int64_t items = std::min(kMaxItems, share);
     const int64_t realizations = std::min(items, job.realizations), pixels = items / realizations;
     const int64_t along = (job.realizations + realizations - 1) / realizations;
     const int64_t across = (job.pixels + pixels - 1) / pixels;
@@ -68,7 +72,7 @@ void run_waveform(const BoundJob& job, WaveformBlock proto, int threads, const s
         block.first_realization = (chunk / across) * realizations;
         block.realizations = std::min(realizations, job.realizations - block.first_realization);
         block.stop = &stop;
-        std::vector<int64_t> cycle;
+        std::vector<int32_t> cycle;
         std::vector<double> phase;
         block.start_cycle = nullptr;
         block.start_phase = nullptr;
@@ -77,8 +81,12 @@ void run_waveform(const BoundJob& job, WaveformBlock proto, int threads, const s
             block.start_cycle = cycle.data();
             block.start_phase = phase.data();
         }
-        const std::unique_ptr<double[]> edges(new double[kWaveformTeam * edges_of(job.samples)]);
-        const std::unique_ptr<uint32_t[]> guides(new uint32_t[kWaveformTeam * cells_of(job.samples)]);
+        const std::unique_ptr<double[]> energy(new double[layout.parts + 1]);
+        const std::unique_ptr<int32_t[]> cell(new int32_t[layout.parts + 1]);
+        const std::unique_ptr<int32_t[]> edges(new int32_t[proto.team * layout.edges]);
+        const std::unique_ptr<uint16_t[]> guides(new uint16_t[proto.team * layout.cells]);
+        block.energy = energy.get();
+        block.cell = cell.get();
         block.edges = edges.get();
         block.guides = guides.get();
         if (!stop.load(std::memory_order_relaxed)) kernel(block);

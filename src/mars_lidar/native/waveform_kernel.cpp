@@ -1,14 +1,10 @@
-// The kernel of waveforms: waits are drawn ahead in vectors, and then looked up in the pixel's table one by one.
-//
-// The chain from one registration to the next is some 80 cycles long (a look-up of C, one of its inverse, a division),
-// far longer than its instructions take. So a team of items takes turns: while one waits for its tables the others
-// compute. Scalar double precision in the chain: what is gathered from the tables of different pixels gains nothing
-// from vectors.
+// The kernel of waveforms. As in exact_runner.h lanes work on different items and a lane whose exposure has ended takes
+// the next one, waits are drawn ahead, and registrations are logged before they are counted; but here every pixel has
+// a table of its own, which its realizations share.
 #include "waveform_kernel.h"
 
-#include "registration.h"
+#include "exact_writers.h"
 #include "waveform_modes.h"
-#include "waveform_table.h"
 
 #define MARS_JOIN2(a, b) a##b
 #define MARS_JOIN(a, b) MARS_JOIN2(a, b)
@@ -17,225 +13,269 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
-constexpr int kTeam = kWaveformTeam;
-constexpr int kWaits = 32;        // drawn ahead; a multiple of every number of lanes
-constexpr int kPollWaveform = 512;  // rounds between looks at `stop`
+constexpr int kWaitsAhead = 8;             // registrations drawn ahead
+constexpr int kRoundsToPoll = 512;         // between looks at `stop`
+constexpr int32_t kIdleCycle = 100000001;  // every exposure has ended; + kWaitsAhead (kForever + t_d) fits 32 bits
 
-// Waits of one item's next registrations.
-struct Waits {
-    double energy[kWaits];  // photons beyond the whole periods
-    int32_t whole[kWaits];
+// What is logged for timestamps: phases in double precision, finer than those of exact_writers.h.
+template <Sink sink>
+struct WaveLog : Log<sink> {};
+template <>
+struct WaveLog<Sink::kTimestamps> {
+    alignas(64) int32_t bin[kLog][kLanes], cycle[kLog][kLanes];
+    alignas(64) double phase[kLog][kLanes];
 };
 
-MARS_INLINE void draw_ahead(Waits& to, const Pair<uint32_t>& key, uint32_t event, double total) {
-    float exponentials[kWaits];
-    uint32_t fresh[kWaits], count[kLanes];
-    for (int lane = 0; lane < kLanes; ++lane) count[lane] = event + static_cast<uint32_t>(lane);
-    const UInt key0 = splat(key.first), key1 = splat(key.second), stage = splat(kStageArrival);
-    UInt events = load<UInt>(count);
-    for (int k = 0; k < kWaits; k += kLanes) {
-        const Pair<UInt> words = threefry<13>(events, stage, key0, key1);
-        store(exponentials + k, exponential(words.first));
-        store(fresh + k, words.second);
-        events = events + static_cast<uint32_t>(kLanes);
-    }
-    const double inverse = 1.0 / total;
-    int32_t longest = 0;
-    for (int k = 0; k < kWaits; ++k) {
-        const double wait = static_cast<double>(exponentials[k]) * inverse;
-        const double periods = wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever);
-        const int32_t whole = static_cast<int32_t>(periods);
-        to.whole[k] = whole;
-        to.energy[k] = (periods - static_cast<double>(whole)) * total;
-        longest = whole > longest ? whole : longest;
-    }
-    if (longest < static_cast<int32_t>(kLongWait)) return;
-    for (int k = 0; k < kWaits; ++k) {  // a fresh fraction: `refresh` of registration.h
-        if (to.whole[k] < static_cast<int32_t>(kLongWait)) continue;
-        const double v = (fresh[k] + 0.5) * 0x1p-32;
-        to.energy[k] = total * (v - 0.5 * total * v * (1.0 - v) * (1.0 - total * (1.0 - 2.0 * v) / 3.0));
-    }
+ExactBlock output_of(const WaveformBlock& block) {
+    ExactBlock output{};
+    output.job = block.job;
+    output.out = block.out;
+    return output;
 }
 
-// Where the registrations of one item go.
+// Writes the rows of single lanes, slots being items of the job.
 template <Sink sink>
-struct Output;
+struct WaveWriter {
+    ExactBlock output;
+    Writer<sink> writer;
 
-template <>
-struct Output<Sink::kCounts> {
-    int64_t* count;
-
-    void open(const WaveformBlock& block, int64_t item) {
-        count = static_cast<int64_t*>(block.out) + item;
-        *count = 0;
-    }
-    MARS_INLINE void write(int32_t, double, int32_t) { ++*count; }
-};
-
-template <class Count>
-struct Row {
-    Count* row;
-
-    void open(const WaveformBlock& block, int64_t item) {
-        const size_t bins = static_cast<size_t>(block.job->bins);
-        row = static_cast<Count*>(block.out) + static_cast<size_t>(item) * bins;
-        memset(row, 0, bins * sizeof(Count));
-    }
-    MARS_INLINE void write(int32_t, double, int32_t bin) { ++row[bin]; }
-};
-
-template <>
-struct Output<Sink::kHistogram16> : Row<uint16_t> {};
-template <>
-struct Output<Sink::kHistogram32> : Row<uint32_t> {};
-
-template <>
-struct Output<Sink::kTimestamps> {
-    double* times;
-    int32_t *cycles, *bins;
-
-    void open(const WaveformBlock& block, int64_t item) {
-        const int64_t first = block.offsets[item];
-        times = block.times + first;
-        cycles = block.cycles + first;
-        bins = block.bins + first;
-    }
-    MARS_INLINE void write(int32_t cycle, double phase, int32_t bin) {
-        *times++ = static_cast<double>(cycle) + phase;
-        *cycles++ = cycle;
-        *bins++ = bin;
+    explicit WaveWriter(const WaveformBlock& block) : output(output_of(block)), writer(output) {}
+    void open(int, int64_t item) { writer.open(item); }
+    template <int n>
+    void write(const int64_t* items, const WaveLog<sink>& log, int lane, int from, int to) {
+        writer.template write<n>(items, log, lane, from, to);
     }
 };
 
-template <class Mode, Sink sink, class Index>
-class WaveformRunner {
+template <>
+struct WaveWriter<Sink::kTimestamps> {
+    const WaveformBlock& block;
+    int64_t next[kLanes];
+
+    explicit WaveWriter(const WaveformBlock& b) : block(b) {}
+    void open(int lane, int64_t item) { next[lane] = block.offsets[item]; }
+    template <int n>
+    void write(const int64_t*, const WaveLog<Sink::kTimestamps>& log, int first, int from, int to) {
+        for (int lane = first; lane < first + n; ++lane)
+            for (int k = from; k < to; ++k) {
+                if (log.bin[k][lane] < 0) continue;
+                const int64_t record = next[lane]++;
+                block.times[record] = static_cast<double>(log.cycle[k][lane]) + log.phase[k][lane];
+                block.cycles[record] = log.cycle[k][lane];
+                block.bins[record] = log.bin[k][lane];
+            }
+    }
+};
+
+template <DetectorMode mode, Sink sink>
+class WaveRunner {
 public:
-    explicit WaveformRunner(const WaveformBlock& block)
-        : block_(block), job_(*block.job), mode_(job_, static_cast<double>(job_.samples)),
-          bins_per_part_(static_cast<double>(job_.bins) / static_cast<double>(job_.samples)),
-          periods_per_part_(1.0 / static_cast<double>(job_.samples)) {
-        const int64_t edges = edges_of(job_.samples), cells = cells_of(job_.samples);
-        for (int k = 0; k < kTeam; ++k) {
-            tables_[k].edge = block.edges + k * edges;
-            tables_[k].guide = reinterpret_cast<Index*>(block.guides + k * cells);
-        }
+    explicit WaveRunner(const WaveformBlock& block)
+        : block_(block), job_(*block.job), system_(wave_system(job_)), layout_(job_.samples),
+          bins_per_part_(static_cast<double>(job_.bins) / static_cast<double>(job_.samples)), writer_(block) {
+        tables_.edge = block.edges;
+        tables_.guide = block.guides;
+        tables_.shift = layout_.shift;
+        tables_.group = layout_.group;
     }
 
     void run() {
-        while (busy_ < kTeam && take(team_[busy_])) ++busy_;
-        for (int round = 1; busy_ > 0; ++round) {
-            for (int k = 0; k < busy_; ++k) draw_ahead(team_[k].waits, team_[k].key, team_[k].event, total(team_[k]));
-            if (busy_ == kTeam) {
-                for (int k = 0; k < kWaits; ++k)
-                    for (Member& m : team_) step(m, k);
-            } else {
-                for (int k = 0; k < kWaits; ++k)
-                    for (int i = 0; i < busy_; ++i) step(team_[i], k);
-            }
-            for (int k = 0; k < busy_; ++k) {
-                Member& m = team_[k];
-                m.event += kWaits;
-                if (m.from.cycle < job_.cycles) continue;
-                --users_[m.table];
-                if (!take(m)) m = team_[--busy_], --k;
-            }
-            if (round % kPollWaveform == 0 && block_.stop->load(std::memory_order_relaxed)) return;
+        for (int lane = 0; lane < kLanes; ++lane) take(lane);
+        load_items();
+        for (int round = 1; running_ > 0; ++round) {
+            WaveWait ahead[kWaitsAhead];
+            for (int k = 0; k < kWaitsAhead; ++k)
+                ahead[k] = draw_wave(rates_, key0_, key1_, event_ + static_cast<uint32_t>(k));
+            for (int k = 0; k < kWaitsAhead; ++k) step(ahead[k], rows_ + k);
+            event_ = event_ + static_cast<uint32_t>(kWaitsAhead);
+            rows_ += kWaitsAhead;
+            if (any(from_.cycle >= system_.cycles)) exchange();
+            if (rows_ == kLog) flush();
+            if (round % kRoundsToPoll == 0 && block_.stop->load(std::memory_order_relaxed)) return;
         }
     }
 
 private:
-    struct Member {
-        Instant from;  // where the search for the next arrival begins
-        int table;
-        Mode mode;
-        Output<sink> output;
-        Pair<uint32_t> key;
-        uint32_t event;
-        Waits waits;
-    };
-
-    MARS_INLINE void step(Member& m, int k) {
-        const WaveformTable<Index>& table = tables_[m.table];
-        const double sum = table.energy(m.from.x) + m.waits.energy[k];
-        const int64_t over = sum >= table.total;
-        const double energy = sum - table.none[over];
-        const double x = table.position(energy < table.top ? energy : table.top);
-        const int64_t turns = m.waits.whole[k] + over;
-        const double least[2] = {m.from.x, 0.0};  // rounding must not turn time back within a period
-        const double held = least[turns != 0];
-        const Instant hit = {m.from.cycle + turns, x > held ? x : held};
-        const bool seen = m.mode(hit, m.from);
+    MARS_INLINE void step(const WaveWait& wait, int row) {
+        const WaveTime hit = next_arrival(tables_, from_, wait);
         // inside the exposure: 0 <= cycle < cycles, one unsigned comparison
-        if (!(seen & (static_cast<uint64_t>(hit.cycle) < static_cast<uint64_t>(job_.cycles)))) return;
-        const int32_t bin = static_cast<int32_t>(hit.x * bins_per_part_);
-        const double phase = hit.x * periods_per_part_;
-        m.output.write(static_cast<int32_t>(hit.cycle), phase < kLastPhase ? phase : kLastPhase,
-                       bin < job_.bins ? bin : job_.bins - 1);
+        const Mask outside = as_uint(hit.cycle) >= static_cast<uint32_t>(system_.cycles);
+        const Mask unseen = advance<mode>(system_, hit, from_, memory_);
+        Int bin = hit.part;
+        if (sink == Sink::kTimestamps || system_.bins != system_.parts) {
+            alignas(64) int32_t part[kLanes];
+            alignas(64) float inside[kLanes];
+            store(part, hit.part);
+            store(inside, hit.inside);
+            for (int lane = 0; lane < kLanes; ++lane) {
+                const double x = static_cast<double>(part[lane]) + static_cast<double>(inside[lane]);
+                if constexpr (sink == Sink::kTimestamps) log_.phase[row][lane] = x / system_.parts;
+                part[lane] = static_cast<int32_t>(x * bins_per_part_);
+            }
+            if (system_.bins != system_.parts) bin = minimum(load<Int>(part), splat(system_.bins - 1));
+        }
+        if constexpr (sink == Sink::kTimestamps) store(log_.cycle[row], hit.cycle);
+        store(log_.bin[row], select(outside | unseen, splat(-1), bin));
     }
 
-    double total(const Member& m) const { return tables_[m.table].total; }
+    // Writes what a lane has logged for its present item, up to row `to`.
+    void flush(int lane, int to) {
+        if (items_[lane] >= 0) writer_.template write<1>(items_ + lane, log_, lane, first_row_[lane], to);
+        first_row_[lane] = to;
+    }
 
-    // Gives a member the next item with any light, or says that there is none left.
-    MARS_NOINLINE bool take(Member& m) {
-        for (; pixel_ < block_.pixels; ++pixel_, realization_ = 0) {
+    // Empties the log, several lanes at once where all have work.
+    MARS_NOINLINE void flush() {
+        constexpr int team = kLanes < 4 ? kLanes : 4;
+        for (int lane = 0; lane < kLanes; lane += team) {
+            int common = 0;
+            bool busy = true;
+            for (int i = lane; i < lane + team; ++i) {
+                if (first_row_[i] > common) common = first_row_[i];
+                busy = busy && items_[i] >= 0;
+            }
+            if (!busy) common = rows_;
+            for (int i = lane; i < lane + team; ++i) flush(i, common);
+            if (busy) writer_.template write<team>(items_ + lane, log_, lane, common, rows_);
+        }
+        memset(first_row_, 0, sizeof first_row_);
+        rows_ = 0;
+    }
+
+    // Gives the lanes whose exposure has ended another item.
+    MARS_NOINLINE void exchange() {
+        spill(cycle_, from_.cycle);
+        spill(part_, from_.part);
+        store(inside_, from_.inside);
+        store(events_, event_);
+        if constexpr (mode == DetectorMode::kParalyzable) {
+            store(ready_cycle_, memory_.ready.cycle);
+            store(ready_part_, memory_.ready.part);
+            store(ready_inside_, memory_.ready.inside);
+        }
+        for (int lane = 0; lane < kLanes; ++lane) {
+            if (cycle_[lane] < system_.cycles) continue;
+            flush(lane, rows_);
+            if (items_[lane] >= 0) {
+                --running_;
+                --users_[slot_[lane]];
+            }
+            take(lane);
+        }
+        load_items();
+    }
+
+    // Puts the next item with any light into a lane; one without work idles beyond the end of the exposure.
+    void take(int lane) {
+        events_[lane] = 0;
+        first_row_[lane] = rows_;
+        items_[lane] = -1;
+        slot_[lane] = 0;
+        rates_.total[lane] = rates_.inverse[lane] = 0.0;
+        cycle_[lane] = kIdleCycle;
+        part_[lane] = 0;
+        inside_[lane] = 0.0f;
+        ready_cycle_[lane] = INT32_MIN;
+        ready_part_[lane] = 0;
+        ready_inside_[lane] = 0.0f;
+        for (; running_ < block_.team && pixel_ < block_.pixels; ++pixel_, realization_ = 0) {
             const int64_t pixel = block_.first_pixel + pixel_;
             if (realization_ == 0) prepare(pixel);
             while (realization_ < block_.realizations) {
-                const int64_t r = block_.first_realization + realization_;
-                const int64_t place = pixel_ * block_.realizations + realization_++;
-                m.output.open(block_, r * job_.pixels + pixel);
-                const WaveformTable<Index>& table = tables_[latest_];
-                if (!table.lit()) continue;
-                m.from = {0, 0.0};
-                if (block_.start_cycle) {
-                    const double x = block_.start_phase[place] * table.parts;
-                    m.from = {block_.start_cycle[place], x < table.end ? x : table.end};
-                }
-                m.mode = mode_;
-                m.key = stream_key(job_.seed, job_.first_realization + static_cast<uint32_t>(r),
-                                   job_.pixel_index[pixel]);
-                m.event = 0;
-                m.table = latest_;
+                const int64_t place = pixel_ * block_.realizations + realization_;
+                const int64_t r = block_.first_realization + realization_++, item = r * job_.pixels + pixel;
+                writer_.open(lane, item);
+                if (!(photons_ >= 1e-30)) continue;
+                begin(lane, place);
+                rates_.total[lane] = photons_;
+                rates_.inverse[lane] = 1.0 / photons_;
+                const Pair<uint32_t> key = stream_key(job_.seed, job_.first_realization + static_cast<uint32_t>(r),
+                                                      job_.pixel_index[pixel]);
+                key0s_[lane] = key.first;
+                key1s_[lane] = key.second;
+                items_[lane] = item;
+                slot_[lane] = latest_;
                 ++users_[latest_];
-                return true;
+                ++running_;
+                return;
             }
         }
-        return false;
     }
 
-    // The table of the next pixel, in a place that no member uses.
+    // Where the search for the first arrival begins.
+    void begin(int lane, int64_t place) {
+        cycle_[lane] = 0;
+        if (!block_.start_cycle) return;
+        const WaveSpan at = wave_span(block_.start_phase[place], system_.parts);
+        const bool turn = at.parts >= system_.parts;
+        cycle_[lane] = block_.start_cycle[place] + (turn ? 1 : 0);
+        part_[lane] = turn ? 0 : at.parts;
+        inside_[lane] = at.rest;
+    }
+
+    // The table of the next pixel, in a slot that no lane uses.
     void prepare(int64_t pixel) {
         latest_ = 0;
         while (users_[latest_] > 0) ++latest_;
-        tables_[latest_].prepare(job_.waveform + pixel * job_.samples, job_.samples, job_.background[pixel]);
+        photons_ = fill_table(layout_, job_.waveform + pixel * job_.samples, job_.background[pixel],
+                              {block_.energy, block_.cell}, block_.edges + latest_ * layout_.edges,
+                              block_.guides + latest_ * layout_.cells);
     }
 
-    static constexpr double kLastPhase = 0x1.fffffffffffffp-1;
+    void load_items() {
+        alignas(64) int32_t edges[kLanes], guides[kLanes];
+        for (int lane = 0; lane < kLanes; ++lane) {
+            edges[lane] = slot_[lane] * static_cast<int32_t>(layout_.edges);
+            guides[lane] = slot_[lane] * static_cast<int32_t>(layout_.cells);
+        }
+        tables_.edges = load<Int>(edges);
+        tables_.guides = load<Int>(guides);
+        key0_ = load<UInt>(key0s_);
+        key1_ = load<UInt>(key1s_);
+        event_ = load<UInt>(events_);
+        from_ = {load<Int>(cycle_), load<Int>(part_), load<Float>(inside_)};
+        memory_.ready = {load<Int>(ready_cycle_), load<Int>(ready_part_), load<Float>(ready_inside_)};
+    }
 
     const WaveformBlock& block_;
     const Job& job_;
-    const Mode mode_;  // before the first arrival
-    const double bins_per_part_, periods_per_part_;
+    const WaveSystem system_;
+    const TableLayout layout_;
+    const double bins_per_part_;
+
+    // the lanes
+    WaveTables tables_;
+    WaveRates rates_;
+    UInt key0_, key1_, event_;
+    WaveTime from_;
+    WaveMemory memory_;
+
+    // the same as plain numbers, for changing single lanes
+    alignas(64) int32_t cycle_[kLanes];
+    alignas(64) int32_t part_[kLanes];
+    float inside_[kLanes], ready_inside_[kLanes];
+    int32_t ready_cycle_[kLanes], ready_part_[kLanes];
+    uint32_t key0s_[kLanes] = {}, key1s_[kLanes] = {}, events_[kLanes];
+    int64_t items_[kLanes];  // of the job, or -1
+    int32_t slot_[kLanes];   // the table of a lane
+    int first_row_[kLanes];
+
     int64_t pixel_ = 0, realization_ = 0;  // the next item
-    int latest_ = 0, users_[kTeam] = {};  // the latest pixel's table; members that use each one
-    WaveformTable<Index> tables_[kTeam];
-    Member team_[kTeam];  // the first `busy_` have work
-    int busy_ = 0;
+    int32_t latest_ = 0;                   // slot of the latest pixel's table ...
+    double photons_ = 0.0;                 // ... and its photons per period
+    int users_[kLanes + 1] = {};           // lanes that use each slot
+    int running_ = 0, rows_ = 0;
+    WaveWriter<sink> writer_;
+    WaveLog<sink> log_;
 };
 
-template <class Mode, Sink sink>
-void run_indices(const WaveformBlock& block) {
-    if (block.job->samples < 65536) return WaveformRunner<Mode, sink, uint16_t>(block).run();
-    return WaveformRunner<Mode, sink, uint32_t>(block).run();
-}
-
-template <class Mode>
-void run_mode(const WaveformBlock& block) {
+template <DetectorMode mode>
+void run(const WaveformBlock& block) {
     switch (block.sink) {
-        case Sink::kCounts: return run_indices<Mode, Sink::kCounts>(block);
-        case Sink::kHistogram16: return run_indices<Mode, Sink::kHistogram16>(block);
-        case Sink::kHistogram32: return run_indices<Mode, Sink::kHistogram32>(block);
-        case Sink::kTimestamps: return run_indices<Mode, Sink::kTimestamps>(block);
+        case Sink::kCounts: return WaveRunner<mode, Sink::kCounts>(block).run();
+        case Sink::kHistogram16: return WaveRunner<mode, Sink::kHistogram16>(block).run();
+        case Sink::kHistogram32: return WaveRunner<mode, Sink::kHistogram32>(block).run();
+        case Sink::kTimestamps: return WaveRunner<mode, Sink::kTimestamps>(block).run();
     }
 }
 
@@ -244,10 +284,10 @@ void run_mode(const WaveformBlock& block) {
 
 void MARS_JOIN(waveform_kernel_, MARS_LEVEL)(const WaveformBlock& block) {
     switch (block.job->mode) {
-        case DetectorMode::kNonparalyzable: return run_mode<FreeRunning>(block);
-        case DetectorMode::kParalyzable: return run_mode<ParalyzableMode>(block);
-        case DetectorMode::kSynchronous: return run_mode<SynchronousMode>(block);
-        case DetectorMode::kGated: return run_mode<GatedMode>(block);
+        case DetectorMode::kNonparalyzable: return run<DetectorMode::kNonparalyzable>(block);
+        case DetectorMode::kParalyzable: return run<DetectorMode::kParalyzable>(block);
+        case DetectorMode::kSynchronous: return run<DetectorMode::kSynchronous>(block);
+        case DetectorMode::kGated: return run<DetectorMode::kGated>(block);
     }
 }
 

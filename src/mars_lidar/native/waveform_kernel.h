@@ -9,14 +9,12 @@
 
 namespace mars {
 
-constexpr int kWaveformTeam = 4;  // pixels, or realizations of one, that are worked on side by side
-
 // Pixels times realizations of a job.
 struct WaveformBlock {
     const Job* job;
     int64_t first_pixel, pixels;
     int64_t first_realization, realizations;  // relative to the job's first
-    const int64_t* start_cycle;  // (pixels, realizations) where the search begins, or null: armed at 0
+    const int32_t* start_cycle;  // (pixels, realizations) where the search begins, or null: armed at 0
     const double* start_phase;   // in periods, [0, 1)
     Sink sink;
     void* out;               // of the job: counts int64 (items); histograms (items, bins), not yet zeroed
@@ -24,8 +22,11 @@ struct WaveformBlock {
     double* times;           // timestamps, in periods; likewise below
     int32_t* cycles;
     int32_t* bins;
-    double* edges;           // memory for the team's tables: waveform_table.h
-    uint32_t* guides;
+    int64_t team;            // tables that there is memory for: waveform_table.h
+    double* energy;          // to work in: (samples + 1)
+    int32_t* cell;           // likewise
+    int32_t* edges;
+    uint16_t* guides;
     const std::atomic<bool>* stop;
 };
 

@@ -13,19 +13,31 @@
 
 namespace mars {
 
-// The table of one pixel with its memory, by phase in [0, 1).
+// C of one pixel and its inverse, by phase in [0, 1), in double precision.
 class PixelWaveform {
 public:
-    PixelWaveform(const Job& job, int64_t pixel)
-        : parts_(job.samples), edges_(edges_of(parts_)), guide_(cells_of(parts_)) {
-        table_.edge = edges_.data();
-        table_.guide = guide_.data();
-        table_.prepare(job.waveform + pixel * parts_, parts_, job.background[pixel]);
+    PixelWaveform(const Job& job, int64_t pixel) : parts_(job.samples), edges_(job.samples + 1) {
+        total_ = integrate(job.waveform + pixel * parts_, parts_, edges_.data()) + job.background[pixel];
+        const double each = job.background[pixel] / static_cast<double>(parts_);
+        for (int64_t j = 1; j < parts_; ++j) edges_[j] += static_cast<double>(j) * each;
+        edges_[parts_] = std::max(total_, edges_[parts_ - 1]);
     }
 
-    double total() const { return table_.total; }
-    double energy(double phase) const { return table_.energy(std::min(phase * table_.parts, table_.end)); }
-    double phase(double energy) const { return table_.position(std::min(energy, table_.top)) / table_.parts; }
+    double total() const { return total_; }
+
+    double energy(double phase) const {
+        const double x = phase * static_cast<double>(parts_);
+        const int64_t j = std::min(static_cast<int64_t>(x), parts_ - 1);
+        return edges_[j] + (edges_[j + 1] - edges_[j]) * (x - static_cast<double>(j));
+    }
+
+    double phase(double energy) const {
+        const int64_t above = std::upper_bound(edges_.begin(), edges_.end(), energy) - edges_.begin();
+        const int64_t j = std::min(std::max<int64_t>(above - 1, 0), parts_ - 1);
+        const double step = edges_[j + 1] - edges_[j];
+        const double inside = step > 0.0 ? std::min((energy - edges_[j]) / step, 1.0) : 0.0;
+        return std::min((static_cast<double>(j) + inside) / static_cast<double>(parts_), 1.0 - 0x1p-53);
+    }
 
     // In at least 1024 parts, or `least` up to 16384; a whole number of them in each sample.
     std::vector<double> photons(double least) const {
@@ -40,9 +52,8 @@ public:
 
 private:
     int64_t parts_;
+    double total_;
     std::vector<double> edges_;
-    std::vector<uint32_t> guide_;
-    WaveformTable<uint32_t> table_;
 };
 
 class WaveformWarmedUp {
@@ -68,7 +79,7 @@ public:
     }
 
     // Cycle and phase from which on the arrivals of one realization matter.
-    void draw(uint32_t realization, GapSearch& search, int64_t& cycle, double& phase) const {
+    void draw(uint32_t realization, GapSearch& search, int32_t& cycle, double& phase) const {
         const Pair<uint32_t> key = stream_key(job_.seed, realization, pixel_);
         const double total = wave_.total(), u = start_uniform(key);
         const auto place = [&](uint32_t, const Pair<uint32_t>& words) { return wave_.phase(unit(words) * total); };
@@ -77,7 +88,7 @@ public:
                                 : synchronous_ ? static_cast<double>(synchronous_->periods(u))
                                                : 0.0;
         const double periods = std::floor(residual);
-        cycle = cycle_ + static_cast<int64_t>(periods);
+        cycle = static_cast<int32_t>(cycle_ + static_cast<int64_t>(periods));
         phase = residual - periods;
     }
 

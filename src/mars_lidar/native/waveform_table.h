@@ -1,113 +1,108 @@
-// The integrated rate C of one pixel whose rate is constant in each of T equal parts of the period, and its inverse.
+// The integrated rate C of one pixel whose rate is constant in each of T equal parts of the period.
 //
-// Positions x are in parts, 0 <= x < T; energies are photons since the start of the period. C is kept in double
-// precision at the edges of the parts, so that each part has its own energy to 1e-16 of a period's, however bright
-// its neighbours. The inverse finds its part by a guide table (H.-C. Chen, Y. Asau, "On generating random variates
-// from an empirical distribution", AIIE Transactions 6, 1974): the period's energy cut into equal cells, and for each
-// cell the last part that begins before it.
+// The kernel keeps C at the edges of the parts as integers, 2^31 for the photons of a period. Each part so has its own
+// energy to 2^-31 of the period's, which as many registrations as a pixel may have cannot tell from the truth, and a
+// part without light has none at all; energies add up and carry over without rounding. The inverse finds its part by
+// a guide table (H.-C. Chen, Y. Asau, "On generating random variates from an empirical distribution", AIIE
+// Transactions 6, 1974): the period's energy cut into equal cells, and for each cell the part at its beginning.
 #pragma once
 #include <cstdint>
-#include <cstring>
 
 #include "lanes.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
 
-constexpr int64_t kCellsPerPart = 2;  // two cells a part: hardly a search needs a third step
-constexpr int64_t kFill = 8;          // cells written at once
-constexpr int64_t kSpare = 3;         // edges past the last one, out of reach: steps need no bound
+constexpr int32_t kFull = 0x7fffffff;  // energy at the end of the period, one unit less than a whole one
+constexpr int64_t kSpareEdges = 4;     // beyond the last one: four edges are looked at together
+constexpr int64_t kFill = 8;           // cells written at once
+constexpr int kMostCellBits = 17;
 
-// Doubles and indices behind a table of T parts.
-inline int64_t edges_of(int64_t parts) { return parts + 1 + kSpare; }
-inline int64_t cells_of(int64_t parts) { return kCellsPerPart * parts + 2 + kFill; }
-
-// The largest number below a positive one.
-MARS_INLINE double next_below(double x) {
-    uint64_t word;
-    memcpy(&word, &x, sizeof word);
-    --word;
-    memcpy(&x, &word, sizeof x);
-    return x;
+// Asks for memory that will be read soon, the waveform of the next pixel; what is not there does no harm.
+MARS_INLINE void fetch(const double* from) {
+#if defined(__GNUC__)
+    __builtin_prefetch(from, 0, 2);
+#else
+    (void)from;
+#endif
 }
 
-template <class Index>
-struct WaveformTable {
-    double* edge;  // (T + 1 + spare) photons before each edge
-    Index* guide;  // (cells + 2 + fill)
-    double parts, end;  // T, and the largest position below it
-    double total, top;  // photons of a period, and the largest number below that
-    double scale;       // cells per photon
-    double none[2];     // 0 and `total`: what a full period takes away
-
-    // `photons` (T) of the waveform and a constant background.
-    void prepare(const double* photons, int64_t number, double background) {
-        parts = static_cast<double>(number);
-        end = next_below(parts);
-        accumulate(photons, number, background / parts);
-        total = edge[number];
-        top = total > 0.0 ? next_below(total) : 0.0;
-        none[0] = 0.0;
-        none[1] = total;
-        constexpr double kBeyond = 1e300;
-        for (int64_t k = 1; k <= kSpare; ++k) edge[number + k] = kBeyond;
-        if (!lit()) return;
-        scale = static_cast<double>(kCellsPerPart * number) / total;
-        // Monotonic, as rounding is: where `energy` is at least that of an edge, so is its cell.
-        int64_t cell = 0;
-        guide[0] = 0;
-        for (int64_t j = 0; j < number; ++j) {
-            const int64_t next = cell_of(edge[j + 1]);
-            Index* const to = guide + cell + 1;
-            for (int64_t k = 0; k < kFill; ++k) to[k] = static_cast<Index>(j);
-            for (int64_t k = kFill; k < next - cell; ++k) to[k] = static_cast<Index>(j);
-            cell = next;
-        }
+// C at the edges: `edge` (parts + 1) in photons, without the background. In eight runs of parts side by side, because
+// each addition waits for the one before it.
+inline double integrate(const double* photons, int64_t parts, double* edge) {
+    constexpr int64_t kRuns = 8;
+    const int64_t length = parts / kRuns;
+    double sum[kRuns] = {};
+    const double* from = photons;
+    double* to = edge + 1;
+    for (int64_t j = 0; j < length; ++j, ++from, ++to) {
+        fetch(photons + parts + 8 * j);
+        for (int64_t run = 0; run < kRuns; ++run) to[run * length] = sum[run] += from[run * length];
     }
-
-    bool lit() const { return total >= 1e-30; }
-
-    // Photons before a position.
-    MARS_INLINE double energy(double x) const {
-        const int32_t j = static_cast<int32_t>(x);
-        const double low = edge[j], high = edge[j + 1];
-        return low + (high - low) * (x - static_cast<double>(j));
+    edge[0] = 0.0;
+    double before = 0.0;
+    for (int64_t run = 0; run < kRuns; ++run) {
+        double* const of_run = edge + run * length + 1;
+        for (int64_t j = 0; j < length; ++j) of_run[j] += before;
+        before += sum[run];
     }
+    for (int64_t j = kRuns * length; j < parts; ++j) edge[j + 1] = before += photons[j];
+    return before;
+}
 
-    // The position before which there are `energy` photons, 0 <= energy <= top.
-    MARS_INLINE double position(double energy) const {
-        int64_t j = guide[cell_of(energy)];
-        j += edge[j + 1] <= energy;  // steps without a branch; edges that meet enclose nothing
-        j += edge[j + 1] <= energy;
-        while (edge[j + 1] <= energy) ++j;
-        const double low = edge[j], high = edge[j + 1];
-        const double x = static_cast<double>(static_cast<int32_t>(j)) + (energy - low) / (high - low);
-        return x < end ? x : end;
-    }
+// How the tables of a job lie in memory, one after the other.
+struct TableLayout {
+    int64_t parts, edges, cells;  // T, and the places that a table takes of either kind
+    int shift;                    // cell = energy >> shift
+    int group;                    // a guide's entry stands for 2^group parts, so that 16 bits will do
 
-private:
-    MARS_INLINE int64_t cell_of(double energy) const { return static_cast<int32_t>(energy * scale); }
-
-    // Sums over eight runs of parts side by side, because each addition waits for the one before it.
-    void accumulate(const double* photons, int64_t number, double each) {
-        constexpr int64_t kRuns = 8;
-        const int64_t length = number / kRuns;
-        double sum[kRuns] = {};
-        for (int64_t j = 0; j < length; ++j)
-            for (int64_t run = 0; run < kRuns; ++run) {
-                sum[run] += photons[run * length + j] + each;
-                edge[run * length + j + 1] = sum[run];
-            }
-        edge[0] = 0.0;
-        double before = 0.0;
-        for (int64_t run = 0; run < kRuns; ++run) {
-            double* const to = edge + run * length + 1;
-            for (int64_t j = 0; j < length; ++j) to[j] += before;
-            before += sum[run];
-        }
-        for (int64_t j = kRuns * length; j < number; ++j) edge[j + 1] = before += photons[j] + each;
+    explicit TableLayout(int64_t number) : parts(number), edges(number + 1 + kSpareEdges), group(0) {
+        int bits = 1;
+        while (bits < kMostCellBits && (int64_t{1} << bits) < 2 * number) ++bits;
+        shift = 31 - bits;
+        cells = (int64_t{1} << bits) + kFill;
+        while ((number - 1) >> group > 0xffff) ++group;
     }
 };
+
+MARS_NOINLINE inline void fill_cells(uint16_t* from, const uint16_t* to, uint16_t entry) {
+    for (; from < to; ++from) *from = entry;
+}
+
+// Room to work in while a table is filled: (parts + 1) each.
+struct TableScratch {
+    double* energy;
+    int32_t* cell;
+};
+
+// Fills a table. Returns the photons of a period; below 1e-30 the table is left as it is.
+inline double fill_table(const TableLayout& layout, const double* photons, double background,
+                         const TableScratch& scratch, int32_t* edge, uint16_t* guide) {
+    const int32_t parts = static_cast<int32_t>(layout.parts), shift = layout.shift, group = layout.group;
+    const double total = integrate(photons, parts, scratch.energy) + background;
+    if (!(total >= 1e-30)) return total;
+    const double units = 0x1p31 / total, each = background / static_cast<double>(parts);
+    for (int32_t j = 0; j <= parts; ++j) {
+        const double energy = (scratch.energy[j] + static_cast<double>(j) * each) * units;
+        edge[j] = static_cast<int32_t>(energy < 2147483647.0 ? energy : 2147483647.0);
+    }
+    // what shines to the end of the period, and the dark after it, ends at its end, whatever rounding says
+    const int32_t last = edge[parts];
+    for (int32_t j = parts; j >= 0 && edge[j] == last; --j) edge[j] = kFull;
+    for (int64_t k = 1; k <= kSpareEdges; ++k) edge[parts + k] = kFull;
+    const uint32_t up = (uint32_t{1} << shift) - 1u;
+    for (int32_t j = 0; j <= parts; ++j)  // the first cell that begins at or after the edge
+        scratch.cell[j] = static_cast<int32_t>((static_cast<uint32_t>(edge[j]) + up) >> shift);
+    int32_t cell = 0;
+    for (int32_t j = 0; j < parts; ++j) {
+        const int32_t next = scratch.cell[j + 1];
+        const uint16_t entry = static_cast<uint16_t>(j >> group);
+        for (int k = 0; k < kFill; ++k) guide[cell + k] = entry;
+        if (next - cell > kFill) fill_cells(guide + cell + kFill, guide + next, entry);
+        cell = next;
+    }
+    return total;
+}
 
 }  // namespace MARS_LEVEL
 }  // namespace mars

@@ -97,6 +97,12 @@ def _quantisation(request: Request) -> list[Path]:
     return run(request)
 
 
+def _transients(request: Request) -> list[Path]:
+    from mars_lidar.studies.transients import run
+
+    return run(request)
+
+
 def _table(request: Request) -> list[Path]:
     from mars_lidar.studies.table import run
 
@@ -118,6 +124,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "joint-table": ("variance of signal window and bins, covariance of neighbours: every engine", _joint_table),
     "quantisation": ("what a table's lookup costs, nearest and interpolated, over its size", _quantisation),
     "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
+    "transients": ("two returns in fog through the dead time of three detectors", _transients),
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
 }
 

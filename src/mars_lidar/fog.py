@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mars_lidar import _validate
+from mars_lidar._memory import check_memory
 
 if TYPE_CHECKING:
     from mars_lidar.flux import FloatArray, Flux
@@ -35,6 +36,7 @@ def in_fog(
     photons = _validate.real("backscatter", backscatter, low=0.0)
     first = _validate.real("nearest_m", nearest_m, low=0.0, strict_low=True)
     number = 4 * system.bins if parts is None else _validate.integer("parts", parts, low=1, high=2**20)
+    check_memory(48 * math.prod(flux.shape) * number, "the waveforms", "take rows: flux[rows]")
     lit = flux.returns_signal > 0
     depth = np.where(lit, 0.5 * SPEED_OF_LIGHT_M_PER_NS * flux.returns_delay_ns, 0.0)
     if (depth < 0.0).any():
@@ -49,8 +51,9 @@ def in_fog(
         part_ns = system.period_ns / number
         farthest = np.asarray(np.where(lit.any(0), depth.max(0, initial=0.0), math.inf), np.float64)  # ends the beam
         reach = min(float(farthest.max()), first + 0.5 * _DARK / alpha)
-        edges = np.arange(math.ceil(2.0 * reach / (SPEED_OF_LIGHT_M_PER_NS * part_ns)) + 2) * part_ns
-        share = _share(0.5 * SPEED_OF_LIGHT_M_PER_NS * edges, alpha, first)
+        number_of_edges = math.ceil(2.0 * reach / (SPEED_OF_LIGHT_M_PER_NS * part_ns)) + 2
+        edges = np.arange(number_of_edges, dtype=np.float64) * part_ns
+        share = _share(np.multiply(0.5 * SPEED_OF_LIGHT_M_PER_NS, edges), alpha, first)
         until = _share(farthest, alpha, first)
         cloud = np.diff(np.minimum(share, until[..., None]), axis=-1)
         if cloud.any():

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks import effects, engines, exposures, laws, memory, numpy_mars, paths, startup, storage, sweeps
+from benchmarks import effects, engines, exposures, laws, memory, numpy_mars, paths, startup, storage, sweeps, waveforms
 from benchmarks.config import DEFAULT, FULL, QUICK, Config
 from benchmarks.floor import Bandwidth, measure_bandwidth
 from benchmarks.machine import Interference, describe_machine
@@ -26,6 +26,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "pixels": sweeps.image_sweep,
     "paths": paths.exact_paths,
     "effects": effects.detector_effects,
+    "waveform": waveforms.waveform_engine,
     "exposure": laws.exposure_laws,
     "stationary": laws.stationary_distribution,
     "codecs": storage.codecs,

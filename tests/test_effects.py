@@ -236,9 +236,12 @@ def test_jitter_leaves_the_count_law_alone():
 
 @pytest.mark.parametrize("name", EACH)
 @pytest.mark.parametrize("mode", MODES)
-def test_bits_do_not_depend_on_level_threads_and_parts(name: str, mode: str):
+@pytest.mark.parametrize("wave", [False, True])
+def test_bits_do_not_depend_on_level_threads_and_parts(name: str, mode: str, wave: bool):
     random = np.random.default_rng(2)
     flux = ml.Flux(random.uniform(0, 3, (5, 40)), random.uniform(0, 2, (5, 40)), random.uniform(0, 100, (5, 40)))
+    if wave:
+        flux = ml.Flux(waveform=random.exponential(0.05, (5, 40, 64)), background=flux.background)
     system = case_of(pixel(EACH[name], mode)).system
     whole = ml.simulate(flux, system, seed=9, threads=1)
     for level in _core.levels()[1:]:
@@ -261,8 +264,9 @@ def test_off_is_the_ideal_pixel():
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_recorder_that_changes_nothing_gives_the_plain_bits(mode: str):
-    plain = case_of(pixel({}, mode))
-    idle = case_of(pixel({"max_events_per_exposure": 100_000, "code_density": (1.0, 1.0)}, mode))
+@pytest.mark.parametrize("wave", [False, True])
+def test_a_recorder_that_changes_nothing_gives_the_plain_bits(mode: str, wave: bool):
+    plain = case_of(pixel({}, mode), wave=wave)
+    idle = case_of(pixel({"max_events_per_exposure": 100_000, "code_density": (1.0, 1.0)}, mode), wave=wave)
     a, b = (ml.simulate(case.flux, case.system, seed=4, realizations=50) for case in (plain, idle))
     assert np.array_equal(a, b)

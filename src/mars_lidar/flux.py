@@ -158,6 +158,40 @@ class Flux:
         _fill(flux, self.returns_signal * share, self.returns_delay_ns, background, wave, self.info)
         return flux
 
+    def in_fog(
+        self,
+        system: System,
+        *,
+        extinction_per_m: float,
+        backscatter: float,
+        nearest_m: float = 1.0,
+        parts: int | None = None,
+    ) -> Flux:
+        """The same returns through homogeneous fog, as a waveform: attenuated, and behind the fog's own light.
+
+        With alpha the extinction and z = c tau / 2, by the lidar equation for single scattering (U. Wandinger,
+        "Introduction to lidar", in C. Weitkamp, ed., Lidar, Springer 2005), through the pulse of the system::
+
+            S_k -> S_k exp(-2 alpha z_k)
+            fog:   backscatter * g(z),   g(z) ~ exp(-2 alpha z) / z^2   from z_0 to the pixel's farthest return
+
+        g integrates to 1 from z_0 to infinity; a pixel without a return sees all of it.
+
+        Parameters
+        ----------
+        extinction_per_m
+            Extinction coefficient alpha, 1/m; 3.91 / (visibility in m), by Koschmieder's law.
+        backscatter
+            Photons per period that fog without a target sends back.
+        nearest_m
+            Depth z_0 from which on laser and field of view overlap, m, > 0.
+        parts
+            Parts of the waveform; default 4 for each bin of the histogram.
+        """
+        from mars_lidar.fog import in_fog
+
+        return in_fog(self, system, extinction_per_m, backscatter, nearest_m, parts)
+
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W)."""

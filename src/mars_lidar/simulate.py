@@ -14,6 +14,7 @@ from mars_lidar._memory import check_memory
 from mars_lidar.engines import Engine, find_engine
 from mars_lidar.engines.base import Progress, Records, Task
 from mars_lidar.flux import Flux
+from mars_lidar.stored_flux import StoredFlux
 from mars_lidar.system import System
 from mars_lidar.timestamps import Timestamps
 
@@ -163,6 +164,8 @@ def _task(
         raise TypeError(f"flux must be a Flux, got {type(flux).__name__}")
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
+    if isinstance(flux, StoredFlux):
+        flux = flux[:]  # whole, or a MemoryError that says so
     first = _validate.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = _validate.integer("realizations", realizations, low=1, high=2**32 - first)
     _validate.integer("seed", seed, low=0, high=2**64 - 1)

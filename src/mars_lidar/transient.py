@@ -17,10 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar import _validate
 from mars_lidar._memory import check_memory
 from mars_lidar.flux import Flux
+from mars_lidar.stored_flux import StoredFlux
 from mars_lidar.system import System
 
 FloatArray = NDArray[np.float64]
 _BAND_BYTES = 64 * 2**20
+_WORK_BYTES = 8 * 2**20  # of rows that are folded and convolved together, some six times over
 _MAX_PARTS = 2**20
 _DELAYS = 64  # midpoints inside a part for the pulse's average: error below (part / pulse width)^2 / 1e5
 
@@ -146,8 +148,8 @@ class Transient:
         if sbr != math.inf:
             _validate.real("sbr", sbr, low=0.0, strict_low=True)
         _validate.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
-        first, last, step = rows.indices(self.shape[0])
-        if step != 1 or first >= last:
+        first, last, stride = rows.indices(self.shape[0])
+        if stride != 1 or first >= last:
             raise ValueError(f"rows must select a run of at least one of {self.shape[0]}, got {rows!r}")
         number = max(system.bins, math.ceil(system.period_ns / self.bin_ns * (1 - 1e-12)))
         number = _validate.integer("parts", number if parts is None else parts, low=1, high=_MAX_PARTS)
@@ -162,10 +164,9 @@ class Transient:
         check_memory(4 * size, "the waveforms of these rows", "take fewer rows at a time")  # Flux keeps a copy
         waveform = np.empty((last - first, self.shape[1], number))
         spread = _spread_spectrum(system, number) if pulse else None
-        for band in self.bands():
-            here = slice(max(band.start, first), min(band.stop, last))
-            if here.start >= here.stop:
-                continue
+        step = max(1, _WORK_BYTES // (8 * self.shape[1] * max(number, self.values.shape[2])))
+        for begin in range(first, last, step):
+            here = slice(begin, min(begin + step, last))
             light = self._on_period(self._rows(here), system.period_ns, number)
             if spread is not None:
                 total = light.sum(-1, keepdims=True)
@@ -184,6 +185,36 @@ class Transient:
             "pulse_convolved": pulse,
         }
         return Flux(waveform=waveform, background=background, info=info)
+
+    def stored_flux(
+        self,
+        system: System,
+        *,
+        signal: float | None = None,
+        photons_per_unit: float | None = None,
+        sbr: float = math.inf,
+        dark_counts_per_s: float = 0.0,
+        pulse: bool = True,
+        parts: int | None = None,
+    ) -> StoredFlux:
+        """The flux as `flux` gives it, for a transient larger than memory: rows are read when they are used.
+
+        `mars_lidar.io.simulate_to` takes it band by band. Parameters and errors are those of `flux`; the transient
+        is read once at this call, for its `totals`.
+        """
+
+        def make(rows: slice) -> Flux:
+            return self.flux(
+                system, signal=signal, photons_per_unit=photons_per_unit, sbr=sbr,
+                dark_counts_per_s=dark_counts_per_s, pulse=pulse, parts=parts, rows=rows,
+            )  # fmt: skip
+
+        first = make(slice(0, 1))
+        assert first.waveform is not None
+        lit = self.totals[self.totals > 0]
+        scale = first.info["mean_signal"] / float(lit.mean())
+        background = np.full(self.shape, first.info["mean_background"])
+        return StoredFlux(scale * self.totals, background, first.waveform.shape[-1], make, first.info)
 
     def _rows(self, rows: slice) -> FloatArray:
         values = np.asarray(self.values[rows])

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-_SCENE, _SYSTEM = "Scene (one of --scene and --depth)", "System"
+_SCENE, _SYSTEM = "Scene (one of --scene, --depth and --transient)", "System"
 _EFFECTS = "Effects of the detector (off by default)"
+_TRANSIENT = "Rendered transient (with --transient)"
 _LIGHT, _RUN, _OUTPUT = "Light", "Simulation", "Output"
 
 
@@ -66,6 +67,46 @@ FocalPx = Annotated[
 Index = Annotated[
     int | None,
     _option("--index", panel=_SCENE, help="Frame of a NYUv2 .mat given as --depth, from 0."),
+]
+Transient = Annotated[
+    Path | None,
+    _option(
+        "--transient", panel=_SCENE,
+        help="Rendered transient (y, x, time), read in bands: .npy, .npz, .h5, .hdf5 (tal and mitransient too), .mat.",
+    ),
+]
+TransientBinNs = Annotated[
+    float | None,
+    _option("--transient-bin-ns", panel=_TRANSIENT, help="Width of its time bins, ns.", default="what the file says"),
+]
+TransientStartNs = Annotated[
+    float | None,
+    _option(
+        "--transient-start-ns", panel=_TRANSIENT, help="Travel time at its first bin, ns.",
+        default="what the file says, else 0",
+    ),
+]
+TransientName = Annotated[
+    str | None,
+    _option("--transient-name", panel=_TRANSIENT, help="Which array of the file.", default="transient"),
+]
+TransientChannel = Annotated[
+    int | None,
+    _option("--transient-channel", panel=_TRANSIENT, help="Which channel of a file (y, x, time, channel), from 0."),
+]
+TransientPulse = Annotated[
+    bool | None,
+    _option(
+        "--transient-pulse/--no-transient-pulse", panel=_TRANSIENT, default="yes",
+        help="Convolve with the system's pulse; no where the transient contains it already.",
+    ),
+]
+PhotonsPerUnit = Annotated[
+    float | None,
+    _option(
+        "--photons-per-unit", panel=_TRANSIENT,
+        help="Instead of --signal: detectable photons per period for one unit of its light.",
+    ),
 ]
 System = Annotated[
     Path | None,
@@ -202,6 +243,13 @@ Signal = Annotated[
     _option(
         "--signal", panel=_LIGHT, default="1",
         help="Mean signal S over the pixels with a return, detectable photons per laser period.",
+    ),
+]
+SignalLevel = Annotated[
+    float | None,
+    _option(
+        "--signal", panel=_LIGHT, default="1",
+        help="Mean signal S over the pixels with a return or light, detectable photons per laser period.",
     ),
 ]
 Sbr = Annotated[

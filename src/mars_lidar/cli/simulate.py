@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from mars_lidar.cli.console import table as print_table
 from mars_lidar.cli.system_options import Effects, build_system
 
 if TYPE_CHECKING:
+    from mars_lidar.flux import Flux
     from mars_lidar.io import Written
     from mars_lidar.scene import Scene
     from mars_lidar.system import System
@@ -27,6 +29,7 @@ EPILOG = "\n\n".join(
         "mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5",
         "mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr",
         "mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr",
+        "mars-lidar simulate --transient render.hdf5 --signal 0.5 --sbr 5 -o transient.zarr",
         "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
         "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
         "S and B are expected detectable photons per laser period, after detection efficiency. Dead time "
@@ -45,6 +48,13 @@ def simulate(
     depth_unit_m: options.DepthUnitM = None,
     focal_px: options.FocalPx = None,
     index: options.Index = None,
+    transient: options.Transient = None,
+    transient_bin_ns: options.TransientBinNs = None,
+    transient_start_ns: options.TransientStartNs = None,
+    transient_name: options.TransientName = None,
+    transient_channel: options.TransientChannel = None,
+    transient_pulse: options.TransientPulse = None,
+    photons_per_unit: options.PhotonsPerUnit = None,
     system: options.System = None,
     period_ns: options.PeriodNs = None,
     dead_time_ns: options.DeadTimeNs = None,
@@ -72,7 +82,7 @@ def simulate(
     jitter_file: options.JitterFile = None,
     jitter_bin_ns: options.JitterBinNs = None,
     code_density_file: options.CodeDensityFile = None,
-    signal: options.Signal = 1.0,
+    signal: options.SignalLevel = None,
     sbr: options.Sbr = 1.0,
     attenuation: options.Attenuation = "none",
     ambient: options.Ambient = None,
@@ -132,15 +142,46 @@ def simulate(
             pulse_bin_ns=pulse_bin_ns,
             pulse_origin=pulse_origin,
         )
-        view, source = chosen_scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px, index)
-        flux = view.flux(
-            instrument,
-            signal=signal,
-            sbr=sbr,
-            attenuation=attenuation,  # type: ignore[arg-type]  # checked there
-            ambient=ambient,  # type: ignore[arg-type]
-            dark_counts_per_s=dark_counts,
-        )
+        given = {
+            "--transient-bin-ns": transient_bin_ns,
+            "--transient-start-ns": transient_start_ns,
+            "--transient-name": transient_name,
+            "--transient-channel": transient_channel,
+            "--transient-pulse": transient_pulse,
+            "--photons-per-unit": photons_per_unit,
+        }
+        flux: Flux
+        if transient is None:
+            _refuse(given, "--transient")
+            view, source = chosen_scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px, index)
+            flux = view.flux(
+                instrument,
+                signal=1.0 if signal is None else signal,
+                sbr=sbr,
+                attenuation=attenuation,  # type: ignore[arg-type]  # checked there
+                ambient=ambient,  # type: ignore[arg-type]
+                dark_counts_per_s=dark_counts,
+            )
+            depth_m, reflectivity = view.depth_m, view.reflectivity
+        else:
+            if scene is not None or depth is not None:
+                raise ValueError("the scene is one of --scene, --depth and --transient, got two of them")
+            _refuse({"--size": size, "--image": image, "--index": index, "--ambient": ambient}, "a scene")
+            if attenuation != "none":
+                raise ValueError(f"--attenuation is for scenes; a transient has it in it, got {attenuation!r}")
+            from mars_lidar.io import read_transient
+
+            light = read_transient(
+                transient, bin_ns=transient_bin_ns, start_ns=transient_start_ns, name=transient_name,
+                channel=transient_channel,
+            )  # fmt: skip
+            if signal is None and photons_per_unit is None:
+                signal = 1.0
+            flux = light.stored_flux(
+                instrument, signal=signal, photons_per_unit=photons_per_unit, sbr=sbr, dark_counts_per_s=dark_counts,
+                pulse=transient_pulse is not False,
+            )  # fmt: skip
+            source, depth_m, reflectivity = f"transient {transient}", None, None
         from mars_lidar.io import simulate_to
 
         with progress_bar("simulating") as progress:
@@ -152,8 +193,8 @@ def simulate(
                 realizations=realizations,
                 seed=seed,
                 threads=threads,
-                depth_m=view.depth_m,
-                reflectivity=view.reflectivity,
+                depth_m=depth_m,
+                reflectivity=reflectivity,
                 source=source,
                 overwrite=overwrite,
                 progress=progress,
@@ -165,6 +206,12 @@ def simulate(
         if picture:
             _draw(out, png)
         _summary(written, png if picture else None, began)
+
+
+def _refuse(given: Mapping[str, object], what: str) -> None:
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(f"{name} belongs to {what}, which is not given")
 
 
 def chosen_scene(

@@ -32,7 +32,7 @@ class ExactEngine(Engine):
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every registration, binned as it is drawn."""
         if task.flux.waveform is not None:
-            _core.waveform_histogram(task.job, out, task.threads, task.progress)
+            _core.waveform_histogram(task.job, out, task.threads, self.level, task.progress)
         else:
             _core.exact_histogram(task.job, task.pulse, out, task.threads, self.level, task.progress)
 
@@ -40,7 +40,7 @@ class ExactEngine(Engine):
         """The first of the two passes for timestamps."""
         out = np.empty(task.items, np.int64)
         if task.flux.waveform is not None:
-            _core.waveform_counts(task.job, out, task.threads, None)
+            _core.waveform_counts(task.job, out, task.threads, self.level, None)
         else:
             _core.exact_counts(task.job, task.pulse, out, task.threads, self.level, None)
         return out
@@ -49,7 +49,7 @@ class ExactEngine(Engine):
         """The second pass: the same draws again, now with a place to go."""
         where = (records.offsets, records.times, records.cycle, records.bin)
         if task.flux.waveform is not None:
-            _core.waveform_timestamps(task.job, *where, task.threads, task.progress)
+            _core.waveform_timestamps(task.job, *where, task.threads, self.level, task.progress)
         else:
             _core.exact_timestamps(task.job, task.pulse, *where, task.threads, self.level, task.progress)
         if task.system.detector.jitter is not None:

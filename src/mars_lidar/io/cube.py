@@ -171,7 +171,7 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
         if not (complete or allow_incomplete):
             told = f" ({store.progress})" if store.progress else ""
             raise IncompleteFileError(f"{source} is incomplete: its simulation did not finish{told}")
-        recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]))
+        recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]), store.rows_of)
         total = store.attrs.get("registrations")
         return Cube(
             histogram=store.histogram,

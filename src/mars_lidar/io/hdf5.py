@@ -34,7 +34,11 @@ class Hdf5Writer(Writer):
             self._file.attrs["complete"] = 0
             scales = []
             for v in layout.variables(recipe):
-                _label(self._file.create_dataset(v.name, data=v.data), v.labels)
+                stored = self._file.create_dataset(v.name, shape=v.data.shape, dtype=v.data.dtype)
+                for rows in v.bands():
+                    stored[rows] = v.data[rows]
+                    self._disk.check()
+                _label(stored, v.labels)
                 if v.dims == (v.name,):
                     self._file[v.name].make_scale(v.name)
                     scales.append(v.name)
@@ -111,7 +115,8 @@ def open_store(path: Path) -> OpenedStore:
     def read(name: str) -> NDArray[Any]:
         return np.asarray(file[name][...])
 
-    return OpenedStore(attrs, frozenset(file), read, file["histogram"], complete, "", file.close)
+    names = frozenset(file)
+    return OpenedStore(attrs, names, read, file["histogram"], complete, "", file.close, lambda name: file[name])
 
 
 class _ForgivingFile:

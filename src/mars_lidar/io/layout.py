@@ -27,7 +27,8 @@ once complete, ``registrations``.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.flux import Flux
 from mars_lidar.io.recipe import Recipe
+from mars_lidar.stored_flux import BAND_BYTES, StoredFlux, Waveforms
 from mars_lidar.system import System
 
 FORMAT = "mars-lidar cube"
@@ -52,7 +54,7 @@ class Variable:
 
     name: str
     dims: tuple[str, ...]
-    data: NDArray[Any]
+    data: Any  # an array, or `Waveforms`, which are read by `bands`
     units: str
     long_name: str
 
@@ -60,6 +62,13 @@ class Variable:
     def labels(self) -> dict[str, str]:
         """Attributes of the variable."""
         return {"long_name": self.long_name, "units": self.units}
+
+    def bands(self) -> Iterator[slice]:
+        """Parts along the first axis that fit in memory."""
+        if isinstance(self.data, Waveforms):
+            yield from self.data.bands()
+        elif self.data.size:
+            yield slice(0, self.data.shape[0])
 
 
 def variables(recipe: Recipe) -> list[Variable]:
@@ -124,11 +133,21 @@ def recipe_from(
     names: frozenset[str],
     read: Callable[[str], NDArray[Any]],
     realizations: int,
+    rows_of: Callable[[str], Any] | None = None,
 ) -> Recipe:
-    """The recipe that `variables` and `attributes` wrote; `read` returns a variable by name."""
+    """The recipe that `variables` and `attributes` wrote.
+
+    `read` returns a variable by name; `rows_of` one that is read from disk when it is sliced, for waveforms larger
+    than `BAND_BYTES`.
+    """
+    flux: Flux
     background, info = read("background"), json.loads(attrs["flux"])
     if "waveform" in names:
-        flux = Flux(waveform=read("waveform"), background=background, info=info)
+        stored = None if rows_of is None else rows_of("waveform")
+        if stored is not None and 8 * math.prod(stored.shape) > BAND_BYTES:
+            flux = _stored_flux(stored, read("signal"), background, info)
+        else:
+            flux = Flux(waveform=read("waveform"), background=background, info=info)
     elif "returns_signal" in names:
         returns = zip(read("returns_signal"), read("returns_delay"), strict=True)
         zero = np.zeros_like(background)
@@ -150,6 +169,15 @@ def recipe_from(
         source=str(attrs["source"]),
         settings=json.loads(attrs.get("engine_settings", "{}")),
     )
+
+
+def _stored_flux(
+    waveforms: Any, signal: NDArray[Any], background: NDArray[Any], info: dict[str, Any]
+) -> StoredFlux:
+    def make(rows: slice) -> Flux:
+        return Flux(waveform=np.asarray(waveforms[rows]), background=background[rows], info=info)
+
+    return StoredFlux(signal, background, int(waveforms.shape[-1]), make, info)
 
 
 def check_format(path: object, attrs: Mapping[str, Any]) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar.flux import Flux
+from mars_lidar.stored_flux import StoredFlux
 from mars_lidar.system import System
 
 BLOCK_BYTES = 64 * 2**20  # one call of the simulator: enough work for every core, little beside the output
@@ -113,6 +114,8 @@ class Recipe:
         pixel = bins * self.dtype.itemsize
         columns = min(width, max(1, target_bytes // pixel))
         rows = min(height, max(1, target_bytes // (columns * pixel)))
+        if isinstance(self.flux, StoredFlux):  # blocks are made of whole chunks, and must hold the waveforms
+            rows = min(rows, max(1, BLOCK_BYTES // max(1, self.flux.waveform_bytes // height)))
         together = min(realizations, max(1, target_bytes // (height * width * pixel)))
         return together, rows, columns, bins
 
@@ -123,6 +126,8 @@ class Recipe:
         """
         realizations, height, width, bins = self.shape
         row_bytes = width * bins * self.dtype.itemsize
+        if isinstance(self.flux, StoredFlux):  # whose waveforms are in memory while a part is simulated
+            row_bytes = max(row_bytes, self.flux.waveform_bytes // height)
         images = BLOCK_BYTES // (height * row_bytes)
         if images >= 1:
             step = max(chunks[0], images // chunks[0] * chunks[0])

@@ -74,6 +74,7 @@ class OpenedStore:
     complete: bool
     progress: str  # how far an incomplete file got, for people; empty where that is not known
     close: Callable[[], None]
+    rows_of: Callable[[str], Any] | None = None  # a variable that is read when it is sliced
 
 
 class Writer(ABC):

@@ -32,6 +32,8 @@ def read_transient(
     - ``.npz``: the array `name` (default ``transient``); ``bin_ns`` and ``start_ns`` where it holds them.
     - ``.h5``, ``.hdf5``: the data set `name` (default ``transient``), with attributes ``bin_ns`` and
       ``start_ns`` where it has them.
+    - ``.mat``: the variable `name` (default ``transient``), (H, W, T), with ``bin_ns`` and ``start_ns`` where it holds
+      them. Version 7.3 stays on disk, older ones are read whole.
     - ``.h5``, ``.hdf5`` with a data set ``H``: a capture of tal: ``H_format`` T_Sx_Sy, so ``H`` is (T, x, y);
       ``delta_t`` and ``t_start`` are metres of optical path (time = path / c). Pixel (y, x) is H[:, x, y].
       Whether the ways from the laser and to the camera are in it, ``t_accounts_first_and_last_bounces`` tells;
@@ -45,7 +47,7 @@ def read_transient(
         Width of a bin and travel time at the start of bin 0, ns; where given they take the place of the
         file's. A ``.npy`` tells neither: `bin_ns` is needed, `start_ns` is 0.
     name
-        Which array of an ``.npz`` or ``.h5``.
+        Which array of an ``.npz``, ``.h5`` or ``.mat``.
     channel
         Which of the C channels of a 4-D array (colours of a renderer).
 
@@ -68,8 +70,10 @@ def read_transient(
         values, told = _from_npz(source, name or _NAME)
     elif suffix in (".h5", ".hdf5"):
         values, told = _from_hdf5(source, name)
+    elif suffix == ".mat":
+        values, told = _from_mat(source, name or _NAME)
     else:
-        raise ValueError(f"{source}: a transient must be a .npy, .npz, .h5 or .hdf5 file")
+        raise ValueError(f"{source}: a transient must be a .npy, .npz, .h5, .hdf5 or .mat file")
     width = told.get("bin_ns") if bin_ns is None else bin_ns
     if width is None:
         raise ValueError(f"{source}: does not tell the width of a time bin: give bin_ns")
@@ -126,6 +130,30 @@ def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
             return _Rows(path, wanted, tuple(data.shape), turned=False), told
     except (ValueError, TypeError, OSError, KeyError) as error:
         raise ValueError(f"{path}: cannot be read ({error})") from error
+
+
+def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
+    import h5py
+
+    try:
+        if h5py.is_hdf5(path):  # version 7.3; MATLAB's first axis comes last
+            with h5py.File(path, "r") as file:
+                if not isinstance(file.get(name), h5py.Dataset) or file[name].ndim != 3:
+                    raise ValueError(f"no variable {name!r} of three axes, got {', '.join(file) or 'nothing'}")
+                told = {key: float(np.ravel(file[key])[0]) for key in ("bin_ns", "start_ns") if key in file}
+                bins, width, height = file[name].shape
+                return _Rows(path, name, (height, width, bins), turned=True), told
+        from scipy.io import loadmat, whosmat
+
+        listed = {key: shape for key, shape, _ in whosmat(path)}
+        if name not in listed:
+            raise ValueError(f"no variable {name!r}, got {', '.join(listed) or 'nothing'}")
+        check_memory(8 * int(np.prod(listed[name])), f"the values of {path}", "a .mat of version 7.3 is read in parts")
+        wanted = [key for key in (name, "bin_ns", "start_ns") if key in listed]
+        found = loadmat(path, variable_names=wanted)
+    except (ValueError, TypeError, OSError, KeyError, NotImplementedError, IndexError) as error:
+        raise ValueError(f"{path}: cannot be read ({error})") from error
+    return found[name], {key: float(np.ravel(found[key])[0]) for key in wanted[1:]}
 
 
 def _tal(path: Path, file: Any) -> tuple[Any, dict[str, float]]:

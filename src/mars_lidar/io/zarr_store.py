@@ -51,7 +51,8 @@ class ZarrWriter(Writer):
                 dimension_names=v.dims,
                 attributes={**v.labels},
             )
-            array[...] = v.data
+            for rows in v.bands():
+                array[rows] = v.data[rows]
         self.chunks = recipe.chunks(_CHUNK_BYTES)
         group.create_array(
             "histogram",
@@ -106,7 +107,7 @@ def open_store(path: Path) -> OpenedStore:
         array: Any = group[name]
         return np.asarray(array[...])
 
-    return OpenedStore(attrs, names, read, histogram, complete, progress, lambda: None)
+    return OpenedStore(attrs, names, read, histogram, complete, progress, lambda: None, lambda name: group[name])
 
 
 def _compressor(dtype: np.dtype[Any], shuffle: Any) -> Any:
@@ -121,9 +122,9 @@ def _compressor(dtype: np.dtype[Any], shuffle: Any) -> Any:
     return BloscCodec(cname="zstd", clevel=1, shuffle=shuffle, typesize=dtype.itemsize)
 
 
-def _map_chunks(data: NDArray[Any]) -> tuple[int, ...]:
+def _map_chunks(data: Any) -> tuple[int, ...]:
     """Whole maps; a large waveform in bands of rows."""
     if data.nbytes <= 8 * _CHUNK_BYTES or data.ndim < 3:
-        return data.shape
+        return tuple(data.shape)
     rows = max(1, _CHUNK_BYTES * data.shape[0] // data.nbytes)
     return (rows, *data.shape[1:])

@@ -2,7 +2,7 @@
 // item of the block, so that dim and bright pixels do not wait for each other. The waits of the next registrations
 // are drawn ahead, because the chain from one registration to the next is what limits the speed. Compiled once for
 // each vector level, and for each mode of the detector, so that none pays for another; and once more with a recorder
-// (exact_recorder.h) between registrations and log.
+// (recorder.h) between registrations and log.
 #pragma once
 #include <cstring>
 #include <type_traits>
@@ -58,9 +58,6 @@ MARS_INLINE Rate load_rate(const RateArray& from) {
     return {load<Float>(from.rate), load<Float>(from.inverse), load<Float>(from.never)};
 }
 
-// What lies between a registration and the log.
-enum class Stage { kPlain, kRecording };
-
 template <DetectorMode mode, bool gaussian, bool whole, Stage stage, Sink sink>
 class Runner {
 public:
@@ -100,7 +97,7 @@ private:
             outside = outside | advance<mode>(system_, hit, cycle, phase, delay_, event_ + static_cast<uint32_t>(k),
                                               armed_, memory_);
         if constexpr (stage == Stage::kRecording) {
-            seen_[k] = {hit, cycle, phase, outside};
+            seen_[k] = {hit, cycle, phase, outside, bin};
             return;
         }
         log(rows_ + k, outside, bin, cycle, phase);
@@ -116,12 +113,11 @@ private:
 
     // Records the registrations of a round.
     MARS_INLINE void record() {
-        recorder_.take(seen_, key0_, key1_, event_);
-        for (int k = 0; k < kAhead; ++k) {
-            const Int bin = recorder_.template bin<sink == Sink::kTimestamps>(seen_[k]);
-            log(rows_ + k, seen_[k].lost, bin, seen_[k].cycle, seen_[k].phase);
-        }
-        if (recorder_.fills()) armed_.frame = select(recorder_.full(), splat(kIdleFrame), armed_.frame);  // no more there
+        recorder_.template take<sink == Sink::kTimestamps>(seen_, key0_, key1_, event_);
+        for (int k = 0; k < kAhead; ++k)
+            log(rows_ + k, seen_[k].lost, seen_[k].bin, seen_[k].cycle, seen_[k].phase);
+        if (recorder_.fills())  // nothing more can be recorded there
+            armed_.frame = select(recorder_.full(), splat(kIdleFrame), armed_.frame);
     }
 
     // Writes what a lane has logged for its present item, up to row `to`.
@@ -238,8 +234,8 @@ private:
 
     int64_t taken_ = 0;
     int running_ = 0, rows_ = 0;
-    std::conditional_t<stage == Stage::kRecording, Recorder, NoRecorder> recorder_;
-    Registration seen_[stage == Stage::kRecording ? kAhead : 1];
+    std::conditional_t<stage == Stage::kRecording, Recorder<FrameClock>, NoRecorder> recorder_;
+    FrameClock::Registration seen_[stage == Stage::kRecording ? kAhead : 1];
     Writer<sink> writer_;
     Log<sink> log_;
 };

@@ -1,74 +1,104 @@
-// The recording of registrations for waveforms, in double precision: exact_recorder.h says what it does.
+// How the recorder sees the times of waveform_runner.h.
 #pragma once
-#include "recording_view.h"
-#include "waveform_modes.h"
+#include <algorithm>
+
+#include "recorder.h"
+#include "waveform_arrival.h"
 
 namespace mars {
+inline namespace MARS_LEVEL {
 
-// Takes the registrations of one item, in order; hands those that are recorded to `write`(cycle, phase).
-template <class Write>
-class WaveformRecorder {
-public:
-    WaveformRecorder(const Job& job, const JitterView& jitter, int64_t item, Write write)
-        : job_(job), rule_(*job.recording), jitter_(jitter), write_(std::move(write)),
-          key_(stream_key(job.seed, job.realization(item), job.pixel_index[job.pixel(item)])),
-          dead_whole_(static_cast<int64_t>(rule_.electronics_dead_time)),
-          dead_fraction_(rule_.electronics_dead_time - static_cast<double>(dead_whole_)) {}
+// Parts of the waveform; what is recorded in double precision, lane by lane.
+struct PartClock {
+    using Time = WaveTime;
 
-    void operator()(int32_t cycle, double phase) {
-        const uint32_t event = event_++;
-        const Instant hit{cycle, phase};
-        if (hit.before(ready_)) return;
-        if (rule_.electronics_dead_time > job_.dead_time) ready_ = hit.plus(dead_whole_, dead_fraction_);
-        if (cycle != last_period_) in_period_ = 0;
-        last_period_ = cycle;
-        if (in_period_ == rule_.most_per_period || in_exposure_ == rule_.most_per_exposure) return;
-        ++in_period_;
-        ++in_exposure_;
-        if (jitter_.on) {
-            phase += jitter(event);
-            const double whole = std::floor(phase);
-            phase = std::min(phase - whole, std::nextafter(1.0, 0.0));
-            cycle = round_exposure(cycle + static_cast<int32_t>(whole), job_.cycles);
+    // One registration of each lane.
+    struct Registration {
+        Time hit;
+        Int cycle;
+        Mask lost;
+        Int bin;
+        alignas(64) double phase[kLanes];
+    };
+
+    // One time per lane as plain numbers.
+    struct TimeArray {
+        int32_t cycle[kLanes], part[kLanes];
+        float inside[kLanes];
+
+        void forget(int lane) {
+            cycle[lane] = INT32_MIN;
+            part[lane] = 0;
+            inside[lane] = 0.0f;
         }
-        write_(cycle, rule_.codes.edges.empty() ? phase : converted(phase));
+        void save(const Time& time) {
+            store(cycle, time.cycle);
+            store(part, time.part);
+            store(inside, time.inside);
+        }
+        Time load_lanes() const { return {load<Int>(cycle), load<Int>(part), load<Float>(inside)}; }
+    };
+
+    explicit PartClock(const Job& job)
+        : bins(job.bins), cycles(job.cycles), parts(static_cast<int32_t>(job.samples)),
+          dead(wave_span(job.recording->electronics_dead_time, parts)) {}
+
+    MARS_INLINE Time recovered(const Time& hit) const { return later(hit, dead, parts); }
+
+    MARS_INLINE void move(Registration& r, Float jitter) const {
+        alignas(64) float jitters[kLanes];
+        alignas(64) int32_t cycle[kLanes];
+        store(jitters, jitter);
+        store(cycle, r.cycle);
+        for (int lane = 0; lane < kLanes; ++lane) {
+            const double moved = r.phase[lane] + static_cast<double>(jitters[lane]);
+            int32_t whole = static_cast<int32_t>(moved);
+            whole -= moved < static_cast<double>(whole) ? 1 : 0;
+            r.phase[lane] = std::min(moved - static_cast<double>(whole), kLastPhase);
+            cycle[lane] = round_exposure(cycle[lane] + whole, cycles);
+        }
+        r.cycle = load<Int>(cycle);
     }
+
+    MARS_INLINE void find_bin(Registration& r) const {
+        alignas(64) int32_t bin[kLanes];
+        for (int lane = 0; lane < kLanes; ++lane)
+            bin[lane] = static_cast<int32_t>(r.phase[lane] * static_cast<double>(bins));
+        r.bin = minimum(load<Int>(bin), splat(bins - 1));
+    }
+
+    // `convert` of recording_view.h in double precision.
+    template <bool timed>
+    MARS_INLINE void convert_time(const CodeTable& codes, Registration& r) const {
+        alignas(64) int32_t bin[kLanes];
+        for (int lane = 0; lane < kLanes; ++lane) {
+            const double told = converted(codes, r.phase[lane], bin[lane]);
+            if constexpr (timed) r.phase[lane] = told;
+        }
+        r.bin = load<Int>(bin);
+    }
+
+    static constexpr double kLastPhase = 1.0 - 0x1p-53;
+
+    int32_t bins, cycles, parts;
+    WaveSpan dead;
 
 private:
-    double jitter(uint32_t event) const {
-        auto word = [&](uint32_t stage) {
-            const auto pair = threefry<13, uint32_t>(event >> 1, stage, key_.first, key_.second);
-            return event & 1 ? pair.second : pair.first;
-        };
-        if (!jitter_.gaussian) return jitter_of<false, false>(jitter_, word(kStageJitter), 0u);
-        if (jitter_.tail_below == 0) return jitter_of<true, false>(jitter_, word(kStageJitter), 0u);
-        return jitter_of<true, true>(jitter_, word(kStageJitter), word(kStageJitter + 1));
-    }
-
-    double converted(double phase) const {
-        const std::vector<double>& edges = rule_.codes.edges;
-        const int64_t n = static_cast<int64_t>(edges.size()) - 1;
-        const double x = phase * job_.bins;
-        const int64_t first = std::min(static_cast<int64_t>(x) / n * n, job_.bins - n);
+    double converted(const CodeTable& codes, double phase, int32_t& bin) const {
+        const int32_t n = static_cast<int32_t>(codes.edges.size()) - 1;
+        const double x = phase * static_cast<double>(bins);
+        const int32_t first = std::min(static_cast<int32_t>(x) / n * n, bins - n);
         const double inside = x - static_cast<double>(first);
-        int64_t code = rule_.codes.guide[static_cast<size_t>(inside * rule_.codes.cells_per_bin)];
+        const double* const edges = codes.edges.data();
+        int32_t code = codes.guide[static_cast<int32_t>(inside * static_cast<double>(codes.cells_per_bin))];
         while (code > 0 && inside < edges[code]) --code;  // the guide's own rounding
         while (code + 1 < n && inside >= edges[code + 1]) ++code;
         const double width = edges[code + 1] - edges[code];
         const double part = width > 0.0 ? std::min((inside - edges[code]) / width, 0x1.ffffffffp-1) : 0.0;
-        return std::min((static_cast<double>(first + code) + part) / job_.bins, std::nextafter(1.0, 0.0));
+        bin = first + code;
+        return std::min((static_cast<double>(bin) + part) / static_cast<double>(bins), kLastPhase);
     }
-
-    const Job& job_;
-    const Recording& rule_;
-    const JitterView& jitter_;
-    Write write_;
-    const Pair<uint32_t> key_;
-    const int64_t dead_whole_;
-    const double dead_fraction_;
-    Instant ready_{INT32_MIN, 0.0};
-    int32_t last_period_ = INT32_MIN, in_period_ = 0, in_exposure_ = 0;
-    uint32_t event_ = 0;
 };
 
+}  // namespace MARS_LEVEL
 }  // namespace mars

@@ -117,6 +117,12 @@ def _reconstruction(request: Request) -> list[Path]:
     return run(request)
 
 
+def _transients(request: Request) -> list[Path]:
+    from mars_lidar.studies.transients import run
+
+    return run(request)
+
+
 def _table(request: Request) -> list[Path]:
     from mars_lidar.studies.table import run
 
@@ -141,6 +147,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "hardware": ("T6: streams calibrated and validated, faulty detectors; --stream adds a measured one", _hardware),
     "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
     "reconstruction": ("bias and error of depth and signal over flux, every method, beside the bound", _reconstruction),
+    "transients": ("two returns in fog through the dead time of three detectors", _transients),
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
 }
 

@@ -1,0 +1,143 @@
+// From one time to the next arrival at a pixel with a waveform, one pixel per lane.
+#pragma once
+#include "registration.h"
+#include "waveform_gather.h"
+#include "waveform_table.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+constexpr float kLastInside = 1.0f - 0x1p-24f;
+
+// A time: the period, the part of the waveform in it, and the place in the part, in [0, 1): 2^-24 of a part fine.
+struct WaveTime {
+    Int cycle, part;
+    Float inside;
+};
+
+MARS_INLINE Mask before(const WaveTime& a, const WaveTime& b) {
+    const Mask in_period = (a.part < b.part) | ((a.part == b.part) & (a.inside < b.inside));
+    return (a.cycle < b.cycle) | ((a.cycle == b.cycle) & in_period);
+}
+
+MARS_INLINE WaveTime earlier(Mask first, const WaveTime& a, const WaveTime& b) {
+    return {select(first, a.cycle, b.cycle), select(first, a.part, b.part), select(first, a.inside, b.inside)};
+}
+
+// A length of time in periods, parts and a rest of a part.
+struct WaveSpan {
+    int32_t periods, parts;
+    float rest;
+};
+
+inline WaveSpan wave_span(double periods, int32_t parts) {
+    const int32_t whole = static_cast<int32_t>(periods);
+    const double x = (periods - static_cast<double>(whole)) * static_cast<double>(parts);
+    WaveSpan span = {whole, static_cast<int32_t>(x), 0.0f};
+    span.rest = static_cast<float>(x - static_cast<double>(span.parts));
+    if (span.rest >= 1.0f) span.rest = kLastInside;
+    return span;  // parts == `parts` is a period, as good as any
+}
+
+MARS_INLINE WaveTime later(const WaveTime& time, const WaveSpan& span, int32_t parts) {
+    const Float sum = time.inside + span.rest;
+    const Mask carry = sum >= 1.0f;
+    const Int part = plus_if(time.part + span.parts, carry);
+    const Mask turn = part >= parts;
+    return {plus_if(time.cycle + span.periods, turn), select(turn, part - parts, part), minus_if(sum, carry)};
+}
+
+// A wait: whole periods, and the energy beyond them.
+struct WaveWait {
+    Int whole, energy;
+};
+
+// Rates of the lanes: photons per period and the inverse, 0 and 0 for a lane without work.
+struct WaveRates {
+    double total[kLanes], inverse[kLanes];
+};
+
+// In double precision, because the energy beyond the whole periods has to be right to 2^-31 of a period's.
+MARS_INLINE WaveWait draw_wave(const WaveRates& rates, UInt key0, UInt key1, UInt event) {
+    alignas(64) float exponentials[kLanes];
+    alignas(64) uint32_t fresh[kLanes];
+    alignas(64) int32_t whole[kLanes], energy[kLanes];
+    const Pair<UInt> words = threefry<13>(event, splat(kStageArrival), key0, key1);
+    store(exponentials, exponential(words.first));
+    for (int lane = 0; lane < kLanes; ++lane) {
+        const double wait = static_cast<double>(exponentials[lane]) * rates.inverse[lane];
+        const double periods = wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever);
+        whole[lane] = static_cast<int32_t>(periods);
+        energy[lane] = static_cast<int32_t>((periods - static_cast<double>(whole[lane])) * 0x1p31);
+    }
+    const Int count = load<Int>(whole);
+    if (any(count >= static_cast<int32_t>(kLongWait))) {  // a fresh fraction: `refresh` of registration.h
+        store(fresh, words.second);
+        for (int lane = 0; lane < kLanes; ++lane) {
+            const double v = (fresh[lane] + 0.5) * 0x1p-32, total = rates.total[lane];
+            const double x = v - 0.5 * total * v * (1.0 - v) * (1.0 - total * (1.0 - 2.0 * v) * (1.0 / 3.0));
+            if (whole[lane] >= static_cast<int32_t>(kLongWait)) energy[lane] = static_cast<int32_t>(x * 0x1p31);
+        }
+    }
+    return {count, load<Int>(energy)};
+}
+
+// The tables that the lanes look into.
+struct WaveTables {
+    const int32_t* edge;
+    const uint16_t* guide;
+    Int edges, guides;  // where each lane's table begins
+    int32_t shift, group;
+};
+
+// Lanes whose cell holds more than two edges: one by one.
+MARS_NOINLINE inline void walk(const WaveTables& tables, Int energy, Mask lanes, Int& part, Int& low, Int& high) {
+    alignas(64) int32_t e[kLanes], j[kLanes], begin[kLanes], on[kLanes], a[kLanes], b[kLanes];
+    spill(e, energy);
+    spill(j, part);
+    spill(a, low);
+    spill(b, high);
+    spill(begin, tables.edges);
+    spill(on, one_if(lanes));
+    for (int lane = 0; lane < kLanes; ++lane) {
+        if (!on[lane]) continue;
+        const int32_t* const edge = tables.edge + begin[lane];
+        int32_t k = j[lane];
+        while (edge[k + 1] <= e[lane]) ++k;
+        j[lane] = k;
+        a[lane] = edge[k];
+        b[lane] = edge[k + 1];
+    }
+    part = load<Int>(j);
+    low = load<Int>(a);
+    high = load<Int>(b);
+}
+
+// C^-1(C(from) + wait).
+MARS_INLINE WaveTime next_arrival(const WaveTables& tables, const WaveTime& from, const WaveWait& wait) {
+    Int low, high;
+    gather_two(tables.edge, tables.edges + from.part, low, high);
+    const Int width = high - low;
+    const Int here = low + minimum(truncate(to_float(width) * from.inside), width);
+    const UInt sum = as_uint(here) + as_uint(wait.energy);
+    const Mask over = as_int(sum) < 0;
+    const Int turns = plus_if(wait.whole, over);
+    const Int energy = minimum(as_int(sum & 0x7fffffffu), splat(kFull - 1));
+
+    Int part = gather_short(tables.guide, tables.guides + (energy >> tables.shift));
+    if (tables.group > 0) part = as_int(as_uint(part) << tables.group);
+    Int edge[4];
+    gather_four(tables.edge, tables.edges + part, edge);
+    // edges that meet enclose nothing: the last one that is not above the energy begins its part
+    const Mask one = energy >= edge[1], two = energy >= edge[2], more = energy >= edge[3];
+    part = plus_if(plus_if(part, one), two);
+    low = select(two, edge[2], select(one, edge[1], edge[0]));
+    high = select(two, edge[3], select(one, edge[2], edge[1]));
+    if (any(more)) walk(tables, energy, more, part, low, high);
+    const Float inside = quotient(to_float(energy - low) + 0.5f, to_float(high - low));
+    const WaveTime hit = {from.cycle + turns, part, minimum(inside, splat(kLastInside))};
+    return earlier(before(hit, from), from, hit);  // rounding must not turn time back
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

@@ -1,6 +1,7 @@
 """mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
 
 from mars_lidar._version import __version__
+from mars_lidar.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.effects import Jitter, SampledJitter
 from mars_lidar.flux import Flux, dark_count_map
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
@@ -19,7 +20,9 @@ from mars_lidar.table import Lookup, QuantisationError, Table
 from mars_lidar.timestamps import Timestamps
 
 __all__ = [
+    "Afterpulsing",
     "CountLaw",
+    "Crosstalk",
     "Detector",
     "Flux",
     "GaussianPulse",

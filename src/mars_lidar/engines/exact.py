@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.detector import MODES
+from mars_lidar.effects import LIGHT_EFFECTS
 from mars_lidar.engines.base import Engine, Records, Task
 
 
@@ -23,6 +24,7 @@ class ExactEngine(Engine):
     name = "exact"
     description = "every registered photon, nothing approximated; the default"
     modes = MODES
+    effects = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns")
 
     def __init__(self, level: str = "") -> None:
         self.level = level

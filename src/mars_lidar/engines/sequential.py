@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.detector import MODES
+from mars_lidar.effects import AVALANCHE_EFFECTS, LIGHT_EFFECTS
 from mars_lidar.engines.base import Engine, Records, Task
 
 
@@ -22,6 +23,7 @@ class SequentialEngine(Engine):
     name = "sequential"
     description = "every arrival drawn, sorted and rejected one by one: slow, independent gold standard"
     modes = MODES
+    effects = (*LIGHT_EFFECTS, *AVALANCHE_EFFECTS)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every arrival that finds the pixel armed."""

@@ -1,0 +1,115 @@
+// What the lanes of the exact engine have in their traps: the next release of every lane side by side, and those after
+// it in one heap per lane. The lanes count down to the avalanche that leaves carriers; what happens then is scalar.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "registration.h"
+#include "trap_law.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+class TrapLanes {
+public:
+    explicit TrapLanes(const Job& job) : law_(job), last_(job.cycles + 1) {}
+
+    Time next() const { return {load<Int>(frame_), load<Float>(phase_)}; }
+    Int generation() const { return load<Int>(generation_); }
+
+    // An exposure begins at a lane, or none: it idles.
+    void open(int lane, uint32_t key0, uint32_t key1, bool busy) {
+        key_[lane][0] = key0;
+        key_[lane][1] = key1;
+        number_[lane] = 0;
+        countdown_[lane] = busy ? law_.until_next(key_[lane], 0) : std::numeric_limits<int32_t>::max();
+        waiting_[lane].clear();
+        show(lane);
+    }
+
+    // Carriers that are released before `from`, while the pixel is blind, are lost.
+    MARS_INLINE void lose(Time from) {
+        for (Mask lost = before(next(), from); any(lost); lost = before(next(), from)) drop(lost);
+    }
+
+    // Removes the next release of some lanes.
+    MARS_NOINLINE void drop(Mask lanes) {
+        int32_t chosen[kLanes];
+        store(chosen, one_if(lanes));
+        for (int lane = 0; lane < kLanes; ++lane) {
+            if (!chosen[lane]) continue;
+            std::pop_heap(waiting_[lane].begin(), waiting_[lane].end());
+            waiting_[lane].pop_back();
+            show(lane);
+        }
+    }
+
+    // Avalanches of some lanes at `time`, of generation 0 (photons), 1 (releases of their carriers), ...
+    MARS_INLINE void avalanche(Mask lanes, Time time, Int generation) {
+        const Int left = minus_if(load<Int>(countdown_), lanes & (generation < law_.generations()));
+        store(countdown_, left);
+        const Mask due = left == 0;
+        if (any(due)) fill(due, time, generation);
+    }
+
+private:
+    struct Carrier {
+        int64_t time;  // in units of 2^-32 period from the beginning of frame 0
+        int32_t generation;
+
+        bool operator<(const Carrier& other) const {  // the heap's first is the earliest
+            return time != other.time ? time > other.time : generation > other.generation;
+        }
+    };
+
+    MARS_NOINLINE void fill(Mask lanes, Time time, Int generation) {
+        int32_t chosen[kLanes], frame[kLanes], generations[kLanes];
+        float phase[kLanes];
+        store(chosen, one_if(lanes));
+        store(frame, time.frame);
+        store(phase, time.phase);
+        store(generations, generation);
+        double delays[TrapLaw::kMostCarriers];
+        for (int lane = 0; lane < kLanes; ++lane) {
+            if (!chosen[lane]) continue;
+            const uint32_t number = ++number_[lane];
+            const int carriers = law_.draw(key_[lane], number, delays);
+            for (int k = 0; k < carriers; ++k) {
+                const double after = static_cast<double>(phase[lane]) + 0.5 + delays[k];
+                if (after > 4e9) continue;
+                const int64_t whole = static_cast<int64_t>(after), at = frame[lane] + whole;
+                if (at > last_) continue;  // after the exposure
+                const double fraction = after - static_cast<double>(whole);
+                waiting_[lane].push_back({at * kUnit + static_cast<int64_t>(fraction * 0x1p32), generations[lane] + 1});
+                std::push_heap(waiting_[lane].begin(), waiting_[lane].end());
+            }
+            countdown_[lane] = law_.until_next(key_[lane], number);
+            show(lane);
+        }
+    }
+
+    void show(int lane) {
+        const bool none = waiting_[lane].empty();
+        const int64_t time = none ? kNever * kUnit : waiting_[lane].front().time;
+        const int64_t fraction = time & (kUnit - 1);
+        const float phase = static_cast<float>(fraction) * 0x1p-32f - 0.5f;
+        frame_[lane] = static_cast<int32_t>((time - fraction) / kUnit);
+        phase_[lane] = phase < 0.5f ? phase : 0x1.fffffep-2f;
+        generation_[lane] = none ? 0 : waiting_[lane].front().generation;
+    }
+
+    static constexpr int64_t kUnit = int64_t{1} << 32, kNever = std::numeric_limits<int32_t>::max();
+
+    const TrapLaw law_;
+    const int64_t last_;  // frame
+    uint32_t key_[kLanes][2], number_[kLanes];
+    int32_t countdown_[kLanes], frame_[kLanes], generation_[kLanes];
+    float phase_[kLanes];
+    std::vector<Carrier> waiting_[kLanes];
+};
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

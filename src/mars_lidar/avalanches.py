@@ -127,7 +127,8 @@ class Afterpulsing:
     @classmethod
     def from_dict(cls, data: Any) -> Afterpulsing:
         """The afterpulsing that `to_dict` described."""
-        known = _validate.known_keys("afterpulsing", data, ("probability", "delay_ns", "delays", "bin_ns", "generations"))
+        names = ("probability", "delay_ns", "delays", "bin_ns", "generations")
+        known = _validate.known_keys("afterpulsing", data, names)
         if "probability" not in known:
             raise ValueError("afterpulsing must give probability")
         return cls(**known)

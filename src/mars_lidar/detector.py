@@ -57,8 +57,8 @@ class Detector:
     afterpulsing
         `Afterpulsing`: carriers that an avalanche leaves in traps and that trigger others when they are released.
     twilight_ns
-        Arrivals within this time before the end of a dead time, ns, are not lost: the pixel fires at its end (a twilight
-        pulse). At most the dead time; mode ``"nonparalyzable"`` only.
+        Arrivals within this time before the end of a dead time, ns, are not lost: the pixel fires at its end (a
+        twilight pulse). At most the dead time; mode ``"nonparalyzable"`` only.
     crosstalk
         `Crosstalk`: avalanches trigger neighbouring pixels. The pixels of an image then depend on each other.
     electronics_dead_time_ns

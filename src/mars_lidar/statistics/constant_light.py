@@ -7,6 +7,7 @@ J. Lightwave Technol. 38, 4765 (2020), arXiv 2001.10036; derived in docs/detecto
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,7 @@ def _exponential(rate: float, dead: float, twilight: float, p: float, delay: flo
     """Mean interval, ns. Every avalanche finds the same decaying intensity, level / delay e^(-u / delay)."""
     from scipy.integrate import quad
 
+    scale = min(delay, 1.0 / rate)  # of the integrands
     level, interval = p, math.inf
     for _ in range(_ROUNDS):
         seen = level * math.exp(-dead / delay)
@@ -70,8 +72,7 @@ def _exponential(rate: float, dead: float, twilight: float, p: float, delay: flo
         def armed(s: float, seen: float = seen) -> float:  # P(no avalanche up to s after the recovery)
             return math.exp(-rate * s + seen * math.expm1(-s / delay))
 
-        # E e^(-s / delay) of the next avalanche, by parts; the scale of the integrand is the shorter of two
-        scale = min(delay, 1.0 / rate)
+        # E e^(-s / delay) of the next avalanche, by parts
         mean = quad(lambda x: armed(x * scale) * scale, 0.0, 60.0 / (rate * scale), limit=400)[0]
         part = quad(lambda x: armed(x * scale) * math.exp(-x * scale / delay) * scale, 0.0, 60.0, limit=400)[0]
         decay = again + (1.0 - again) * (1.0 - part / delay)
@@ -85,16 +86,16 @@ def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.floa
     """Mean interval, ns; `density` (n,) are the carriers of an avalanche in cells of `cell` ns."""
     from scipy.signal import fftconvolve
 
-    n, edges = density.size, np.arange(density.size + 1) * cell
+    n, edges = density.size, np.arange(density.size + 1, dtype=np.float64) * cell
     carriers, interval = density, math.inf
     for _ in range(_ROUNDS):
         below = np.concatenate([[0.0], np.cumsum(carriers)])
 
-        def between(low: NDArray[np.float64], below: NDArray[np.float64] = below) -> NDArray[np.float64]:
-            """Carriers in the cells that begin at `low`."""
-            return np.asarray(np.diff(np.interp(np.append(low, low[-1] + cell), edges, below)))
+        def between(at: Any, below: NDArray[np.float64] = below) -> NDArray[np.float64]:
+            """Carriers (n,) in the cells with edges `at` (n + 1,)."""
+            return np.asarray(np.diff(np.interp(at, edges, below)))
 
-        free = between(edges[:-1] + dead)
+        free = between(edges + dead)
         last_part = np.interp([dead - twilight, dead], edges, below)
         again = -math.expm1(-rate * twilight - float(last_part[1] - last_part[0]))
         hazard = rate * cell + free
@@ -102,7 +103,7 @@ def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.floa
         fires = -np.diff(armed)
         mean = float(np.sum(fires / hazard) * cell + armed[-1] / rate)
         # what an avalanche `s` after the recovery finds at u: the carriers at dead + s + u; s in the middle of a cell
-        later = between(edges[:-1] + dead + 0.5 * cell)
+        later = between(edges + (dead + 0.5 * cell))
         found = fftconvolve(later, fires[::-1])[n - 1 :]
         carriers = density + (1.0 - again) * np.maximum(found, 0.0) + again * free
         last, interval = interval, dead + (1.0 - again) * mean

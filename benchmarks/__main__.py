@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks import engines, exposures, laws, memory, numpy_mars, paths, startup, sweeps
+from benchmarks import effects, engines, exposures, laws, memory, numpy_mars, paths, startup, sweeps
 from benchmarks.config import DEFAULT, FULL, QUICK, Config
 from benchmarks.floor import Bandwidth, measure_bandwidth
 from benchmarks.machine import Interference, describe_machine
@@ -25,6 +25,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "cycles": sweeps.exposure_sweep,
     "pixels": sweeps.image_sweep,
     "paths": paths.exact_paths,
+    "effects": effects.detector_effects,
     "exposure": laws.exposure_laws,
     "stationary": laws.stationary_distribution,
     "memory": memory.peak_memory,

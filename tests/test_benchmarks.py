@@ -37,7 +37,7 @@ TINY = Config(
     starts=1,
     commands=1,
 )
-IN_PROCESS = ("exact", "numpy", "flux", "cycles", "pixels", "paths", "exposure", "stationary")
+IN_PROCESS = ("exact", "numpy", "flux", "cycles", "pixels", "paths", "effects", "exposure", "stationary")
 TIMING_COLUMNS = {
     "case", "engine", "level", "threads", "pixels", "cycles", "S + B", "registrations", "ms", "ms least",
     "CPU ms", "ns/reg/core", "x reference", "MiB written", "write floor ms", "ops/reg least",

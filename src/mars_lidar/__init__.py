@@ -2,8 +2,9 @@
 
 from mars_lidar._version import __version__
 from mars_lidar.avalanches import Afterpulsing, Crosstalk
+from mars_lidar.dark_counts import dark_count_map
 from mars_lidar.effects import Jitter, SampledJitter
-from mars_lidar.flux import Flux, dark_count_map
+from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.scene import Scene
 from mars_lidar.simulate import simulate, simulate_timestamps

@@ -124,11 +124,11 @@ class Jitter:
         return np.asarray(np.where(x > -5.0, near, np.exp(exponent) * ndtr(z - ratio)), dtype=np.float64)
 
     def check(self, period_ns: float) -> None:
-        """Sigma from 1e-6 to 1 period, as for a pulse, and the tail's mean up to 1 period."""
-        if not 1e-6 * period_ns <= self.sigma_ns <= period_ns:
+        """Sigma from 1e-6 to 1/20 period: 8.5 sigma lie within half a period. The tail's mean up to a period."""
+        if not 1e-6 * period_ns <= self.sigma_ns <= 0.05 * period_ns:
             raise ValueError(
-                f"sigma_ns of a jitter must lie in [{1e-6 * period_ns:g}, {period_ns:g}] ns (1e-6 to 1 period), "
-                f"got {self.sigma_ns:g}"
+                f"sigma_ns of a jitter must lie in [{1e-6 * period_ns:g}, {0.05 * period_ns:g}] ns "
+                f"(1e-6 to 1/20 period), got {self.sigma_ns:g}"
             )
         if self.tail_ns > period_ns:
             raise ValueError(f"tail_ns of a jitter must be at most the period, {period_ns:g} ns, got {self.tail_ns:g}")
@@ -176,6 +176,9 @@ class SampledJitter:
     def std_ns(self) -> float:
         """Standard deviation, ns."""
         return math.sqrt(max(self._moment(2) - self._moment(1) ** 2, 0.0))
+
+    def __repr__(self) -> str:
+        return f"SampledJitter({len(self.values)} samples, bin_ns={self.bin_ns:g}, origin={self.origin!r})"
 
     def _moment(self, order: int) -> float:
         edges, mass = self._edges(), np.diff(self.cumulative(self._edges()))

@@ -48,6 +48,18 @@ detector:
 #   gate_width_ns: 20.0  # for this long; may reach round the end of the period
 #   gate_step_ns: 0.0    # moves by this ...
 #   gate_cycles: 1       # ... every so many periods (more than 1 only with a step)
+# Effects, off unless given, in the order in which they act (docs/detectors.md); further lines of detector:
+#   detection_efficiency: 0.25       # then S and B are photons on the pixel, not detectable ones
+#   dark_count_hz: 100.0             # counts/s of every pixel
+#   electronics_dead_time_ns: 120.0  # of the TDC, beside that of the pixel; matters where it is longer
+#   max_events_per_period: 1         # the TDC records the first ones only, of a period ...
+#   max_events_per_exposure: 1000    # ... and of an exposure
+#   jitter:                          # of a record; leave it out of the pulse above then
+#     kind: gaussian                 # or sampled, with values, bin_ns and origin as for a pulse
+#     fwhm_ns: 0.1
+#     tail_ns: 0.2                   # exponential tail: its mean ...
+#     tail_fraction: 0.1             # ... and the share of the records that are in it
+#   code_density: [1.1, 0.9, 1.05, 0.95]  # relative widths of TDC codes, repeating; their number divides the bins
 
 # State of the pixel at the start of an exposure: armed (ready), or stationary (warmed up).
 start: armed

@@ -142,6 +142,7 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
             f"start {system.start}",
         ),
         *_gate(system.detector),
+        *_effects(system.detector),
         ("bins", f"{1e3 * system.bin_ns:.5g} ps, {system.depth_m(system.bin_ns):.3g} m of depth each"),
         ("flux", photons),
     ]
@@ -169,6 +170,17 @@ def _gate(detector: Detector) -> list[tuple[str, str]]:
         every = "every period" if detector.gate_cycles == 1 else f"every {detector.gate_cycles} periods"
         told += f", moved by {detector.gate_step_ns:.6g} ns {every}"
     return [("gate", told)]
+
+
+def _effects(detector: Detector) -> list[tuple[str, str]]:
+    told = []
+    for name in detector.effects:
+        value = getattr(detector, name)
+        if name == "code_density":
+            told.append(f"code_density of {len(value)} codes")
+        else:
+            told.append(f"{name} {_short(value)}")
+    return [("effects", ", ".join(told))] if told else []
 
 
 def _on_disk(cube: Cube) -> int:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 _SCENE, _SYSTEM = "Scene (one of --scene and --depth)", "System"
+_EFFECTS = "Effects of the detector (off by default)"
 _LIGHT, _RUN, _OUTPUT = "Light", "Simulation", "Output"
 
 
@@ -141,6 +142,59 @@ Start = Annotated[
     _option(
         "--start", panel=_SYSTEM,
         help="Pixel at the start of an exposure: armed (ready) or stationary (warmed up).", default="armed",
+    ),
+]
+DetectionEfficiency = Annotated[
+    float | None,
+    _option(
+        "--detection-efficiency", panel=_EFFECTS, default="1: --signal counts detectable photons",
+        help="Photon detection efficiency, fill factor included, in (0, 1].",
+    ),
+]
+DarkCountHz = Annotated[
+    float | None,
+    _option("--dark-count-hz", panel=_EFFECTS, help="Dark counts of every pixel, counts/s.", default="0"),
+]
+ElectronicsDeadTimeNs = Annotated[
+    float | None,
+    _option(
+        "--electronics-dead-time-ns", panel=_EFFECTS, default="0",
+        help="Dead time of the electronics after an event, ns; without effect unless longer than --dead-time-ns.",
+    ),
+]
+MaxEventsPerPeriod = Annotated[
+    int | None,
+    _option("--max-events-per-period", panel=_EFFECTS, help="Events recorded of a period.", default="no limit"),
+]
+MaxEventsPerExposure = Annotated[
+    int | None,
+    _option("--max-events-per-exposure", panel=_EFFECTS, help="Events recorded of an exposure.", default="no limit"),
+]
+JitterFwhmNs = Annotated[
+    float | None,
+    _option("--jitter-fwhm-ns", panel=_EFFECTS, help="Gaussian timing jitter: full width at half maximum, ns."),
+]
+JitterTailNs = Annotated[
+    float | None,
+    _option("--jitter-tail-ns", panel=_EFFECTS, help="Mean of the exponential tail of the jitter, ns ..."),
+]
+JitterTailFraction = Annotated[
+    float | None,
+    _option("--jitter-tail-fraction", panel=_EFFECTS, help="... and share of the events that are in it."),
+]
+JitterFile = Annotated[
+    Path | None,
+    _option("--jitter-file", panel=_EFFECTS, help="Measured jitter instead: 1-D .npy array of its density."),
+]
+JitterBinNs = Annotated[
+    float | None,
+    _option("--jitter-bin-ns", panel=_EFFECTS, help="Sample width of --jitter-file, ns."),
+]
+CodeDensityFile = Annotated[
+    Path | None,
+    _option(
+        "--code-density-file", panel=_EFFECTS,
+        help="TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins.",
     ),
 ]
 Signal = Annotated[

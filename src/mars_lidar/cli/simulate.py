@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, say
 from mars_lidar.cli.console import table as print_table
-from mars_lidar.cli.system_options import build_system
+from mars_lidar.cli.system_options import Effects, build_system
 
 if TYPE_CHECKING:
     from mars_lidar.io import Written
@@ -28,6 +28,7 @@ EPILOG = "\n\n".join(
         "mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr",
         "mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr",
         "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
+        "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
         "S and B are expected detectable photons per laser period, after detection efficiency. Dead time "
         "bends histograms where S + B is not small.",
     )
@@ -60,6 +61,17 @@ def simulate(
     pulse_bin_ns: options.PulseBinNs = None,
     pulse_origin: options.PulseOrigin = None,
     start: options.Start = None,
+    detection_efficiency: options.DetectionEfficiency = None,
+    dark_count_hz: options.DarkCountHz = None,
+    electronics_dead_time_ns: options.ElectronicsDeadTimeNs = None,
+    max_events_per_period: options.MaxEventsPerPeriod = None,
+    max_events_per_exposure: options.MaxEventsPerExposure = None,
+    jitter_fwhm_ns: options.JitterFwhmNs = None,
+    jitter_tail_ns: options.JitterTailNs = None,
+    jitter_tail_fraction: options.JitterTailFraction = None,
+    jitter_file: options.JitterFile = None,
+    jitter_bin_ns: options.JitterBinNs = None,
+    code_density_file: options.CodeDensityFile = None,
     signal: options.Signal = 1.0,
     sbr: options.Sbr = 1.0,
     attenuation: options.Attenuation = "none",
@@ -99,6 +111,19 @@ def simulate(
             gate_width_ns=gate_width_ns,
             gate_step_ns=gate_step_ns,
             gate_cycles=gate_cycles,
+            effects=Effects(
+                detection_efficiency=detection_efficiency,
+                dark_count_hz=dark_count_hz,
+                electronics_dead_time_ns=electronics_dead_time_ns,
+                max_events_per_period=max_events_per_period,
+                max_events_per_exposure=max_events_per_exposure,
+                jitter_fwhm_ns=jitter_fwhm_ns,
+                jitter_tail_ns=jitter_tail_ns,
+                jitter_tail_fraction=jitter_tail_fraction,
+                jitter_file=jitter_file,
+                jitter_bin_ns=jitter_bin_ns,
+                code_density_file=code_density_file,
+            ),
             start=start,
             pulse_sigma_ns=pulse_sigma_ns,
             pulse_fwhm_ns=pulse_fwhm_ns,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mars_lidar.effects import FIELDS
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.system import Detector, System
 
@@ -16,6 +18,49 @@ DEFAULT_SYSTEM = System(
     detector=Detector(dead_time_ns=75.0),
     start="armed",
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effects:
+    """The options that switch on effects of the detector; None: as in the file."""
+
+    detection_efficiency: float | None
+    dark_count_hz: float | None
+    electronics_dead_time_ns: float | None
+    max_events_per_period: int | None
+    max_events_per_exposure: int | None
+    jitter_fwhm_ns: float | None
+    jitter_tail_ns: float | None
+    jitter_tail_fraction: float | None
+    jitter_file: Path | None
+    jitter_bin_ns: float | None
+    code_density_file: Path | None
+
+    def given(self) -> dict[str, Any]:
+        """Fields of `Detector`, as plain data."""
+        told: dict[str, Any] = {name: getattr(self, name) for name in FIELDS if hasattr(self, name)}
+        told["jitter"] = self._jitter()
+        if self.code_density_file is not None:
+            told["code_density"] = _array("--code-density-file", self.code_density_file)
+        return {name: value for name, value in told.items() if value is not None}
+
+    def _jitter(self) -> dict[str, Any] | None:
+        gaussian = {
+            "fwhm_ns": self.jitter_fwhm_ns, "tail_ns": self.jitter_tail_ns, "tail_fraction": self.jitter_tail_fraction
+        }  # fmt: skip
+        gaussian = {name: value for name, value in gaussian.items() if value is not None}
+        if self.jitter_file is not None:
+            if gaussian:
+                raise ValueError("the jitter is given once: choose --jitter-file or --jitter-fwhm-ns and its tail")
+            if self.jitter_bin_ns is None:
+                raise ValueError(f"--jitter-file {self.jitter_file} needs --jitter-bin-ns, its samples' width in ns")
+            values = _array("--jitter-file", self.jitter_file)
+            return {"kind": "sampled", "values": values.tolist(), "bin_ns": self.jitter_bin_ns}
+        if self.jitter_bin_ns is not None:
+            raise ValueError("--jitter-bin-ns belongs to --jitter-file, which is not given")
+        if gaussian and self.jitter_fwhm_ns is None:
+            raise ValueError("--jitter-tail-ns and --jitter-tail-fraction need --jitter-fwhm-ns")
+        return {"kind": "gaussian", **gaussian} if gaussian else None
 
 
 def build_system(
@@ -30,6 +75,7 @@ def build_system(
     gate_width_ns: float | None = None,
     gate_step_ns: float | None = None,
     gate_cycles: int | None = None,
+    effects: Effects | None = None,
     start: str | None,
     pulse_sigma_ns: float | None,
     pulse_fwhm_ns: float | None,
@@ -55,6 +101,7 @@ def build_system(
         "gate_cycles": gate_cycles,
     }
     given = {name: value for name, value in detector.items() if value is not None}
+    given |= {} if effects is None else effects.given()
     if given:
         changes["detector"] = _detector(base.detector, given)
     return base.replace(**{name: value for name, value in changes.items() if value is not None})
@@ -64,7 +111,7 @@ def _detector(base: Detector, given: dict[str, Any]) -> Detector:
     """`base` with what is given in place of its values; a gate of the file goes with its mode."""
     known = base.to_dict()
     if given.get("mode", base.mode) != base.mode:
-        known = {"dead_time_ns": base.dead_time_ns}
+        known = {name: value for name, value in known.items() if name != "mode" and not name.startswith("gate_")}
     return Detector.from_dict(known | given)
 
 
@@ -96,15 +143,19 @@ def _pulse(
 
 
 def _measured(file: Path, bin_ns: float, origin: str) -> SampledPulse:
-    import numpy as np
-
-    if file.suffix != ".npy":
-        raise ValueError(f"--pulse-file must be a 1-D .npy array, got {str(file)!r}")
-    try:
-        values = np.load(file, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{file}: {error}") from error
+    values = _array("--pulse-file", file)
     try:
         return SampledPulse(values, bin_ns, origin)
     except (ValueError, TypeError) as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def _array(option: str, file: Path) -> Any:
+    import numpy as np
+
+    if file.suffix != ".npy":
+        raise ValueError(f"{option} must be a 1-D .npy array, got {str(file)!r}")
+    try:
+        return np.load(file, allow_pickle=False)
+    except (ValueError, EOFError) as error:
         raise ValueError(f"{file}: {error}") from error

@@ -9,6 +9,7 @@ from hashlib import blake2b
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.flux import Flux
 from mars_lidar.statistics._cells import Cells
 from mars_lidar.system import System
@@ -19,6 +20,7 @@ IndexArray = NDArray[np.int64]
 _PARTS = 8192  # of the period, at least, in which several returns are written as a waveform
 _BATCH_BYTES = 64 * 2**20  # work area of the statistics of distinct pixels
 _MOST_CELLS = 4096
+_EFFECTS = LIGHT_EFFECTS + TIMING_EFFECTS
 
 
 def single_return(flux: Flux) -> tuple[FloatArray, FloatArray] | None:
@@ -97,11 +99,11 @@ def _cells(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> Cell
     background = flux.background.reshape(-1)[pixels]
     if flux.waveform is not None:
         wave = flux.waveform.reshape(-1, flux.waveform.shape[-1])[pixels]
-        return Cells.of(None, background, system, waveform=wave)
+        return Cells.of(None, background, system, waveform=wave, effects=_EFFECTS)
     single = single_return(flux)
     if single is not None:
         own = single[1][pixels] if delays else None
-        return Cells.of(single[0][pixels], background, system, delay_ns=own)
+        return Cells.of(single[0][pixels], background, system, delay_ns=own, effects=_EFFECTS)
     signal = flux.returns_signal.reshape(len(flux.returns_signal), -1)[:, pixels]
     delay = np.nan_to_num(flux.returns_delay_ns.reshape(len(flux.returns_signal), -1)[:, pixels])
     parts = _parts(system)
@@ -109,4 +111,4 @@ def _cells(flux: Flux, system: System, pixels: IndexArray, delays: bool) -> Cell
     for s, tau in zip(signal, delay, strict=True):
         lit = np.flatnonzero(s > 0)
         wave[lit] += s[lit, None] * system.pulse.bin_energy(tau[lit], system.period_ns, parts)
-    return Cells.of(None, background, system, waveform=np.maximum(wave, 0.0))
+    return Cells.of(None, background, system, waveform=np.maximum(wave, 0.0), effects=_EFFECTS)

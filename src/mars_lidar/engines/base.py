@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.detector import MODES, Mode
-from mars_lidar.effects import LIGHT_EFFECTS, require_effects
+from mars_lidar.detector import MODES, Detector, Mode
+from mars_lidar.effects import LIGHT_EFFECTS, Jitter, code_edges, require_effects
 from mars_lidar.flux import Flux
+from mars_lidar.pulse import GaussianPulse, Pulse
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
     from mars_lidar import _core
-    from mars_lidar.pulse import Pulse
 
 Progress = Callable[[int, int], object]
 
@@ -91,6 +91,7 @@ class Task:
             gate_step=step,
             gate_cycles=detector.gate_cycles or 1,
             **self._avalanches(),
+            recording=_recording(detector, self.system.period_ns) if detector.effects else None,
         )
 
     def _avalanches(self) -> dict[str, Any]:
@@ -129,6 +130,15 @@ class Records:
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         n = int(offsets[-1])
         return cls(offsets, np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32))
+
+    def sort(self) -> None:
+        """Put the registrations of each item in order of time, which jitter may have changed."""
+        item = np.repeat(np.arange(self.offsets.size - 1), np.diff(self.offsets))
+        if not ((np.diff(self.times) < 0.0) & (np.diff(item) == 0)).any():
+            return
+        order = np.lexsort((self.times, item))
+        for array in (self.times, self.cycle, self.bin):
+            array[:] = array[order]
 
 
 class Engine(ABC):
@@ -184,6 +194,28 @@ class Engine(ABC):
     def timestamps(self, task: Task, records: Records) -> None:
         """Fill `records`, allocated from `counts`, with the draws of `histogram`."""
         raise ValueError(f"engine {self.name!r} draws histograms only, not timestamps; use 'exact'")
+
+
+@lru_cache(maxsize=16)
+def _recording(detector: Detector, period_ns: float) -> _core.Recording:
+    from mars_lidar import _core
+
+    jitter, no_limit = detector.jitter, 2**31 - 1
+    shape: Pulse | None = None
+    tail = tail_fraction = 0.0
+    if isinstance(jitter, Jitter):
+        shape, tail, tail_fraction = GaussianPulse(sigma_ns=jitter.sigma_ns), jitter.tail_ns, jitter.tail_fraction
+    elif jitter is not None:
+        shape = jitter.shape
+    return _core.Recording(
+        electronics_dead_time=detector.electronics_dead_time_ns / period_ns,
+        most_per_period=detector.max_events_per_period or no_limit,
+        most_per_exposure=detector.max_events_per_exposure or no_limit,
+        jitter=None if shape is None else _pulse_table(shape, period_ns),
+        tail=tail / period_ns,
+        tail_fraction=tail_fraction,
+        code_edges=None if detector.code_density is None else code_edges(detector.code_density),
+    )
 
 
 @lru_cache(maxsize=16)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.detector import MODES
-from mars_lidar.effects import LIGHT_EFFECTS
+from mars_lidar.effects import EFFECTS
 from mars_lidar.engines.base import Engine, Records, Task
 
 
@@ -24,7 +24,7 @@ class ExactEngine(Engine):
     name = "exact"
     description = "every registered photon, nothing approximated; the default"
     modes = MODES
-    effects = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns")
+    effects = tuple(name for name in EFFECTS if name != "crosstalk")
 
     def __init__(self, level: str = "") -> None:
         self.level = level
@@ -52,3 +52,5 @@ class ExactEngine(Engine):
             _core.waveform_timestamps(task.job, *where, task.threads, task.progress)
         else:
             _core.exact_timestamps(task.job, task.pulse, *where, task.threads, self.level, task.progress)
+        if task.system.detector.jitter is not None:
+            records.sort()

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _validate
+from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.engines._count_shape import CountTimesShape, normalised
 from mars_lidar.engines._counts import CountLaws, Matched, Poisson, RoundedGaussian, Tabulated
 from mars_lidar.engines._pixels import Group, groups
@@ -56,6 +57,7 @@ class MarsEngine(CountTimesShape):
 
     name = "mars"
     description = "count law x mean histogram: cost flat in the exposure, bins not correlated as they should be"
+    effects = LIGHT_EFFECTS + TIMING_EFFECTS
     options: ClassVar[tuple[str, ...]] = ("table", "count", "interpolation")
 
     def __init__(
@@ -84,12 +86,10 @@ class MarsEngine(CountTimesShape):
 
     def _evaluated(self, run: Run, group: Group) -> Batch:
         from mars_lidar.statistics._pmf import exact_windows
-        from mars_lidar.statistics.exposure import refined_moments
+        from mars_lidar.statistics.exposure import recorded_moments
 
         task = run.task
-        exposure = refined_moments(
-            group.cells, task.system.bins, tolerance=1e-4, threads=task.threads, progress=run.waiting
-        )
+        exposure = recorded_moments(group.cells, tolerance=1e-4, threads=task.threads, progress=run.waiting)
         cumulants = exposure.cumulants.reshape(-1, 4)
         if self.count == "exact" and task.system.dead_time_periods > 0.0:
             windows = exact_windows(group.cells, cumulants, exposure.bins.reshape(-1), task.threads)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.detector import MODES
-from mars_lidar.effects import AVALANCHE_EFFECTS, LIGHT_EFFECTS
+from mars_lidar.effects import EFFECTS
 from mars_lidar.engines.base import Engine, Records, Task
 
 
@@ -23,7 +23,7 @@ class SequentialEngine(Engine):
     name = "sequential"
     description = "every arrival drawn, sorted and rejected one by one: slow, independent gold standard"
     modes = MODES
-    effects = (*LIGHT_EFFECTS, *AVALANCHE_EFFECTS)
+    effects = EFFECTS
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every arrival that finds the pixel armed."""
@@ -39,3 +39,5 @@ class SequentialEngine(Engine):
         """The second pass: the same draws again."""
         where = (records.offsets, records.times, records.cycle, records.bin)
         _core.sequential_timestamps(task.job, task.pulse, *where, 1.0, task.threads, task.progress)
+        if task.system.detector.jitter is not None:
+            records.sort()

@@ -5,6 +5,7 @@
 
 #include "job.h"
 #include "pulse.h"
+#include "recording.h"
 
 namespace mars {
 
@@ -18,6 +19,11 @@ using Matrix = nb::ndarray<T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 // A job together with the arrays that it points into.
 struct BoundJob : Job {
     nb::object arrays;
+};
+
+// A recording together with the tables that it points to.
+struct BoundRecording : Recording {
+    nb::object tables;
 };
 
 void bind_pulse(nb::module_& module);

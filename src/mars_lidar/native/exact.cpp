@@ -21,7 +21,7 @@ namespace {
 
 struct Level {
     const char* name;
-    ExactKernel kernel, modes;  // free running, and all other modes
+    ExactKernel kernel, modes, recording;  // free running, all other modes, and any with a recorder
 };
 
 // Widest first.
@@ -30,29 +30,33 @@ std::vector<Level> levels() {
 #if defined(MARS_HAS_avx512)
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        found.push_back({"avx512", exact_kernel_avx512, exact_modes_kernel_avx512});
+        found.push_back({"avx512", exact_kernel_avx512, exact_modes_kernel_avx512, exact_recording_kernel_avx512});
 #endif
 #if defined(MARS_HAS_avx2)
-    if (__builtin_cpu_supports("avx2")) found.push_back({"avx2", exact_kernel_avx2, exact_modes_kernel_avx2});
+    if (__builtin_cpu_supports("avx2"))
+        found.push_back({"avx2", exact_kernel_avx2, exact_modes_kernel_avx2, exact_recording_kernel_avx2});
 #endif
 #if defined(MARS_HAS_vector128)
-    found.push_back({"vector128", exact_kernel_vector128, exact_modes_kernel_vector128});
+    found.push_back(
+        {"vector128", exact_kernel_vector128, exact_modes_kernel_vector128, exact_recording_kernel_vector128});
 #endif
-    found.push_back({"scalar", exact_kernel_scalar, exact_modes_kernel_scalar});
+    found.push_back({"scalar", exact_kernel_scalar, exact_modes_kernel_scalar, exact_recording_kernel_scalar});
     return found;
 }
 
-ExactKernel kernel_of(const std::string& name, DetectorMode mode) {
+ExactKernel kernel_of(const std::string& name, const Job& job) {
     for (const Level& level : levels())
         if (name.empty() || name == level.name)
-            return mode == DetectorMode::kNonparalyzable ? level.kernel : level.modes;
+            return job.recording                                ? level.recording
+                   : job.mode == DetectorMode::kNonparalyzable ? level.kernel
+                                                               : level.modes;
     throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
 }
 
 // Cuts a job into blocks of consecutive items and runs them.
 void run_exact(const BoundJob& job, const PulseTable& pulse, ExactBlock proto, int threads, const std::string& level,
                const nb::object& progress) {
-    const ExactKernel kernel = kernel_of(level, job.mode);
+    const ExactKernel kernel = kernel_of(level, job);
     proto.job = &job;
     proto.pulse = &pulse;
     const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));

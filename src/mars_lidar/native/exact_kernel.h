@@ -1,5 +1,6 @@
-// The exact engine's inner loop, two functions per vector level (exact_kernel.cpp and exact_modes_kernel.cpp are
-// compiled once for each): free-running pixels, and all other modes.
+// The exact engine's inner loop, three functions per vector level (exact_kernel.cpp, exact_modes_kernel.cpp and
+// exact_recording_kernel.cpp are compiled once for each): free-running pixels, all other modes, and pixels of any mode
+// whose registrations are not simply recorded.
 #pragma once
 #include <atomic>
 #include <cstdint>
@@ -35,18 +36,22 @@ using ExactKernel = void (*)(const ExactBlock&);
 #ifdef MARS_HAS_scalar
 void exact_kernel_scalar(const ExactBlock& block);
 void exact_modes_kernel_scalar(const ExactBlock& block);
+void exact_recording_kernel_scalar(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_vector128
 void exact_kernel_vector128(const ExactBlock& block);
 void exact_modes_kernel_vector128(const ExactBlock& block);
+void exact_recording_kernel_vector128(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_avx2
 void exact_kernel_avx2(const ExactBlock& block);
 void exact_modes_kernel_avx2(const ExactBlock& block);
+void exact_recording_kernel_avx2(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_avx512
 void exact_kernel_avx512(const ExactBlock& block);
 void exact_modes_kernel_avx512(const ExactBlock& block);
+void exact_recording_kernel_avx512(const ExactBlock& block);
 #endif
 
 }  // namespace mars

@@ -1,12 +1,15 @@
 // The exact engine's inner loop. Lanes work on different pixels; a lane whose exposure has ended takes the next
 // item of the block, so that dim and bright pixels do not wait for each other. The waits of the next registrations
 // are drawn ahead, because the chain from one registration to the next is what limits the speed. Compiled once for
-// each vector level, and for each mode of the detector, so that none pays for another.
+// each vector level, and for each mode of the detector, so that none pays for another; and once more with a recorder
+// (exact_recorder.h) between registrations and log.
 #pragma once
 #include <cstring>
+#include <type_traits>
 
 #include "detector_modes.h"
 #include "exact_kernel.h"
+#include "exact_recorder.h"
 #include "exact_writers.h"
 #include "pulse_view.h"
 
@@ -55,11 +58,14 @@ MARS_INLINE Rate load_rate(const RateArray& from) {
     return {load<Float>(from.rate), load<Float>(from.inverse), load<Float>(from.never)};
 }
 
-template <DetectorMode mode, bool gaussian, bool whole, Sink sink>
+// What lies between a registration and the log.
+enum class Stage { kPlain, kRecording };
+
+template <DetectorMode mode, bool gaussian, bool whole, Stage stage, Sink sink>
 class Runner {
 public:
     explicit Runner(const ExactBlock& block)
-        : block_(block), job_(*block.job), system_(view(job_, *block.pulse)), writer_(block) {}
+        : block_(block), job_(*block.job), system_(view(job_, *block.pulse)), recorder_(job_), writer_(block) {}
 
     void run() {
         for (int lane = 0; lane < kLanes; ++lane) take(lane);
@@ -68,6 +74,7 @@ public:
             for (int k = 0; k < kAhead; ++k)
                 ahead_[k] = draw(background_, returns_[0].flux, key0_, key1_, event_ + static_cast<uint32_t>(k));
             for (int k = 0; k < kAhead; ++k) step(k);
+            if constexpr (stage == Stage::kRecording) record();
             event_ = event_ + static_cast<uint32_t>(kAhead);
             rows_ += kAhead;
             if (any(armed_.frame > system_.cycles)) exchange();
@@ -92,11 +99,29 @@ private:
         if constexpr (mode != DetectorMode::kNonparalyzable)
             outside = outside | advance<mode>(system_, hit, cycle, phase, delay_, event_ + static_cast<uint32_t>(k),
                                               armed_, memory_);
-        store(log_.bin[rows_ + k], select(outside, splat(-1), bin));
-        if constexpr (sink == Sink::kTimestamps) {
-            store(log_.cycle[rows_ + k], cycle);
-            store(log_.phase[rows_ + k], phase);
+        if constexpr (stage == Stage::kRecording) {
+            seen_[k] = {hit, cycle, phase, outside};
+            return;
         }
+        log(rows_ + k, outside, bin, cycle, phase);
+    }
+
+    MARS_INLINE void log(int row, Mask lost, Int bin, Int cycle, Float phase) {
+        store(log_.bin[row], select(lost, splat(-1), bin));
+        if constexpr (sink == Sink::kTimestamps) {
+            store(log_.cycle[row], cycle);
+            store(log_.phase[row], phase);
+        }
+    }
+
+    // Records the registrations of a round.
+    MARS_INLINE void record() {
+        recorder_.take(seen_, key0_, key1_, event_);
+        for (int k = 0; k < kAhead; ++k) {
+            const Int bin = recorder_.template bin<sink == Sink::kTimestamps>(seen_[k]);
+            log(rows_ + k, seen_[k].lost, bin, seen_[k].cycle, seen_[k].phase);
+        }
+        if (recorder_.fills()) armed_.frame = select(recorder_.full(), splat(kIdleFrame), armed_.frame);  // no more there
     }
 
     // Writes what a lane has logged for its present item, up to row `to`.
@@ -129,6 +154,7 @@ private:
         store(frame_array_, armed_.frame);
         store(phase_array_, armed_.phase);
         store(event_array_, event_);
+        if constexpr (stage == Stage::kRecording) recorder_.save_lanes();
         for (int lane = 0; lane < kLanes; ++lane) {
             if (frame_array_[lane] <= system_.cycles) continue;
             flush(lane, rows_);
@@ -144,6 +170,7 @@ private:
         const bool busy = taken_ < block_.items;
         const int64_t item = block_.first_item + (busy ? taken_ : 0), pixel = job_.pixel(item);
         event_array_[lane] = 0;
+        if constexpr (stage == Stage::kRecording) recorder_.begin(lane);
         first_row_array_[lane] = rows_;
         const float delay = wrapped(job_.delay[pixel] + block_.pulse->centre);
         delay_array_[lane] = delay;
@@ -178,6 +205,7 @@ private:
         key1_ = load<UInt>(key1_array_);
         event_ = load<UInt>(event_array_);
         armed_ = {load<Int>(frame_array_), load<Float>(phase_array_)};
+        if constexpr (stage == Stage::kRecording) recorder_.load_lanes();
     }
 
     // `periods` in [0, 1).
@@ -210,17 +238,19 @@ private:
 
     int64_t taken_ = 0;
     int running_ = 0, rows_ = 0;
+    std::conditional_t<stage == Stage::kRecording, Recorder, NoRecorder> recorder_;
+    Registration seen_[stage == Stage::kRecording ? kAhead : 1];
     Writer<sink> writer_;
     Log<sink> log_;
 };
 
-template <DetectorMode mode, bool gaussian, bool whole>
+template <DetectorMode mode, bool gaussian, bool whole, Stage stage = Stage::kPlain>
 void run(const ExactBlock& block) {
     switch (block.sink) {
-        case Sink::kCounts: return Runner<mode, gaussian, whole, Sink::kCounts>(block).run();
-        case Sink::kHistogram16: return Runner<mode, gaussian, whole, Sink::kHistogram16>(block).run();
-        case Sink::kHistogram32: return Runner<mode, gaussian, whole, Sink::kHistogram32>(block).run();
-        case Sink::kTimestamps: return Runner<mode, gaussian, whole, Sink::kTimestamps>(block).run();
+        case Sink::kCounts: return Runner<mode, gaussian, whole, stage, Sink::kCounts>(block).run();
+        case Sink::kHistogram16: return Runner<mode, gaussian, whole, stage, Sink::kHistogram16>(block).run();
+        case Sink::kHistogram32: return Runner<mode, gaussian, whole, stage, Sink::kHistogram32>(block).run();
+        case Sink::kTimestamps: return Runner<mode, gaussian, whole, stage, Sink::kTimestamps>(block).run();
     }
 }
 

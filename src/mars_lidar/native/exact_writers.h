@@ -7,6 +7,7 @@
 
 #include "exact_kernel.h"
 #include "lanes.h"
+#include "recording.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -83,8 +84,9 @@ struct Writer<Sink::kTimestamps> {
             for (int k = from; k < to; ++k) {
                 if (log.bin[k][lane] < 0) continue;
                 const int64_t record = next[slots[lane - first]]++;
-                block.times[record] = static_cast<double>(log.cycle[k][lane]) + static_cast<double>(log.phase[k][lane]);
-                block.cycles[record] = log.cycle[k][lane];
+                const int32_t cycle = round_exposure(log.cycle[k][lane], block.job->cycles);
+                block.times[record] = static_cast<double>(cycle) + static_cast<double>(log.phase[k][lane]);
+                block.cycles[record] = cycle;
                 block.bins[record] = log.bin[k][lane];
             }
     }

@@ -29,6 +29,7 @@ struct Crosstalk {
     double probability[9] = {};
     int64_t height = 0, width = 0;  // 0: none
 };
+struct Recording;
 
 struct Job {
     int64_t pixels = 0;
@@ -45,6 +46,7 @@ struct Job {
     Traps traps;
     double twilight = 0.0;     // arrivals this long before the end of a dead time fire at its end
     Crosstalk crosstalk;
+    const Recording* recording = nullptr;  // of the registrations, or null: as they are
     const double* signal = nullptr;       // (returns, pixels)
     const double* delay = nullptr;        // (returns, pixels), finite, any number of periods
     const double* background = nullptr;   // (pixels)

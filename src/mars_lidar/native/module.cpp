@@ -1,5 +1,6 @@
 // The native core `mars_lidar._core`: thin bindings, no checks beyond shapes; Python validates.
 #include "bindings.h"
+#include "pulse_table.h"
 
 #include <algorithm>
 
@@ -7,6 +8,28 @@
 
 namespace mars {
 namespace {
+
+void bind_recording(nb::module_& module) {
+    nb::class_<BoundRecording>(module, "Recording", "What happens to registrations; times in laser periods.")
+        .def(
+            "__init__",
+            [](BoundRecording* self, double electronics_dead_time, int32_t most_per_period, int32_t most_per_exposure,
+               const PulseTable* jitter, double tail, double tail_fraction,
+               std::optional<Vector<const double>> code_edges) {
+                new (self) BoundRecording();
+                self->electronics_dead_time = electronics_dead_time;
+                self->most_per_period = most_per_period;
+                self->most_per_exposure = most_per_exposure;
+                self->jitter = jitter;
+                self->tail = tail;
+                self->tail_fraction = tail_fraction;
+                if (code_edges) self->codes.set({code_edges->data(), code_edges->data() + code_edges->shape(0)});
+                self->tables = nb::cast(jitter);
+            },
+            nb::kw_only(), nb::arg("electronics_dead_time"), nb::arg("most_per_period"),
+            nb::arg("most_per_exposure"), nb::arg("jitter").none(), nb::arg("tail"), nb::arg("tail_fraction"),
+            nb::arg("code_edges").none());
+}
 
 void bind_job(nb::module_& module) {
     nb::class_<BoundJob>(module, "Job", "Flux and system of one call, in laser periods.")
@@ -19,7 +42,7 @@ void bind_job(nb::module_& module) {
                double gate_start, double gate_width, double gate_step, int32_t gate_cycles, double traps,
                double trap_delay, std::optional<Vector<const double>> trap_delays, double trap_sample,
                int32_t generations, double twilight, std::optional<Matrix<const double>> crosstalk,
-               int64_t height, int64_t width) {
+               int64_t height, int64_t width, const BoundRecording* recording) {
                 const size_t pixels = background.shape(0);
                 if (signal.shape(1) != pixels || delay.shape(0) != signal.shape(0) || delay.shape(1) != pixels ||
                     pixel_index.shape(0) != pixels || (waveform && waveform->shape(0) != pixels))
@@ -59,7 +82,9 @@ void bind_job(nb::module_& module) {
                 self->waveform = waveform ? waveform->data() : nullptr;
                 self->samples = waveform ? static_cast<int64_t>(waveform->shape(1)) : 0;
                 self->pixel_index = pixel_index.data();
-                self->arrays = nb::make_tuple(signal, delay, background, waveform, pixel_index, trap_delays);
+                self->recording = recording;
+                self->arrays =
+                    nb::make_tuple(signal, delay, background, waveform, pixel_index, trap_delays, recording);
             },
             nb::kw_only(), nb::arg("signal"), nb::arg("delay"), nb::arg("background"),
             nb::arg("waveform").none(), nb::arg("pixel_index"), nb::arg("realizations"),
@@ -68,7 +93,8 @@ void bind_job(nb::module_& module) {
             nb::arg("gate_width") = 1.0, nb::arg("gate_step") = 0.0, nb::arg("gate_cycles") = 1,
             nb::arg("traps") = 0.0, nb::arg("trap_delay") = 0.0, nb::arg("trap_delays").none() = nb::none(),
             nb::arg("trap_sample") = 0.0, nb::arg("generations") = INT32_MAX, nb::arg("twilight") = 0.0,
-            nb::arg("crosstalk").none() = nb::none(), nb::arg("height") = 0, nb::arg("width") = 0)
+            nb::arg("crosstalk").none() = nb::none(), nb::arg("height") = 0, nb::arg("width") = 0,
+            nb::arg("recording").none() = nb::none())
         .def_prop_ro("items", [](const BoundJob& self) { return self.items(); });
 }
 
@@ -77,8 +103,9 @@ void bind_job(nb::module_& module) {
 
 NB_MODULE(_core, module) {
     module.doc() = "Native core of mars_lidar.";
-    mars::bind_job(module);
     mars::bind_pulse(module);
+    mars::bind_recording(module);
+    mars::bind_job(module);
     mars::bind_exact(module);
     mars::bind_waveform(module);
     mars::bind_sequential(module);

@@ -17,6 +17,7 @@ inline namespace MARS_LEVEL {
 constexpr uint32_t kStageArrival = 0;     // background and first return
 constexpr uint32_t kStageArrivalFine = 1;  // fresh fractions for long waits of those two
 constexpr uint32_t kStageStart = 2;       // arrivals before a stationary exposure: waits and components; + 1: phases
+constexpr uint32_t kStageJitter = 4;      // first word of the counter: half the number; + 1: tails
 constexpr uint32_t kStageReturns = 16;    // + 2 k: returns 2 k + 1 and 2 k + 2; + 2 k + 1: their fractions
 
 constexpr float kLongWait = 128.0f;        // periods; a float32 wait is coarser than 2^-16 period beyond

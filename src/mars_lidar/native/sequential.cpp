@@ -10,6 +10,7 @@
 #include "parallel.h"
 #include "pulse_table.h"  // nanobind wants the complete type; only the shape inside is used
 #include "sequential_events.h"
+#include "sequential_recorder.h"
 #include "sequential_pixel.h"
 
 namespace mars {
@@ -33,10 +34,18 @@ public:
     Simulator(const Job& job, const PulseShape& pulse, const std::atomic<bool>& stop)
         : job_(job), pulse_(pulse), stop_(stop) {}
 
-    // Calls registered(cycle, phase) for the registrations of an item in order of time. Returns early on
-    // stop.
+    // Calls recorded(cycle, phase) for the records of an item, in the order of their registrations. Returns early
+    // on stop.
+    template <class Recorded>
+    void run(int64_t item, const Recorded& recorded) {
+        if (!job_.recording) return walk(item, recorded);
+        SequentialRecorder recorder(job_, item);
+        walk(item, [&](int64_t cycle, double phase) { recorder.take(cycle, phase, recorded); });
+    }
+
+private:
     template <class Registered>
-    void run(int64_t item, const Registered& registered) {
+    void walk(int64_t item, const Registered& registered) {
         const int64_t index = job_.pixel(item);
         Arrivals arrivals(job_, pulse_, index);
         if (arrivals.photons_per_period() == 0.0) return;
@@ -52,7 +61,6 @@ public:
         }
     }
 
-private:
     // A stationary start: the pixel lives through some 300 dead times before the exposure, which are
     // discarded.
     //

@@ -17,6 +17,7 @@
 #include "registration.h"
 #include "stationary.h"
 #include "waveform_modes.h"
+#include "waveform_recorder.h"
 
 namespace mars {
 namespace {
@@ -173,13 +174,22 @@ void run_mode(const BoundJob& job, int threads, const nb::object& progress, cons
 }
 
 template <class Make>
-void run_waveform(const BoundJob& job, int threads, const nb::object& progress, const Make& make) {
+void run_modes(const BoundJob& job, int threads, const nb::object& progress, const Make& make) {
     switch (job.mode) {
         case DetectorMode::kNonparalyzable: return run_mode<FreeRunning>(job, threads, progress, make);
         case DetectorMode::kParalyzable: return run_mode<ParalyzableMode>(job, threads, progress, make);
         case DetectorMode::kSynchronous: return run_mode<SynchronousMode>(job, threads, progress, make);
         case DetectorMode::kGated: return run_mode<GatedMode>(job, threads, progress, make);
     }
+}
+
+template <class Make>
+void run_waveform(const BoundJob& job, int threads, const nb::object& progress, const Make& make) {
+    if (!job.recording) return run_modes(job, threads, progress, make);
+    const JitterView jitter = jitter_view(*job.recording);
+    run_modes(job, threads, progress, [&](int64_t item) {
+        return WaveformRecorder<decltype(make(item))>(job, jitter, item, make(item));
+    });
 }
 
 int32_t bin_of(const Job& job, double phase) {

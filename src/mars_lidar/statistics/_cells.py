@@ -142,14 +142,23 @@ class Cells:
             f"t_d = {self.system.dead_time_periods:g} periods, {self.system.cycles} cycles{place}"
         )
 
+    @property
+    def _sharpness(self) -> float:
+        """Integral of the squared shape of the signal over the period: 1 / width, the narrowest of all cells."""
+        if self.waveform is not None:
+            return float(self.waveform.shape[-1] * np.max(np.sum(self.waveform**2, -1)))
+        probe = 2**14
+        energy = self.system.pulse.bin_energy(0.5 * self.system.period_ns, self.system.period_ns, probe)
+        return float(probe * np.sum(energy**2))
+
+    @property
+    def finest(self) -> float:
+        """Standard deviation, in periods, of a Gaussian as narrow as the signal."""
+        return float(1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0)))
+
     def first_bins(self, out_bins: int) -> int:
         """Bins of the first grid: even, a multiple of `out_bins`, a bin at most half a sigma of the pulse."""
-        if self.waveform is None:
-            probe = 2**14
-            energy = self.system.pulse.bin_energy(0.5 * self.system.period_ns, self.system.period_ns, probe)
-            sharpness = probe * float(np.sum(energy**2))
-        else:
-            sharpness = self.waveform.shape[-1] * float(np.max(np.sum(self.waveform**2, -1)))
+        sharpness = self._sharpness
         gate_width = self.system.detector.gate_periods(self.system.period_ns)[2]
         sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / _MAX_FIRST_BINS))
         wanted = min(max(_MIN_BINS, _BINS_PER_WIDTH * sharpness), _MAX_FIRST_BINS)

@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.statistics._timing import Timing, is_timed
 from mars_lidar.system import System
 
 Progress = Callable[[int, int], object]
@@ -115,9 +117,23 @@ def exposure_moments(
     """
     cells = Cells.of(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what="exposure_moments", modes=("nonparalyzable", "gated"),
+        what="exposure_moments", modes=("nonparalyzable", "gated"), effects=LIGHT_EFFECTS + TIMING_EFFECTS,
     )  # fmt: skip
-    return refined_moments(cells, system.bins, tolerance=tolerance, threads=threads, progress=progress)
+    return recorded_moments(cells, tolerance=tolerance, threads=threads, progress=progress)
+
+
+def recorded_moments(
+    cells: Cells, *, tolerance: float, threads: int | None, progress: Progress | None = None
+) -> Exposure:
+    """`exposure_moments` of checked cells, histogram in the bins of their system; jitter and code widths are in it."""
+    if not is_timed(cells.system):
+        return refined_moments(cells, cells.system.bins, tolerance=tolerance, threads=threads, progress=progress)
+    timing = Timing(cells.system, cells.finest)
+    untimed = replace(cells, system=timing.untimed)
+    found = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
+    return replace(
+        found, histogram=timing.forward(found.histogram), histogram_rate=timing.forward(found.histogram_rate)
+    )
 
 
 def refined_moments(

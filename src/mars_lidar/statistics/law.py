@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
 from mars_lidar.detector import MODES, Mode
+from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._gate import PLAIN
 from mars_lidar.statistics._pmf import Window, exact_windows, gaussian_window, poisson_window
+from mars_lidar.statistics._timing import recorded
 from mars_lidar.statistics.exposure import Exposure, refined_moments, stationary_histogram, thread_count
-from mars_lidar.statistics.histogram import mean_histograms
+from mars_lidar.statistics.histogram import histogram_effects, mean_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 from mars_lidar.system import System
 
@@ -164,7 +166,7 @@ def count_law(
     edge = _rearm(rearm, method == "mars", f"method {method!r}")
     cells = Cells.of(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what=f"count_law of method {method!r}", modes=_LAW_MODES[method],
+        what=f"count_law of method {method!r}", modes=_LAW_MODES[method], effects=LIGHT_EFFECTS + TIMING_EFFECTS,
     )  # fmt: skip
     team = thread_count(threads)
     if method == "exact" and system.detector.mode == "synchronous":
@@ -226,6 +228,7 @@ def registration_pdf(
     cells = Cells.of(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
         what=f"registration_pdf of method {method!r}", modes=PLAIN if method == "chain" else MODES,
+        effects=_shape_effects(method, system),
     )  # fmt: skip
     if method == "chain":
         shape = _chain_shapes(cells, edge)
@@ -235,11 +238,19 @@ def registration_pdf(
         warm = replace(cells, system=system.replace(start="stationary"))
         shape = mean_histograms(warm, tolerance, threads)
     else:
-        shape = stationary_histogram(cells, system.bins, tolerance=tolerance, threads=threads)
+        shape = recorded(
+            cells, lambda some, parts: stationary_histogram(some, parts, tolerance=tolerance, threads=threads)
+        )
     total = shape.sum(-1, keepdims=True)
     dark = total == 0.0
     shape = np.where(dark, 1.0 / system.bins, shape / np.where(dark, 1.0, total))
     return np.asarray(shape.reshape(*cells.shape, system.bins), dtype=np.float64)
+
+
+def _shape_effects(method: str, system: System) -> tuple[str, ...]:
+    if method == "chain":
+        return LIGHT_EFFECTS
+    return histogram_effects(system) if method == "exposure" else LIGHT_EFFECTS + TIMING_EFFECTS
 
 
 def _rearm(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"]:

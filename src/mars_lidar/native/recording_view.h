@@ -1,0 +1,85 @@
+// Jitter and codes as the exact engine's loops see them.
+#pragma once
+#include <algorithm>
+
+#include "pulse_view.h"
+#include "recording.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+struct JitterView {
+    PulseView shape;
+    bool on = false, gaussian = false;
+    float centre = 0.0f, tail = 0.0f;
+    uint32_t tail_below = 0;  // of a 32-bit word; the tail takes no record where 0
+    float tail_scale = 0.0f;  // spreads the words below that over 31 bits
+};
+
+inline JitterView jitter_view(const Recording& recording) {
+    JitterView view{};
+    if (!recording.jitter) return view;
+    view.shape = pulse_view(*recording.jitter);
+    view.on = true;
+    view.gaussian = recording.jitter->shape.gaussian();
+    view.centre = static_cast<float>(recording.jitter->centre);
+    view.tail = static_cast<float>(recording.tail);
+    view.tail_below = static_cast<uint32_t>(std::min(recording.tail_fraction * 0x1p32, 0x1p32 - 1.0));
+    view.tail_scale = view.tail_below ? static_cast<float>(1.0 / recording.tail_fraction) : 0.0f;
+    return view;
+}
+
+// The jitter of a record from two words; the second is used by the tail only. The energy of the shape below it is kept
+// signed, as in pulse_table.h: the first word is a uniform number on (0, 1) that is relatively fine at both ends.
+template <bool gaussian, bool tail>
+MARS_INLINE Float jitter_of(const JitterView& jitter, UInt place, UInt late) {
+    const Int n = as_int(place >> 1);
+    const Float u = (to_float(n) + 0.5f) * 0x1p-31f, rest = (to_float(0x7fffffff - n) + 0.5f) * -0x1p-31f;
+    const Float p = select(u < jitter.shape.split, u, rest);
+    Float x = quantile<gaussian>(jitter.shape, p);
+    if constexpr (!gaussian) x = x + jitter.centre;
+    if constexpr (tail) {
+        // given that it is below the bound the word is uniform again, for an exponential number of its own
+        const Float stretched = minimum(to_float(as_int(late >> 1)) * jitter.tail_scale, splat(2147483520.0f));
+        const Float delay = exponential(as_uint(truncate(stretched)) << 1) * jitter.tail;
+        x = x + select(late < splat(jitter.tail_below), delay, splat(0.0f));
+    }
+    return x;
+}
+
+// Whole periods of a time, which becomes its phase in [0, 1).
+MARS_INLINE Int split_off_periods(Float& phase) {
+    Int whole = truncate(phase);
+    whole = minus_if(whole, phase < to_float(whole));
+    phase = minimum(phase - to_float(whole), splat(0x1.fffffep-1f));
+    return whole;
+}
+
+// The bin of a phase, which becomes the phase that the converter tells: as far into its code, one bin wide, as the time
+// is into the code's width.
+template <bool timed>
+MARS_INLINE Int convert(const CodeTable& codes, int32_t bins, Float& phase) {
+    const int32_t n = static_cast<int32_t>(codes.upper.size());
+    const Float x = phase * static_cast<float>(bins);
+    Int pattern = minimum(truncate(x * codes.patterns_per_bin), splat(bins / n - 1));
+    pattern = minus_if(pattern, x < to_float(pattern) * static_cast<float>(n));  // rounding; likewise below
+    const Float first = to_float(pattern) * static_cast<float>(n);
+    const Float inside = minimum(x - first, splat(static_cast<float>(n) * 0x1.fffffep-1f));
+    Int code = gather(codes.guide.data(), truncate(inside * codes.cells_per_bin));
+    Float upper = gather(codes.upper.data(), code);
+    Mask beyond = inside >= upper;
+    while (any(beyond)) {
+        code = plus_if(code, beyond);
+        upper = gather(codes.upper.data(), code);
+        beyond = inside >= upper;
+    }
+    if constexpr (timed) {
+        const Float left = minimum((upper - inside) * gather(codes.codes_per_bin.data(), code), splat(1.0f));
+        const Float told = (first + to_float(code)) + (1.0f - maximum(left, splat(0x1p-24f)));
+        phase = minimum(told * (1.0f / static_cast<float>(bins)), splat(0x1.fffffep-1f));
+    }
+    return minimum(truncate(first) + code, splat(bins - 1));
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

@@ -20,7 +20,7 @@ _KERNELS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Afterpulsing:
     """Carriers that an avalanche leaves in traps and that are released later: each is an arrival like a photon.
 
@@ -71,6 +71,13 @@ class Afterpulsing:
         if self.generations is not None:
             number = _validate.integer("generations", self.generations, low=1, high=_MAX_GENERATIONS)
             set_field(self, "generations", number)
+
+    def __repr__(self) -> str:
+        delays = f"delay_ns={self.delay_ns}"
+        if self.delays is not None:
+            delays = f"delays=<{len(self.delays)} samples>, bin_ns={self.bin_ns:g}"
+        limit = "" if self.generations is None else f", generations={self.generations}"
+        return f"Afterpulsing(probability={self.probability:g}, {delays}{limit})"
 
     @classmethod
     def after_dead_time(

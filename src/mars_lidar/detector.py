@@ -131,6 +131,16 @@ class Detector:
                 f"got gate_cycles={self.gate_cycles} with gate_step_ns=0"
             )
 
+    @classmethod
+    def preset(cls, name: str) -> Detector:
+        """A detector as published, by its name in `mars_lidar.presets.PRESETS` (docs/detectors.md).
+
+        `dataclasses.replace` changes fields. Efficiencies are left at 1: they go with the wavelength.
+        """
+        from mars_lidar.presets import preset
+
+        return preset(name)
+
     def _check_avalanches(self) -> None:
         if self.twilight_ns > 0.0 and self.mode != "nonparalyzable":
             raise ValueError(
@@ -207,9 +217,11 @@ class Detector:
 
     @classmethod
     def from_dict(cls, data: Any) -> Detector:
-        """The detector that `to_dict` described."""
+        """The detector that `to_dict` described; ``preset: NAME`` stands for the fields of a preset."""
         names = tuple(field.name for field in dataclasses.fields(cls))
-        known = dict(_validate.known_keys("detector", data, names))
+        known = dict(_validate.known_keys("detector", data, (*names, "preset")))
+        if "preset" in known:
+            known = cls.preset(known.pop("preset")).to_dict() | known
         for name, field in effects.FIELDS.items():
             if field.read is not None and known.get(name) is not None:
                 known[name] = field.read(known[name])

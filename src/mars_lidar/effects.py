@@ -308,6 +308,6 @@ def require_effects(what: str, detector: Detector, able: tuple[str, ...], instea
     """Raise ValueError, naming the first effect that is on and not in `able`, and what `instead` says of it."""
     for name in detector.effects:
         if name not in able:
-            raise ValueError(
-                f"{what} does not do {name} of the detector, got {plain(getattr(detector, name))!r}{instead(name)}"
-            )
+            value = repr(getattr(detector, name))
+            told = value if len(value) <= 100 else f"{value[:97]}..."
+            raise ValueError(f"{what} does not do {name} of the detector, got {told}{instead(name)}")

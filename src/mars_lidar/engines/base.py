@@ -100,10 +100,8 @@ class Task:
         told: dict[str, Any] = {}
         traps, crosstalk = detector.afterpulsing, detector.crosstalk
         if traps is not None:
-            told["traps"] = traps.probability
-            if traps.delay_ns is not None:
-                told["trap_delay"] = traps.delay_ns / period
-            else:
+            told |= {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period}
+            if traps.delays is not None:
                 told |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period}
             if traps.generations is not None:
                 told["generations"] = traps.generations

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.detector import MODES
-from mars_lidar.effects import EFFECTS
+from mars_lidar.effects import AVALANCHE_EFFECTS, EFFECTS
 from mars_lidar.engines.base import Engine, Records, Task
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
 
 
 class ExactEngine(Engine):
@@ -28,6 +30,13 @@ class ExactEngine(Engine):
 
     def __init__(self, level: str = "") -> None:
         self.level = level
+
+    def check(self, flux: Flux, system: System) -> None:
+        """Waveforms are drawn without what avalanches leave behind."""
+        if flux.waveform is not None:
+            for name in AVALANCHE_EFFECTS:
+                if name in system.detector.effects:
+                    raise ValueError(f"engine 'exact' does not do {name} with a waveform; use 'sequential'")
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every registration, binned as it is drawn."""

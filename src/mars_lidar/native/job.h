@@ -14,8 +14,8 @@ struct Gate {
     int32_t cycles = 1;
 };
 
-// Afterpulsing: every avalanche leaves Poisson(mean) carriers, released after delays of mean `mean_delay`, exponential,
-// or sampled: `below` (samples + 1) is their distribution function at the edges of samples of `sample` periods.
+// Afterpulsing: every avalanche leaves Poisson(mean) carriers, released after delays of mean `mean_delay`: exponential,
+// or sampled, `below` (samples + 1) is their distribution function at the edges of samples of `sample` periods.
 struct Traps {
     double mean = 0.0, mean_delay = 0.0;
     const double* below = nullptr;

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "sequential_pixel.h"
+#include "sequential_recorder.h"
 
 namespace mars {
 namespace {
@@ -33,10 +34,17 @@ public:
     EventSimulator(const Job& job, const PulseShape& pulse, const std::atomic<bool>& stop)
         : job_(job), pulse_(pulse), stop_(stop), twilight_(Time{0, 0}.plus(job.twilight)) {}
 
-    // Calls registered(cycle, phase) for the registrations of an item in order of time. Returns early on stop. With
-    // crosstalk, where all pixels of a realization are simulated at once, item after item from the first on.
+    // Calls recorded(cycle, phase) for the records of an item, in the order of their registrations. Returns early on
+    // stop. With crosstalk, where all pixels of a realization are simulated at once: item after item from the first on.
+    template <class Recorded>
+    void run(int64_t item, const Recorded& recorded) {
+        SequentialRecorder recorder(job_, item);
+        walk(item, [&](int64_t cycle, double phase) { recorder.take(cycle, phase, recorded); });
+    }
+
+private:
     template <class Registered>
-    void run(int64_t item, const Registered& registered) {
+    void walk(int64_t item, const Registered& registered) {
         if (job_.crosstalk.width == 0) {
             simulate(item, 1, [&](int64_t, int64_t cycle, double phase) { registered(cycle, phase); });
             return;
@@ -52,7 +60,6 @@ public:
         std::vector<std::pair<int32_t, double>>().swap(image_[static_cast<size_t>(pixel)]);
     }
 
-private:
     static constexpr double kPhotons = 1 << 14;  // about as many are drawn together
 
     struct Member {
@@ -102,7 +109,7 @@ private:
         if (!job_.stationary) return 0;
         int64_t start = 0;
         for (Member& member : pixels_) {
-            const double settle = job_.dead_time + 1.0 + 0.125 * mean_delay();
+            const double settle = job_.dead_time + 1.0 + 0.125 * job_.traps.mean_delay;
             const double length = settle * (256.0 + 64.0 * member.random.uniform());
             member.pixel.ready = Time{0, 0}.plus(-length);
             start = std::min(start, member.pixel.ready.cycle);
@@ -112,11 +119,6 @@ private:
             member.pixel.ready = member.pixel.armed(member.pixel.ready);
         }
         return start;
-    }
-
-    double mean_delay() const {
-        if (!(job_.traps.mean > 0.0)) return 0.0;
-        return job_.traps.below ? job_.traps.sample * static_cast<double>(job_.traps.samples) : job_.traps.mean_delay;
     }
 
     void push_photon(int64_t k, int64_t start) {

@@ -20,14 +20,19 @@ public:
     Time next() const { return {load<Int>(frame_), load<Float>(phase_)}; }
     Int generation() const { return load<Int>(generation_); }
 
-    // An exposure begins at a lane, or none: it idles.
-    void open(int lane, uint32_t key0, uint32_t key1, bool busy) {
+    // A lane without work.
+    void close(int lane) {
+        countdown_[lane] = std::numeric_limits<int32_t>::max();
+        waiting_[lane].clear();
+        show(lane);
+    }
+    // An exposure begins at a lane.
+    void open(int lane, uint32_t key0, uint32_t key1) {
+        close(lane);
         key_[lane][0] = key0;
         key_[lane][1] = key1;
         number_[lane] = 0;
-        countdown_[lane] = busy ? law_.until_next(key_[lane], 0) : std::numeric_limits<int32_t>::max();
-        waiting_[lane].clear();
-        show(lane);
+        if (law_.on()) countdown_[lane] = law_.until_next(key_[lane], 0);
     }
 
     // Carriers that are released before `from`, while the pixel is blind, are lost.
@@ -49,6 +54,7 @@ public:
 
     // Avalanches of some lanes at `time`, of generation 0 (photons), 1 (releases of their carriers), ...
     MARS_INLINE void avalanche(Mask lanes, Time time, Int generation) {
+        if (!law_.on()) return;
         const Int left = minus_if(load<Int>(countdown_), lanes & (generation < law_.generations()));
         store(countdown_, left);
         const Mask due = left == 0;
@@ -109,6 +115,11 @@ private:
     int32_t countdown_[kLanes], frame_[kLanes], generation_[kLanes];
     float phase_[kLanes];
     std::vector<Carrier> waiting_[kLanes];
+};
+
+// In place of them where avalanches leave nothing.
+struct NoTraps {
+    explicit NoTraps(const Job&) {}
 };
 
 }  // namespace MARS_LEVEL

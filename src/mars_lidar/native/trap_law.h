@@ -17,6 +17,8 @@ public:
 
     explicit TrapLaw(const Job& job);
 
+    bool on() const { return traps_.mean > 0.0; }
+
     // Avalanches of generation 0 (photons), 1, ... leave carriers below this one.
     int32_t generations() const { return traps_.generations; }
 

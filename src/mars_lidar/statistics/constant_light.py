@@ -72,8 +72,11 @@ def _exponential(rate: float, dead: float, twilight: float, p: float, delay: flo
         def armed(s: float, seen: float = seen) -> float:  # P(no avalanche up to s after the recovery)
             return math.exp(-rate * s + seen * math.expm1(-s / delay))
 
+        def soon(x: float, seen: float = seen) -> float:  # its part that depends on the releases
+            return scale * math.exp(-rate * x * scale - seen) * math.expm1(seen * math.exp(-x * scale / delay))
+
         # E e^(-s / delay) of the next avalanche, by parts
-        mean = quad(lambda x: armed(x * scale) * scale, 0.0, 60.0 / (rate * scale), limit=400)[0]
+        mean = math.exp(-seen) / rate + quad(soon, 0.0, 60.0, epsabs=0.0, limit=400)[0]
         part = quad(lambda x: armed(x * scale) * math.exp(-x * scale / delay) * scale, 0.0, 60.0, limit=400)[0]
         decay = again + (1.0 - again) * (1.0 - part / delay)
         level, last, interval = p / (1.0 - math.exp(-dead / delay) * decay), interval, dead + (1.0 - again) * mean

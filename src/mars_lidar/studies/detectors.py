@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.detector import Detector
+from mars_lidar.effects import AVALANCHE_EFFECTS
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate_timestamps
@@ -105,11 +106,14 @@ def run(request: Request) -> list[Path]:
 
 def outcome(shown: Shown, exposures: int) -> Outcome:
     """Simulate one detector, and predict what is known of it."""
-    system = System(
-        period_ns=100.0, cycles=500, bins=200, pulse=GaussianPulse(sigma_ns=1.0), detector=shown.detector
-    )
-    times = simulate_timestamps(Flux(np.full((1, exposures), SIGNAL), BACKGROUND, DELAY_NS), system, seed=SEED)
-    counts = times.counts[0]
+    pulse = GaussianPulse(sigma_ns=1.0)
+    system = System(period_ns=100.0, cycles=500, bins=200, pulse=pulse, detector=shown.detector)
+    coupled = shown.detector.crosstalk is not None  # the exposures are then the pixels of one square image
+    side = round(math.sqrt(exposures))
+    flux = Flux(np.full((side, side) if coupled else (1, exposures), SIGNAL), BACKGROUND, DELAY_NS)
+    times = simulate_timestamps(flux, system, engine="sequential" if coupled else "exact", seed=SEED)
+    counts = times.counts.ravel()
+    exposures = counts.size
     each = np.bincount(times.bin, minlength=system.bins) / exposures
     item = np.repeat(np.arange(exposures), counts)
     second = _mean_square(item * system.bins + times.bin, exposures, system.bins)
@@ -127,7 +131,7 @@ def _mean_square(place: NDArray[np.int64], exposures: int, bins: int) -> FloatAr
 
 
 def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] | None, FloatArray | None]:
-    if system.detector.gate_moves:
+    if system.detector.gate_moves or set(system.detector.effects) & set(AVALANCHE_EFFECTS):
         return None, None, None
     expected = mean_histogram(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
     if system.detector.mode == "paralyzable":

@@ -265,7 +265,8 @@ def _code_density(value: Any) -> tuple[float, ...]:
     widths = widths.astype(np.float64)
     bad = ~(np.isfinite(widths) & (widths >= 0.0))
     if bad.any() or not 0.0 < widths.sum() < math.inf:
-        raise ValueError(f"code_density must be finite, non-negative and not all 0, got {widths[bad][:1] or widths}")
+        got = f"{widths[bad][0]:g}" if bad.any() else f"a sum of {widths.sum():g}"
+        raise ValueError(f"code_density must be finite, non-negative and not all 0, got {got}")
     return tuple(widths.tolist())
 
 

@@ -91,22 +91,25 @@ def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.floa
 def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
     """Mean histogram (bins,) of pixel (y, x) over many exposures, by the exact finite-exposure statistics.
 
-    None where that takes too long for a picture, does not converge, or is not known: behind a gate that moves. The
-    engine "poisson" has no dead time: its mean is the incident rate, inside of the gate.
+    None where that takes too long for a picture, does not converge, or is not known: behind a gate that moves, with
+    limits on events. The engine "poisson" has no dead time: its mean is the detected rate, inside of the gate.
     """
+    from mars_lidar.statistics import ConvergenceError, mean_histogram
+    from mars_lidar.statistics.histogram import histogram_effects
+
     system, flux = cube.system, cube.flux
-    if system.detector.gate_moves:
+    effects = system.detector.effects
+    if system.detector.gate_moves or not set(effects) <= set(histogram_effects(system)):
         return None
     if cube.engine == "poisson" and system.detector.mode != "gated":
-        return incident_rate(flux, system, y, x) * system.cycles
+        return incident_rate(flux[y, x].detected(system), system, 0, 0) * system.cycles
     if system.cycles > _PREDICTED_CYCLES and system.detector.mode != "paralyzable":  # whose mean has a closed form
         return None
     if cube.engine == "poisson":
         system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))
-    from mars_lidar.statistics import ConvergenceError, mean_histogram
-
+    tolerance = 1e-2 if "electronics_dead_time_ns" in effects else 1e-4  # seconds each beyond that
     try:
-        return mean_histogram(system=system, **law_arguments(flux, system, y, x))
+        return mean_histogram(system=system, tolerance=tolerance, **law_arguments(flux, system, y, x))
     except ConvergenceError:
         return None
 

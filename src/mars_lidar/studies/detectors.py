@@ -17,7 +17,7 @@ from mars_lidar.effects import AVALANCHE_EFFECTS
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate_timestamps
-from mars_lidar.statistics import count_law, mean_histogram, paralyzable_moments
+from mars_lidar.statistics import count_law, electronics_moments, mean_histogram, paralyzable_moments
 from mars_lidar.studies import Request
 from mars_lidar.studies.report import configuration, save_csv, save_text, table
 from mars_lidar.system import System
@@ -28,6 +28,7 @@ SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
 SEED = 20
 _REACH = 3.0  # periods of inter-registration times that are shown
 _BINS_OF_INTERVALS = 150
+_SIMULATED_ONLY = (*AVALANCHE_EFFECTS, "max_events_per_period", "max_events_per_exposure")
 
 
 @dataclass(frozen=True)
@@ -131,9 +132,12 @@ def _mean_square(place: NDArray[np.int64], exposures: int, bins: int) -> FloatAr
 
 
 def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] | None, FloatArray | None]:
-    if system.detector.gate_moves or set(system.detector.effects) & set(AVALANCHE_EFFECTS):
+    if system.detector.gate_moves or set(system.detector.effects) & set(_SIMULATED_ONLY):
         return None, None, None
     expected = mean_histogram(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+    if "electronics_dead_time_ns" in system.detector.effects:
+        recorded = electronics_moments(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+        return expected, (float(recorded.mean), float(recorded.variance)), None
     if system.detector.mode == "paralyzable":
         found = paralyzable_moments(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
         return expected, (float(found.mean), float(found.variance)), None

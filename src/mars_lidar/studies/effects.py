@@ -59,7 +59,7 @@ def run(request: Request) -> list[Path]:
     """Write effects.md, effects.csv, effects_rate.csv and a figure for each group of effects."""
     from mars_lidar.studies.detector_figures import draw_all
 
-    exposures = 400 if request.quick else 40_000
+    exposures = 400 if request.quick else 10_000
     outcomes = []
     for shown in SHOWN:
         request.tell(f"effects: {shown.name}")

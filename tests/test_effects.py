@@ -18,6 +18,7 @@ from harness import (
     PERIOD_NS,
     SHAPE,
     Case,
+    JointLaw,
     Law,
     armed_count_pmf,
     check,
@@ -209,6 +210,17 @@ def test_electronics_dead_time_of_an_undisturbed_pixel_in_the_long_run():
         assert found.histogram.sum() == pytest.approx(found.mean)
     steps = np.diff(means, axis=0)
     assert steps[1] == pytest.approx(2.0 * steps[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("effects", [{"jitter": TAIL, "code_density": CODES}, {"jitter": SAMPLED}])
+def test_joint_law_of_records(effects: dict[str, Any]):
+    case = case_of(pixel(effects, dead=60.0), 20_000)
+    oracle = JointLaw.of(case)
+    check(ENGINES["exact"], case, oracle, {COUNTS, SHAPE, JOINT})
+    full = oracle.law.covariance()
+    assert np.allclose(np.diag(full), oracle.law.lag(0), rtol=1e-6)
+    assert np.allclose(full[np.arange(64), (np.arange(64) + 1) % 64], oracle.law.lag(1), atol=1e-6 * full.max())
+    assert oracle.law.count_variance == pytest.approx(float(full.sum()), rel=1e-6)
 
 
 def test_mars_draws_jittered_records():

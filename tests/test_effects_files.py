@@ -64,8 +64,10 @@ def test_engines_refuse_what_they_do_not_do(engine, name):
 def test_statistics_refuse_what_they_do_not_know(name):
     one = system(REAL.without(*(other for other in EFFECTS if other != name)))
     with pytest.raises(ValueError, match=f"does not do {name} of the detector.*simulate it with engine 'exact'"):
-        ml.joint_law(1.0, 0.5, one)
+        ml.holding_time_covariance(1.0, 0.5, one)
     if name not in TIMING_EFFECTS:
+        with pytest.raises(ValueError, match=f"joint_law.*{name}"):
+            ml.joint_law(1.0, 0.5, one)
         with pytest.raises(ValueError, match=f"count_law.*{name}"):
             ml.count_law(1.0, 0.5, one)
     with pytest.raises(ValueError, match=f"a table does not do {name}"):

@@ -8,7 +8,7 @@ solution for a window's weights gives the window's variance. Derivation and equa
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,9 +16,12 @@ from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
 from mars_lidar._memory import check_memory
+from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._joint_pixel import Pixel, movement
+from mars_lidar.statistics._joint_timed import TimedPixel
+from mars_lidar.statistics._timing import Timing, is_timed
 from mars_lidar.system import System
 
 _MAX_BINS = 2**20  # of the grid, unless the histogram itself has more
@@ -70,7 +73,21 @@ def joint_law(
             raise ValueError(f"{name} must be a scalar (one pixel), got shape {np.shape(value)}")
     if waveform is not None and np.ndim(waveform) != 1:
         raise ValueError(f"waveform must be (T,) of one pixel, got shape {np.shape(waveform)}")
-    cells = Cells.of(signal, background, system, delay_ns=delay_ns, waveform=waveform)
+    cells = Cells.of(
+        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="joint_law",
+        effects=LIGHT_EFFECTS + TIMING_EFFECTS,
+    )  # fmt: skip
+    if not is_timed(system):
+        return replace(_law(cells, tolerance), system=system)
+    timing = Timing(cells.system, cells.finest)
+    law = _law(replace(cells, system=timing.untimed), tolerance)
+    pixel = TimedPixel(law._pixel, law.mean, timing) if isinstance(law._pixel, Pixel) else None
+    return replace(law, system=system, mean=timing.forward(law.mean), _pixel=pixel)
+
+
+def _law(cells: Cells, tolerance: float) -> JointLaw:
+    """The law of registrations of checked cells."""
+    system = cells.system
     if system.dead_time_periods == 0.0 or cells.signal[0] + cells.background[0] == 0.0:
         return _poisson(cells)
     out = system.bins
@@ -117,7 +134,7 @@ class JointLaw:
     movement: float
     grid_bins: int
     settled: int
-    _pixel: Pixel | None = field(repr=False)
+    _pixel: Pixel | TimedPixel | None = field(repr=False)
 
     @property
     def sweeps(self) -> int:

@@ -18,6 +18,7 @@ from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate
 from mars_lidar.statistics import JointLaw, joint_law
+from mars_lidar.statistics._joint_pixel import Pixel
 from mars_lidar.studies import Tell
 from mars_lidar.system import Detector, System
 
@@ -172,7 +173,7 @@ def variance_scores(x: FloatArray, variance: FloatArray) -> FloatArray:
 
 def leading(law: JointLaw, weights: FloatArray) -> float:
     """Variance of a window by the term that grows with the exposure alone, without start and end."""
-    assert law._pixel is not None
+    assert isinstance(law._pixel, Pixel)
     assert law._pixel.law is not None
     return law._pixel.law.leading(np.repeat(weights, law.grid_bins // weights.size))
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import stats
+from typer.testing import CliRunner
 
 import mars_lidar as ml
 from harness import (
@@ -24,7 +26,8 @@ from harness import (
     two_lobes,
     two_mean_vectors,
 )
-from mars_lidar import _core, statistics
+from mars_lidar import _core, io, statistics
+from mars_lidar.cli import app
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.statistics import constant_light_rate
@@ -283,3 +286,31 @@ def test_round_trip_and_preset():
     assert ml.Detector.from_dict({"preset": "excelitas-spcm-aqrh", "dead_time_ns": 30.0}).dead_time_ns == 30.0
     # all of its afterpulses outlive the recovery
     assert module.afterpulsing.cumulative(module.dead_time_ns) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_command_line(tmp_path: Path):
+    def run(*options: str) -> Any:
+        return CliRunner().invoke(app, ["simulate", "--scene", "room", "--size", "4", "--no-picture", *options])
+
+    file = tmp_path / "module.npz"
+    done = run("--detector", "excelitas-spcm-aqrh", "--twilight-ns", "1.5", "-o", str(file))
+    assert done.exit_code == 0, done.output
+    detector = io.load(file).system.detector
+    assert detector == replace(ml.Detector.preset("excelitas-spcm-aqrh"), twilight_ns=1.5)
+    file = tmp_path / "crosstalk.npz"
+    done = run("--crosstalk", "0.1", "--crosstalk-kernel", "4", "--engine", "sequential", "-o", str(file))
+    assert done.exit_code == 0, done.output
+    cube = io.load(file)
+    assert cube.system.detector.crosstalk == ml.Crosstalk(probability=0.1, kernel="4")
+    assert np.array_equal(io.regenerate(cube), cube.histogram)
+    with pytest.raises(ValueError, match="rows must be all 4 rows with crosstalk"):
+        io.regenerate(cube, rows=slice(1, 2))
+    for options, told in (
+        (("--afterpulse-delay-ns", "3"), "belong together"),
+        (("--crosstalk-kernel", "4"), "belongs to --crosstalk"),
+        (("--crosstalk", "0.1"), "use 'sequential'"),
+        (("--detector", "spad"), "excelitas-spcm-aqrh"),
+    ):
+        failed = run(*options, "-o", str(tmp_path / "not.npz"))
+        assert failed.exit_code != 0
+        assert told in " ".join(failed.output.split())

@@ -17,7 +17,7 @@ from mars_lidar.studies import Request
 from mars_lidar.studies.detectors import DEAD_NS, SEED, Shown, _settings, outcome, row
 from mars_lidar.studies.report import configuration, save_csv, save_text, table
 
-CODES = tuple(1.0 + 0.6 * np.cos(np.pi * k) + 0.2 * np.sin(0.7 * k) for k in range(8))
+CODES = tuple(1.0 + 0.25 * np.sin(2.0 * np.pi * k / 8.0) for k in range(8))
 SHOWN = (
     Shown("free running", "", Detector(dead_time_ns=DEAD_NS)),
     Shown("efficiency 0.3", "light", Detector(dead_time_ns=DEAD_NS, detection_efficiency=0.3)),
@@ -49,7 +49,7 @@ SHOWN = (
         "jitter",
         Detector(dead_time_ns=DEAD_NS, jitter=Jitter(sigma_ns=0.5, tail_ns=6.0, tail_fraction=0.4)),
     ),
-    Shown("codes of 0.4 to 1.8 bins", "converter", Detector(dead_time_ns=DEAD_NS, code_density=CODES)),
+    Shown("codes of 0.75 to 1.25 bins", "converter", Detector(dead_time_ns=DEAD_NS, code_density=CODES)),
     Shown("1 event a period", "limits", Detector(dead_time_ns=DEAD_NS, max_events_per_period=1)),
     Shown("400 events an exposure", "limits", Detector(dead_time_ns=DEAD_NS, max_events_per_exposure=400)),
 )

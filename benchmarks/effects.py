@@ -15,10 +15,13 @@ from benchmarks.timing import in_turn
 from benchmarks.workload import EngineRun, Workload, maps, system
 
 GOAL_JITTER = 1.3
+GOAL_AFTERPULSING = 2.0
 _IDEAL = "ideal pixel (reference)"
 _JITTER = "jitter, Gaussian"
+_AFTERPULSING = "afterpulsing, {:g} carriers an avalanche"
 _NOTE = (
-    "One thread, widest level, warm memory. Every row draws the same registrations but for those of the efficiency; "
+    "One thread, widest level, warm memory. Every row draws the same registrations but for those of the efficiency and "
+    "of afterpulses; "
     "with the electronics' dead time and the limits fewer of them are recorded. The sampled jitter has 60 samples, the "
     "tail takes a tenth of the records, 64 codes repeat."
 )
@@ -43,6 +46,11 @@ def detector_effects(config: Config, bandwidth: Bandwidth) -> Section:
     detectors["all that act on records"] = {
         name: value for effects in list(detectors.values())[2:] for name, value in effects.items()
     } | {"jitter": ml.Jitter(sigma_ns=0.05, tail_ns=0.2, tail_fraction=0.1)}
+    for share in (0.02, 0.2):
+        detectors[_AFTERPULSING.format(share)] = {"afterpulsing": ml.Afterpulsing(probability=share, delay_ns=60.0)}
+    detectors["preset of a module: afterpulses, twilight pulses"] = {
+        name: getattr(ml.Detector.preset("excelitas-spcm-aqrh"), name) for name in ("afterpulsing", "twilight_ns")
+    }
     workloads = {
         name: Workload(flux, instrument.replace(detector=dataclasses.replace(instrument.detector, **effects)))
         for name, effects in detectors.items()
@@ -56,6 +64,9 @@ def detector_effects(config: Config, bandwidth: Bandwidth) -> Section:
         row["ns/reg/core"] = 1e9 * times[row["case"]].cpu_median / ideal.registrations
     cost = times[_JITTER].cpu_median / times[_IDEAL].cpu_median
     section.goals.append(Goal("exact with Gaussian jitter: time over that of the ideal pixel", cost, GOAL_JITTER, ""))
+    rare = _AFTERPULSING.format(0.02)
+    cost = times[rare].cpu_median / times[_IDEAL].cpu_median
+    section.goals.append(Goal(f"exact with {rare}: time over that of the ideal pixel", cost, GOAL_AFTERPULSING, ""))
     return section
 
 

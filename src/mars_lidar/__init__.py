@@ -1,6 +1,7 @@
 """mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
 
 from mars_lidar._version import __version__
+from mars_lidar.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.dark_counts import dark_count_map
 from mars_lidar.dataset.run import Generated, generate
 from mars_lidar.effects import Jitter, SampledJitter
@@ -22,8 +23,10 @@ from mars_lidar.table import Lookup, QuantisationError, Table
 from mars_lidar.timestamps import Timestamps
 
 __all__ = [
+    "Afterpulsing",
     "Calibration",
     "CountLaw",
+    "Crosstalk",
     "Detector",
     "Flux",
     "GaussianPulse",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from mars_lidar import _validate, effects
+from mars_lidar.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.effects import Jitter, SampledJitter
 
 Mode = Literal["nonparalyzable", "paralyzable", "synchronous", "gated"]
@@ -53,6 +54,13 @@ class Detector:
     dark_count_hz
         Rate of avalanches without a photon, counts/s: uniform in time, in the gate of a gated pixel only. Rates pixel
         by pixel: `Flux.with_dark_counts`.
+    afterpulsing
+        `Afterpulsing`: carriers that an avalanche leaves in traps and that trigger others when they are released.
+    twilight_ns
+        Arrivals within this time before the end of a dead time, ns, are not lost: the pixel fires at its end (a
+        twilight pulse). At most the dead time; mode ``"nonparalyzable"`` only.
+    crosstalk
+        `Crosstalk`: avalanches trigger neighbouring pixels. The pixels of an image then depend on each other.
     electronics_dead_time_ns
         An avalanche is recorded only where none was within this time before it, t_e, ns, beside the dead time of the
         pixel itself; without effect unless longer. The electronics are ready at the start of an exposure.
@@ -75,6 +83,9 @@ class Detector:
     gate_cycles: int | None = None
     detection_efficiency: float = 1.0
     dark_count_hz: float = 0.0
+    afterpulsing: Afterpulsing | None = None
+    twilight_ns: float = 0.0
+    crosstalk: Crosstalk | None = None
     electronics_dead_time_ns: float = 0.0
     max_events_per_period: int | None = None
     max_events_per_exposure: int | None = None
@@ -88,6 +99,7 @@ class Detector:
                 set_field(self, name, field.checked(getattr(self, name)))
         set_field(self, "dead_time_ns", _validate.real("dead_time_ns", self.dead_time_ns, low=0.0))
         _validate.choice("mode", self.mode, MODES)
+        self._check_avalanches()
         if self.mode != "gated":
             for name in _GATE:
                 if getattr(self, name) is not None:
@@ -119,6 +131,33 @@ class Detector:
                 f"got gate_cycles={self.gate_cycles} with gate_step_ns=0"
             )
 
+    @classmethod
+    def preset(cls, name: str) -> Detector:
+        """A detector as published, by its name in `mars_lidar.presets.PRESETS` (docs/detectors.md).
+
+        `dataclasses.replace` changes fields. Efficiencies are left at 1: they go with the wavelength.
+        """
+        from mars_lidar.presets import preset
+
+        return preset(name)
+
+    def _check_avalanches(self) -> None:
+        if self.twilight_ns > 0.0 and self.mode != "nonparalyzable":
+            raise ValueError(
+                "twilight_ns belongs to mode 'nonparalyzable', whose pixel recovers at the end of the dead time, "
+                f"and must be 0 with mode {self.mode!r}, got {self.twilight_ns:g}"
+            )
+        if self.twilight_ns > self.dead_time_ns:
+            raise ValueError(
+                f"twilight_ns must lie in [0, {self.dead_time_ns:g}], the dead time at whose end it is, "
+                f"got {self.twilight_ns:g}"
+            )
+        if self.crosstalk is not None and self.dead_time_ns == 0.0:
+            raise ValueError(
+                "crosstalk needs dead_time_ns > 0: pixels that are never blind would trigger each other back and "
+                "forth at one instant, got dead_time_ns=0"
+            )
+
     @property
     def effects(self) -> tuple[str, ...]:
         """Names of the effects that are on and change anything, in the order in which they act."""
@@ -147,6 +186,8 @@ class Detector:
         """Raise ValueError, naming the field, for what makes no sense at this laser period, binning and start."""
         if self.jitter is not None:
             self.jitter.check(period_ns)
+        if self.afterpulsing is not None:
+            self.afterpulsing.check(period_ns)
         if self.code_density is not None and bins % len(self.code_density):
             raise ValueError(
                 f"code_density must have a number of codes that divides the {bins} bins of the histogram, "
@@ -176,9 +217,11 @@ class Detector:
 
     @classmethod
     def from_dict(cls, data: Any) -> Detector:
-        """The detector that `to_dict` described."""
+        """The detector that `to_dict` described; ``preset: NAME`` stands for the fields of a preset."""
         names = tuple(field.name for field in dataclasses.fields(cls))
-        known = dict(_validate.known_keys("detector", data, names))
+        known = dict(_validate.known_keys("detector", data, (*names, "preset")))
+        if "preset" in known:
+            known = cls.preset(known.pop("preset")).to_dict() | known
         for name, field in effects.FIELDS.items():
             if field.read is not None and known.get(name) is not None:
                 known[name] = field.read(known[name])

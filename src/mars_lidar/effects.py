@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.pulse import FWHM_PER_SIGMA, SampledPulse
 
 if TYPE_CHECKING:
@@ -24,13 +25,16 @@ if TYPE_CHECKING:
 LIGHT_EFFECTS = ("detection_efficiency", "dark_count_hz")
 """What changes the flux only, `Flux.detected`: every engine and statistic takes it."""
 
+AVALANCHE_EFFECTS = ("afterpulsing", "twilight_ns", "crosstalk")
+"""What avalanches leave behind: further arrivals, in the same pixel or in its neighbours."""
+
 TIMING_EFFECTS = ("jitter", "code_density")
 """What moves records and leaves their number as it is."""
 
 RECORDING_EFFECTS = ("electronics_dead_time_ns", "max_events_per_period", "max_events_per_exposure", *TIMING_EFFECTS)
 """What happens to the registrations of a pixel, in order: which are recorded, and at what time."""
 
-EFFECTS = (*LIGHT_EFFECTS, *RECORDING_EFFECTS)
+EFFECTS = (*LIGHT_EFFECTS, *AVALANCHE_EFFECTS, *RECORDING_EFFECTS)
 """Names of all effects: fields of `Detector`."""
 
 _MAX_RATE_HZ = 1e12
@@ -245,6 +249,12 @@ def _jitter(value: Any) -> Jitter | SampledJitter:
     return value
 
 
+def _instance(name: str, value: Any, of: type) -> Any:
+    if not isinstance(value, of):
+        raise TypeError(f"{name} must be of type {of.__name__}, got {value!r}")
+    return value
+
+
 def _code_density(value: Any) -> tuple[float, ...]:
     widths = np.asarray(value)
     if widths.dtype.kind not in "fiu" or widths.ndim != 1 or not 2 <= widths.size <= _MAX_CODES:
@@ -265,6 +275,9 @@ FIELDS: dict[str, Field] = {
         1.0, lambda v: _validate.real("detection_efficiency", v, low=0.0, high=1.0, strict_low=True)
     ),
     "dark_count_hz": Field(0.0, lambda v: _validate.real("dark_count_hz", v, low=0.0, high=_MAX_RATE_HZ)),
+    "afterpulsing": Field(None, lambda v: _instance("afterpulsing", v, Afterpulsing), Afterpulsing.from_dict),
+    "twilight_ns": Field(0.0, lambda v: _validate.real("twilight_ns", v, low=0.0)),
+    "crosstalk": Field(None, lambda v: _instance("crosstalk", v, Crosstalk), Crosstalk.from_dict),
     "electronics_dead_time_ns": Field(0.0, lambda v: _validate.real("electronics_dead_time_ns", v, low=0.0)),
     "max_events_per_period": Field(
         None, lambda v: _validate.integer("max_events_per_period", v, low=1, high=_MAX_EVENTS)
@@ -296,6 +309,6 @@ def require_effects(what: str, detector: Detector, able: tuple[str, ...], instea
     """Raise ValueError, naming the first effect that is on and not in `able`, and what `instead` says of it."""
     for name in detector.effects:
         if name not in able:
-            raise ValueError(
-                f"{what} does not do {name} of the detector, got {plain(getattr(detector, name))!r}{instead(name)}"
-            )
+            value = repr(getattr(detector, name))
+            told = value if len(value) <= 100 else f"{value[:97]}..."
+            raise ValueError(f"{what} does not do {name} of the detector, got {told}{instead(name)}")

@@ -179,6 +179,11 @@ def _task(
     drawn_by.check_effects(system)
     drawn_by.check(flux, system)
     index = _pixel_index(pixel_index, flux.shape)
+    if system.detector.crosstalk is not None and not np.array_equal(index, np.arange(index.size)):
+        raise ValueError(
+            "pixel_index must be that of a whole image with crosstalk, 0 to H * W - 1: pixels depend on each other, "
+            f"so that no part of it can be made alone, got {index[0]} to {index[-1]}"
+        )
     return Task(flux, system, number, first, index, seed, team, progress)
 
 
@@ -207,6 +212,9 @@ def _check_registrations(flux: Flux, system: System) -> None:
         most, what = photons * (system.cycles + dead), "arrivals of mode 'paralyzable'"
     elif mode == "synchronous":
         most = min(most, float(system.cycles))
+    traps = system.detector.afterpulsing
+    if traps is not None:  # each avalanche is followed by up to p / (1 - p) others
+        most /= 1.0 - traps.probability
     if most > 0.5 * _MAX_REGISTRATIONS:
         raise ValueError(
             f"a pixel must have at most {0.5 * _MAX_REGISTRATIONS:.3g} expected {what}, "

@@ -48,9 +48,17 @@ detector:
 #   gate_width_ns: 20.0  # for this long; may reach round the end of the period
 #   gate_step_ns: 0.0    # moves by this ...
 #   gate_cycles: 1       # ... every so many periods (more than 1 only with a step)
+# A published detector:  preset: excelitas-spcm-aqrh  with other fields to change
 # Effects, off unless given, in the order in which they act (docs/detectors.md); further lines of detector:
 #   detection_efficiency: 0.25       # then S and B are photons on the pixel, not detectable ones
 #   dark_count_hz: 100.0             # counts/s of every pixel
+#   afterpulsing:                    # carriers in traps: each that is released is an arrival like a photon
+#     probability: 0.02              # mean number per avalanche, those included that are lost in the dead time
+#     delay_ns: 60.0                 # exponential after the avalanche; or  delays: [0, 3, 2, 1]  with  bin_ns: 40.0
+#   twilight_ns: 2.0                 # photons so late in the dead time fire at its end
+#   crosstalk:                       # avalanches trigger neighbours; with the sequential engine
+#     probability: 0.01              # mean number of neighbours
+#     kernel: "8"                    # or "4", or 3 x 3 weights
 #   electronics_dead_time_ns: 120.0  # of the TDC, beside that of the pixel; matters where it is longer
 #   max_events_per_period: 1         # the TDC records the first ones only, of a period ...
 #   max_events_per_exposure: 1000    # ... and of an exposure

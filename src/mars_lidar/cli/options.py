@@ -119,6 +119,13 @@ PeriodNs = Annotated[
     float | None,
     _option("--period-ns", panel=_SYSTEM, help="Laser period, ns.", default="133.33, 7.5 MHz"),
 ]
+DetectorPreset = Annotated[
+    str | None,
+    _option(
+        "--detector", panel=_SYSTEM,
+        help="Detector by name, in place of the file's (docs/detectors.md): excelitas-spcm-aqrh.",
+    ),
+]
 DeadTimeNs = Annotated[
     float | None,
     _option("--dead-time-ns", panel=_SYSTEM, help="Dead time after a registration, ns.", default="75"),
@@ -195,6 +202,36 @@ DetectionEfficiency = Annotated[
 DarkCountHz = Annotated[
     float | None,
     _option("--dark-count-hz", panel=_EFFECTS, help="Dark counts of every pixel, counts/s.", default="0"),
+]
+AfterpulseProbability = Annotated[
+    float | None,
+    _option(
+        "--afterpulse-probability", panel=_EFFECTS,
+        help="Mean number of trapped carriers that an avalanche leaves, those lost in the dead time included ...",
+        default="0",
+    ),
+]
+AfterpulseDelayNs = Annotated[
+    float | None,
+    _option("--afterpulse-delay-ns", panel=_EFFECTS, help="... and their mean delay after the avalanche, ns."),
+]
+TwilightNs = Annotated[
+    float | None,
+    _option(
+        "--twilight-ns", panel=_EFFECTS, default="0",
+        help="Arrivals this long before the end of the dead time fire at its end, ns.",
+    ),
+]
+Crosstalk = Annotated[
+    float | None,
+    _option(
+        "--crosstalk", panel=_EFFECTS, default="0",
+        help="Mean number of neighbours that an avalanche triggers; with --engine sequential.",
+    ),
+]
+CrosstalkKernel = Annotated[
+    str | None,
+    _option("--crosstalk-kernel", panel=_EFFECTS, help="Which neighbours: 4 or 8.", default="8"),
 ]
 ElectronicsDeadTimeNs = Annotated[
     float | None,

@@ -26,6 +26,11 @@ class Effects:
 
     detection_efficiency: float | None
     dark_count_hz: float | None
+    afterpulse_probability: float | None
+    afterpulse_delay_ns: float | None
+    twilight_ns: float | None
+    crosstalk: float | None
+    crosstalk_kernel: str | None
     electronics_dead_time_ns: float | None
     max_events_per_period: int | None
     max_events_per_exposure: int | None
@@ -40,6 +45,15 @@ class Effects:
         """Fields of `Detector`, as plain data."""
         told: dict[str, Any] = {name: getattr(self, name) for name in FIELDS if hasattr(self, name)}
         told["jitter"] = self._jitter()
+        told["afterpulsing"] = _together(
+            {"probability": self.afterpulse_probability, "delay_ns": self.afterpulse_delay_ns},
+            "--afterpulse-probability and --afterpulse-delay-ns",
+        )
+        if self.crosstalk_kernel is not None and self.crosstalk is None:
+            raise ValueError("--crosstalk-kernel belongs to --crosstalk, which is not given")
+        told["crosstalk"] = None
+        if self.crosstalk is not None:
+            told["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
         if self.code_density_file is not None:
             told["code_density"] = _array("--code-density-file", self.code_density_file)
         return {name: value for name, value in told.items() if value is not None}
@@ -63,12 +77,20 @@ class Effects:
         return {"kind": "gaussian", **gaussian} if gaussian else None
 
 
+def _together(values: dict[str, Any], names: str) -> dict[str, Any] | None:
+    given = [value is not None for value in values.values()]
+    if any(given) and not all(given):
+        raise ValueError(f"{names} belong together: both, or neither")
+    return values if all(given) else None
+
+
 def build_system(
     file: Path | None,
     *,
     period_ns: float | None,
     cycles: int | None,
     bins: int | None,
+    preset: str | None = None,
     dead_time_ns: float | None,
     mode: str | None = None,
     gate_start_ns: float | None = None,
@@ -85,6 +107,8 @@ def build_system(
 ) -> System:
     """The system of `file` (or the default one) with the options that are not None in place of its values."""
     base = DEFAULT_SYSTEM if file is None else System.load(file)
+    if preset is not None:
+        base = base.replace(detector=Detector.preset(preset))
     changes: dict[str, Any] = {
         "period_ns": period_ns,
         "cycles": cycles,

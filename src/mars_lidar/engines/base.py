@@ -90,8 +90,27 @@ class Task:
             gate_width=width,
             gate_step=step,
             gate_cycles=detector.gate_cycles or 1,
+            **self._avalanches(),
             recording=_recording(detector, self.system.period_ns) if detector.effects else None,
         )
+
+    def _avalanches(self) -> dict[str, Any]:
+        """What avalanches leave behind, as the native job takes it; only what is on."""
+        detector, period = self.system.detector, self.system.period_ns
+        told: dict[str, Any] = {}
+        traps, crosstalk = detector.afterpulsing, detector.crosstalk
+        if traps is not None:
+            told |= {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period}
+            if traps.delays is not None:
+                told |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period}
+            if traps.generations is not None:
+                told["generations"] = traps.generations
+        if detector.twilight_ns:
+            told["twilight"] = detector.twilight_ns / period
+        if crosstalk is not None:
+            height, width = self.flux.shape
+            told |= {"crosstalk": crosstalk.probabilities, "height": height, "width": width}
+        return told
 
 
 @dataclass(frozen=True, eq=False)

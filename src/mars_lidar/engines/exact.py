@@ -24,7 +24,7 @@ class ExactEngine(Engine):
     name = "exact"
     description = "every registered photon, nothing approximated; the default"
     modes = MODES
-    effects = EFFECTS
+    effects = tuple(name for name in EFFECTS if name != "crosstalk")
 
     def __init__(self, level: str = "") -> None:
         self.level = level

@@ -135,6 +135,8 @@ class Recipe:
                 yield slice(first, min(first + step, realizations)), slice(0, height)
             return
         band = max(chunks[1], BLOCK_BYTES // row_bytes // chunks[1] * chunks[1])
+        if self.system.detector.crosstalk is not None:  # no part of an image can be made alone
+            band = height
         for k in range(realizations):
             for row in range(0, height, band):
                 yield slice(k, k + 1), slice(row, min(row + band, height))
@@ -144,7 +146,12 @@ class Recipe:
 
         Both slices count from the start of this cube and have explicit ends.
         """
-        width = self.flux.shape[1]
+        height, width = self.flux.shape
+        if self.system.detector.crosstalk is not None and (rows.start, rows.stop) != (0, height):
+            raise ValueError(
+                f"rows must be all {height} rows with crosstalk, where the pixels of an image depend on each other, "
+                f"got {rows.start} to {rows.stop}"
+            )
         index = self.pixel_index
         first, last = rows.start * width, rows.stop * width
         return {

@@ -15,13 +15,14 @@
 #include "exact_start.h"
 #include "parallel.h"
 #include "pulse_table.h"
+#include "trap_law.h"
 
 namespace mars {
 namespace {
 
 struct Level {
     const char* name;
-    ExactKernel kernel, modes, recording;  // free running, all other modes, and any with a recorder
+    ExactKernel kernel, modes, recording, avalanches;  // free running, all other modes, any with more to it
 };
 
 // Widest first.
@@ -30,24 +31,28 @@ std::vector<Level> levels() {
 #if defined(MARS_HAS_avx512)
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        found.push_back({"avx512", exact_kernel_avx512, exact_modes_kernel_avx512, exact_recording_kernel_avx512});
+        found.push_back({"avx512", exact_kernel_avx512, exact_modes_kernel_avx512, exact_recording_kernel_avx512,
+                         exact_avalanche_kernel_avx512});
 #endif
 #if defined(MARS_HAS_avx2)
     if (__builtin_cpu_supports("avx2"))
-        found.push_back({"avx2", exact_kernel_avx2, exact_modes_kernel_avx2, exact_recording_kernel_avx2});
+        found.push_back({"avx2", exact_kernel_avx2, exact_modes_kernel_avx2, exact_recording_kernel_avx2,
+                         exact_avalanche_kernel_avx2});
 #endif
 #if defined(MARS_HAS_vector128)
-    found.push_back(
-        {"vector128", exact_kernel_vector128, exact_modes_kernel_vector128, exact_recording_kernel_vector128});
+    found.push_back({"vector128", exact_kernel_vector128, exact_modes_kernel_vector128,
+                     exact_recording_kernel_vector128, exact_avalanche_kernel_vector128});
 #endif
-    found.push_back({"scalar", exact_kernel_scalar, exact_modes_kernel_scalar, exact_recording_kernel_scalar});
+    found.push_back({"scalar", exact_kernel_scalar, exact_modes_kernel_scalar, exact_recording_kernel_scalar,
+                     exact_avalanche_kernel_scalar});
     return found;
 }
 
 ExactKernel kernel_of(const std::string& name, const Job& job) {
     for (const Level& level : levels())
         if (name.empty() || name == level.name)
-            return job.recording                                ? level.recording
+            return job.avalanches_matter()                     ? level.avalanches
+                   : job.recording                             ? level.recording
                    : job.mode == DetectorMode::kNonparalyzable ? level.kernel
                                                                : level.modes;
     throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
@@ -70,8 +75,14 @@ void run_exact(const BoundJob& job, const PulseTable& pulse, ExactBlock proto, i
         std::vector<float> phase;
         block.start_cycle = nullptr;
         block.start_phase = nullptr;
-        if (job.stationary && job.dead_time > 0.0) {
-            draw_starts(job, pulse, block, cycle, phase);
+        const bool avalanches = job.avalanches_matter();
+        if (job.stationary && (job.dead_time > 0.0 || avalanches)) {
+            if (job.dead_time > 0.0) draw_starts(job, pulse, block, cycle, phase);
+            if (avalanches) {  // from the state without afterpulses
+                cycle.resize(static_cast<size_t>(block.items), 0);
+                phase.resize(static_cast<size_t>(block.items), 0.0f);
+                for (int32_t& start : cycle) start -= settling_periods(job);
+            }
             block.start_cycle = cycle.data();
             block.start_phase = phase.data();
         }

@@ -37,21 +37,25 @@ using ExactKernel = void (*)(const ExactBlock&);
 void exact_kernel_scalar(const ExactBlock& block);
 void exact_modes_kernel_scalar(const ExactBlock& block);
 void exact_recording_kernel_scalar(const ExactBlock& block);
+void exact_avalanche_kernel_scalar(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_vector128
 void exact_kernel_vector128(const ExactBlock& block);
 void exact_modes_kernel_vector128(const ExactBlock& block);
 void exact_recording_kernel_vector128(const ExactBlock& block);
+void exact_avalanche_kernel_vector128(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_avx2
 void exact_kernel_avx2(const ExactBlock& block);
 void exact_modes_kernel_avx2(const ExactBlock& block);
 void exact_recording_kernel_avx2(const ExactBlock& block);
+void exact_avalanche_kernel_avx2(const ExactBlock& block);
 #endif
 #ifdef MARS_HAS_avx512
 void exact_kernel_avx512(const ExactBlock& block);
 void exact_modes_kernel_avx512(const ExactBlock& block);
 void exact_recording_kernel_avx512(const ExactBlock& block);
+void exact_avalanche_kernel_avx512(const ExactBlock& block);
 #endif
 
 }  // namespace mars

@@ -54,6 +54,15 @@ struct FrameClock {
         r.bin = convert<timed>(codes, bins, r.phase);
     }
 
+    // The time of a lane as whole frames and the rest of one in [0, 1), or in units of 2^-32.
+    static int32_t whole(const TimeArray& from, int lane) { return from.frame[lane]; }
+    static double rest(const TimeArray& from, int lane) { return static_cast<double>(from.phase[lane]) + 0.5; }
+    static void put(TimeArray& to, int lane, int32_t whole, uint32_t rest) {
+        const float phase = static_cast<float>(static_cast<int64_t>(rest)) * 0x1p-32f - 0.5f;
+        to.frame[lane] = whole;
+        to.phase[lane] = phase < 0.5f ? phase : 0x1.fffffep-2f;
+    }
+
     int32_t bins, dead_whole;
     float dead_fraction;
 };

@@ -12,6 +12,7 @@
 #include "exact_recorder.h"
 #include "exact_writers.h"
 #include "pulse_view.h"
+#include "trap_lanes.h"
 
 #define MARS_JOIN2(a, b) a##b
 #define MARS_JOIN(a, b) MARS_JOIN2(a, b)
@@ -60,9 +61,14 @@ MARS_INLINE Rate load_rate(const RateArray& from) {
 
 template <DetectorMode mode, bool gaussian, bool whole, Stage stage, Sink sink>
 class Runner {
+    static constexpr bool kRecords = stage != Stage::kPlain, kTraps = stage == Stage::kAvalanches;
+    static_assert(!(kTraps && whole && mode == DetectorMode::kNonparalyzable), "twilight moves the search");
+
 public:
     explicit Runner(const ExactBlock& block)
-        : block_(block), job_(*block.job), system_(view(job_, *block.pulse)), recorder_(job_), writer_(block) {}
+        : block_(block), job_(*block.job), system_(view(job_, *block.pulse)), recorder_(job_), traps_(job_),
+          twilight_whole_(static_cast<int32_t>(job_.twilight)),
+          twilight_fraction_(static_cast<float>(job_.twilight - twilight_whole_)), writer_(block) {}
 
     void run() {
         for (int lane = 0; lane < kLanes; ++lane) take(lane);
@@ -71,7 +77,7 @@ public:
             for (int k = 0; k < kAhead; ++k)
                 ahead_[k] = draw(background_, returns_[0].flux, key0_, key1_, event_ + static_cast<uint32_t>(k));
             for (int k = 0; k < kAhead; ++k) step(k);
-            if constexpr (stage == Stage::kRecording) record();
+            if constexpr (kRecords) record();
             event_ = event_ + static_cast<uint32_t>(kAhead);
             rows_ += kAhead;
             if (any(armed_.frame > system_.cycles)) exchange();
@@ -82,8 +88,12 @@ public:
 
 private:
     MARS_INLINE void step(int k) {
-        const Time hit = next_registration<gaussian, whole>(system_, returns_, armed_, ahead_[k], key0_, key1_,
-                                                            event_ + static_cast<uint32_t>(k), memory_);
+        const UInt event = event_ + static_cast<uint32_t>(k);
+        Time from = armed_;
+        if constexpr (kTraps) from = search_start(event);
+        Time hit = next_registration<gaussian, whole>(system_, returns_, from, ahead_[k], key0_, key1_, event, memory_);
+        Int generation = splat(0);
+        if constexpr (kTraps) generation = earliest_arrival(hit);
         if constexpr (mode == DetectorMode::kNonparalyzable) armed_ = rearm(system_, hit);
         // from the frames of the first return to laser periods
         const Float shifted = hit.phase + delay_;
@@ -93,10 +103,14 @@ private:
         const Int bin = minimum(truncate(phase * static_cast<float>(system_.bins)), splat(system_.bins - 1));
         // inside the exposure: 0 <= cycle < cycles, one unsigned comparison
         Mask outside = as_uint(cycle) >= static_cast<uint32_t>(system_.cycles);
-        if constexpr (mode != DetectorMode::kNonparalyzable)
-            outside = outside | advance<mode>(system_, hit, cycle, phase, delay_, event_ + static_cast<uint32_t>(k),
-                                              armed_, memory_);
-        if constexpr (stage == Stage::kRecording) {
+        if constexpr (mode != DetectorMode::kNonparalyzable) {
+            const Mask unseen = advance<mode>(system_, hit, cycle, phase, delay_, event, armed_, memory_);
+            if constexpr (kTraps) traps_.avalanche(select(unseen, splat(1), splat(0)) == 0, hit, generation);
+            outside = outside | unseen;
+        } else if constexpr (kTraps) {
+            traps_.avalanche(splat(0) == 0, hit, generation);
+        }
+        if constexpr (kRecords) {
             seen_[k] = {hit, cycle, phase, outside, bin};
             return;
         }
@@ -118,6 +132,35 @@ private:
             log(rows_ + k, seen_[k].lost, seen_[k].bin, seen_[k].cycle, seen_[k].phase);
         if (recorder_.fills())  // nothing more can be recorded there
             armed_.frame = select(recorder_.full(), splat(kIdleFrame), armed_.frame);
+    }
+
+    // Where the search for the next arrival begins: twilight pulses are of arrivals before the pixel is armed. Carriers
+    // released before that are lost.
+    MARS_INLINE Time search_start(UInt event) {
+        Time from = armed_;
+        if constexpr (mode == DetectorMode::kNonparalyzable) {
+            const Float phase = armed_.phase - twilight_fraction_;
+            const Mask wrap = phase < -0.5f;
+            const Time before_armed = {minus_if(armed_.frame - twilight_whole_, wrap), plus_if(phase, wrap)};
+            from = earlier(event > 0u, before_armed, armed_);  // no avalanche before the first
+        }
+        traps_.lose(from);
+        return from;
+    }
+
+    // Of the next photon and the next carrier the one that comes first is the next arrival; its generation.
+    MARS_INLINE Int earliest_arrival(Time& hit) {
+        const Time release = traps_.next();
+        const Mask first = before(release, hit);
+        Int generation = splat(0);
+        if (any(first)) {
+            hit = earlier(first, release, hit);
+            generation = select(first, traps_.generation(), generation);
+            memory_.known = memory_.known & (select(first, splat(1), splat(0)) == 0);
+            traps_.drop(first);
+        }
+        if constexpr (mode == DetectorMode::kNonparalyzable) hit = earlier(before(hit, armed_), armed_, hit);
+        return generation;
     }
 
     // Writes what a lane has logged for its present item, up to row `to`.
@@ -150,7 +193,7 @@ private:
         store(frame_array_, armed_.frame);
         store(phase_array_, armed_.phase);
         store(event_array_, event_);
-        if constexpr (stage == Stage::kRecording) recorder_.save_lanes();
+        if constexpr (kRecords) recorder_.save_lanes();
         for (int lane = 0; lane < kLanes; ++lane) {
             if (frame_array_[lane] <= system_.cycles) continue;
             flush(lane, rows_);
@@ -166,7 +209,7 @@ private:
         const bool busy = taken_ < block_.items;
         const int64_t item = block_.first_item + (busy ? taken_ : 0), pixel = job_.pixel(item);
         event_array_[lane] = 0;
-        if constexpr (stage == Stage::kRecording) recorder_.begin(lane);
+        if constexpr (kRecords) recorder_.begin(lane);
         first_row_array_[lane] = rows_;
         const float delay = wrapped(job_.delay[pixel] + block_.pulse->centre);
         delay_array_[lane] = delay;
@@ -183,10 +226,13 @@ private:
         phase_array_[lane] = start - static_cast<float>(wrap);
         frame_array_[lane] = busy ? (warm ? block_.start_cycle[taken_] : 0) + wrap : kIdleFrame;
         slot_array_[lane] = busy ? taken_ : -1;
+        if constexpr (kTraps)
+            if (!busy) traps_.close(lane);
         if (!busy) return;
         const Pair<uint32_t> key = stream_key(job_.seed, job_.realization(item), job_.pixel_index[pixel]);
         key0_array_[lane] = key.first;
         key1_array_[lane] = key.second;
+        if constexpr (kTraps) traps_.open(lane, key.first, key.second);
         writer_.open(taken_);
         ++taken_;
         ++running_;
@@ -201,7 +247,7 @@ private:
         key1_ = load<UInt>(key1_array_);
         event_ = load<UInt>(event_array_);
         armed_ = {load<Int>(frame_array_), load<Float>(phase_array_)};
-        if constexpr (stage == Stage::kRecording) recorder_.load_lanes();
+        if constexpr (kRecords) recorder_.load_lanes();
     }
 
     // `periods` in [0, 1).
@@ -234,8 +280,11 @@ private:
 
     int64_t taken_ = 0;
     int running_ = 0, rows_ = 0;
-    std::conditional_t<stage == Stage::kRecording, Recorder<FrameClock>, NoRecorder> recorder_;
-    FrameClock::Registration seen_[stage == Stage::kRecording ? kAhead : 1];
+    std::conditional_t<kRecords, Recorder<FrameClock>, NoRecorder> recorder_;
+    FrameClock::Registration seen_[kRecords ? kAhead : 1];
+    std::conditional_t<kTraps, TrapLanes<FrameClock>, NoTraps> traps_;
+    const int32_t twilight_whole_;
+    const float twilight_fraction_;
     Writer<sink> writer_;
     Log<sink> log_;
 };

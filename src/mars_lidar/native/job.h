@@ -14,6 +14,21 @@ struct Gate {
     int32_t cycles = 1;
 };
 
+// Afterpulsing: every avalanche leaves Poisson(mean) carriers, released after delays of mean `mean_delay`: exponential,
+// or sampled, `below` (samples + 1) is their distribution function at the edges of samples of `sample` periods.
+struct Traps {
+    double mean = 0.0, mean_delay = 0.0;
+    const double* below = nullptr;
+    int64_t samples = 0;
+    double sample = 0.0;
+    int32_t generations = INT32_MAX;  // avalanches of this generation leave none; photons trigger generation 0
+};
+
+// The probabilities that an avalanche triggers each of its neighbours, row by row, in an image of this size.
+struct Crosstalk {
+    double probability[9] = {};
+    int64_t height = 0, width = 0;  // 0: none
+};
 struct Recording;
 
 struct Job {
@@ -28,6 +43,9 @@ struct Job {
     bool stationary = false;   // warmed up at t = 0, else armed
     DetectorMode mode = DetectorMode::kNonparalyzable;
     Gate gate;                 // of kGated
+    Traps traps;
+    double twilight = 0.0;     // arrivals this long before the end of a dead time fire at its end
+    Crosstalk crosstalk;
     const Recording* recording = nullptr;  // of the registrations, or null: as they are
     const double* signal = nullptr;       // (returns, pixels)
     const double* delay = nullptr;        // (returns, pixels), finite, any number of periods
@@ -36,6 +54,8 @@ struct Job {
     int64_t samples = 0;
     const uint32_t* pixel_index = nullptr;  // (pixels): names the random streams
 
+    // Whether avalanches have consequences beyond the dead time.
+    bool avalanches_matter() const { return traps.mean > 0.0 || twilight > 0.0 || crosstalk.width > 0; }
     int64_t items() const { return pixels * realizations; }  // item = realization * pixels + pixel
     uint32_t realization(int64_t item) const { return first_realization + static_cast<uint32_t>(item / pixels); }
     int64_t pixel(int64_t item) const { return item % pixels; }

@@ -116,7 +116,7 @@ struct NoRecorder {
 };
 
 // What lies between a registration and the log.
-enum class Stage { kPlain, kRecording };
+enum class Stage { kPlain, kRecording, kAvalanches };  // the last: what avalanches leave behind, and recording
 
 }  // namespace MARS_LEVEL
 }  // namespace mars

@@ -23,6 +23,8 @@ constexpr uint32_t kStageReturns = 16;    // + 2 k: returns 2 k + 1 and 2 k + 2;
 constexpr float kLongWait = 128.0f;        // periods; a float32 wait is coarser than 2^-16 period beyond
 constexpr float kForever = 134217728.0f;   // 2^27 periods: beyond every exposure
 
+constexpr uint32_t kStageTraps = 0x40000000;  // afterpulses, by the number of the avalanche that leaves carriers (+ k)
+
 // Tables of the pulse, see pulse_table.h.
 struct PulseView {
     const float* forward;

@@ -9,6 +9,7 @@
 #include "histogram_output.h"
 #include "parallel.h"
 #include "pulse_table.h"  // nanobind wants the complete type; only the shape inside is used
+#include "sequential_events.h"
 #include "sequential_recorder.h"
 #include "sequential_pixel.h"
 
@@ -113,7 +114,7 @@ private:
 };
 
 // Calls work(simulator, item, stop) for all items, in chunks of about equal work.
-template <class Pixel, class Work>
+template <template <class> class Simulation, class Pixel, class Work>
 void for_pixels(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
                const Work& work) {
     double photons = 0.0;
@@ -122,25 +123,37 @@ void for_pixels(const Job& job, const PulseShape& pulse, int threads, const nb::
         photons += Arrivals(job, pulse, k * job.pixels / looks).photons_per_period();
     const double per_item = 1.0 + photons / static_cast<double>(looks) * job.cycles;
     const int64_t size =
-        std::max<int64_t>(1, static_cast<int64_t>(std::min(kChunkPhotons / per_item, 4096.0)));
+        job.crosstalk.width ? job.pixels  // an image at a time, since its pixels influence each other
+                            : std::max<int64_t>(1, static_cast<int64_t>(std::min(kChunkPhotons / per_item, 4096.0)));
     const int64_t items = job.items();
     run_chunks(
         (items + size - 1) / size, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-            Simulator<Pixel> simulator(job, pulse, stop);
+            Simulation<Pixel> simulator(job, pulse, stop);
             for (int64_t item = chunk * size; item < std::min(items, (chunk + 1) * size) && !stop; ++item)
                 work(simulator, item, stop);
         });
 }
 
+template <template <class> class Simulation, class Work>
+void for_modes(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
+               const Work& work) {
+    switch (job.mode) {
+        case DetectorMode::kNonparalyzable:
+            return for_pixels<Simulation, FreePixel>(job, pulse, threads, progress, work);
+        case DetectorMode::kParalyzable:
+            return for_pixels<Simulation, ParalyzablePixel>(job, pulse, threads, progress, work);
+        case DetectorMode::kSynchronous:
+            return for_pixels<Simulation, SynchronousPixel>(job, pulse, threads, progress, work);
+        case DetectorMode::kGated:
+            return for_pixels<Simulation, GatedPixel>(job, pulse, threads, progress, work);
+    }
+}
+
 template <class Work>
 void for_items(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
                const Work& work) {
-    switch (job.mode) {
-        case DetectorMode::kNonparalyzable: return for_pixels<FreePixel>(job, pulse, threads, progress, work);
-        case DetectorMode::kParalyzable: return for_pixels<ParalyzablePixel>(job, pulse, threads, progress, work);
-        case DetectorMode::kSynchronous: return for_pixels<SynchronousPixel>(job, pulse, threads, progress, work);
-        case DetectorMode::kGated: return for_pixels<GatedPixel>(job, pulse, threads, progress, work);
-    }
+    job.avalanches_matter() ? for_modes<EventSimulator>(job, pulse, threads, progress, work)
+                            : for_modes<Simulator>(job, pulse, threads, progress, work);
 }
 
 inline int32_t bin_of(double phase, int32_t bins) {

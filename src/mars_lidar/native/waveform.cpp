@@ -14,27 +14,40 @@
 
 #include "bindings.h"
 #include "parallel.h"
+#include "trap_law.h"
 #include "waveform_kernel.h"
 #include "waveform_start.h"
 
 namespace mars {
 namespace {
 
-WaveformKernel kernel_of(const std::string& level, const Job& job) {
+struct Kernels {
+    WaveformKernel plain, recording, avalanches;
+};
+
+Kernels kernels_of(const std::string& level) {
     const auto asked = [&](const char* name) { return level.empty() || level == name; };
 #if defined(MARS_HAS_avx512)
     if (asked("avx512") && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
         __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        return job.recording ? waveform_recording_kernel_avx512 : waveform_kernel_avx512;
+        return {waveform_kernel_avx512, waveform_recording_kernel_avx512, waveform_avalanche_kernel_avx512};
 #endif
 #if defined(MARS_HAS_avx2)
-    if (asked("avx2") && __builtin_cpu_supports("avx2")) return job.recording ? waveform_recording_kernel_avx2 : waveform_kernel_avx2;
+    if (asked("avx2") && __builtin_cpu_supports("avx2"))
+        return {waveform_kernel_avx2, waveform_recording_kernel_avx2, waveform_avalanche_kernel_avx2};
 #endif
 #if defined(MARS_HAS_vector128)
-    if (asked("vector128")) return job.recording ? waveform_recording_kernel_vector128 : waveform_kernel_vector128;
+    if (asked("vector128"))
+        return {waveform_kernel_vector128, waveform_recording_kernel_vector128, waveform_avalanche_kernel_vector128};
 #endif
-    if (asked("scalar")) return job.recording ? waveform_recording_kernel_scalar : waveform_kernel_scalar;
+    if (asked("scalar"))
+        return {waveform_kernel_scalar, waveform_recording_kernel_scalar, waveform_avalanche_kernel_scalar};
     throw std::invalid_argument("level must be one that this processor runs, got '" + level + "'");
+}
+
+WaveformKernel kernel_of(const std::string& level, const Job& job) {
+    const Kernels kernels = kernels_of(level);
+    return job.avalanches_matter() ? kernels.avalanches : job.recording ? kernels.recording : kernels.plain;
 }
 
 // Where the items of a block begin that are warmed up at the start of the exposure.
@@ -76,8 +89,14 @@ void run_waveform(const BoundJob& job, WaveformBlock proto, int threads, const s
         std::vector<double> phase;
         block.start_cycle = nullptr;
         block.start_phase = nullptr;
-        if (job.stationary && job.dead_time > 0.0) {
-            draw_starts(job, block, cycle, phase);
+        const bool avalanches = job.avalanches_matter();
+        if (job.stationary && (job.dead_time > 0.0 || avalanches)) {
+            if (job.dead_time > 0.0) draw_starts(job, block, cycle, phase);
+            if (avalanches) {  // from the state without afterpulses
+                cycle.resize(block.pixels * block.realizations, 0);
+                phase.resize(block.pixels * block.realizations, 0.0);
+                for (int32_t& start : cycle) start -= settling_periods(job);
+            }
             block.start_cycle = cycle.data();
             block.start_phase = phase.data();
         }

@@ -47,6 +47,15 @@ MARS_INLINE WaveTime later(const WaveTime& time, const WaveSpan& span, int32_t p
     return {plus_if(time.cycle + span.periods, turn), select(turn, part - parts, part), minus_if(sum, carry)};
 }
 
+MARS_INLINE WaveTime sooner(const WaveTime& time, const WaveSpan& span, int32_t parts) {
+    const Float rest = time.inside - span.rest;
+    const Mask borrow = rest < 0.0f;
+    const Int part = minus_if(time.part - span.parts, borrow);
+    const Mask turn = part < 0;
+    return {minus_if(time.cycle - span.periods, turn), select(turn, part + parts, part),
+            minimum(plus_if(rest, borrow), splat(kLastInside))};
+}
+
 // A wait: whole periods, and the energy beyond them.
 struct WaveWait {
     Int whole, energy;

@@ -1,5 +1,5 @@
 // The exact engine's inner loop for waveforms, one function per vector level (waveform_runner.h is compiled once for
-// each), and another with a recorder.
+// each), and others with a recorder and with traps.
 #pragma once
 #include <atomic>
 #include <cstdint>
@@ -35,18 +35,22 @@ using WaveformKernel = void (*)(const WaveformBlock&);
 #ifdef MARS_HAS_scalar
 void waveform_kernel_scalar(const WaveformBlock& block);
 void waveform_recording_kernel_scalar(const WaveformBlock& block);
+void waveform_avalanche_kernel_scalar(const WaveformBlock& block);
 #endif
 #ifdef MARS_HAS_vector128
 void waveform_kernel_vector128(const WaveformBlock& block);
 void waveform_recording_kernel_vector128(const WaveformBlock& block);
+void waveform_avalanche_kernel_vector128(const WaveformBlock& block);
 #endif
 #ifdef MARS_HAS_avx2
 void waveform_kernel_avx2(const WaveformBlock& block);
 void waveform_recording_kernel_avx2(const WaveformBlock& block);
+void waveform_avalanche_kernel_avx2(const WaveformBlock& block);
 #endif
 #ifdef MARS_HAS_avx512
 void waveform_kernel_avx512(const WaveformBlock& block);
 void waveform_recording_kernel_avx512(const WaveformBlock& block);
+void waveform_avalanche_kernel_avx512(const WaveformBlock& block);
 #endif
 
 }  // namespace mars

@@ -78,6 +78,18 @@ struct PartClock {
         r.bin = load<Int>(bin);
     }
 
+    // The time of a lane as whole periods and the rest of one in [0, 1), or in units of 2^-32.
+    static int32_t whole(const TimeArray& from, int lane) { return from.cycle[lane]; }
+    double rest(const TimeArray& from, int lane) const {
+        return (static_cast<double>(from.part[lane]) + static_cast<double>(from.inside[lane])) / parts;
+    }
+    void put(TimeArray& to, int lane, int32_t whole, uint32_t rest) const {
+        const uint64_t at = static_cast<uint64_t>(rest) * static_cast<uint64_t>(parts);
+        to.cycle[lane] = whole;
+        to.part[lane] = static_cast<int32_t>(at >> 32);
+        to.inside[lane] = static_cast<float>(static_cast<int32_t>((at & 0xffffffffu) >> 8)) * 0x1p-24f;
+    }
+
     static constexpr double kLastPhase = 1.0 - 0x1p-53;
 
     int32_t bins, cycles, parts;

@@ -6,6 +6,7 @@
 #include <type_traits>
 
 #include "exact_writers.h"
+#include "trap_lanes.h"
 #include "waveform_kernel.h"
 #include "waveform_modes.h"
 #include "waveform_recorder.h"
@@ -73,13 +74,14 @@ struct WaveWriter<Sink::kTimestamps> {
 
 template <DetectorMode mode, Stage stage, Sink sink>
 class WaveRunner {
-    static constexpr bool kRecords = stage != Stage::kPlain, kTimed = sink == Sink::kTimestamps;
+    static constexpr bool kRecords = stage != Stage::kPlain, kTraps = stage == Stage::kAvalanches;
+    static constexpr bool kTimed = sink == Sink::kTimestamps;
 
 public:
     explicit WaveRunner(const WaveformBlock& block)
         : block_(block), job_(*block.job), system_(wave_system(job_)), layout_(job_.samples),
           bins_per_part_(static_cast<double>(job_.bins) / static_cast<double>(job_.samples)), recorder_(job_),
-          writer_(block) {
+          traps_(job_), twilight_(wave_span(job_.twilight, system_.parts)), writer_(block) {
         tables_.edge = block.edges;
         tables_.guide = block.guides;
         tables_.shift = layout_.shift;
@@ -105,10 +107,15 @@ public:
 
 private:
     MARS_INLINE void step(const WaveWait& wait, int k) {
-        const WaveTime hit = next_arrival(tables_, from_, wait);
+        WaveTime from = from_;
+        if constexpr (kTraps) from = search_start(k);
+        WaveTime hit = next_arrival(tables_, from, wait);
+        Int generation = splat(0);
+        if constexpr (kTraps) generation = earliest_arrival(hit);
         // inside the exposure: 0 <= cycle < cycles, one unsigned comparison
         const Mask outside = as_uint(hit.cycle) >= static_cast<uint32_t>(system_.cycles);
         const Mask unseen = advance<mode>(system_, hit, from_, memory_);
+        if constexpr (kTraps) traps_.avalanche(select(unseen, splat(1), splat(0)) == 0, hit, generation);
         if constexpr (kRecords) {
             const Int bin = place<true>(hit, seen_[k].phase);
             seen_[k].hit = hit;
@@ -156,6 +163,31 @@ private:
         }
         if (recorder_.fills())  // nothing more can be recorded there
             from_.cycle = select(recorder_.full(), splat(kIdleCycle), from_.cycle);
+    }
+
+    // Where the search for the next arrival begins, as in exact_runner.h; carriers released before that are lost.
+    MARS_INLINE WaveTime search_start(int k) {
+        WaveTime from = from_;
+        if constexpr (mode == DetectorMode::kNonparalyzable) {
+            const Mask after_another = event_ + static_cast<uint32_t>(k) > 0u;
+            from = earlier(after_another, sooner(from_, twilight_, system_.parts), from_);
+        }
+        traps_.lose(from);
+        return from;
+    }
+
+    // Of the next photon and the next carrier the one that comes first is the next arrival; its generation.
+    MARS_INLINE Int earliest_arrival(WaveTime& hit) {
+        const WaveTime release = traps_.next();
+        const Mask first = before(release, hit);
+        Int generation = splat(0);
+        if (any(first)) {
+            hit = earlier(first, release, hit);
+            generation = select(first, traps_.generation(), generation);
+            traps_.drop(first);
+        }
+        if constexpr (mode == DetectorMode::kNonparalyzable) hit = earlier(before(hit, from_), from_, hit);
+        return generation;
     }
 
     // Writes what a lane has logged for its present item, up to row `to`.
@@ -210,6 +242,7 @@ private:
     void take(int lane) {
         events_[lane] = 0;
         if constexpr (kRecords) recorder_.begin(lane);
+        if constexpr (kTraps) traps_.close(lane);
         first_row_[lane] = rows_;
         items_[lane] = -1;
         slot_[lane] = 0;
@@ -235,6 +268,7 @@ private:
                                                       job_.pixel_index[pixel]);
                 key0s_[lane] = key.first;
                 key1s_[lane] = key.second;
+                if constexpr (kTraps) traps_.open(lane, key.first, key.second);
                 items_[lane] = item;
                 slot_[lane] = latest_;
                 ++users_[latest_];
@@ -310,6 +344,8 @@ private:
     int running_ = 0, rows_ = 0;
     std::conditional_t<kRecords, Recorder<PartClock>, NoRecorder> recorder_;
     PartClock::Registration seen_[kRecords ? kWaitsAhead : 1];
+    std::conditional_t<kTraps, TrapLanes<PartClock>, NoTraps> traps_;
+    const WaveSpan twilight_;
     WaveWriter<sink> writer_;
     WaveLog<sink> log_;
 };

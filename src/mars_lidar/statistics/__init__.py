@@ -3,6 +3,7 @@
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewal_moments, renewal_pmf
 from mars_lidar.statistics.chain import PhaseChain, Stationary
+from mars_lidar.statistics.constant_light import constant_light_rate
 from mars_lidar.statistics.electronics import ElectronicsMoments, electronics_moments
 from mars_lidar.statistics.exposure import Exposure, exposure_moments
 from mars_lidar.statistics.grid import photons_per_bin
@@ -31,6 +32,7 @@ __all__ = [
     "ParalyzableMoments",
     "PhaseChain",
     "Stationary",
+    "constant_light_rate",
     "count_law",
     "electronics_moments",
     "exposure_moments",

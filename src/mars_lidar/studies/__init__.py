@@ -51,6 +51,12 @@ def _detectors(request: Request) -> list[Path]:
     return run(request)
 
 
+def _effects(request: Request) -> list[Path]:
+    from mars_lidar.studies.effects import run
+
+    return run(request)
+
+
 def _matched(request: Request) -> list[Path]:
     from mars_lidar.studies.matched_report import run
 
@@ -139,6 +145,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "long-exposures": ("the feedback engine at a million cycles and more against the closed form", _long_exposures),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
     "detectors": ("what each mode of a detector does to the same flux, simulated and in closed form", _detectors),
+    "effects": ("what each effect of a detector does to the same flux, simulated and in closed form", _effects),
     "matched": ("a law of the count from four cumulants: total variation to the exact law", _matched),
     "reference": ("every count law against simulated reference cases; needs --data", _reference),
     "count-law": ("T1: every simulator's count law and shape against simulation", _count_law),

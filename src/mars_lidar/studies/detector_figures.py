@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def draw_all(folder: Path, outcomes: Sequence[Outcome]) -> list[Path]:
+def draw_all(folder: Path, outcomes: Sequence[Outcome], study: str = "detectors") -> list[Path]:
     """Draw the figures into `folder`."""
     names = list(dict.fromkeys(each.shown.figure for each in outcomes if each.shown.figure))
     with style():
-        return [_mode(folder / f"detectors_{name}.png", of_figure(outcomes, name)) for name in names]
+        return [_mode(folder / f"{study}_{name}.png", of_figure(outcomes, name)) for name in names]
 
 
 def _mode(path: Path, shown: Sequence[Outcome]) -> Path:

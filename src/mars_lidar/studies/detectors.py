@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.detector import Detector
+from mars_lidar.effects import AVALANCHE_EFFECTS
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate_timestamps
-from mars_lidar.statistics import count_law, mean_histogram, paralyzable_moments
+from mars_lidar.statistics import count_law, electronics_moments, mean_histogram, paralyzable_moments
 from mars_lidar.studies import Request
 from mars_lidar.studies.report import configuration, save_csv, save_text, table
 from mars_lidar.system import System
@@ -27,6 +28,7 @@ SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
 SEED = 20
 _REACH = 3.0  # periods of inter-registration times that are shown
 _BINS_OF_INTERVALS = 150
+_SIMULATED_ONLY = (*AVALANCHE_EFFECTS, "max_events_per_period", "max_events_per_exposure")
 
 
 @dataclass(frozen=True)
@@ -105,11 +107,14 @@ def run(request: Request) -> list[Path]:
 
 def outcome(shown: Shown, exposures: int) -> Outcome:
     """Simulate one detector, and predict what is known of it."""
-    system = System(
-        period_ns=100.0, cycles=500, bins=200, pulse=GaussianPulse(sigma_ns=1.0), detector=shown.detector
-    )
-    times = simulate_timestamps(Flux(np.full((1, exposures), SIGNAL), BACKGROUND, DELAY_NS), system, seed=SEED)
-    counts = times.counts[0]
+    pulse = GaussianPulse(sigma_ns=1.0)
+    system = System(period_ns=100.0, cycles=500, bins=200, pulse=pulse, detector=shown.detector)
+    coupled = shown.detector.crosstalk is not None  # the exposures are then the pixels of one square image
+    side = round(math.sqrt(exposures))
+    flux = Flux(np.full((side, side) if coupled else (1, exposures), SIGNAL), BACKGROUND, DELAY_NS)
+    times = simulate_timestamps(flux, system, engine="sequential" if coupled else "exact", seed=SEED)
+    counts = times.counts.ravel()
+    exposures = counts.size
     each = np.bincount(times.bin, minlength=system.bins) / exposures
     item = np.repeat(np.arange(exposures), counts)
     second = _mean_square(item * system.bins + times.bin, exposures, system.bins)
@@ -127,9 +132,12 @@ def _mean_square(place: NDArray[np.int64], exposures: int, bins: int) -> FloatAr
 
 
 def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] | None, FloatArray | None]:
-    if system.detector.gate_moves:
+    if system.detector.gate_moves or set(system.detector.effects) & set(_SIMULATED_ONLY):
         return None, None, None
     expected = mean_histogram(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+    if "electronics_dead_time_ns" in system.detector.effects:
+        recorded = electronics_moments(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+        return expected, (float(recorded.mean), float(recorded.variance)), None
     if system.detector.mode == "paralyzable":
         found = paralyzable_moments(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
         return expected, (float(found.mean), float(found.variance)), None

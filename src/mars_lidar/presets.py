@@ -1,0 +1,40 @@
+"""Detectors that have been measured, by name: parameters as published. Sources: docs/detectors.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mars_lidar import _validate
+from mars_lidar.avalanches import Afterpulsing
+from mars_lidar.detector import Detector
+
+# Afterpulses of the module of serial number 3605H by time after the recovery, ns, and the share of them up to then:
+# the distribution that goes with Straka et al. (github.com/ivo-s/SPAD-counting-model, apDist_3605H.txt, 81 ps bins),
+# condensed to ten steps. Most of them come within a third of a nanosecond, the rest spread over 200 ns.
+_RECOVERY_NS, _STEP_NS = 24.0, 0.324
+_UNTIL_NS = np.array([0.324, 2.43, 8.1, 16.2, 24.3, 32.4, 56.7, 113.4, 226.8])
+_SHARE = np.array([0.593, 0.686, 0.784, 0.846, 0.883, 0.903, 0.938, 0.975, 1.0])
+
+
+def _excelitas_spcm_aqrh() -> Detector:
+    """Straka et al., J. Lightwave Technol. 38, 4765 (2020), and the program that goes with it."""
+    edges = np.arange(round(_UNTIL_NS[-1] / _STEP_NS) + 1) * _STEP_NS
+    share = np.diff(np.interp(edges, np.append(0.0, _UNTIL_NS), np.append(0.0, _SHARE)))
+    blind = np.zeros(round(_RECOVERY_NS / _STEP_NS))
+    return Detector(
+        dead_time_ns=_RECOVERY_NS,
+        afterpulsing=Afterpulsing(
+            probability=0.0171, delays=tuple(np.concatenate([blind, share]).round(9)), bin_ns=_RECOVERY_NS / blind.size
+        ),
+        twilight_ns=3.2,
+    )
+
+
+PRESETS: dict[str, Callable[[], Detector]] = {"excelitas-spcm-aqrh": _excelitas_spcm_aqrh}
+
+
+def preset(name: str) -> Detector:
+    """The detector of that name; ValueError with all names if there is none."""
+    return PRESETS[_validate.choice("preset", name, tuple(PRESETS))]()

@@ -1,0 +1,115 @@
+"""Mean registration rate under constant light, with dead time, afterpulses and twilight pulses.
+
+Straka, Grygar, Hloušek, Ježek, "Counting statistics of actively quenched SPADs under continuous illumination",
+J. Lightwave Technol. 38, 4765 (2020), arXiv 2001.10036; derived in docs/detectors.md, equations (9) to (11).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import _validate
+from mars_lidar.detector import Detector
+from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS, require_effects
+
+_EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", *TIMING_EFFECTS)
+_TOLERANCE = 1e-12
+_ROUNDS = 500
+_MOST_CELLS = 2**22
+_MAX_RATE_HZ = 1e12
+
+
+def constant_light_rate(rate_hz: float, detector: Detector) -> float:
+    """Mean rate of registrations of a free-running pixel under constant light, counts/s.
+
+    Exact without afterpulsing, 1 / (t_d + e^(-lambda alpha) / lambda). With afterpulsing it is the law to first order
+    in the afterpulse probability p: the carriers in the traps are taken to be those of the mean over all histories, so
+    that the error is of the order p^2.
+
+    Parameters
+    ----------
+    rate_hz
+        Photons per second at the pixel, before its detection efficiency; dark counts come on top.
+    detector
+        Of mode ``"nonparalyzable"``, without crosstalk or a longer dead time of the electronics, and afterpulses of all
+        generations.
+    """
+    light = _validate.real("rate_hz", rate_hz, low=0.0, high=_MAX_RATE_HZ)
+    require_effects("constant_light_rate", detector, _EFFECTS, lambda _: "; simulate it with engine 'sequential'")
+    if detector.mode != "nonparalyzable":
+        raise ValueError(f"constant_light_rate treats mode 'nonparalyzable' only, got {detector.mode!r}")
+    rate = (light * detector.detection_efficiency + detector.dark_count_hz) * 1e-9  # per ns
+    dead, twilight, traps = detector.dead_time_ns, detector.twilight_ns, detector.afterpulsing
+    if rate == 0.0:
+        return 0.0
+    if traps is None:
+        return 1e9 / (dead + math.exp(-rate * twilight) / rate)
+    if traps.generations is not None:
+        raise ValueError(
+            f"constant_light_rate treats afterpulses of all generations, generations=None, got {traps.generations}"
+        )
+    if traps.delay_ns is not None:
+        return 1e9 / _exponential(rate, dead, twilight, traps.probability, traps.delay_ns)
+    parts = min(max(1, math.ceil(40 * rate * (traps.bin_ns or 0.0))), max(1, _MOST_CELLS // len(traps.delays or (0,))))
+    density = np.repeat(np.diff(traps.edges_below) / parts, parts) * traps.probability
+    return 1e9 / _sampled(rate, dead, twilight, density, (traps.bin_ns or 0.0) / parts)
+
+
+def _exponential(rate: float, dead: float, twilight: float, p: float, delay: float) -> float:
+    """Mean interval, ns. Every avalanche finds the same decaying intensity, level / delay e^(-u / delay)."""
+    from scipy.integrate import quad
+
+    scale = min(delay, 1.0 / rate)  # of the integrands
+    level, interval = p, math.inf
+    for _ in range(_ROUNDS):
+        seen = level * math.exp(-dead / delay)
+        again = -math.expm1(-rate * twilight - seen * math.expm1(twilight / delay))
+
+        def armed(s: float, seen: float = seen) -> float:  # P(no avalanche up to s after the recovery)
+            return math.exp(-rate * s + seen * math.expm1(-s / delay))
+
+        def soon(x: float, seen: float = seen) -> float:  # its part that depends on the releases
+            return scale * math.exp(-rate * x * scale - seen) * math.expm1(seen * math.exp(-x * scale / delay))
+
+        # E e^(-s / delay) of the next avalanche, by parts
+        mean = math.exp(-seen) / rate + quad(soon, 0.0, 60.0, epsabs=0.0, limit=400)[0]
+        part = quad(lambda x: armed(x * scale) * math.exp(-x * scale / delay) * scale, 0.0, 60.0, limit=400)[0]
+        decay = again + (1.0 - again) * (1.0 - part / delay)
+        level, last, interval = p / (1.0 - math.exp(-dead / delay) * decay), interval, dead + (1.0 - again) * mean
+        if abs(interval - last) <= _TOLERANCE * interval:
+            return interval
+    return interval
+
+
+def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.float64], cell: float) -> float:
+    """Mean interval, ns; `density` (n,) are the carriers of an avalanche in cells of `cell` ns."""
+    from scipy.signal import fftconvolve
+
+    n, edges = density.size, np.arange(density.size + 1, dtype=np.float64) * cell
+    carriers, interval = density, math.inf
+    for _ in range(_ROUNDS):
+        below = np.concatenate([[0.0], np.cumsum(carriers)])
+
+        def between(at: Any, below: NDArray[np.float64] = below) -> NDArray[np.float64]:
+            """Carriers (n,) in the cells with edges `at` (n + 1,)."""
+            return np.asarray(np.diff(np.interp(at, edges, below)))
+
+        free = between(edges + dead)
+        last_part = np.interp([dead - twilight, dead], edges, below)
+        again = -math.expm1(-rate * twilight - float(last_part[1] - last_part[0]))
+        hazard = rate * cell + free
+        armed = np.exp(-np.concatenate([[0.0], np.cumsum(hazard)]))
+        fires = -np.diff(armed)
+        mean = float(np.sum(fires / hazard) * cell + armed[-1] / rate)
+        # what an avalanche `s` after the recovery finds at u: the carriers at dead + s + u; s in the middle of a cell
+        later = between(edges + (dead + 0.5 * cell))
+        found = fftconvolve(later, fires[::-1])[n - 1 :]
+        carriers = density + (1.0 - again) * np.maximum(found, 0.0) + again * free
+        last, interval = interval, dead + (1.0 - again) * mean
+        if abs(interval - last) <= _TOLERANCE * interval:
+            return interval
+    return interval

@@ -1,0 +1,27 @@
+"""The study of a detector's effects."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from mars_lidar.studies import effects
+from mars_lidar.studies.__main__ import main
+
+
+def test_quick_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A few of its rows; the law of the electronics takes a minute."""
+    few = [shown for shown in effects.SHOWN if shown.figure in ("", "afterpulsing", "crosstalk", "jitter")]
+    monkeypatch.setattr(effects, "SHOWN", few)
+    assert main(["effects", "--quick", "--out", str(tmp_path)]) == 0
+    with (tmp_path / "effects.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["detector"] for row in rows] == [shown.name for shown in few]
+    text = (tmp_path / "effects.md").read_text()
+    figures = sorted(path.name for path in tmp_path.glob("*.png"))
+    assert figures == ["effects_afterpulsing.png", "effects_crosstalk.png", "effects_jitter.png"]
+    assert all(f"({name})" in text for name in figures)
+    with (tmp_path / "effects_rate.csv").open() as file:
+        assert [abs(float(row["z"])) < 5.4 for row in csv.DictReader(file)] == [True] * 5

@@ -64,7 +64,7 @@ def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
         "--dead-time-ns", 20,
         "--cycles", 40, "--bins", 32, "--pulse-file", tmp_path / "irf.npy", "--pulse-bin-ns", 0.1,
         "--pulse-origin", "centroid", "--start", "stationary", "--signal", 0.7, "--sbr", 2.5,
-        "--attenuation", "inverse_square", "--ambient", "reflectivity", "--dark-counts", 1e5,
+        "--attenuation", "inverse_square", "--ambient", "reflectivity", "--dark-count-hz", 1e5,
         "--engine", "sequential", "--realizations", 3, "--seed", 8, "--threads", 1, "--no-picture", "-o", out,
     )  # fmt: skip
     assert done.exit_code == 0, done.output
@@ -75,7 +75,7 @@ def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
         cycles=40,
         bins=32,
         pulse=pulse,
-        detector=ml.Detector(dead_time_ns=20.0),
+        detector=ml.Detector(dead_time_ns=20.0, dark_count_hz=1e5),
         start="stationary",
     )
     flux = ml.Scene.example("room", size=10, seed=4).flux(
@@ -84,7 +84,6 @@ def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
         sbr=2.5,
         attenuation="inverse_square",
         ambient="reflectivity",
-        dark_counts_per_s=1e5,
     )
     with io.load(out) as cube:
         assert cube.system == system

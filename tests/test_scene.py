@@ -3,6 +3,7 @@
 import json
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -188,6 +189,18 @@ def test_dark_counts_come_on_top(scene, system):
     assert flux.background.mean() == pytest.approx(0.5 + 0.01, rel=1e-12)  # 1e5 /s in 100 ns
     assert flux.info["achieved_sbr"] == pytest.approx(4.0, rel=1e-12)
     assert flux.info["achieved_sbr_with_dark"] == pytest.approx(2.0 / 0.51, rel=1e-12)
+
+
+def test_dark_counts_are_counts_whatever_the_efficiency(scene, system):
+    """The same by the argument, by the detector and by a map."""
+    blind = system.replace(detector=replace(system.detector, detection_efficiency=0.25))
+    noisy = system.replace(detector=replace(blind.detector, dark_count_hz=1e5))
+    light = scene.flux(blind, signal=2.0, sbr=4.0)
+    given = scene.flux(blind, signal=2.0, sbr=4.0, dark_counts_per_s=1e5)
+    expected = 0.25 * light.background + 0.01
+    for flux in (given.detected(blind), light.detected(noisy), light.with_dark_counts(1e5, blind).detected(blind)):
+        np.testing.assert_allclose(flux.background, expected, rtol=1e-12)
+    assert given.info["achieved_sbr_with_dark"] == pytest.approx(2.0 * 0.25 / (0.5 * 0.25 + 0.01), rel=1e-12)
 
 
 def test_no_ambient_light(scene, system):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -45,6 +46,9 @@ def test_levels_are_means_over_the_pixels_with_light(light):
     assert flux.signal[1, 2] == 0.0
     np.testing.assert_allclose(flux.background, 1.5 / 3.0 + 1e6 * 100e-9, rtol=1e-14)
     assert flux.info["mean_signal"] == pytest.approx(1.5)
+    blind = SYSTEM.replace(detector=replace(SYSTEM.detector, detection_efficiency=0.25))
+    flux = ml.Flux.from_transient(light, blind, bin_ns=0.5, signal=1.5, sbr=3.0, dark_counts_per_s=1e6)
+    np.testing.assert_allclose(flux.detected(blind).background, 0.25 * 1.5 / 3.0 + 1e6 * 100e-9, rtol=1e-14)
 
 
 @pytest.mark.parametrize("start", [0.0, 40.0, -10.0, 1234.5])

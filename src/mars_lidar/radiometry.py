@@ -51,7 +51,7 @@ def scene_flux(
     b = np.zeros(scene.shape)
     if ratio < math.inf:
         b = _scaled(light, level / ratio, valid, "ambient light", f"sbr={ratio:g}")
-    dark = rate * system.period_ns * 1e-9
+    dark = rate * system.period_ns * 1e-9 / system.detector.detection_efficiency  # photons for as many counts
     wrapped = int(np.count_nonzero(scene.depth_m[valid] >= reach))
     info = {
         "source": "Scene.flux",

@@ -148,7 +148,7 @@ class Scene:
         With V the set of valid pixels (those with a return), z the depth, rho the reflectivity::
 
             S   = signal * w / mean_V(w),             w = rho * g(z),   g = 1 or 1 / z^2
-            B   = signal / sbr * a / mean_V(a)  +  dark_counts_per_s * t_r
+            B   = signal / sbr * a / mean_V(a)  +  dark_counts_per_s * t_r / detection_efficiency
             tau = 2 z / c
 
         so that ``mean_V(S) = signal`` and ``mean_V(S) / mean_V(B - dark) = sbr``. Pixels without return have
@@ -171,7 +171,8 @@ class Scene:
             does not fall with distance) or ``"map"`` (the scene's background map). None: the map where there
             is one, else uniform.
         dark_counts_per_s
-            Dark count rate of a pixel, counts/s, the same in all.
+            Dark counts of a pixel, counts/s, the same in all, besides those of the detector (`Detector.dark_count_hz`):
+            what is counted, whatever the detection efficiency.
 
         Returns
         -------

@@ -110,7 +110,7 @@ class Transient:
         With L the light of a pixel, summed over all bins, and V the pixels with any light::
 
             S = signal * L / mean_V(L)      or      S = photons_per_unit * L
-            B = mean_V(S) / sbr  +  dark_counts_per_s * t_r
+            B = mean_V(S) / sbr  +  dark_counts_per_s * t_r / detection_efficiency
 
         Time is folded with the laser period: light that arrives after its end comes in the next one.
 
@@ -125,7 +125,8 @@ class Transient:
         sbr
             Mean signal over ambient photons, uniform over the image; inf: no ambient light.
         dark_counts_per_s
-            Dark count rate of a pixel, counts/s.
+            Dark counts of a pixel, counts/s, besides those of the detector (`Detector.dark_count_hz`): what is counted,
+            whatever the detection efficiency.
         pulse
             Convolve with the system's pulse (for what a delta pulse sends back). False: the pulse and the
             detector's response are in the transient already.
@@ -158,7 +159,7 @@ class Transient:
             raise ValueError("values must have light in some pixel, got none")
         mean = float(lit.mean())
         scale = signal / mean if signal is not None else float(photons_per_unit or 0.0)
-        dark = dark_counts_per_s * 1e-9 * system.period_ns
+        dark = dark_counts_per_s * 1e-9 * system.period_ns / system.detector.detection_efficiency
         background = (scale * mean / sbr if sbr != math.inf else 0.0) + dark
         size = 8 * (last - first) * self.shape[1] * number
         check_memory(4 * size, "the waveforms of these rows", "take fewer rows at a time")  # Flux keeps a copy

@@ -103,11 +103,11 @@ def compare(
     pulse_bin_ns: options.PulseBinNs = None,
     pulse_origin: options.PulseOrigin = None,
     start: options.Start = None,
+    dark_count_hz: options.DarkCountHz = None,
     signal: options.Signal = 1.0,
     sbr: options.Sbr = 1.0,
     attenuation: options.Attenuation = "none",
     ambient: options.Ambient = None,
-    dark_counts: options.DarkCounts = 0.0,
     engines: Engines = None,
     against: Against = "exact",
     realizations: Realizations = 10_000,
@@ -149,6 +149,7 @@ def compare(
             gate_width_ns=gate_width_ns,
             gate_step_ns=gate_step_ns,
             gate_cycles=gate_cycles,
+            dark_count_hz=dark_count_hz,
             start=start,
             pulse_sigma_ns=pulse_sigma_ns,
             pulse_fwhm_ns=pulse_fwhm_ns,
@@ -163,7 +164,6 @@ def compare(
             sbr=sbr,
             attenuation=attenuation,  # type: ignore[arg-type]  # checked there
             ambient=ambient,  # type: ignore[arg-type]
-            dark_counts_per_s=dark_counts,
         )
         from mars_lidar.cli.compare_tables import as_data, show
         from mars_lidar.studies.compare import compare as run

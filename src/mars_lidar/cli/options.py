@@ -201,7 +201,10 @@ DetectionEfficiency = Annotated[
 ]
 DarkCountHz = Annotated[
     float | None,
-    _option("--dark-count-hz", panel=_EFFECTS, help="Dark counts of every pixel, counts/s.", default="0"),
+    _option(
+        "--dark-count-hz", "--dark-counts", panel=_EFFECTS, default="0",
+        help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
+    ),
 ]
 AfterpulseProbability = Annotated[
     float | None,
@@ -307,10 +310,6 @@ Ambient = Annotated[
         help="Ambient light over the image: uniform, reflectivity, or map (of the scene).",
         default="map where there is one, else uniform",
     ),
-]
-DarkCounts = Annotated[
-    float,
-    _option("--dark-counts", panel=_LIGHT, help="Dark counts of a pixel, counts/s, on top.", default="0"),
 ]
 Engine = Annotated[
     str,

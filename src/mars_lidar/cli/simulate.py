@@ -93,7 +93,6 @@ def simulate(
     sbr: options.Sbr = 1.0,
     attenuation: options.Attenuation = "none",
     ambient: options.Ambient = None,
-    dark_counts: options.DarkCounts = 0.0,
     engine: options.Engine = "exact",
     table: options.Table = None,
     count: options.Count = None,
@@ -173,7 +172,6 @@ def simulate(
                 sbr=sbr,
                 attenuation=attenuation,  # type: ignore[arg-type]  # checked there
                 ambient=ambient,  # type: ignore[arg-type]
-                dark_counts_per_s=dark_counts,
             )
             depth_m, reflectivity = view.depth_m, view.reflectivity
         else:
@@ -191,7 +189,7 @@ def simulate(
             if signal is None and photons_per_unit is None:
                 signal = 1.0
             flux = light.stored_flux(
-                instrument, signal=signal, photons_per_unit=photons_per_unit, sbr=sbr, dark_counts_per_s=dark_counts,
+                instrument, signal=signal, photons_per_unit=photons_per_unit, sbr=sbr,
                 pulse=transient_pulse is not False,
             )  # fmt: skip
             source, depth_m, reflectivity = f"transient {transient}", None, None

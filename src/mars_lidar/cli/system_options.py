@@ -97,6 +97,7 @@ def build_system(
     gate_width_ns: float | None = None,
     gate_step_ns: float | None = None,
     gate_cycles: int | None = None,
+    dark_count_hz: float | None = None,
     effects: Effects | None = None,
     start: str | None,
     pulse_sigma_ns: float | None,
@@ -123,6 +124,7 @@ def build_system(
         "gate_width_ns": gate_width_ns,
         "gate_step_ns": gate_step_ns,
         "gate_cycles": gate_cycles,
+        "dark_count_hz": dark_count_hz,
     }
     given = {name: value for name, value in detector.items() if value is not None}
     given |= {} if effects is None else effects.given()

@@ -196,7 +196,7 @@ def _check_levels(scene: Scene, recipe: DatasetRecipe) -> None:
         if system.period_ns not in units:
             units[system.period_ns] = flux_of(scene, system, light, 1.0, unit_sbr, dark=0.0)
         unit = units[system.period_ns]
-        dark = light.dark_counts_per_s * system.period_ns * 1e-9
+        dark = light.dark_counts_per_s * system.period_ns * 1e-9 / system.detector.detection_efficiency
         for signal, sbr in light.levels:
             total = unit.signal + unit.background / sbr
             y, x = (int(k) for k in np.unravel_index(int(total.argmax()), total.shape))

@@ -200,6 +200,15 @@ def test_electronics_dead_time_statistics(dead: float, electronics: float, start
     check(ENGINES["exact"], case, law, {COUNTS, SHAPE})
 
 
+def test_electronics_dead_time_in_bins_narrower_than_the_pulse():
+    """Cells of the kernel are wider than these bins, which the pulse fills unevenly."""
+    detector = pixel({"electronics_dead_time_ns": 130.0}, dead=45.0)
+    case = case_of(detector, 20_000, cycles=120, bins=320)
+    found = electronics_moments(1.2, 0.8, case.system, delay_ns=37.0)
+    assert found.bins < 320
+    check(ENGINES["exact"], case, Law(histogram=found.histogram), {SHAPE})
+
+
 def test_electronics_dead_time_of_an_undisturbed_pixel_in_the_long_run():
     """Extrapolated once the state repeats: the same as run through, and linear in the exposure."""
     means = []

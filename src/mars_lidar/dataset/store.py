@@ -30,6 +30,8 @@ from mars_lidar.io.scan import Problem
 from mars_lidar.io.store import IncompleteFileError
 from mars_lidar.scene import Scene
 
+_SCENE_BYTES = 4 << 20  # of one map: scenes are read this many at once, each read costs a millisecond
+
 
 @dataclass(frozen=True)
 class Item:
@@ -59,6 +61,7 @@ class Dataset:
             told = self.attrs.get("format_version")
             raise ValueError(f"{path} has layout version {told}; version {FORMAT_VERSION} can be read")
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
+        self._scene_block: tuple[int, tuple[NDArray[np.float64], ...] | None] = (0, None)
 
     @property
     def planned(self) -> bool:
@@ -93,11 +96,21 @@ class Dataset:
 
     def scene(self, number: int) -> Scene:
         """A scene as it was read."""
-        group: Any = self.group["scenes"]
-        depth, reflectivity, background = (
-            np.asarray(group[name][number]) for name in ("depth", "reflectivity", "background")
-        )
+        first, maps = self._scene_block
+        if maps is None or not first <= number < first + len(maps[0]):
+            size = 8 * math.prod(self._scene_maps[0].shape[1:])
+            count = max(1, _SCENE_BYTES // size)
+            first = number // count * count
+            maps = tuple(np.asarray(array[first : first + count]) for array in self._scene_maps)
+            self._scene_block = first, maps  # together: several threads read
+        depth, reflectivity, background = (values[number - first] for values in maps)
         return Scene(depth, reflectivity, None if np.isnan(background).all() else background)
+
+    @cached_property
+    def _scene_maps(self) -> tuple[Any, ...]:
+        """The arrays of `scene`, opened once."""
+        group: Any = self.group["scenes"]
+        return tuple(group[name] for name in ("depth", "reflectivity", "background"))
 
     def scene_names(self) -> list[str]:
         """Names of all scenes."""

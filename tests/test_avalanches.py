@@ -71,6 +71,7 @@ CASES = [
     case(WAVE, 0.3, dead_time_ns=75.0, afterpulsing=EXPONENTIAL, twilight_ns=31.0),
     case(WAVE, 0.3, "stationary", dead_time_ns=220.0, afterpulsing=SAMPLED, twilight_ns=130.0),
     case(WAVE, 0.3, "stationary", dead_time_ns=30.0, mode="paralyzable", afterpulsing=EXPONENTIAL),
+    case(WAVE, 0.0, dead_time_ns=0.0, afterpulsing=ml.Afterpulsing(probability=0.9, delay_ns=900.0), cycles=20),
     case(WAVE, 0.3, dead_time_ns=130.0, mode="synchronous", afterpulsing=SAMPLED, bins=50),
     case(WAVE, 0.5, "stationary", dead_time_ns=100.0, afterpulsing=SAMPLED, electronics_dead_time_ns=170.0,
          jitter=ml.Jitter(sigma_ns=1.5), max_events_per_exposure=31, **GATE),

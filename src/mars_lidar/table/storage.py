@@ -13,6 +13,7 @@ from mars_lidar.io.store import TemporarySibling, check_target
 from mars_lidar.system import System
 from mars_lidar.table.cache import FORMAT
 from mars_lidar.table.entries import Entries
+from mars_lidar.table.node_laws import NodeLaws
 from mars_lidar.table.start_phase import StartPhases
 
 if TYPE_CHECKING:
@@ -61,9 +62,10 @@ def load(path: Path, system: System) -> Table:
     phases = StartPhases(
         **{n: arrays["phase_" + n] for n in ("signal", "background", "phase", "correction", "settled")}
     )
+    laws = NodeLaws(**{name: arrays["law_" + name] for name in ("row", "first", "offsets", "pmf")})
     table = Table(
         system, header["method"], arrays["signal"], arrays["background"], header["rearm"], float(header["tolerance"]),
-        json.loads(header["provenance"]), entries, phases,
+        json.loads(header["provenance"]), entries, phases, laws,
     )  # fmt: skip
     if not table.serves(system.cycles):
         raise ValueError(
@@ -88,6 +90,8 @@ def read_header(path: Path) -> dict[str, Any]:
         "enough": arrays["enough"],
         "nbytes": path.stat().st_size,
         "shape_bytes": arrays["shape"].nbytes,
+        "laws": arrays["law_row"].size,
+        "law_bytes": arrays["law_pmf"].nbytes,
     }
 
 
@@ -118,6 +122,10 @@ def _arrays(table: Table) -> dict[str, NDArray[Any]]:
         "phase_phase": phases.phase,
         "phase_correction": phases.correction,
         "phase_settled": phases.settled.astype(np.uint8),
+        "law_row": table.laws.row,
+        "law_first": table.laws.first,
+        "law_offsets": table.laws.offsets,
+        "law_pmf": table.laws.pmf,
         "shape": entries.shape,
     }
     if entries.startup is not None:

@@ -229,7 +229,7 @@ def _laws(header: dict[str, Any]) -> str:
     if header["method"] == "mars":
         return "none: the paper's count is a Gaussian"
     if not number:
-        return "none kept: four cumulants fix the law of every entry"
+        return "none kept: four cumulants fix the law of every entry, or the file is of an older format"
     return f"{number:,} of {entries:,} entries keep the law of their count, {header['law_bytes'] / 1e6:,.3g} MB"
 
 

@@ -15,6 +15,7 @@ namespace mars {
 namespace trust {
 
 constexpr double kAtomsAgree = 3e-4;                // of integers with normal bases
+constexpr double kAtomsWide = 7.0, kAtomsWideAgree = 6e-3;  // variance from which a look at one of these is enough
 constexpr double kFree = 0.25, kFreeAgree = 1.5e-3;  // variance / mean of a count that is not locked; gains and losses
 // sums of many parts: a skewness that explains the kurtosis, a quantile that rises well, many registrations
 constexpr double kKurtosis = 0.02, kSlope = 0.3, kSlopeReach = 4.0, kLeastMean = 16.0;
@@ -72,8 +73,10 @@ inline bool trusted(const Cumulants& k, const MatchedLaw& law) {
         if (free.misfit < HUGE_VAL && window.gain_loss(4, free) < kFreeAgree && window.gain_loss(3, free) < kFreeAgree)
             return true;
     }
-    if (law.form() == MatchedLaw::Form::atoms)
+    if (law.form() == MatchedLaw::Form::atoms) {
+        if (k.variance > kAtomsWide) return window.normal(4) < kAtomsWideAgree;
         return window.normal(3) < kAtomsAgree && window.normal(4) < kAtomsAgree;
+    }
     const double skewness = k.third * k.third / (k.variance * k.variance * k.variance);
     const double kurtosis = k.fourth / (k.variance * k.variance);
     return k.mean > kLeastMean && std::fabs(kurtosis - skewness) < kKurtosis && law.least_slope(kSlopeReach) > kSlope &&

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _KIND = "mars-lidar table"
 _SUFFIXES = (".h5", ".hdf5")
 _MAPPED = ("shape", "startup")
+_READABLE = (1, FORMAT)  # the first kept no laws of entries
 
 
 def save(table: Table, path: Path, *, overwrite: bool) -> None:
@@ -122,15 +123,16 @@ def _arrays(table: Table) -> dict[str, NDArray[Any]]:
         "phase_phase": phases.phase,
         "phase_correction": phases.correction,
         "phase_settled": phases.settled.astype(np.uint8),
-        "law_row": table.laws.row,
-        "law_first": table.laws.first,
-        "law_offsets": table.laws.offsets,
-        "law_pmf": table.laws.pmf,
         "shape": entries.shape,
+        **_laws(table.laws),
     }
     if entries.startup is not None:
         arrays["startup"] = entries.startup
     return arrays
+
+
+def _laws(laws: NodeLaws) -> dict[str, NDArray[Any]]:
+    return {"law_row": laws.row, "law_first": laws.first, "law_offsets": laws.offsets, "law_pmf": laws.pmf}
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -144,14 +146,19 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             header = dict(file.attrs.items())
             if header.get("kind") != _KIND:
                 raise ValueError(f"{path} is not a table of mars-lidar")
-            if int(header["format"]) != FORMAT:
-                raise ValueError(f"{path} is a table of format {header['format']}; this version reads {FORMAT}")
+            if int(header["format"]) not in _READABLE:
+                raise ValueError(
+                    f"{path} is a table of format {header['format']}; this version reads "
+                    f"{' and '.join(map(str, _READABLE))}"
+                )
             arrays = {
                 name: _mapped(path, data) if name in _MAPPED else _own(data[()]) for name, data in file.items()
             }
     except OSError as error:
         raise ValueError(f"{path} is not an HDF5 file that can be read: {error}") from error
     arrays["phase_settled"] = arrays["phase_settled"].astype(bool)
+    if "law_row" not in arrays:
+        arrays.update(_laws(NodeLaws.none()))
     return header, arrays
 
 

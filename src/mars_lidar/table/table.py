@@ -272,7 +272,7 @@ class Table:
         background: Grid = PAPER_GRID["background"],
         **options: Any,
     ) -> Table:
-        """`build`, or the same table from the user's cache (docs/table.md, 6), which keeps what is built."""
+        """`build`, or the same table from the user's cache (docs/table.md, 7), which keeps what is built."""
         from mars_lidar.table.cache import cached
 
         return cached(system, signal, background, **options)

@@ -38,7 +38,7 @@ def simulate(
     progress: Progress | None = None,
     report: dict[str, float] | None = None,
     table: Table | None = None,
-    count: Literal["exact", "gaussian"] | None = None,
+    count: Literal["exact", "matched", "gaussian"] | None = None,
     interpolation: Literal["bilinear", "nearest"] | None = None,
     outside: Literal["error", "exact"] | None = None,
 ) -> NDArray[Any]:
@@ -76,7 +76,8 @@ def simulate(
         For ``"mars"`` and ``"renewal"``: the lookup table (`mars_lidar.Table`); see
         `mars_lidar.engines.MarsEngine`.
     count
-        For ``"mars"``: the law of the count, ``"exact"`` (default) or ``"gaussian"`` (the paper's).
+        For ``"mars"``: the law of the count, ``"exact"`` (default), ``"matched"`` (to four cumulants) or
+        ``"gaussian"`` (the paper's).
     interpolation
         For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
     outside

@@ -152,7 +152,7 @@ def test_training_from_the_command_line(tmp_path: Path):
     system = tmp_path / "small.yaml"
     SMALL.save(system)
     arguments = ["neural", "train", "--system", str(system), "-o", str(path)]
-    arguments += ["--steps", "150", "--pairs", "300", "--threads", "1"]
+    arguments += ["--steps", "150", "--pairs", "300"]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     assert {p.name for p in tmp_path.iterdir()} == {"net.npz", "net.csv", "net.png", "small.yaml"}

@@ -46,7 +46,6 @@ def train(
     steps: Annotated[int, typer.Option(help="Steps.", rich_help_panel=_TRAINING)] = 1750,
     pairs: Annotated[int, typer.Option(help="Pairs to learn from.", rich_help_panel=_TRAINING)] = 6000,
     seed: Annotated[int, typer.Option(help="Of pairs, weights and order.", rich_help_panel=_TRAINING)] = 0,
-    threads: options.Threads = None,
     overwrite: options.Overwrite = False,
 ) -> None:
     """Train the network of a system on the Markov chain of phases, and validate it on held-out fluxes."""
@@ -60,17 +59,12 @@ def train(
         from mars_lidar.learn.neural.model import check_target
         from mars_lidar.learn.neural.training import Point, save_curves
         from mars_lidar.learn.neural.training import train as train_map
-        from mars_lidar.statistics.exposure import thread_count
 
         check_target(out, overwrite)
         fluxes = FluxRange(
             signal=_pair("--signal", signal), background=_pair("--background", background), returns=returns
         )
         chosen = Training(fluxes=fluxes, steps=steps, pairs=pairs, seed=seed)
-        import torch
-
-        torch.set_num_threads(thread_count(threads))
-
         def tell(point: Point) -> None:
             say(
                 f"step {point.step}: total variation {point.tv_mean:.4f}, 95 % {point.tv_95:.4f}, largest "

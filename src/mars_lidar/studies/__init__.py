@@ -19,7 +19,7 @@ class Request:
     """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
-    the study "hardware".
+    the study "hardware"; `config` the size of the study "downstream".
     """
 
     out: Path
@@ -28,6 +28,7 @@ class Request:
     tell: Tell = str
     truth: str = "sequential"
     stream: Path | None = None
+    config: str = "small"
 
 
 Study = Callable[[Request], list[Path]]
@@ -117,6 +118,12 @@ def _reconstruction(request: Request) -> list[Path]:
     return run(request)
 
 
+def _downstream(request: Request) -> list[Path]:
+    from mars_lidar.studies.downstream import run
+
+    return run(request)
+
+
 def _table(request: Request) -> list[Path]:
     from mars_lidar.studies.table import run
 
@@ -141,6 +148,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "hardware": ("T6: streams calibrated and validated, faulty detectors; --stream adds a measured one", _hardware),
     "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
     "reconstruction": ("bias and error of depth and signal over flux, every method, beside the bound", _reconstruction),
+    "downstream": ("T5: networks trained on every simulator's data, tested on gold; --config", _downstream),
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
 }
 

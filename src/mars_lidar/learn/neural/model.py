@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, rolled
+from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, one_thread, rolled
 from mars_lidar.learn.neural.pairs import FluxRange
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
@@ -94,18 +94,13 @@ class NeuralMap:
     def pdf(self, photons: FloatArray) -> FloatArray:
         """Registration PDFs (P, bins) of fluxes (P, bins), photons per bin and period, each with some light."""
         out = np.empty(photons.shape)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # sums in the same order whatever the machine
-        try:
-            with torch.inference_mode():
-                for first in range(0, len(photons), _BATCH):
-                    some = photons[first : first + _BATCH]
-                    filled = np.concatenate([some, np.repeat(some[:1], _BATCH - len(some), axis=0)])
-                    flux, shift = canonical(torch.from_numpy(filled).to(torch.float32))
-                    found = rolled(self.network(flux), -shift).to(torch.float64).exp().numpy()[: len(some)]
-                    out[first : first + _BATCH] = found / found.sum(-1, keepdims=True)
-        finally:
-            torch.set_num_threads(threads)
+        with one_thread(), torch.inference_mode():
+            for first in range(0, len(photons), _BATCH):
+                some = photons[first : first + _BATCH]
+                filled = np.concatenate([some, np.repeat(some[:1], _BATCH - len(some), axis=0)])
+                flux, shift = canonical(torch.from_numpy(filled).to(torch.float32))
+                found = rolled(self.network(flux), -shift).to(torch.float64).exp().numpy()[: len(some)]
+                out[first : first + _BATCH] = found / found.sum(-1, keepdims=True)
         return out
 
     def moments(self, photons: FloatArray, pdf: FloatArray, cycles: int) -> tuple[FloatArray, FloatArray]:

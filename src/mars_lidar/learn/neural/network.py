@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from mars_lidar.io.optional import MissingLibraryError
 
@@ -81,6 +83,17 @@ class PdfAutoencoder(nn.Module):
 
         early = torch.lerp(at(ago), at(ago - 1), back - shift)
         return torch.clamp(whole * total + below - early, min=0.0)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Sums in the same order whatever the machine; layers as small as these lose by more threads anyway."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def canonical(photons: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from mars_lidar import _validate
 from mars_lidar.engines.base import Progress
 from mars_lidar.learn.neural.model import NeuralMap
-from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, rolled
+from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, one_thread, rolled
 from mars_lidar.learn.neural.pairs import Pairs
 from mars_lidar.learn.neural.plan import Training
 from mars_lidar.statistics._gate import require_mode
@@ -89,6 +89,13 @@ def train(
     require_mode("the neural map", system)
     system = system.detected()
     _validate.integer("bins of the neural map", system.bins, low=_MIN_BINS, high=2**16)
+    with one_thread():
+        return _train(system, chosen, progress, tell)
+
+
+def _train(
+    system: System, chosen: Training, progress: Progress | None, tell: Callable[[Point], object] | None
+) -> Trained:
     torch.manual_seed(chosen.seed)
     network = PdfAutoencoder(system.bins, system.dead_time_periods, chosen.width, chosen.code)
     began, used = time.monotonic(), time.process_time()

@@ -82,8 +82,8 @@ class Examples:
 
     def batch(self, index: NDArray[np.int64], scale: float, device: torch.device) -> tuple[Tensor, Tensor]:
         """Normalised cubes (n, bins, H, W) and maps (n, 1, H, W)."""
-        counts = torch.from_numpy(self.cubes[index].astype(np.int32)).to(device)
-        cube = torch.sqrt(counts.to(torch.float32) / scale).permute(0, 3, 1, 2)
+        counts = torch.from_numpy(self.cubes[index].astype(np.float32)).to(device)
+        cube = counts.mul_(1.0 / scale).sqrt_().permute(0, 3, 1, 2)  # bins innermost: channels last, no copy
         return cube, torch.from_numpy(self.maps[index])[:, None].to(device)
 
 

@@ -31,7 +31,7 @@ class CubeUNet(nn.Module):
     bins
         Time bins.
     target
-        ``"depth"``: the output is a share of the unambiguous range; ``"reflectivity"``: of 1. Both by a sigmoid.
+        ``"depth"`` or ``"reflectivity"``: which map the head gives, by a sigmoid, as a share of a stated range.
     stem
         Channels behind the first layer of the stem.
     widths

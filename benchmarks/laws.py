@@ -12,8 +12,10 @@ from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Row, Section
 from benchmarks.timing import Timing, in_turn
 from benchmarks.workload import PERIOD_NS, system
+from mars_lidar.statistics._cells import Cells
+from mars_lidar.statistics._pmf import guessed_windows
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.exposure import exposure_moments
+from mars_lidar.statistics.exposure import exposure_moments, refined_moments
 from mars_lidar.statistics.grid import photons_per_bin
 from mars_lidar.statistics.law import count_law
 
@@ -33,11 +35,17 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
     def pmf() -> object:
         return count_law(signal, background, instrument, method="exact", threads=1).pmf
 
+    narrow = Cells.of(10.0 ** random.uniform(0.3, 1.0, 64), 10.0 ** random.uniform(-2.0, 0.0, 64), instrument)
+    known = refined_moments(narrow, 1, tolerance=1e-4, threads=1)
+
     cases: dict[str, tuple[int, int, Callable[[], object]]] = {
         "moments and mean histogram": (
             signal.size, 1, lambda: exposure_moments(signal, background, instrument, threads=1)
         ),
         "count pmf": (signal.size, 1, pmf),
+        "count pmf of a bright pixel, cumulants from a table": (
+            narrow.size, 1, lambda: guessed_windows(narrow, known.cumulants, known.bins, 1)
+        ),
         "table entries, moments and shapes": (
             grid.shape[1], every, lambda: exposure_moments(*grid, instrument, threads=every)
         ),

@@ -201,7 +201,7 @@ def test_view_draws_a_cube(tmp_path):
     [
         ([], "the scene is one of --scene and --depth, got neither"),
         (["--scene", "room", "--depth", "d.png"], "got both"),
-        (["--scene", "moon"], "name must be one of 'room', got 'moon'"),
+        (["--scene", "moon"], "name must be one of 'room', 'random', got 'moon'"),
         (["--scene", "room", "--image", "a.png"], "--image belongs to --depth"),
         (["--depth", "nowhere.png"], "nowhere.png"),
         (["--scene", "room", "--engine", "quick"], "engine must be one of"),

@@ -320,10 +320,10 @@ def test_levels_that_cannot_be_reached_are_refused(scene, system, told):
 
 
 def test_example_names_and_the_error_that_lists_them():
-    assert Scene.example_names() == ("room",)
+    assert Scene.example_names() == ("room", "random")
     for name in Scene.example_names():
         assert Scene.example(name, size=4).shape == (4, 4)
-    with pytest.raises(ValueError, match="name must be one of 'room', got 'kitchen'"):
+    with pytest.raises(ValueError, match="name must be one of 'room', 'random', got 'kitchen'"):
         Scene.example("kitchen")
 
 

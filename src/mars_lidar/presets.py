@@ -12,7 +12,8 @@ from mars_lidar.detector import Detector
 
 # Afterpulses of the module of serial number 3605H by time after the recovery, ns, and the share of them up to then:
 # the distribution that goes with Straka et al. (github.com/ivo-s/SPAD-counting-model, apDist_3605H.txt, 81 ps bins),
-# condensed to ten steps. Most of them come within a third of a nanosecond, the rest spread over 200 ns.
+# condensed to nine steps. Those up to 57 ns are read off that histogram; how the remaining 6 % spread up to 227 ns is
+# our estimate. Most of them come within a third of a nanosecond.
 _RECOVERY_NS, _STEP_NS = 24.0, 0.324
 _UNTIL_NS = np.array([0.324, 2.43, 8.1, 16.2, 24.3, 32.4, 56.7, 113.4, 226.8])
 _SHARE = np.array([0.593, 0.686, 0.784, 0.846, 0.883, 0.903, 0.938, 0.975, 1.0])

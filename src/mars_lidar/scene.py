@@ -16,7 +16,7 @@ from mars_lidar.system import System
 
 FloatArray = NDArray[np.float64]
 
-_EXAMPLES = ("room",)
+_EXAMPLES = ("room", "random")
 _MAX_DEPTH_M = 1e9  # beyond the Moon; keeps delays far inside what a double resolves to a picosecond
 _MAX_SIDE = 1 << 13
 
@@ -203,6 +203,7 @@ class Scene:
         """A built-in scene, ray-cast by this package: no files needed, exact depth, any size.
 
         ``"room"``: walls, floor, a door to a passage, boxes, spheres, a table, a test chart; 2.4 to 8.7 m.
+        ``"random"``: a room of its own for every seed, boxes and spheres in it, and its own view; up to 17 m.
         Depth is the range along the ray of the pixel's centre; reflectivity is albedo times the cosine of
         incidence (Lambert, laser at the camera).
 
@@ -218,6 +219,10 @@ class Scene:
         _validate.choice("name", name, _EXAMPLES)
         seed = _validate.integer("seed", seed, low=0, high=2**64 - 1)
         shape = _image_size(size if isinstance(size, tuple | list) else (size, size))
+        if name == "random":
+            from mars_lidar.random_scene import random_scene
+
+            return cls(*random_scene(shape, seed))
         from mars_lidar.room import room
 
         return cls(*room(shape, seed))

@@ -19,6 +19,9 @@ from mars_lidar.system import System
 from mars_lidar.timestamps import Timestamps
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mars_lidar.learn.neural import NeuralMap
     from mars_lidar.table import Table
 
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
@@ -38,9 +41,10 @@ def simulate(
     progress: Progress | None = None,
     report: dict[str, float] | None = None,
     table: Table | None = None,
-    count: Literal["exact", "gaussian"] | None = None,
+    count: Literal["exact", "matched", "gaussian"] | None = None,
     interpolation: Literal["bilinear", "nearest"] | None = None,
     outside: Literal["error", "exact"] | None = None,
+    model: NeuralMap | str | Path | None = None,
 ) -> NDArray[Any]:
     """Histogram cubes of an image.
 
@@ -53,8 +57,8 @@ def simulate(
     engine
         ``"exact"`` (default), ``"feedback"`` (whole histograms, at a cost independent of the exposure),
         ``"auto"`` (the faster of these two, pixel by pixel), ``"sequential"`` (slow, independent gold standard),
-        ``"mars"`` (count law x shape), ``"renewal"`` and ``"poisson"`` (baselines), or an `Engine` of your own
-        settings.
+        ``"mars"`` (count law x shape), ``"renewal"``, ``"neural"`` and ``"poisson"`` (baselines), or an
+        `Engine` of your own settings.
     realizations
         Independent exposures of the whole image.
     first_realization
@@ -76,18 +80,21 @@ def simulate(
         For ``"mars"`` and ``"renewal"``: the lookup table (`mars_lidar.Table`); see
         `mars_lidar.engines.MarsEngine`.
     count
-        For ``"mars"``: the law of the count, ``"exact"`` (default) or ``"gaussian"`` (the paper's).
+        For ``"mars"``: the law of the count, ``"exact"`` (default), ``"matched"`` (to four cumulants) or
+        ``"gaussian"`` (the paper's).
     interpolation
         For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
     outside
         For a table, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
+    model
+        For ``"neural"``: a `mars_lidar.learn.neural.NeuralMap` or its file; default: the one for the example system.
 
     Returns
     -------
     NDArray
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given).
     """
-    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside)
+    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside, model=model)
     task = _task(
         flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress
     )

@@ -32,6 +32,9 @@ def test_a_file_says_what_the_table_said(tmp_path, method):
     assert isinstance(read.shapes().base, np.memmap)
     assert (read.system, read.method, read.provenance) == (table.system, method, table.provenance)
     assert read.nbytes == table.nbytes
+    for name in ("row", "first", "offsets", "pmf"):
+        assert np.array_equal(getattr(read.laws, name), getattr(table.laws, name))
+    assert (table.laws.row.size > 0) == (method == "exposure")
     for cycles in (None, 1000):
         assert np.array_equal(read.shapes(cycles), table.shapes(cycles))
         a, b = (t.lookup([0.4, 3.0, 0.0], 1.3, delay_ns=[3.0, 70.0, 1.0], cycles=cycles) for t in (read, table))
@@ -58,6 +61,31 @@ def test_another_system_is_refused(tmp_path, change, told):
     longer = ml.Table.load(tmp_path / "t.h5", table.system.replace(cycles=900))
     assert np.array_equal(longer.lookup(1.0, 1.0).cumulants, table.lookup(1.0, 1.0, cycles=900).cumulants)
     assert np.array_equal(longer.shapes(), table.shapes(900))
+
+
+def test_files_of_other_formats(tmp_path):
+    """One of format 1 has no laws of entries: these are evaluated, to the same counts."""
+    table = small_table()
+    table.save(tmp_path / "t.h5")
+    row = table.laws.row[-1]
+    signal, background = table.signal[row // table.background.size], table.background[row % table.background.size]
+    flux, reports = ml.Flux(np.full((2, 2), signal), background, 50.0), []
+    cubes = []
+    for number in (2, 1, 3):
+        with h5py.File(tmp_path / "t.h5", "a") as file:
+            file.attrs["format"] = number
+            if number == 1:
+                for name in ("law_row", "law_first", "law_offsets", "law_pmf"):
+                    del file[name]
+        if number == 3:
+            with pytest.raises(ValueError, match="is a table of format 3; this version reads 1 and 2"):
+                ml.Table.load(tmp_path / "t.h5", table.system)
+            continue
+        read, report = ml.Table.load(tmp_path / "t.h5", table.system), {}
+        cubes.append(ml.simulate(flux, table.system, engine="mars", table=read, realizations=20, report=report))
+        reports.append(report["laws_evaluated"])
+    assert reports == [0, 1]
+    assert np.array_equal(*cubes)
 
 
 def test_files_that_are_not_tables(tmp_path, monkeypatch):
@@ -134,7 +162,8 @@ def test_commands(tmp_path, own_cache):
     done = run("table", "build", *small, "-o", tmp_path / "t.h5", "--check-law")
     assert done.exit_code == 0, done.output
     told = run("table", "info", tmp_path / "t.h5")
-    for word in ("0 and 5 log-spaced values in [0.1, 5]", "105 MB", "108 GB", "count law", "start phases"):
+    words = "0 and 5 log-spaced values in [0.1, 5]", "105 MB", "108 GB", "count law", "start phases", "exact laws"
+    for word in words:
         assert word in told.output, word
     assert run("table", "build", *small, "-o", tmp_path / "t.h5").exit_code == 2
     assert run("table", "build", *small).exit_code == 0

@@ -15,8 +15,11 @@ from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
 from mars_lidar.cli.init import init
 from mars_lidar.cli.inspect import info, view
 from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
+from mars_lidar.cli.neural import app as neural_app
 from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
 from mars_lidar.cli.simulate import EPILOG, simulate
+from mars_lidar.cli.study import SETTINGS as STUDY_SETTINGS
+from mars_lidar.cli.study import study
 from mars_lidar.cli.table import app as table_app
 
 app = typer.Typer(
@@ -39,8 +42,10 @@ app.command(no_args_is_help=True, epilog=INSPECT_EPILOG)(inspect)
 app.command(no_args_is_help=True, epilog=CALIBRATE_EPILOG)(calibrate)
 app.command(no_args_is_help=True, epilog=VALIDATE_EPILOG)(validate)
 app.command(no_args_is_help=True, epilog=RECONSTRUCT_EPILOG)(reconstruct)
+app.command(context_settings=STUDY_SETTINGS)(study)
 app.command()(init)
 app.add_typer(table_app, name="table")
+app.add_typer(neural_app, name="neural")
 
 
 _EPILOG = "\n\n".join(

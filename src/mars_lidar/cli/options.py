@@ -331,7 +331,8 @@ Count = Annotated[
     str | None,
     _option(
         "--count", panel=_RUN, default="exact",
-        help="For --engine mars: the law of the count, exact or gaussian (the paper's).",
+        help="For --engine mars: the law of the count: exact, matched (to four cumulants, faster with --table) or "
+        "gaussian (the paper's).",
     ),
 ]
 Interpolation = Annotated[

@@ -197,6 +197,7 @@ def _rows(path: Path) -> list[tuple[str, str]]:
             f"{shapes * _DEPTHS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
         ),
         ("cycles", serves),
+        ("exact laws", _laws(header)),
         (
             "system",
             f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
@@ -221,6 +222,15 @@ def _rows(path: Path) -> list[tuple[str, str]]:
             )
         )
     return rows
+
+
+def _laws(header: dict[str, Any]) -> str:
+    number, entries = header["laws"], header["enough"].size
+    if header["method"] == "mars":
+        return "none: the paper's count is a Gaussian"
+    if not number:
+        return "none kept: four cumulants fix the law of every entry, or the file is of an older format"
+    return f"{number:,} of {entries:,} entries keep the law of their count, {header['law_bytes'] / 1e6:,.3g} MB"
 
 
 def _line(path: Path) -> str:

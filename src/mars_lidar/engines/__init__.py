@@ -8,6 +8,7 @@ from mars_lidar.engines.base import Engine
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
+from mars_lidar.engines.neural import NeuralEngine
 from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.renewal import RenewalEngine
 from mars_lidar.engines.sequential import SequentialEngine
@@ -16,9 +17,11 @@ ENGINES: dict[str, Engine] = {
     engine.name: engine
     for engine in (
         ExactEngine(), FeedbackEngine(), AutoEngine(), SequentialEngine(), MarsEngine(), RenewalEngine(),
-        PoissonEngine(),
+        NeuralEngine(), PoissonEngine(),
     )
 }
+
+ANY_SYSTEM = tuple(name for name, engine in ENGINES.items() if engine.any_system)
 
 
 def find_engine(engine: str | Engine, **options: Any) -> Engine:
@@ -38,4 +41,4 @@ def find_engine(engine: str | Engine, **options: Any) -> Engine:
     return type(found)(**given) if given else found
 
 
-__all__ = ["ENGINES", "Engine", "MarsEngine", "RenewalEngine", "find_engine"]
+__all__ = ["ANY_SYSTEM", "ENGINES", "Engine", "MarsEngine", "NeuralEngine", "RenewalEngine", "find_engine"]

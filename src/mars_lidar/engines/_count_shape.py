@@ -56,11 +56,11 @@ class CountTimesShape(Engine):
         """Draws the pixels on the grid; returns the others."""
         with run.stage("lookup_s"):
             entries, left = reader.read(run.task, pixels)
-        run.draw(entries.batch(self._laws_of(run.task.system, entries)))
+        run.draw(entries.batch(self._laws_of(run, reader, entries)))
         return left
 
     @abstractmethod
-    def _laws_of(self, system: System, entries: Entries) -> CountLaws:
+    def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:
         """Laws of the counts of pixels from a table."""
 
     @abstractmethod

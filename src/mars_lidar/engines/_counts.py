@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -134,3 +134,23 @@ class Tabulated(CountLaws):
 
         laws = {"first": self.first, "offsets": self.offsets, "cumulative": self.cumulative}
         streams.fill(_core.tabulated_counts, out, law=self.law, **laws)
+
+
+@dataclass(frozen=True, eq=False)
+class Mended(CountLaws):
+    """Laws of which those of the pixels `at` (ascending) are replaced by `others`, one for each of them."""
+
+    laws: CountLaws
+    at: IndexArray
+    others: CountLaws
+
+    def part(self, pixels: slice) -> CountLaws:
+        start, stop = int(pixels.start), int(pixels.stop)
+        low, high = (int(k) for k in np.searchsorted(self.at, (start, stop)))
+        laws = self.laws.part(pixels)
+        return Mended(laws, self.at[low:high] - start, self.others.part(slice(low, high))) if high > low else laws
+
+    def fill(self, streams: Streams, out: IndexArray) -> None:
+        self.laws.fill(streams, out)
+        some = replace(streams, pixel_index=np.ascontiguousarray(streams.pixel_index[self.at]))
+        out[:, self.at] = self.others.draw(some)

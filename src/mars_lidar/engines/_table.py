@@ -40,6 +40,7 @@ class Entries:
     pixels: IndexArray
     signal: FloatArray
     background: FloatArray
+    delay_ns: FloatArray
     cumulants: FloatArray
     shapes: NDArray[np.float32]
     guides: NDArray[np.float32]
@@ -121,12 +122,14 @@ class TableReader:
         )
         order = np.flatnonzero(~look.outside)
         order = order[np.argsort(look.rows[order, 0])]
-        signal, background, cumulants = signal[order], background[order], look.cumulants[order]
-        alignment = Alignment.of(system, signal, background, delay[order], cumulants[:, 0] / system.cycles)
+        signal, background, delay = signal[order], background[order], delay[order]
+        cumulants = look.cumulants[order]
+        alignment = Alignment.of(system, signal, background, delay, cumulants[:, 0] / system.cycles)
         entries = Entries(
             pixels[order],
             signal,
             background,
+            delay,
             cumulants,
             *_shapes(self.table, system.cycles),
             look.rows[order],

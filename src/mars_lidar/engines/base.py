@@ -150,6 +150,7 @@ class Engine(ABC):
     description: ClassVar[str]
     modes: ClassVar[tuple[Mode, ...]] = ("nonparalyzable",)  # of the detector, that the engine reproduces
     effects: ClassVar[tuple[str, ...]] = LIGHT_EFFECTS  # likewise
+    any_system: ClassVar[bool] = True  # False: it draws the system that it was made for
     options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
 
     @property

@@ -12,7 +12,7 @@ from mars_lidar.engines._count_shape import CountTimesShape, normalised
 from mars_lidar.engines._counts import CountLaws, RoundedGaussian
 from mars_lidar.engines._pixels import Group, groups, single_return
 from mars_lidar.engines._synthesis import Batch, Run
-from mars_lidar.engines._table import Entries
+from mars_lidar.engines._table import Entries, TableReader
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
@@ -55,8 +55,8 @@ class RenewalEngine(CountTimesShape):
     ) -> None:
         super().__init__(table, interpolation, outside, level)
 
-    def _laws_of(self, system: System, entries: Entries) -> CountLaws:
-        return _laws(system, entries.signal, entries.background)
+    def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:
+        return _laws(run.task.system, entries.signal, entries.background)
 
     def _evaluate(self, run: Run, pixels: IndexArray) -> None:
         """The chain of each distinct pixel; one return is solved at the canonical delay and moved."""

@@ -77,7 +77,7 @@ def simulate_to(
     overwrite: bool = False,
     progress: Progress | None = None,
     table: Table | None = None,
-    count: Literal["exact", "gaussian"] | None = None,
+    count: Literal["exact", "matched", "gaussian"] | None = None,
     interpolation: Literal["bilinear", "nearest"] | None = None,
     outside: Literal["error", "exact"] | None = None,
 ) -> Written:

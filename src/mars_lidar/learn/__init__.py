@@ -1,13 +1,31 @@
-"""Training: datasets for PyTorch. Needs the extra ``learn``: pip install 'mars-lidar[learn]'."""
+"""Training: streams and datasets for PyTorch, a network for cubes, the training loop.
+
+Needs the extra ``learn``: pip install 'mars-lidar[learn]'.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mars_lidar.learn.fit import Examples, FitPlan, Fitted
+    from mars_lidar.learn.ranges import Choice, LogUniform, SystemRange, Uniform
     from mars_lidar.learn.stored import StoredDataset
+    from mars_lidar.learn.stream import CubeStream
+    from mars_lidar.learn.unet import CubeUNet
 
-_MODULES = {"StoredDataset": "stored"}
+_MODULES = {
+    "Choice": "ranges",
+    "CubeStream": "stream",
+    "CubeUNet": "unet",
+    "Examples": "fit",
+    "FitPlan": "fit",
+    "Fitted": "fit",
+    "LogUniform": "ranges",
+    "StoredDataset": "stored",
+    "SystemRange": "ranges",
+    "Uniform": "ranges",
+}
 
 
 def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
@@ -18,4 +36,15 @@ def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
     return getattr(import_module(f"mars_lidar.learn.{_MODULES[name]}"), name)
 
 
-__all__ = ["StoredDataset"]
+__all__ = [
+    "Choice",
+    "CubeStream",
+    "CubeUNet",
+    "Examples",
+    "FitPlan",
+    "Fitted",
+    "LogUniform",
+    "StoredDataset",
+    "SystemRange",
+    "Uniform",
+]

@@ -16,12 +16,13 @@ from mars_lidar.io.optional import MissingLibraryError
 
 try:
     import torch
-    from torch.utils.data import IterableDataset, get_worker_info
+    from torch.utils.data import IterableDataset
 except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.store import Dataset, open_dataset
+from mars_lidar.learn.places import rank_of, worker_of
 
 _NUMBERS = ("sample", "realization", "scene", "system", "signal_level", "sbr", "seed")
 
@@ -95,9 +96,7 @@ class StoredDataset(IterableDataset[dict[str, Any]]):
             raise TypeError(f"dtype must be a torch.dtype, got {dtype!r}")
         self._dtype = dtype
         self._transform = transform
-        if (rank is None) != (world_size is None):
-            raise ValueError("rank and world_size go together, got one of them")
-        self._rank, self._world = _place(rank, world_size)
+        self._rank, self._world = rank_of(rank, world_size)
         self._epoch = 0
         array = dataset.histogram
         self._realizations = array.shape[1]
@@ -116,8 +115,7 @@ class StoredDataset(IterableDataset[dict[str, Any]]):
         return int(self._samples.size) * int(self._realizations) // self._world
 
     def __iter__(self) -> Iterator[Any]:
-        info = get_worker_info()
-        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
+        worker, workers = worker_of()
         random = np.random.default_rng([self._seed, self._epoch])
         self._epoch += 1
         blocks = self._blocks()
@@ -220,11 +218,3 @@ def _numbers(samples: Any, number: int) -> NDArray[np.int64]:
     if array.min() < 0 or array.max() >= number:
         raise ValueError(f"samples must lie in [0, {number}), got {array.min()} to {array.max()}")
     return np.unique(array).astype(np.int64)
-
-
-def _place(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    if rank is None or world_size is None:
-        running = torch.distributed.is_available() and torch.distributed.is_initialized()
-        return (torch.distributed.get_rank(), torch.distributed.get_world_size()) if running else (0, 1)
-    world = _validate.integer("world_size", world_size, low=1, high=2**31)
-    return _validate.integer("rank", rank, low=0, high=world - 1), world

@@ -1,5 +1,6 @@
 // Bindings of the count law with four given cumulants; engines use matched_law.h itself.
 #include "matched_law.h"
+#include "matched_trust.h"
 
 #include "bindings.h"
 #include "parallel.h"
@@ -36,10 +37,11 @@ void support(Matrix<const double> cumulants, Vector<int64_t> first, Vector<int64
         first.shape(0) != trusted.shape(0))
         throw nb::value_error("first, last and trusted must be of shape (cells)");
     for_cells(cells, threads, [&](int64_t cell) {
-        const MatchedLaw law(cumulants_of(cumulants, cell));
+        const Cumulants given = cumulants_of(cumulants, cell);
+        const MatchedLaw law(given);
         first.data()[cell] = law.first();
         last.data()[cell] = law.last();
-        trusted.data()[cell] = law.trusted();
+        trusted.data()[cell] = mars::trusted(given, law);
     });
 }
 

@@ -49,9 +49,18 @@ public:
 
     Form form() const { return form_; }
 
-    // Whether the law is sure to be close to that of a pixel with these cumulants: a total variation of 0.002,
-    // by a study of exact laws (docs/studies/matched.md).
+    // Whether its form alone makes sure that it is close to the law of a pixel with these cumulants; matched_trust.h
+    // has the whole criterion.
     bool trusted() const { return trusted_; }
+
+    // Of the smooth form: the least slope of the quantile, in standard deviations, on [-reach, reach].
+    double least_slope(double reach) const {
+        const auto slope = [&](double z) { return c1_ + z * (2.0 * c2_ + z * 3.0 * c3_); };
+        double least = std::min(slope(-reach), slope(reach));
+        const double bottom = c3_ > 0.0 ? -c2_ / (3.0 * c3_) : reach;
+        if (std::fabs(bottom) < reach) least = std::min(least, slope(bottom));
+        return least;
+    }
 
     // All but about 1e-15 of the probability lies on first() .. last().
     int64_t first() const { return form_ == Form::smooth ? draw_at(-kReach) : first_; }
@@ -85,7 +94,7 @@ private:
     // thresholds of `trusted`, set by the study
     static constexpr double kSureReach = 4.0;   // standard deviations over which the quantile rises
     static constexpr double kSureRatio = 0.93;  // of gains that are rare, on top of losses
-    static constexpr double kSureFit = 3e-6, kSureSmooth = 3.5, kSureVariance = 0.19;
+    static constexpr double kSureFit = 3e-6, kSureSmooth = 3.5, kSureVariance = 0.19, kSureFive = 0.16;
     static constexpr double kReach = 8.3;         // no word of 52 bits is beyond
     static constexpr double kNeeded = 1.5;        // where the quantile must rise for the law to be any good
 
@@ -172,13 +181,13 @@ private:
         if (one_sided || two_sided || (k.variance < kSureVariance && law.misfit < HUGE_VAL)) {
             if (set_atoms(k, 4, [&](double first) { atoms::base(law, first, size_, below_); })) {
                 trusted_ = one_sided || (law.misfit < kSureFit && law.ratio > kSureRatio) ||
-                           k.variance < kSureVariance;
+                           k.variance < kSureFive;
                 return;
             }
         }
         set_smooth(k);
         const bool rises = trusted_;
-        trusted_ = k.variance < kSureVariance || (rises && k.variance > kSureSmooth);
+        trusted_ = k.variance < kSureFive || (rises && k.variance > kSureSmooth);
         if (rises && k.variance > kSheppard) return;
         const auto normal = [&](double first) { atoms::normal_base(k, first, size_, below_); };
         if (k.variance < kNarrow ? set_atoms(k, 4, normal)

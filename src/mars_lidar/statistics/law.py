@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,15 +22,22 @@ from mars_lidar.statistics.histogram import histogram_effects, mean_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 from mars_lidar.system import System
 
-Method = Literal["exact", "mars", "renewal", "poisson"]
-_METHODS = ("exact", "mars", "renewal", "poisson")
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mars_lidar.learn.neural import NeuralMap
+
+Method = Literal["exact", "mars", "renewal", "neural", "poisson"]
+_METHODS = ("exact", "mars", "renewal", "neural", "poisson")
 _LAW_MODES: dict[str, tuple[Mode, ...]] = {
     "exact": ("nonparalyzable", "synchronous", "gated"),
     "mars": PLAIN,
     "renewal": PLAIN,
+    "neural": PLAIN,
     "poisson": MODES,
 }
-_SHAPES = ("exposure", "stationary", "chain")
+_SHAPES = ("exposure", "stationary", "chain", "neural")
+_OF_CHAIN = ("chain", "neural")
 _REARMS = ("centre", "edge")
 
 
@@ -85,7 +92,7 @@ class CountLaw:
     def pmf(self) -> FloatArray:
         """P(N = n) (..., w) for n in `support`; no more than `outside` lies elsewhere.
 
-        For the Gaussian laws ("mars", "renewal") the normal density integrated from n - 1/2 to n + 1/2, what
+        For the Gaussian laws ("mars", "renewal", "neural") the normal density integrated from n - 1/2 to n + 1/2, what
         lies below 0 included in P(0).
         """
         out = np.zeros((len(self._windows), self._width))
@@ -128,6 +135,7 @@ def count_law(
     rearm: Literal["centre", "edge"] | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
+    model: NeuralMap | str | Path | None = None,
 ) -> CountLaw:
     """Law of the number of registrations in one exposure.
 
@@ -143,6 +151,8 @@ def count_law(
         - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure,
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
+        - ``"neural"``: a stand-in for the neural mapping of arXiv 2505.23992 (`mars_lidar.engines.NeuralEngine`): the
+          Gaussian of the mean that follows from a network's PDF, and a variance without covariances,
         - ``"poisson"``: no dead time, the law of the arrivals (inside of the gate) for every mode.
     delay_ns
         Delay of the return, ns; None: half the period. With ``"exact"`` an array may broadcast with S and B:
@@ -156,6 +166,8 @@ def count_law(
         For ``"exact"``: see `exposure_moments`.
     threads
         Threads to run on; default: all processors that this process may use.
+    model
+        For ``"neural"``: as `simulate`.
 
     Returns
     -------
@@ -164,6 +176,7 @@ def count_law(
     """
     _validate.choice("method", method, _METHODS)
     edge = _rearm(rearm, method == "mars", f"method {method!r}")
+    _model(model, method)
     cells = Cells.of(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
         what=f"count_law of method {method!r}", modes=_LAW_MODES[method], effects=LIGHT_EFFECTS + TIMING_EFFECTS,
@@ -181,7 +194,7 @@ def count_law(
         means = system.cycles * cells.total
         cumulants = np.repeat(means[:, None], 4, axis=1).reshape(*cells.shape, 4)
         return CountLaw(method, cumulants, lambda: [poisson_window(float(m)) for m in means])
-    mean, variance = _gaussian_moments(method, cells, edge)
+    mean, variance = _neural(cells, model)[1:] if method == "neural" else _gaussian_moments(method, cells, edge)
     cumulants = np.zeros((*cells.shape, 4))
     cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
     return CountLaw(
@@ -195,13 +208,14 @@ def registration_pdf(
     signal: ArrayLike | None,
     background: ArrayLike,
     system: System,
-    method: Literal["exposure", "stationary", "chain"] = "exposure",
+    method: Literal["exposure", "stationary", "chain", "neural"] = "exposure",
     *,
     delay_ns: ArrayLike | None = None,
     waveform: ArrayLike | None = None,
     rearm: Literal["centre", "edge"] | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
+    model: NeuralMap | str | Path | None = None,
 ) -> FloatArray:
     """Shape of the mean histogram: the distribution of registrations over the bins of the period.
 
@@ -213,9 +227,13 @@ def registration_pdf(
         - ``"exposure"``: mean histogram of the finite exposure, which is what a measurement averages to,
         - ``"stationary"``: that of a pixel which has been running for long,
         - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500), for detectors
-          of mode ``"nonparalyzable"``; the others are for every mode (docs/detectors.md).
+          of mode ``"nonparalyzable"``; the first two are for every mode (docs/detectors.md),
+        - ``"neural"``: a trained network's answer to the flux, in place of the chain's
+          (`mars_lidar.engines.NeuralEngine`).
     rearm
         ``"centre"`` (default) or ``"edge"`` of the bin, for ``"chain"`` only.
+    model
+        For ``"neural"``: as `simulate`.
 
     Returns
     -------
@@ -225,12 +243,15 @@ def registration_pdf(
     """
     _validate.choice("method", method, _SHAPES)
     edge = _rearm(rearm, method == "chain", f"method {method!r}")
+    _model(model, method)
     cells = Cells.of(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what=f"registration_pdf of method {method!r}", modes=PLAIN if method == "chain" else MODES,
+        what=f"registration_pdf of method {method!r}", modes=PLAIN if method in _OF_CHAIN else MODES,
         effects=_shape_effects(method, system),
     )  # fmt: skip
-    if method == "chain":
+    if method == "neural":
+        shape = _neural(cells, model)[0]
+    elif method == "chain":
         shape = _chain_shapes(cells, edge)
     elif method == "exposure" or system.detector.mode == "synchronous":  # there the same at any time
         shape = mean_histograms(cells, tolerance, threads)
@@ -248,7 +269,7 @@ def registration_pdf(
 
 
 def _shape_effects(method: str, system: System) -> tuple[str, ...]:
-    if method == "chain":
+    if method in _OF_CHAIN:
         return LIGHT_EFFECTS
     return histogram_effects(system) if method == "exposure" else LIGHT_EFFECTS + TIMING_EFFECTS
 
@@ -295,6 +316,20 @@ def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
         )
         out[k] = chain.stationary().pdf.reshape(bins, -1).sum(-1)
     return out
+
+
+def _model(model: object, method: str) -> None:
+    if model is not None and method != "neural":
+        raise ValueError(f"model must be None for method {method!r}, which has no network, got {model!r}")
+
+
+def _neural(cells: Cells, model: NeuralMap | str | Path | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """PDFs (cells, bins), means and variances (cells,) by the network."""
+    from mars_lidar.engines import ENGINES, NeuralEngine
+
+    default = ENGINES["neural"]
+    engine = default if model is None and isinstance(default, NeuralEngine) else NeuralEngine(model)
+    return engine.of_cells(cells)
 
 
 def pixel_of(cells: Cells, k: int) -> tuple[float | None, FloatArray | None, float | None]:

@@ -7,6 +7,7 @@ something depend on the machine, and they name it.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ class Request:
     """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
-    the study "hardware".
+    the study "hardware"; `config` the size of the study "downstream".
     """
 
     out: Path
@@ -28,134 +29,68 @@ class Request:
     tell: Tell = str
     truth: str = "sequential"
     stream: Path | None = None
+    config: str = "small"
 
 
 Study = Callable[[Request], list[Path]]
 
 
-def _covariance(request: Request) -> list[Path]:
-    from mars_lidar.studies.covariance_report import run
+def _study(module: str) -> Study:
+    """`run` of a module of this package, which is imported when it is called."""
 
-    return run(request)
+    def run(request: Request) -> list[Path]:
+        study: Study = importlib.import_module(f"mars_lidar.studies.{module}").run
+        return study(request)
 
-
-def _law(request: Request) -> list[Path]:
-    from mars_lidar.studies.law_report import run
-
-    return run(request)
-
-
-def _detectors(request: Request) -> list[Path]:
-    from mars_lidar.studies.detectors import run
-
-    return run(request)
-
-
-def _effects(request: Request) -> list[Path]:
-    from mars_lidar.studies.effects import run
-
-    return run(request)
-
-
-def _matched(request: Request) -> list[Path]:
-    from mars_lidar.studies.matched_report import run
-
-    return run(request)
-
-
-def _reference(request: Request) -> list[Path]:
-    from mars_lidar.studies.reference import run
-
-    return run(request)
-
-
-def _joint(request: Request) -> list[Path]:
-    from mars_lidar.studies.joint_report import run
-
-    return run(request)
-
-
-def _joint_covariance(request: Request) -> list[Path]:
-    from mars_lidar.studies.joint_covariance_report import run
-
-    return run(request)
-
-
-def _long_exposures(request: Request) -> list[Path]:
-    from mars_lidar.studies.long_exposures import run
-
-    return run(request)
-
-
-def _count_law(request: Request) -> list[Path]:
-    from mars_lidar.studies.count_law_report import run
-
-    return run(request)
-
-
-def _joint_table(request: Request) -> list[Path]:
-    from mars_lidar.studies.joint_table_report import run
-
-    return run(request)
-
-
-def _runtime(request: Request) -> list[Path]:
-    from mars_lidar.studies.runtime_report import run
-
-    return run(request)
-
-
-def _quantisation(request: Request) -> list[Path]:
-    from mars_lidar.studies.quantisation_report import run
-
-    return run(request)
-
-
-def _hardware(request: Request) -> list[Path]:
-    from mars_lidar.studies.hardware_report import run
-
-    return run(request)
-
-
-def _reconstruction(request: Request) -> list[Path]:
-    from mars_lidar.studies.reconstruction import run
-
-    return run(request)
-
-
-def _transients(request: Request) -> list[Path]:
-    from mars_lidar.studies.transients import run
-
-    return run(request)
-
-
-def _table(request: Request) -> list[Path]:
-    from mars_lidar.studies.table import run
-
-    return run(request)
+    return run
 
 
 STUDIES: dict[str, tuple[str, Study]] = {
-    "covariance": ("covariance of holding times, and the rules that truncate its sum", _covariance),
-    "joint": ("can a classifier tell an engine's histograms from exact ones? needs scikit-learn", _joint),
+    "covariance": ("covariance of holding times, and the rules that truncate its sum", _study("covariance_report")),
+    "joint": (
+        "can a classifier tell an engine's histograms from exact ones? needs scikit-learn",
+        _study("joint_report"),
+    ),
     "joint-covariance": (
         "the histogram's covariance in closed form against simulation; --data adds reference cases",
-        _joint_covariance,
+        _study("joint_covariance_report"),
     ),
-    "long-exposures": ("the feedback engine at a million cycles and more against the closed form", _long_exposures),
-    "law": ("where each count law holds: total variation to simulation over flux and exposure", _law),
-    "detectors": ("what each mode of a detector does to the same flux, simulated and in closed form", _detectors),
-    "effects": ("what each effect of a detector does to the same flux, simulated and in closed form", _effects),
-    "matched": ("a law of the count from four cumulants: total variation to the exact law", _matched),
-    "reference": ("every count law against simulated reference cases; needs --data", _reference),
-    "count-law": ("T1: every simulator's count law and shape against simulation", _count_law),
-    "joint-table": ("variance of signal window and bins, covariance of neighbours: every engine", _joint_table),
-    "quantisation": ("what a table's lookup costs, nearest and interpolated, over its size", _quantisation),
-    "hardware": ("T6: streams calibrated and validated, faulty detectors; --stream adds a measured one", _hardware),
-    "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _runtime),
-    "reconstruction": ("bias and error of depth and signal over flux, every method, beside the bound", _reconstruction),
-    "transients": ("two returns in fog through the dead time of three detectors", _transients),
-    "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _table),
+    "long-exposures": (
+        "the feedback engine at a million cycles and more against the closed form",
+        _study("long_exposures"),
+    ),
+    "law": ("where each count law holds: total variation to simulation over flux and exposure", _study("law_report")),
+    "detectors": (
+        "what each mode of a detector does to the same flux, simulated and in closed form",
+        _study("detectors"),
+    ),
+    "effects": (
+        "what each effect of a detector does to the same flux, simulated and in closed form",
+        _study("effects"),
+    ),
+    "matched": ("a law of the count from four cumulants: total variation to the exact law", _study("matched_report")),
+    "reference": ("every count law against simulated reference cases; needs --data", _study("reference")),
+    "count-law": ("T1: every simulator's count law and shape against simulation", _study("count_law_report")),
+    "joint-table": (
+        "variance of signal window and bins, covariance of neighbours: every engine",
+        _study("joint_table_report"),
+    ),
+    "quantisation": (
+        "what a table's lookup costs, nearest and interpolated, over its size",
+        _study("quantisation_report"),
+    ),
+    "hardware": (
+        "T6: streams calibrated and validated, faulty detectors; --stream adds a measured one",
+        _study("hardware_report"),
+    ),
+    "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _study("runtime_report")),
+    "reconstruction": (
+        "bias and error of depth and signal over flux, every method, beside the bound",
+        _study("reconstruction"),
+    ),
+    "transients": ("two returns in fog through the dead time of three detectors", _study("transients")),
+    "downstream": ("T5: networks trained on every simulator's data, tested on gold; --config", _study("downstream")),
+    "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _study("table")),
 }
 
 __all__ = ["STUDIES", "Request", "Study", "Tell"]

@@ -35,7 +35,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--data", type=Path, metavar="DIR",
-        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance')",
+        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance'), or of measured scenes, "
+        "rgbd/ (study 'downstream')",
     )
     parser.add_argument(
         "--stream", type=Path, metavar="FILE",
@@ -46,6 +47,11 @@ def _parser() -> argparse.ArgumentParser:
         help="engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is "
         "several times faster (default: %(default)s)",
     )  # fmt: skip
+    parser.add_argument(
+        "--config", choices=("small", "full"), default="small",
+        help="size of the study 'downstream': an hour or two of two cores, or a GPU (default: %(default)s); with "
+        "--quick a tiny one, seconds",
+    )  # fmt: skip
     return parser
 
 
@@ -55,8 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     if "reference" in given.studies and given.data is None:
         parser.error("study 'reference' needs --data DIR, the folder of the reference cases")
-    if given.data is not None and not any(given.data.glob("*.json")):
-        parser.error(f"--data must be a folder with *.json cases, got {str(given.data)!r}")
+    if given.data is not None and not (any(given.data.glob("*.json")) or (given.data / "rgbd").is_dir()):
+        parser.error(f"--data must be a folder with *.json cases or rgbd/, got {str(given.data)!r}")
     if given.stream is not None and not given.stream.is_file():
         parser.error(f"--stream must be a file, got {str(given.stream)!r}")
     try:
@@ -64,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         parser.error(f"--out must be a folder that can be made, got {str(given.out)!r}: {error.strerror}")
     tell = partial(print, file=sys.stderr, flush=True)
-    request = Request(given.out, given.quick, given.data, tell, given.truth, given.stream)
+    request = Request(given.out, given.quick, given.data, tell, given.truth, given.stream, given.config)
     try:
         for name in dict.fromkeys(given.studies):
             began = time.monotonic()

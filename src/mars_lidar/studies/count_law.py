@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.learn.neural.plan import Training
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.statistics import count_law
 from mars_lidar.studies import Tell
@@ -58,6 +59,8 @@ class Settings:
     bins: int = 1024
     sigma_ns: float = 0.5
     seed: int = 20266
+    steps: int = 1750  # of the training of the neural stand-in, for each system
+    pairs: int = 6000
 
     def system(self, period_ns: float, dead_ns: float) -> System:
         """Armed start."""
@@ -104,6 +107,8 @@ QUICK = Settings(
     sweep_flux=(0.1, 5.0),
     cycles=100,
     bins=256,
+    steps=60,
+    pairs=200,
 )
 
 
@@ -174,7 +179,7 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
     seed = (settings.seed << 16) + number
     sample = draw(truth, signal, background, system, realizations=settings.realizations, seed=seed)
     # another seed: an engine must not share random numbers with the truth
-    asked = simulators(settings.sampled, seed + (1 << 40))
+    asked = simulators(settings.sampled, seed + (1 << 40), Training(steps=settings.steps, pairs=settings.pairs))
     predictions = {one.name: one.predict(signal, background, system) for one in asked}
     cumulants = count_law(signal, background, system, "exact").cumulants
     random = np.random.default_rng([settings.seed, number])

@@ -33,6 +33,7 @@ _LINES = {
     "mars_centre": (COLOURS[4], "-", 1.0),
     "mars_edge": (COLOURS[3], "--", 1.0),
     "renewal": (COLOURS[2], "-", 1.0),
+    "neural": (COLOURS[5], "-.", 1.0),
     "poisson": (COLOURS[0], "-", 1.0),
 }
 _LEGEND = {
@@ -42,6 +43,7 @@ _LEGEND = {
     "mars_edge": "MaRS, paper's, edge",
     "mars_exact": "MaRS, ours, exact",
     "mars_matched": "MaRS, ours, four cumulants",
+    "neural": "neural, stand-in",
 }
 _REACH = 30.0  # standard deviations beyond which a law is named at the panel's side instead of drawn
 

@@ -8,22 +8,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.engines import ENGINES
+from mars_lidar.learn.neural.plan import Training
 from mars_lidar.statistics import CountLaw, count_law, photons_per_bin, registration_pdf
 from mars_lidar.statistics.matched import matched_pmf
 from mars_lidar.studies.distance import Pmf
 from mars_lidar.studies.sample import draw
 from mars_lidar.system import System
 
+if TYPE_CHECKING:
+    from mars_lidar.learn.neural import NeuralMap
+
 FloatArray = NDArray[np.float64]
 
 # engines whose count law is evaluated instead of sampled, and those that are the truth
-_IN_CLOSED_FORM = ("poisson", "renewal", "mars", "exact", "sequential")
+_IN_CLOSED_FORM = ("poisson", "renewal", "neural", "mars", "exact", "sequential")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +58,13 @@ class Simulator:
     predict: Predict
 
 
-def simulators(sampled: int, seed: int) -> list[Simulator]:
-    """All simulators; engines without a law in closed form are asked for `sampled` exposures."""
+def simulators(sampled: int, seed: int, training: Training | None = None) -> list[Simulator]:
+    """All simulators; engines without a law in closed form are asked for `sampled` exposures.
+
+    The network of the neural stand-in is trained for each system as `training` says, once;
+    it is left out where PyTorch is not installed.
+    """
+    plan = training or Training()
     evaluated = [
         Simulator("poisson", "Poisson", _poisson),
         Simulator("renewal", "renewal", _renewal),
@@ -62,6 +73,10 @@ def simulators(sampled: int, seed: int) -> list[Simulator]:
         Simulator("mars_exact", "MaRS, ours, exact law", _exact),
         Simulator("mars_matched", "MaRS, ours, four cumulants", _matched),
     ]
+    if find_spec("torch") is not None:  # the extra "learn"
+        evaluated.append(
+            Simulator("neural", "neural, stand-in", lambda s, b, system: _neural(s, b, system, plan))
+        )
     others = [name for name in ENGINES if name not in _IN_CLOSED_FORM]
     return evaluated + [Simulator(name, f"{name} (sampled)", _sampler(name, sampled, seed)) for name in others]
 
@@ -86,6 +101,19 @@ def _poisson(signal: FloatArray, background: FloatArray, system: System) -> Pred
 def _renewal(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
     shape = registration_pdf(signal, background, system, "chain")
     return of_law(count_law(signal, background, system, "renewal"), shape)
+
+
+def _neural(signal: FloatArray, background: FloatArray, system: System, training: Training) -> Prediction:
+    model = _trained(system.replace(cycles=1, start="armed"), training)
+    shape = registration_pdf(signal, background, system, "neural", model=model)
+    return of_law(count_law(signal, background, system, "neural", model=model), shape)
+
+
+@lru_cache(maxsize=8)
+def _trained(system: System, training: Training) -> NeuralMap:
+    from mars_lidar.learn.neural import train
+
+    return train(system, training).map
 
 
 def _mars(

@@ -19,6 +19,7 @@ from mars_lidar.table.axes import Grid, axis_values, describe
 from mars_lidar.table.cache import request_key
 from mars_lidar.table.entries import Entries, Progress, exposure_entries
 from mars_lidar.table.error import QuantisationError
+from mars_lidar.table.node_laws import NodeLaws, node_laws
 from mars_lidar.table.refine import refined_axes
 from mars_lidar.table.renewal_entries import renewal_entries
 from mars_lidar.table.start_phase import StartPhases, start_phases
@@ -108,21 +109,25 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
         "take fewer points or bins",
     )
     cells = signal.size * background.size
-    total = cells + max(1, cells // 10)  # the start phases take about so much of the time
+    settled = cells + max(1, cells // 10)  # the start phases take about so much of the time
+    total = settled + max(1, cells // 20)  # and the laws of some entries so much
     entries = recipe.entries(
         np.repeat(signal, background.size), np.tile(background, signal.size), system, _part(progress, 0, cells, total)
     )
-    phases = StartPhases.none()
+    phases, laws = StartPhases.none(), NodeLaws.none()
     if recipe.method == "exposure":
         phases = start_phases(
             system, signal, background, entries.cumulants, entries.bins, threads=recipe.threads,
-            progress=_part(progress, cells, total, total),
+            progress=_part(progress, cells, settled, total),
         )  # fmt: skip
+        laws = node_laws(
+            system, signal, background, entries, threads=recipe.threads, progress=_part(progress, settled, total, total)
+        )
     if progress is not None:
         progress(total, total)
     provenance = {"version": __version__, "signal": describe(signal), "background": describe(background)}
     return Table(
-        system, recipe.method, signal, background, recipe.rearm, recipe.tolerance, provenance, entries, phases
+        system, recipe.method, signal, background, recipe.rearm, recipe.tolerance, provenance, entries, phases, laws
     )
 
 

@@ -20,7 +20,7 @@ from mars_lidar.table.axes import Grid, axis_values
 if TYPE_CHECKING:
     from mars_lidar.table.table import Table
 
-FORMAT = 1
+FORMAT = 2
 SUFFIX = ".h5"
 _KEY_LENGTH = 24
 

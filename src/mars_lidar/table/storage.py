@@ -13,6 +13,7 @@ from mars_lidar.io.store import TemporarySibling, check_target
 from mars_lidar.system import System
 from mars_lidar.table.cache import FORMAT
 from mars_lidar.table.entries import Entries
+from mars_lidar.table.node_laws import NodeLaws
 from mars_lidar.table.start_phase import StartPhases
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 _KIND = "mars-lidar table"
 _SUFFIXES = (".h5", ".hdf5")
 _MAPPED = ("shape", "startup")
+_READABLE = (1, FORMAT)  # the first kept no laws of entries
 
 
 def save(table: Table, path: Path, *, overwrite: bool) -> None:
@@ -61,9 +63,10 @@ def load(path: Path, system: System) -> Table:
     phases = StartPhases(
         **{n: arrays["phase_" + n] for n in ("signal", "background", "phase", "correction", "settled")}
     )
+    laws = NodeLaws(**{name: arrays["law_" + name] for name in ("row", "first", "offsets", "pmf")})
     table = Table(
         system, header["method"], arrays["signal"], arrays["background"], header["rearm"], float(header["tolerance"]),
-        json.loads(header["provenance"]), entries, phases,
+        json.loads(header["provenance"]), entries, phases, laws,
     )  # fmt: skip
     if not table.serves(system.cycles):
         raise ValueError(
@@ -88,6 +91,8 @@ def read_header(path: Path) -> dict[str, Any]:
         "enough": arrays["enough"],
         "nbytes": path.stat().st_size,
         "shape_bytes": arrays["shape"].nbytes,
+        "laws": arrays["law_row"].size,
+        "law_bytes": arrays["law_pmf"].nbytes,
     }
 
 
@@ -119,10 +124,15 @@ def _arrays(table: Table) -> dict[str, NDArray[Any]]:
         "phase_correction": phases.correction,
         "phase_settled": phases.settled.astype(np.uint8),
         "shape": entries.shape,
+        **_laws(table.laws),
     }
     if entries.startup is not None:
         arrays["startup"] = entries.startup
     return arrays
+
+
+def _laws(laws: NodeLaws) -> dict[str, NDArray[Any]]:
+    return {"law_row": laws.row, "law_first": laws.first, "law_offsets": laws.offsets, "law_pmf": laws.pmf}
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -136,14 +146,19 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             header = dict(file.attrs.items())
             if header.get("kind") != _KIND:
                 raise ValueError(f"{path} is not a table of mars-lidar")
-            if int(header["format"]) != FORMAT:
-                raise ValueError(f"{path} is a table of format {header['format']}; this version reads {FORMAT}")
+            if int(header["format"]) not in _READABLE:
+                raise ValueError(
+                    f"{path} is a table of format {header['format']}; this version reads "
+                    f"{' and '.join(map(str, _READABLE))}"
+                )
             arrays = {
                 name: _mapped(path, data) if name in _MAPPED else _own(data[()]) for name, data in file.items()
             }
     except OSError as error:
         raise ValueError(f"{path} is not an HDF5 file that can be read: {error}") from error
     arrays["phase_settled"] = arrays["phase_settled"].astype(bool)
+    if "law_row" not in arrays:
+        arrays.update(_laws(NodeLaws.none()))
     return header, arrays
 
 

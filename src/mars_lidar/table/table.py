@@ -24,6 +24,7 @@ from mars_lidar.table.entries import Entries, Progress
 from mars_lidar.table.error import QuantisationError, quantisation_error
 from mars_lidar.table.law import LawError, law_error
 from mars_lidar.table.lookup import Lookup, evaluate
+from mars_lidar.table.node_laws import NodeLaws
 from mars_lidar.table.start_phase import StartPhases
 
 Method = Literal["exposure", "mars"]
@@ -49,6 +50,8 @@ class Table:
         Of the exposure statistics.
     provenance
         How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
+    laws
+        Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.trusted`).
     """
 
     system: System
@@ -60,6 +63,7 @@ class Table:
     provenance: dict[str, Any]
     entries: Entries = field(repr=False)
     start_phases: StartPhases = field(repr=False)
+    laws: NodeLaws = field(repr=False)
 
     @classmethod
     def build(
@@ -268,7 +272,7 @@ class Table:
         background: Grid = PAPER_GRID["background"],
         **options: Any,
     ) -> Table:
-        """`build`, or the same table from the user's cache (docs/table.md, 6), which keeps what is built."""
+        """`build`, or the same table from the user's cache (docs/table.md, 7), which keeps what is built."""
         from mars_lidar.table.cache import cached
 
         return cached(system, signal, background, **options)
@@ -280,7 +284,7 @@ class Table:
         startup = 0 if entries.startup is None else entries.startup.nbytes
         return int(
             entries.shape.nbytes + startup + entries.cumulants.nbytes + entries.rates.nbytes + entries.enough.nbytes
-            + entries.bins.nbytes + phases.correction.nbytes + phases.settled.nbytes
+            + entries.bins.nbytes + phases.correction.nbytes + phases.settled.nbytes + self.laws.nbytes
         )  # fmt: skip
 
     def _cycles(self, cycles: int | None) -> int:

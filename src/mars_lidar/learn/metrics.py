@@ -1,0 +1,49 @@
+"""Errors of reconstructed maps."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar import _validate
+
+
+def psnr(found: ArrayLike, true: ArrayLike, data_range: float) -> float:
+    """Peak signal-to-noise ratio, dB: 20 log10(`data_range` / RMSE); `data_range` is stated, not the data's."""
+    peak = _validate.real("data_range", data_range, low=0.0, strict_low=True)
+    error = rmse(found, true)
+    return math.inf if error == 0.0 else 20.0 * math.log10(peak / error)
+
+
+def rmse(found: ArrayLike, true: ArrayLike) -> float:
+    """Root of the mean squared error over the entries where `true` is finite."""
+    a, b = _pair(found, true)
+    known = np.isfinite(b)
+    if not known.any():
+        raise ValueError("true must have a finite entry, got none")
+    return float(np.sqrt(np.mean((a[known] - b[known]) ** 2)))
+
+
+def ssim(found: ArrayLike, true: ArrayLike, data_range: float) -> float:
+    """Structural similarity (Wang et al. 2004) of two images (H, W), Gaussian window of 1.5 pixels; scikit-image's."""
+    peak = _validate.real("data_range", data_range, low=0.0, strict_low=True)
+    try:
+        from skimage.metrics import structural_similarity
+    except ImportError as error:
+        raise ImportError(f"ssim needs scikit-image: pip install 'mars-lidar[estimate]' ({error})") from error
+    a, b = _pair(found, true)
+    return float(
+        structural_similarity(  # type: ignore[no-untyped-call]
+            a, b, data_range=peak, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+        )
+    )
+
+
+def _pair(found: ArrayLike, true: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
+    a, b = np.asarray(found, dtype=np.float64), np.asarray(true, dtype=np.float64)
+    if a.shape != b.shape:
+        raise ValueError(f"found must have the shape {b.shape} of true, got {a.shape}")
+    return a, b

@@ -1,0 +1,188 @@
+"""Training of a neural map, with validation on held-out fluxes as it goes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mars_lidar import _validate
+from mars_lidar.engines.base import Progress
+from mars_lidar.learn.neural.model import NeuralMap
+from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, one_thread, rolled
+from mars_lidar.learn.neural.pairs import Pairs
+from mars_lidar.learn.neural.plan import Training
+from mars_lidar.statistics._gate import require_mode
+from mars_lidar.system import System
+
+_RATE, _WARM_UP, _CLIP = 4e-3, 0.1, 1.0
+_MIN_BINS = 128
+
+
+@dataclass(frozen=True)
+class Point:
+    """One validation: loss of the steps before it; total variation to the chain and error of the mean count."""
+
+    step: int
+    seconds: float
+    loss: float
+    tv_mean: float
+    tv_95: float
+    tv_max: float
+    mean_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A map, its validation curve, and the total variation of the mean PDF, which ignores the flux."""
+
+    map: NeuralMap
+    curve: list[Point]
+    unconditional: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Tensors:
+    photons: Tensor
+    pdf: Tensor
+    wait: Tensor  # relative to its mean: the PDF of a right mean count gives 1
+
+    @classmethod
+    def of(cls, pairs: Pairs) -> _Tensors:
+        photons, pdf, wait = (
+            torch.from_numpy(x).to(torch.float32)
+            for x in (pairs.photons, pairs.pdf, pairs.wait / pairs.mean_wait[:, None])
+        )
+        photons, shift = canonical(photons)
+        return cls(photons, rolled(pdf, shift), rolled(wait, shift))
+
+
+def train(
+    system: System,
+    training: Training | None = None,
+    *,
+    progress: Progress | None = None,
+    tell: Callable[[Point], object] | None = None,
+) -> Trained:
+    """Train the map of a system; the loss is the total variation to the chain plus the relative error of the mean.
+
+    Parameters
+    ----------
+    system
+        Mode ``"nonparalyzable"``, at least 128 bins, a multiple of 64. Cycles and start do not matter.
+    training
+        Default: under two minutes on one core for 1024 bins.
+    progress
+        Called as ``progress(done, total)``; an exception from it stops the training.
+    tell
+        Called after each validation.
+    """
+    chosen = Training() if training is None else training
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    require_mode("the neural map", system)
+    system = system.detected()
+    _validate.integer("bins of the neural map", system.bins, low=_MIN_BINS, high=2**16)
+    with one_thread():
+        return _train(system, chosen, progress, tell)
+
+
+def _train(
+    system: System, chosen: Training, progress: Progress | None, tell: Callable[[Point], object] | None
+) -> Trained:
+    torch.manual_seed(chosen.seed)
+    network = PdfAutoencoder(system.bins, system.dead_time_periods, chosen.width, chosen.code)
+    began, used = time.monotonic(), time.process_time()
+    total = chosen.steps + (chosen.pairs + chosen.held_out) // 16  # a step costs what some 16 pairs do
+    learn_on, held_out = (
+        _Tensors.of(Pairs.of(chosen.fluxes.draw(system, n, np.random.default_rng([chosen.seed, k])), system))
+        for k, n in ((1, chosen.pairs), (2, chosen.held_out))
+    )
+    made = total - chosen.steps
+    mean_pdf = learn_on.pdf.mean(0)
+    unconditional = float(0.5 * (held_out.pdf - mean_pdf).abs().sum(-1).mean())
+    optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, total_steps=chosen.steps, pct_start=_WARM_UP)
+    order = torch.Generator().manual_seed(chosen.seed)
+    curve, losses = [_validate_on(network, held_out, 0, 0.0, float("nan"))], []
+    for step in range(1, chosen.steps + 1):
+        some = torch.randint(0, chosen.pairs, (chosen.batch,), generator=order)
+        variation, error = _errors(network(learn_on.photons[some]), learn_on.pdf[some], learn_on.wait[some])
+        loss = variation.mean() + error.mean()
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(network.parameters(), _CLIP)
+        optimizer.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+        if progress is not None:
+            progress(made + step, total)
+        if step % chosen.every == 0 or step == chosen.steps:
+            point = _validate_on(network, held_out, step, time.monotonic() - began, float(np.mean(losses)))
+            curve.append(point)
+            losses.clear()
+            if tell is not None:
+                tell(point)
+    network.eval().requires_grad_(False)
+    last = curve[-1]
+    record: dict[str, Any] = {
+        "steps": chosen.steps, "pairs": chosen.pairs, "held_out": chosen.held_out, "seed": chosen.seed,
+        "seconds": round(last.seconds, 1),
+        "processor_seconds": round(time.process_time() - used, 1),
+        "tv_mean": last.tv_mean, "tv_95": last.tv_95, "tv_max": last.tv_max,
+        "mean_error": last.mean_error, "tv_unconditional": unconditional,
+    }  # fmt: skip
+    return Trained(NeuralMap(system, chosen.fluxes, network, record), curve, unconditional)
+
+
+def _errors(log_pdf: Tensor, pdf: Tensor, wait: Tensor) -> tuple[Tensor, Tensor]:
+    """Total variation, and relative error of the mean holding time, (P,) each."""
+    found = log_pdf.exp()
+    return 0.5 * (found - pdf).abs().sum(-1), ((found * wait).sum(-1) - 1.0).abs()
+
+
+def _validate_on(network: PdfAutoencoder, held_out: _Tensors, step: int, seconds: float, loss: float) -> Point:
+    network.eval()
+    with torch.no_grad():
+        variation, error = _errors(network(held_out.photons), held_out.pdf, held_out.wait)
+    network.train()
+    return Point(
+        step, seconds, loss, float(variation.mean()), float(variation.quantile(0.95)), float(variation.max()),
+        float(error.mean()),
+    )  # fmt: skip
+
+
+def save_curves(trained: Trained, stem: Path) -> list[Path]:
+    """Write the validation curve as `stem`.csv and `stem`.png; returns the paths."""
+    import csv
+    from dataclasses import astuple, fields
+
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    table = stem.with_suffix(".csv")
+    with table.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([field.name for field in fields(Point)])
+        writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in astuple(p)] for p in trained.curve)
+    figure = Figure(figsize=(6.4, 3.6), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    steps = [p.step for p in trained.curve]
+    for name, words in (("tv_mean", "mean"), ("tv_95", "95 %"), ("tv_max", "largest")):
+        axes.plot(steps, [getattr(p, name) for p in trained.curve], label=f"total variation, {words}")
+    axes.plot(steps, [p.mean_error for p in trained.curve], ":", label="relative error of the mean count, mean")
+    axes.axhline(trained.unconditional, color="0.5", lw=1.0, ls="--", label="mean PDF, flux ignored")
+    axes.axhline(0.02, color="0.7", lw=1.0, label="0.02")
+    axes.set(yscale="log", xlabel="step", ylabel="on held-out fluxes", ylim=(1e-5, 1.0))
+    axes.legend(fontsize=7, ncols=2, frameon=False, loc="lower left")
+    axes.grid(alpha=0.3)
+    picture = stem.with_suffix(".png")
+    figure.savefig(picture, metadata={"Software": None})
+    return [table, picture]

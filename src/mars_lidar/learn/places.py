@@ -1,0 +1,25 @@
+"""Where this process stands: its rank in a distributed run, its number among the workers of a loader."""
+
+from __future__ import annotations
+
+import torch
+from torch.utils.data import get_worker_info
+
+from mars_lidar import _validate
+
+
+def rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
+    """Rank and number of ranks: as given, else those of torch.distributed where it is initialised, else 0 of 1."""
+    if (rank is None) != (world_size is None):
+        raise ValueError("rank and world_size go together, got one of them")
+    if rank is None or world_size is None:
+        running = torch.distributed.is_available() and torch.distributed.is_initialized()
+        return (torch.distributed.get_rank(), torch.distributed.get_world_size()) if running else (0, 1)
+    world = _validate.integer("world_size", world_size, low=1, high=2**31)
+    return _validate.integer("rank", rank, low=0, high=world - 1), world
+
+
+def worker_of() -> tuple[int, int]:
+    """Number of this worker and of all workers of a DataLoader; 0 of 1 outside of one."""
+    info = get_worker_info()
+    return (0, 1) if info is None else (info.id, info.num_workers)

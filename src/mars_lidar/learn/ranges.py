@@ -1,0 +1,204 @@
+"""From what the settings of a sample are drawn: numbers, and instruments."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mars_lidar import _validate
+from mars_lidar.pulse import GaussianPulse
+from mars_lidar.system import System
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Any number in [low, high], all equally likely."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        _ordered(self)
+
+    def draw(self, random: np.random.Generator) -> float:
+        """One number."""
+        return float(random.uniform(self.low, self.high))
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """The least and the largest."""
+        return self.low, self.high
+
+
+@dataclass(frozen=True)
+class LogUniform:
+    """A positive number in [low, high] whose logarithm is uniform: every factor of two is equally likely."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        _ordered(self, positive=True)
+
+    def draw(self, random: np.random.Generator) -> float:
+        """One number."""
+        drawn = math.exp(random.uniform(math.log(self.low), math.log(self.high)))
+        return min(max(drawn, self.low), self.high)  # the rounding of exp stays inside
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """The least and the largest."""
+        return self.low, self.high
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of some numbers, all equally likely."""
+
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.values, list | tuple) or not self.values:
+            raise TypeError(f"values must be numbers, at least one, got {self.values!r}")
+        object.__setattr__(self, "values", tuple(_number("values", one) for one in self.values))
+
+    def draw(self, random: np.random.Generator) -> float:
+        """One of them."""
+        return self.values[int(random.integers(len(self.values)))]
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """All of them."""
+        return self.values
+
+
+Range = Uniform | LogUniform | Choice
+_DRAWN = ("cycles", "period_ns", "dead_time_ns", "sigma_ns")
+
+
+def as_range(name: str, value: float | Range, *, low: float = 0.0, infinite: bool = False) -> Range:
+    """A range, or a number as a range of one; everything in it is above `low`."""
+    given = value if isinstance(value, Uniform | LogUniform | Choice) else Choice((_number(name, value),))
+    for end in given.ends:
+        if not end > low or (math.isinf(end) and not infinite):
+            most = "inf included" if infinite else "finite"
+            raise ValueError(f"{name} must be above {low:g}, {most}, got {end:g}")
+    return given
+
+
+@dataclass(frozen=True, kw_only=True)
+class SystemRange:
+    """Instruments like `base`, with what is given here drawn anew: a number, or a range of them.
+
+    Everything is drawn independently. The number of bins is that of `base`, so that cubes can be stacked.
+
+    Parameters
+    ----------
+    base
+        What all have in common.
+    cycles
+        Laser periods per exposure, rounded to whole ones.
+    period_ns, dead_time_ns
+        Laser period and dead time, ns. The dead time may be 0.
+    sigma_ns
+        Width of the pulse, ns; it is then a `mars_lidar.GaussianPulse`.
+
+    Raises
+    ------
+    ValueError
+        A setting that makes no instrument: all ends of the ranges are tried in all combinations.
+    """
+
+    base: System
+    cycles: float | Range | None = None
+    period_ns: float | Range | None = None
+    dead_time_ns: float | Range | None = None
+    sigma_ns: float | Range | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.base, System):
+            raise TypeError(f"base must be a System, got {type(self.base).__name__}")
+        for name in _DRAWN:
+            value = getattr(self, name)
+            if value is not None:
+                least = -math.ulp(0.0) if name == "dead_time_ns" else 0.0
+                object.__setattr__(self, name, as_range(name, value, low=least))
+        self.corners()
+
+    def draw(self, random: np.random.Generator) -> System:
+        """One instrument."""
+        return self._system({name: given.draw(random) for name, given in self._ranges().items()})
+
+    def corners(self) -> list[System]:
+        """The instruments at the ends of all ranges."""
+        ranges = self._ranges()
+        ends = itertools.product(*(given.ends for given in ranges.values()))
+        return [self._system(dict(zip(ranges, values, strict=True))) for values in ends]
+
+    def _ranges(self) -> dict[str, Range]:
+        named = {name: getattr(self, name) for name in _DRAWN}
+        return {name: given for name, given in named.items() if given is not None}
+
+    def _system(self, values: dict[str, float]) -> System:
+        changes: dict[str, Any] = {}
+        if "cycles" in values:
+            changes["cycles"] = max(1, round(values["cycles"]))
+        if "period_ns" in values:
+            changes["period_ns"] = values["period_ns"]
+        if "dead_time_ns" in values:
+            changes["detector"] = dataclasses.replace(self.base.detector, dead_time_ns=values["dead_time_ns"])
+        if "sigma_ns" in values:
+            changes["pulse"] = GaussianPulse(sigma_ns=values["sigma_ns"])
+        return self.base.replace(**changes)
+
+
+class SystemList:
+    """One of some instruments, all equally likely."""
+
+    def __init__(self, systems: Sequence[System]) -> None:
+        self._systems = list(systems)
+        for one in self._systems:
+            if not isinstance(one, System):
+                raise TypeError(f"systems must be a System, several, or a SystemRange, got a {type(one).__name__}")
+        if not self._systems:
+            raise ValueError("systems must be at least one, got none")
+        bins = {one.bins for one in self._systems}
+        if len(bins) > 1:
+            raise ValueError(f"systems must have equally many bins, so that cubes can be stacked, got {sorted(bins)}")
+
+    def draw(self, random: np.random.Generator) -> System:
+        """One of them."""
+        return self._systems[int(random.integers(len(self._systems)))]
+
+    def corners(self) -> list[System]:
+        """All of them."""
+        return self._systems
+
+
+def as_systems(value: System | Sequence[System] | SystemRange) -> SystemRange | SystemList:
+    """What instruments are drawn from."""
+    if isinstance(value, SystemRange):
+        return value
+    if isinstance(value, System):
+        return SystemList([value])
+    if isinstance(value, list | tuple):
+        return SystemList(value)
+    raise TypeError(f"systems must be a System, several, or a SystemRange, got {value!r}")
+
+
+def _ordered(given: Uniform | LogUniform, positive: bool = False) -> None:
+    for name in ("low", "high"):
+        number = _validate.real(name, getattr(given, name), low=0.0 if positive else -math.inf, strict_low=positive)
+        object.__setattr__(given, name, number)
+    if given.low > given.high:
+        raise ValueError(f"low must be at most high, got {given.low:g} and {given.high:g}")
+
+
+def _number(name: str, value: Any) -> float:
+    return math.inf if value == math.inf else _validate.real(name, value)

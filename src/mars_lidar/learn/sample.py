@@ -1,0 +1,104 @@
+"""One sample of a stream: which scene, turned how, in what light, seen by what; a function of numbers alone."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mars_lidar.flux import Flux
+from mars_lidar.learn.ranges import Range, SystemList, SystemRange
+from mars_lidar.learn.scenes import SceneSource, generator
+from mars_lidar.pulse import GaussianPulse
+from mars_lidar.scene import Scene
+from mars_lidar.system import System
+
+_TRIES = 20  # places tried for a crop with a return in it
+
+
+@dataclass(frozen=True)
+class Sample:
+    """All that a cube is simulated from."""
+
+    index: int
+    scene: Scene
+    system: System
+    flux: Flux
+    signal_level: float
+    sbr: float
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """What samples are drawn from."""
+
+    source: SceneSource
+    systems: SystemRange | SystemList
+    size: tuple[int, int] | None
+    flips: bool
+    signal: Range
+    sbr: Range
+    depth_scale: Range
+    attenuation: Any
+    ambient: Any
+    dark_counts_per_s: float
+    seed: int
+
+    def sample(self, epoch: int, index: int) -> Sample:
+        """Sample `index` of an epoch. What is drawn for one purpose does not depend on the settings of another."""
+        system = self.systems.draw(generator(4, self.seed, epoch, index))
+        light = generator(5, self.seed, epoch, index)
+        level, sbr, stretch = (given.draw(light) for given in (self.signal, self.sbr, self.depth_scale))
+        scene = self._placed(self.source.scene(self.seed, epoch, index), epoch, index)
+        if stretch != 1.0:
+            scene = Scene(scene.depth_m * stretch, scene.reflectivity, scene.background)
+        with warnings.catch_warnings():  # pixels without return or beyond the range: told by the maps, not every time
+            warnings.simplefilter("ignore", UserWarning)
+            flux = scene.flux(
+                system, signal=level, sbr=sbr, attenuation=self.attenuation, ambient=self.ambient,
+                dark_counts_per_s=self.dark_counts_per_s,
+            )  # fmt: skip
+        seed = int(generator(6, self.seed, epoch, index).integers(2**63))
+        return Sample(index, scene, system, flux, level, sbr, seed)
+
+    def _placed(self, scene: Scene, epoch: int, index: int) -> Scene:
+        """A crop of the scene, mirrored or not: the scene is, before anything is simulated."""
+        random = generator(7, self.seed, epoch, index)
+        down, right = (-1 if self.flips and random.integers(2) else 1 for _ in range(2))
+        height, width = scene.shape if self.size is None else self.size
+        if height > scene.shape[0] or width > scene.shape[1]:
+            raise ValueError(f"size must be at most that of every scene, got {height} × {width} and {scene!r}")
+        for _ in range(_TRIES):
+            y = int(random.integers(scene.shape[0] - height + 1))
+            x = int(random.integers(scene.shape[1] - width + 1))
+            crop = scene[y : y + height, x : x + width]
+            if (crop.reflectivity[crop.valid] > 0.0).any():
+                return crop[::down, ::right]
+        raise ValueError(f"no pixel with a return in {_TRIES} crops of {height} × {width} of {scene!r}")
+
+
+def numbers_of(system: System) -> dict[str, float]:
+    """What a network may want to know of an instrument; `sigma_ns` is NaN for a pulse that is no Gaussian."""
+    pulse = system.pulse
+    return {
+        "period_ns": system.period_ns,
+        "cycles": float(system.cycles),
+        "dead_time_ns": system.detector.dead_time_ns,
+        "sigma_ns": pulse.sigma_ns if isinstance(pulse, GaussianPulse) else math.nan,
+    }
+
+
+def maps_of(sample: Sample) -> dict[str, np.ndarray[Any, Any]]:
+    """The maps (H, W) of a sample."""
+    flux = sample.flux
+    return {
+        "depth": sample.scene.depth_m,
+        "reflectivity": sample.scene.reflectivity,
+        "signal": flux.signal,
+        "background": flux.background,
+        "delay": flux.delay_ns,
+    }

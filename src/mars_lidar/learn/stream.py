@@ -1,0 +1,262 @@
+"""Training examples simulated as they are needed: no two alike, and the same whoever makes them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mars_lidar import _validate
+from mars_lidar.io.optional import MissingLibraryError
+
+try:
+    import torch
+    from torch.utils.data import IterableDataset, get_worker_info
+except ImportError as _error:
+    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
+
+from mars_lidar.engines import Engine, find_engine
+from mars_lidar.io.scan import SceneFile
+from mars_lidar.learn.cubes import CubeMaker
+from mars_lidar.learn.places import rank_of, worker_of
+from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
+from mars_lidar.learn.sample import Recipe, Sample, maps_of, numbers_of
+from mars_lidar.learn.scenes import as_source
+from mars_lidar.scene import Scene, _image_size
+from mars_lidar.system import System
+
+_LAST = 2**62
+
+
+class CubeStream(IterableDataset[dict[str, Any]]):
+    """Cubes and their ground truth for a `torch.utils.data.DataLoader`, simulated as they are asked for.
+
+    Sample k of an epoch is a function of (`seed`, epoch, k) and of the settings here, never of workers, ranks,
+    threads or what came before. Ranks and workers take batches in turn; none is made twice. Give `batch_size` here
+    and ``batch_size=None`` to the loader: then the batches are the same, in the same order, for any number of
+    workers, and are simulated in place instead of copied together.
+
+    An example is a dictionary, with a leading axis where `batch_size` is given: ``cube`` (T, H, W); ``depth`` (m,
+    NaN without a return) and ``reflectivity`` (H, W); ``flux``, a dictionary of ``signal``, ``background`` (photons
+    per period) and ``delay`` (ns) (H, W); ``system``, a dictionary of ``period_ns``, ``cycles``, ``dead_time_ns``,
+    ``sigma_ns``; ``signal_level``, ``sbr``, ``index``, ``seed``. Maps and settings are float32. `sample` gives the
+    Scene, Flux and System themselves.
+
+    Parameters
+    ----------
+    systems
+        A System, several (one is drawn for each sample), or a `SystemRange`.
+    scenes
+        ``"random"`` (default) or ``"room"``: built-in scenes without end. A folder of RGB-D data, whatever
+        `mars_lidar.io.scan` finds in it; or Scenes and `mars_lidar.io.SceneFile` objects: in random order, each
+        once before any comes again.
+    size
+        (H, W), or one number for a square: random crops of that size. None: 64 for built-in scenes, else scenes as
+        they are.
+    epoch_size
+        Samples in an epoch; None (default): without end.
+    batch_size
+        Samples stacked into one example; None (default): one, without that axis.
+    signal, sbr
+        Mean signal photons per period over the image, and signal-to-background ratio, as `mars_lidar.Scene.flux`
+        has them: a number or a range. Default: log-uniform in [0.01, 1] and in [0.1, 10].
+    depth_scale
+        Factor on the depth: a number or a range.
+    flips
+        Mirror scenes at random, up-down and left-right.
+    attenuation, ambient, dark_counts_per_s
+        As for `mars_lidar.Scene.flux`.
+    engine
+        Name or `Engine`, as for `mars_lidar.simulate`.
+    device
+        ``"cpu"``, or ``"cuda"`` to simulate on the GPU and leave the cubes there (in the process of the loader:
+        ``num_workers=0``).
+    layout
+        ``"dense"``, or ``"sparse"``: coalesced COO tensors.
+    axes
+        ``"THW"``: time first, as a view of ``"HWT"`` (torch's channels-last memory format), so without a copy.
+    dtype
+        Of the cube; None: the counts as they are simulated (uint16 or uint32; int32 for sparse ones).
+    reuse
+        Samples for which a built-in scene serves, on average: other crops, flips, light and instruments.
+    seed
+        Integer in [0, 2**63).
+    threads
+        Of one process; default: the processors shared out among the loader's workers.
+    transform
+        Called on each example; what it returns is given out.
+    rank, world_size
+        Of a distributed run; default: those of torch.distributed where it is initialised, else 0 of 1. All ranks
+        give equally many samples of an epoch, so that up to ``world_size - 1`` are left out.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A bad argument, or settings that make no instrument at an end of their range.
+    """
+
+    def __init__(
+        self,
+        systems: System | Sequence[System] | SystemRange,
+        scenes: str | Path | Scene | SceneFile | Sequence[Scene | SceneFile] = "random",
+        *,
+        size: int | tuple[int, int] | None = None,
+        epoch_size: int | None = None,
+        batch_size: int | None = None,
+        signal: float | Range = LogUniform(0.01, 1.0),  # noqa: B008  (frozen)
+        sbr: float | Range = LogUniform(0.1, 10.0),  # noqa: B008
+        depth_scale: float | Range = 1.0,
+        flips: bool = True,
+        attenuation: Literal["none", "inverse_square"] = "none",
+        ambient: Literal["uniform", "reflectivity", "map"] | None = None,
+        dark_counts_per_s: float = 0.0,
+        engine: str | Engine = "exact",
+        device: str | torch.device = "cpu",
+        layout: Literal["dense", "sparse"] = "dense",
+        axes: Literal["THW", "HWT"] = "THW",
+        dtype: torch.dtype | None = torch.float32,
+        reuse: int = 16,
+        seed: int = 0,
+        threads: int | None = None,
+        transform: Callable[[dict[str, Any]], Any] | None = None,
+        rank: int | None = None,
+        world_size: int | None = None,
+    ) -> None:
+        super().__init__()
+        shape = None if size is None else _image_size(size if isinstance(size, tuple | list) else (size, size))
+        if shape is None and isinstance(scenes, str) and scenes in Scene.example_names():
+            shape = (64, 64)
+        drawn = as_systems(systems)
+        _validate.choice("attenuation", attenuation, ("none", "inverse_square"))
+        if ambient is not None:
+            _validate.choice("ambient", ambient, ("uniform", "reflectivity", "map"))
+        self._recipe = Recipe(
+            source=as_source(scenes, shape, reuse), systems=drawn, size=shape, flips=bool(flips),
+            signal=as_range("signal", signal), sbr=as_range("sbr", sbr, infinite=True),
+            depth_scale=as_range("depth_scale", depth_scale), attenuation=attenuation, ambient=ambient,
+            dark_counts_per_s=_validate.real("dark_counts_per_s", dark_counts_per_s, low=0.0),
+            seed=_validate.integer("seed", seed, low=0, high=2**63 - 1),
+        )  # fmt: skip
+        self._size = None if epoch_size is None else _validate.integer("epoch_size", epoch_size, low=1, high=_LAST)
+        self._batch = None if batch_size is None else _validate.integer("batch_size", batch_size, low=1, high=2**20)
+        self._threads = None if threads is None else _validate.integer("threads", threads, low=1, high=1024)
+        self._maker = CubeMaker(find_engine(engine), drawn.corners(), device, layout, axes, dtype)
+        self._transform = transform
+        self._rank, self._world = rank_of(rank, world_size)
+        # epoch and first sample: in shared memory, so that workers that live on through epochs see them change
+        self._state = torch.zeros(2, dtype=torch.int64)
+        self._state.share_memory_()  # type: ignore[no-untyped-call]
+        self._given = 0
+
+    def set_epoch(self, epoch: int, start: int = 0) -> None:
+        """Choose the epoch of the next pass, and its first sample: the one before which an earlier run stopped.
+
+        Without it each pass gives the same epoch again. After n batches a loader has given samples up to
+        ``n * batch_size * world_size``; from there the batches of the rest are those of a run that did not stop.
+        """
+        number = _validate.integer("epoch", epoch, low=0, high=_LAST)
+        most = _LAST if self._size is None else self._size
+        self._state[1] = _validate.integer("start", start, low=0, high=most)
+        self._state[0], self._given = number, 0
+
+    @property
+    def epoch(self) -> int:
+        """Of the next pass, or of the one that is going on."""
+        return int(self._state[0])
+
+    def state_dict(self, batches: int | None = None) -> dict[str, int]:
+        """Where the pass stands, for `load_state_dict`.
+
+        Parameters
+        ----------
+        batches
+            Examples taken from a loader with workers, since the last `set_epoch` or `load_state_dict`: only the
+            caller knows that number. None: counted here, right without workers.
+        """
+        given = self._given if batches is None else _validate.integer("batches", batches, low=0, high=_LAST)
+        start = int(self._state[1]) + given * (self._batch or 1) * self._world
+        if self._size is not None:
+            start = min(start, self._size)
+        return {"seed": self._recipe.seed, "epoch": self.epoch, "start": start}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Go on where `state_dict` was taken; the settings must be the same."""
+        if state["seed"] != self._recipe.seed:
+            raise ValueError(f"the state is of a stream with seed {state['seed']}, this one has {self._recipe.seed}")
+        self.set_epoch(state["epoch"], state["start"])
+
+    def sample(self, index: int) -> Sample:
+        """Scene, Flux, System and seed of a sample of this epoch, not simulated."""
+        most = _LAST if self._size is None else self._size - 1
+        return self._recipe.sample(self.epoch, _validate.integer("index", index, low=0, high=most))
+
+    def __len__(self) -> int:
+        """Examples of one pass on this rank, all workers together."""
+        if self._size is None:
+            raise TypeError("a stream without end has no length; give epoch_size")
+        return math.ceil((self._size - int(self._state[1])) // self._world / (self._batch or 1))
+
+    def __iter__(self) -> Iterator[Any]:
+        epoch, start = self._state.tolist()
+        worker, workers = worker_of()
+        info = get_worker_info()
+        if info is not None and self._maker.on_gpu:
+            raise ValueError("device='cuda' simulates in the process of the loader: use num_workers=0")
+        threads = self._threads or max(1, _processors() // workers)
+        self._given = 0
+        for place, indices in enumerate(self._batches(start)):
+            if place % workers != worker:
+                continue
+            samples = [self._recipe.sample(epoch, index) for index in indices]
+            example = self._example(samples, threads, shared=info is not None)
+            self._given = place + 1
+            yield example if self._transform is None else self._transform(example)
+
+    def _batches(self, start: int) -> Iterator[range]:
+        """Samples of this rank, batch by batch: ranks take whole batches in turn, and equal parts of the last ones."""
+        batch = self._batch or 1
+        turn = batch * self._world
+        while self._size is None or start + turn <= self._size:
+            yield range(start + self._rank * batch, start + (self._rank + 1) * batch)
+            start += turn
+        part = (self._size - start) // self._world
+        if part:
+            yield range(start + self._rank * part, start + (self._rank + 1) * part)
+
+    def _example(self, samples: list[Sample], threads: int, shared: bool) -> dict[str, Any]:
+        device = self._maker.device
+        cube = self._maker.cubes(samples, threads, shared)
+        maps = [maps_of(one) for one in samples]
+        stacked = {
+            name: torch.from_numpy(np.stack([one[name] for one in maps]).astype(np.float32)).to(device)
+            for name in maps[0]
+        }
+        systems = [numbers_of(one.system) for one in samples]
+        example: dict[str, Any] = {
+            "cube": cube,
+            "depth": stacked["depth"],
+            "reflectivity": stacked["reflectivity"],
+            "flux": {name: stacked[name] for name in ("signal", "background", "delay")},
+            "system": {name: torch.tensor([one[name] for one in systems], device=device) for name in systems[0]},
+            "signal_level": torch.tensor([one.signal_level for one in samples], device=device),
+            "sbr": torch.tensor([one.sbr for one in samples], device=device),
+            "index": torch.tensor([one.index for one in samples]),
+            "seed": torch.tensor([one.seed for one in samples]),
+        }
+        return example if self._batch is not None else _first(example)
+
+
+def _first(example: Any) -> Any:
+    """Without the leading axis."""
+    return {name: _first(one) for name, one in example.items()} if isinstance(example, dict) else example[0]
+
+
+def _processors() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1

@@ -1,0 +1,97 @@
+"""Exact laws of the count at those entries of a table whose four cumulants do not fix it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics._pmf import Window, guessed_windows
+from mars_lidar.system import System
+from mars_lidar.table.entries import Entries, Progress
+
+
+@dataclass(frozen=True, eq=False)
+class NodeLaws:
+    """Probabilities of the count of some entries, at the canonical delay and for the cycles of the table.
+
+    Attributes
+    ----------
+    row
+        (m,) entries, ascending, as the rows of `Table.shapes`.
+    first
+        (m,) first count of each.
+    offsets
+        (m + 1,) where the probabilities of each begin in `pmf`.
+    pmf
+        (offsets[-1],) probabilities of the counts first, first + 1, ...
+    """
+
+    row: IndexArray
+    first: IndexArray
+    offsets: IndexArray
+    pmf: FloatArray
+
+    @classmethod
+    def of(cls, row: IndexArray, windows: Sequence[Window]) -> NodeLaws:
+        """From one window for each row."""
+        trimmed = [_trimmed(window) for window in windows]
+        return cls(
+            np.asarray(row, dtype=np.int64),
+            np.array([window.first for window in trimmed], np.int64),
+            np.concatenate([[0], np.cumsum([window.pmf.size for window in trimmed])]).astype(np.int64),
+            np.concatenate([np.empty(0), *(window.pmf for window in trimmed)]),
+        )
+
+    @classmethod
+    def none(cls) -> NodeLaws:
+        """Of no entry."""
+        return cls.of(np.empty(0, np.int64), [])
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the arrays."""
+        return int(self.row.nbytes + self.first.nbytes + self.offsets.nbytes + self.pmf.nbytes)
+
+    def window(self, row: int) -> Window | None:
+        """Law of an entry; None where its cumulants are enough."""
+        k = int(np.searchsorted(self.row, row))
+        if k == self.row.size or self.row[k] != row:
+            return None
+        return Window(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], _NEGLIGIBLE)
+
+
+_NEGLIGIBLE = 1e-12  # probability that is not kept at either end
+
+
+def _trimmed(window: Window) -> Window:
+    below = np.cumsum(window.pmf)
+    some = np.flatnonzero((below > _NEGLIGIBLE) & (below[-1] - below + window.pmf > _NEGLIGIBLE))
+    low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, window.pmf.size)
+    return Window(window.first + low, window.pmf[low:high], _NEGLIGIBLE)
+
+
+def node_laws(
+    system: System,
+    signal: FloatArray,
+    background: FloatArray,
+    entries: Entries,
+    *,
+    threads: int,
+    progress: Progress | None = None,
+) -> NodeLaws:
+    """Laws of the entries of a table with axes `signal`, `background` that `statistics.trusted` does not vouch for."""
+    from mars_lidar.statistics.matched import trusted
+
+    if system.dead_time_periods == 0.0:
+        return NodeLaws.none()  # Poisson
+    row = np.flatnonzero(~trusted(entries.cumulants, threads=threads))
+    if not row.size:
+        return NodeLaws.none()
+    cells = Cells.of(signal[row // background.size], background[row % background.size], system)
+    waiting = None if progress is None else lambda done: progress(done, row.size)
+    return NodeLaws.of(
+        row, guessed_windows(cells, entries.cumulants[row], entries.bins[row], threads, waiting)
+    )

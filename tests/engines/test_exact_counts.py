@@ -1,0 +1,202 @@
+"""Counts of pixels from a table whose four cumulants do not fix the law: kept by the table, or evaluated."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from harness import Case, counts_against_law, require, task_of
+from mars_lidar.engines import MarsEngine
+from mars_lidar.engines._counts import Matched, Mended, Streams, Tabulated
+from mars_lidar.engines._synthesis import Run
+from mars_lidar.engines._table import Entries
+from mars_lidar.statistics._pmf import Window
+from mars_lidar.table import Table
+from mars_lidar.table.law import distance
+
+AIM = 0.002
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=150, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    detector=ml.Detector(dead_time_ns=63.75),
+)  # fmt: skip
+
+
+@cache
+def table(start: str = "armed") -> Table:
+    # bright enough that the count all but locks to the laser
+    return Table.build(SYSTEM.replace(start=start), (2.0, 9.0, 12), (0.02, 0.6, 8))
+
+
+def doubted(seed: int = 0, pixels: int = 400, start: str = "armed", cycles: int = 150, node: bool = False) -> ml.Flux:
+    """Pixels whose cumulants are not trusted; off the nodes unless told."""
+    rng, lut = np.random.default_rng(seed), table(start)
+    if node:
+        row, column = np.divmod(lut.laws.row, lut.background.size)
+        return ml.Flux(lut.signal[row][None], lut.background[column][None], 50.0)
+    signal, background = rng.uniform(2.0, 9.0, pixels), np.exp(rng.uniform(np.log(0.02), np.log(0.6), pixels))
+    delay = rng.uniform(0.0, 100.0, pixels)
+    bad = ~lut.lookup(signal, background, delay_ns=delay, cycles=cycles).trusted()
+    return ml.Flux(signal[bad][None], background[bad][None], delay[bad][None])
+
+
+def laws_of(flux: ml.Flux, system: ml.System, **options: str) -> tuple[Mended, Entries, dict[str, float]]:
+    """What the engine draws the counts of these pixels from, the table's entries of them, and its report."""
+    engine = MarsEngine(table(system.start), **options)
+    task = task_of(Case("pixels", flux, system, flux.signal.size), 1)
+    entries, left = engine.reader.read(task, np.arange(flux.signal.size))
+    assert left.size == 0
+    laws = engine._laws_of(Run(task, np.empty(0)), engine.reader, entries)
+    assert isinstance(laws, Mended)
+    return laws, entries, task.report
+
+
+def window(laws: Mended, k: int) -> Window:
+    law = int(laws.others.law[k])
+    cumulative = laws.others.cumulative[laws.others.offsets[law] : laws.others.offsets[law + 1]]
+    return Window(int(laws.others.first[law]), np.diff(cumulative, prepend=0.0), 0.0)
+
+
+def exact(flux: ml.Flux, system: ml.System, pixel: int) -> Window:
+    delay = float(flux.delay_ns.ravel()[pixel])
+    law = ml.count_law(flux.signal.ravel()[pixel], flux.background.ravel()[pixel], system, delay_ns=delay)
+    return Window(int(law.support[0]), law.pmf, 0.0)
+
+
+@pytest.mark.parametrize(("start", "cycles"), [("armed", 150), ("armed", 400), ("stationary", 150)])
+def test_between_the_entries_the_law_is_exact(start: str, cycles: int):
+    flux, system = doubted(start=start, cycles=cycles), SYSTEM.replace(start=start, cycles=cycles)
+    laws, entries, report = laws_of(flux, system)
+    assert report["pixels_exact_count"] == report["laws_evaluated"] == laws.at.size == flux.signal.size
+    some = range(0, laws.at.size, max(1, laws.at.size // 12))
+    errors = [distance(window(laws, k), exact(flux, system, int(entries.pixels[laws.at[k]]))) for k in some]
+    assert max(errors) < 1e-4  # far below the aim: only the grid of the nearest entries is the table's
+
+
+def test_the_four_cumulants_would_not_do():
+    """What the exact laws are for: at some of these pixels the law of the cumulants is beyond the aim."""
+    lut, flux = table(), doubted()
+    found = lut.lookup(flux.signal, flux.background, delay_ns=flux.delay_ns)
+    from mars_lidar.statistics.matched import matched_pmf
+
+    off = [distance(law, exact(flux, SYSTEM, k)) for k, law in enumerate(matched_pmf(found.cumulants)[:80])]
+    assert max(off) > AIM
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+def test_at_the_entries_the_table_keeps_the_law(start: str):
+    lut, system = table(start), SYSTEM.replace(start=start)
+    found = lut.lookup(np.repeat(lut.signal, lut.background.size), np.tile(lut.background, lut.signal.size))
+    from mars_lidar.statistics.matched import matched_pmf
+
+    sure = found.trusted()
+    assert np.array_equal(np.flatnonzero(~sure), lut.laws.row)
+    assert lut.laws.row.size > 3
+    flux = doubted(start=start, node=True)
+    laws, entries, report = laws_of(flux, system)
+    assert report["laws_evaluated"] == 0  # all were in the table
+    for k in range(0, laws.at.size, max(1, laws.at.size // 6)):
+        pixel = int(entries.pixels[laws.at[k]])
+        # evaluated on another grid: that of 64 bins in the table, that of a single bin here
+        assert distance(window(laws, k), exact(flux, system, pixel)) < 1e-6
+    matched = matched_pmf(found.cumulants)
+    for row in np.flatnonzero(sure)[::16]:
+        law = ml.count_law(lut.signal[row // lut.background.size], lut.background[row % lut.background.size], system)
+        assert distance(matched[row], Window(int(law.support[0]), law.pmf, 0.0)) <= AIM
+
+
+def test_other_delays_and_exposures_are_not_taken_from_the_entries():
+    flux = doubted(node=True)
+    moved = ml.Flux(flux.signal, flux.background, 31.0)
+    assert laws_of(moved, SYSTEM)[2]["laws_evaluated"] > 0
+    assert laws_of(flux, SYSTEM.replace(cycles=400))[2]["laws_evaluated"] > 0
+
+
+def test_the_nearest_entry_gives_its_own_law():
+    flux = doubted(seed=3)
+    laws, entries, _ = laws_of(flux, SYSTEM, interpolation="nearest")
+    lut = table()
+    node = entries.rows[laws.at[0], 0]
+    pixel = entries.pixels[laws.at[0]]
+    signal, background = lut.signal[node // lut.background.size], lut.background[node % lut.background.size]
+    law = ml.count_law(signal, background, SYSTEM, delay_ns=float(flux.delay_ns.ravel()[pixel]))
+    assert distance(window(laws, 0), Window(int(law.support[0]), law.pmf, 0.0)) < 1e-4
+
+
+def test_counts_follow_the_exact_law():
+    flux = doubted()
+    one = ml.Flux(np.full((1, 8), flux.signal[0, 0]), flux.background[0, 0], flux.delay_ns[0, 0])
+    report: dict[str, float] = {}
+    cube = ml.simulate(one, SYSTEM, engine="mars", table=table(), realizations=4000, report=report)
+    assert (report["pixels_exact_count"], report["laws_evaluated"]) == (8, 1)  # alike: evaluated once
+    law = exact(one, SYSTEM, 0)
+    pmf = np.zeros(law.first + law.pmf.size)
+    pmf[law.first :] = law.pmf
+    require({"count law": counts_against_law(cube.sum(-1).ravel(), pmf)}, "doubted pixel from a table")
+
+
+def test_usual_pixels_are_drawn_as_before():
+    """No pixel in doubt: the same bits as from four cumulants; some in doubt: the others keep theirs."""
+    flux = doubted()
+    parts = zip(
+        (flux.signal, flux.background, flux.delay_ns), ([3.0] * 5, [0.55] * 5, np.linspace(0, 90, 5)), strict=True
+    )
+    mixed = ml.Flux(*(np.concatenate([some[0, :5], others])[None] for some, others in parts))
+    lut = table()
+    sure = lut.lookup(mixed.signal, mixed.background, delay_ns=mixed.delay_ns).trusted()
+    assert 0 < sure.sum() < 10
+    cubes = {
+        count: ml.simulate(mixed, SYSTEM, engine="mars", table=lut, count=count, realizations=50)
+        for count in ("exact", "matched")
+    }
+    assert np.array_equal(cubes["exact"][:, 0, sure], cubes["matched"][:, 0, sure])
+    assert not np.array_equal(cubes["exact"], cubes["matched"])
+
+
+def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
+    from mars_lidar.engines import _count_shape, _synthesis
+    from mars_lidar.statistics import _pmf
+
+    flux = doubted(pixels=160)
+    whole = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=2)
+    monkeypatch.setattr(_synthesis, "_BATCH", 4)
+    monkeypatch.setattr(_count_shape, "PIXELS", 11)
+    monkeypatch.setattr(_pmf, "_BLOCK", 3)
+    assert np.array_equal(whole, ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=1))
+    index = np.arange(flux.signal.size).reshape(1, -1)[:, 7:20]
+    part = ml.simulate(flux[:, 7:20], SYSTEM, engine="mars", table=table(), realizations=3, pixel_index=index)
+    assert np.array_equal(part, whole[:, :, 7:20])
+
+
+def test_a_part_of_mended_laws_is_mended_alike():
+    cumulants = np.tile([[40.0, 3.0, -0.7, 0.3]], (9, 1))
+    other = Tabulated.of([Window(7, np.array([0.5, 0.5]), 0.0)], np.zeros(3, np.int64))
+    laws = Mended(Matched(cumulants), np.array([1, 4, 8]), other)
+    streams = Streams(np.arange(9, dtype=np.uint32), 4, 0, 1, 1)
+    whole = laws.draw(streams)
+    assert (whole[:, [1, 4, 8]] < 9).all()
+    for some in (slice(0, 3), slice(3, 7), slice(2, 4), slice(5, 20)):
+        part = Streams(streams.pixel_index[some], 4, 0, 1, 1)
+        assert np.array_equal(laws.part(some).draw(part), whole[:, some])
+
+
+def test_the_evaluation_can_be_stopped(monkeypatch: pytest.MonkeyPatch):
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    flux = doubted()
+    out = np.zeros((1, *flux.signal.shape, 64), SYSTEM.histogram_dtype)
+    with pytest.raises(KeyboardInterrupt):
+        ml.simulate(flux, SYSTEM, engine="mars", table=table(), progress=stop, out=out)
+
+
+def test_the_paper_s_table_and_count_are_left_alone():
+    lut = Table.build(SYSTEM, (2.0, 9.0, 6), (0.02, 0.6, 4), method="mars")
+    report: dict[str, float] = {}
+    ml.simulate(doubted(), SYSTEM, engine="mars", table=lut, report=report)
+    assert report["pixels_exact_count"] == 0
+    assert lut.laws.row.size == 0
+    ml.simulate(doubted(), SYSTEM, engine="mars", table=table(), count="gaussian", report=report)
+    assert "laws_evaluated" not in report

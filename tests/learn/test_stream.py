@@ -1,0 +1,301 @@
+"""The stream: the same samples whoever makes them, maps that belong to the cube, and settings within their ranges."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from torch.utils.data import DataLoader
+
+import mars_lidar as ml
+from mars_lidar.learn import Choice, CubeStream, LogUniform, SystemRange, Uniform
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=60, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
+)
+SYSTEMS = SystemRange(
+    base=SYSTEM, cycles=LogUniform(10, 200), period_ns=Uniform(80, 120), dead_time_ns=Choice([0, 20, 150.0]),
+    sigma_ns=LogUniform(0.2, 2),
+)  # fmt: skip
+
+
+def stream(systems=SYSTEMS, *scenes, **changes) -> CubeStream:
+    return CubeStream(systems, *scenes, **{"size": 6, "epoch_size": 22, "seed": 3, "threads": 1} | changes)
+
+
+def loader(dataset, workers, **changes) -> DataLoader:
+    # threads of the tests' own process (codecs, torch) do not live on in a forked worker
+    context = ("fork" if sys.platform == "linux" else "spawn") if workers else None
+    return DataLoader(dataset, num_workers=workers, multiprocessing_context=context, **changes)
+
+
+def flat(example, prefix="") -> dict[str, torch.Tensor]:
+    out = {}
+    for name, one in example.items():
+        out.update(flat(one, f"{name}.") if isinstance(one, dict) else {prefix + name: one})
+    return out
+
+
+def assert_same(first, second):
+    first, second = flat(first), flat(second)
+    assert list(first) == list(second)
+    for name in first:
+        assert first[name].dtype == second[name].dtype
+        assert torch.equal(torch.nan_to_num(first[name]), torch.nan_to_num(second[name])), name
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.filterwarnings("ignore:Sparse invariant checks")  # torch's own, of a sparse tensor from a worker
+@pytest.mark.parametrize("workers", [1, 2, 4])
+@pytest.mark.parametrize("settings", [{}, {"dtype": None}, {"layout": "sparse"}])
+def test_batches_do_not_depend_on_workers(workers, settings):
+    dataset = stream(batch_size=4, **settings)
+    alone = list(dataset)
+    assert len(alone) == len(dataset) == 6
+    together = list(loader(dataset, workers, batch_size=None))
+    assert len(together) == 6
+    for first, second in zip(alone, together, strict=True):
+        if first["cube"].is_sparse:
+            assert second["cube"].is_coalesced()
+            first, second = ({**one, "cube": one["cube"].to_dense()} for one in (first, second))
+        assert_same(first, second)
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+def test_single_samples_are_those_of_the_batches():
+    dataset = stream()
+    alone = list(dataset)
+    assert [int(one["index"]) for one in alone] == list(range(22))
+    for workers in (0, 2, 4):
+        for one in loader(dataset, workers, batch_size=None):
+            assert_same(one, alone[int(one["index"])])
+    batch = next(iter(stream(batch_size=4)))
+    for place in range(4):
+        assert_same({name: one[place] for name, one in flat(batch).items()}, flat(alone[place]))
+
+
+def test_epochs_seeds_and_threads_differ_or_not_as_they_should():
+    first = next(iter(stream()))
+    assert_same(first, next(iter(stream(threads=2))))
+    other = stream()
+    other.set_epoch(1)
+    for one in (next(iter(other)), next(iter(stream(seed=4)))):
+        assert not torch.equal(first["cube"], one["cube"])
+        assert int(one["seed"]) != int(first["seed"])
+    assert_same(first, next(iter(other.__class__(SYSTEMS, size=6, seed=3))))  # without end: the same samples
+
+
+def test_workers_that_live_on_hear_of_epochs():
+    dataset = stream(epoch_size=4, batch_size=2)
+    lives_on = loader(dataset, 2, batch_size=None, persistent_workers=True)
+    for epoch in (0, 1, 5):
+        dataset.set_epoch(epoch)
+        fresh = stream(epoch_size=4, batch_size=2)
+        fresh.set_epoch(epoch)
+        for first, second in zip(lives_on, fresh, strict=True):
+            assert_same(first, second)
+
+
+@pytest.mark.parametrize("batch_size", [None, 3])
+def test_ranks_share_an_epoch(batch_size):
+    parts = [
+        [int(k) for one in stream(batch_size=batch_size, rank=rank, world_size=4) for k in one["index"].reshape(-1)]
+        for rank in range(4)
+    ]
+    assert {len(part) for part in parts} == {5}
+    every = sorted(itertools.chain(*parts))
+    assert len(set(every)) == 20  # 22 are not divisible
+    assert set(every) <= set(range(22))
+    assert len(stream(batch_size=batch_size, rank=1, world_size=4)) == (5 if batch_size is None else 2)
+
+
+@pytest.mark.parametrize("world", [1, 2])
+def test_resume(world):
+    def make():
+        return stream(batch_size=3, rank=world - 1, world_size=world)
+
+    whole = make()
+    whole.set_epoch(2)
+    every = list(whole)
+    for stop in (0, 1, 3):
+        interrupted = make()
+        interrupted.set_epoch(2)
+        taken = list(itertools.islice(iter(interrupted), stop))
+        state = interrupted.state_dict()
+        assert state == whole.state_dict(batches=stop)
+        again = make()
+        again.load_state_dict(state)
+        rest = list(again)
+        assert len(rest) == len(every) - stop
+        for first, second in zip(every, taken + rest, strict=True):
+            assert_same(first, second)
+    with pytest.raises(ValueError, match="seed 9"):
+        make().load_state_dict(state | {"seed": 9})
+
+
+def test_cube_is_that_of_the_sample():
+    """What is given is what `simulate` makes of the sample's flux, system and seed."""
+    dataset = stream(axes="HWT", dtype=None)
+    for one in itertools.islice(iter(dataset), 8):
+        told = dataset.sample(int(one["index"]))
+        cube = ml.simulate(told.flux, told.system, seed=told.seed)[0]
+        np.testing.assert_array_equal(one["cube"].numpy(), cube)
+        np.testing.assert_array_equal(one["flux"]["signal"].numpy(), told.flux.signal.astype(np.float32))
+        assert int(one["seed"]) == told.seed
+        np.testing.assert_allclose(
+            one["flux"]["delay"], told.system.delay_ns(one["depth"].numpy().astype(float)), rtol=1e-6
+        )
+        assert float(one["system"]["cycles"]) == told.system.cycles
+        np.testing.assert_allclose(one["signal_level"], told.flux.signal.mean(), rtol=1e-6)
+        np.testing.assert_allclose(one["sbr"], told.flux.signal.mean() / told.flux.background.mean(), rtol=1e-6)
+
+
+def test_flips_and_crops_turn_maps_and_cube_together():
+    """A scene whose every pixel is told by its depth: crops and flips show in maps and in counts alike."""
+    depth = np.arange(1.0, 101.0).reshape(10, 10) * 0.14
+    scene = ml.Scene(depth, 0.5 + 0.005 * np.arange(100.0).reshape(10, 10))
+    bright = SYSTEM.replace(cycles=400, pulse=ml.GaussianPulse(sigma_ns=0.05), bins=1000)
+    seen = set()
+    for one in stream(bright, scene, size=(4, 5), epoch_size=40, signal=2.0, sbr=math.inf):
+        place = np.rint(one["depth"].numpy() / 0.14).astype(int) - 1
+        rows, columns = place // 10, place % 10
+        down, right = rows[1, 0] - rows[0, 0], columns[0, 1] - columns[0, 0]
+        np.testing.assert_array_equal(rows, rows[:1, :1] + down * np.arange(4)[:, None] + 0 * columns)
+        np.testing.assert_array_equal(columns, columns[:1, :1] + right * np.arange(5) + 0 * rows)
+        seen.add((int(down), int(right)))
+        np.testing.assert_allclose(one["reflectivity"], scene.reflectivity[rows, columns], rtol=1e-6)
+        peak = (one["cube"].argmax(0).numpy() + 0.5) * bright.bin_ns
+        np.testing.assert_allclose(peak, bright.delay_ns(one["depth"].numpy()), atol=3 * 0.05 + bright.bin_ns)
+    assert seen == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+    for one in stream(bright, scene, size=10, epoch_size=3, flips=False):
+        np.testing.assert_allclose(one["depth"], depth, rtol=1e-6)
+
+
+def test_ranges():
+    """Settings lie within their ranges and follow their laws (Kolmogorov-Smirnov and chi-square, 1e-4 each)."""
+    dataset = CubeStream(
+        SYSTEMS, size=4, signal=LogUniform(0.1, 10), sbr=Choice([1, 2.5]), depth_scale=Uniform(0.5, 2), seed=8
+    )
+    samples = [dataset.sample(k) for k in range(600)]
+    systems = [one.system for one in samples]
+
+    def uniform(values, low, high):
+        assert min(values) >= low
+        assert max(values) <= high
+        assert stats.kstest(values, "uniform", (low, high - low)).pvalue > 1e-4
+
+    uniform([math.log(one.signal_level) for one in samples], math.log(0.1) - 1e-12, math.log(10) + 1e-12)
+    uniform([one.period_ns for one in systems], 80, 120)
+    uniform([math.log(one.pulse.sigma_ns) for one in systems], math.log(0.2) - 1e-12, math.log(2) + 1e-12)
+    assert {10 <= one.cycles <= 200 for one in systems} == {True}
+    for values, allowed in (([one.sbr for one in samples], {1.0, 2.5}),
+                            ([one.detector.dead_time_ns for one in systems], {0.0, 20.0, 150.0})):  # fmt: skip
+        counts = [values.count(one) for one in sorted(allowed)]
+        assert sum(counts) == 600
+        assert stats.chisquare(counts).pvalue > 1e-4
+    assert len({one.seed for one in samples}) == 600
+    lengths = {one.scene.depth_m.max() for one in samples}
+    assert len(lengths) > 500  # crops and scales differ
+
+
+def test_one_range_leaves_the_others_alone():
+    first, second = (CubeStream(SYSTEMS, size=4, flips=flips, seed=8) for flips in (True, False))
+    for k in range(5):
+        assert first.sample(k).system == second.sample(k).system
+        assert first.sample(k).seed == second.sample(k).seed
+        assert first.sample(k).signal_level == second.sample(k).signal_level
+
+
+def test_given_scenes_all_come_before_any_again(tmp_path):
+    scenes = [ml.Scene(np.full((3, 3), 1.0 + k), 1.0) for k in range(5)]
+    for k, scene in enumerate(scenes):
+        np.savez(tmp_path / f"{k}.npz", depth=scene.depth_m, reflectivity=scene.reflectivity)
+    orders = []
+    for source in (scenes, tmp_path):
+        depths = [float(one["depth"][0, 0]) for one in stream(SYSTEM, source, size=None, epoch_size=10)]
+        assert sorted(depths[:5]) == sorted(depths[5:]) == [1, 2, 3, 4, 5]
+        assert depths[:5] != depths[5:]
+        orders.append(depths)
+    assert orders[0] == orders[1]
+
+
+def test_buffers_are_not_given_out_while_they_are_held():
+    dataset = stream(SYSTEM, batch_size=2, epoch_size=40)
+    held = [one["cube"][0] for one in dataset]  # a view keeps the memory
+    copies = [one["cube"][0].clone() for one in dataset]
+    assert len({one.data_ptr() for one in held}) == len(held)
+    for first, second in zip(held, copies, strict=True):
+        assert torch.equal(first, second)
+    freed = {one["cube"].data_ptr() for one in dataset}
+    assert len(freed) <= 6  # memory is used again
+
+
+def test_mixed_counts_and_types():
+    wide = SYSTEM.replace(detector=ml.Detector(dead_time_ns=0.0))
+    assert wide.histogram_dtype == np.uint32
+    raw = list(stream([SYSTEM, wide], dtype=None, batch_size=4))
+    assert {one["cube"].dtype for one in raw} == {torch.uint32}
+    for dtype in (torch.float64, torch.float16, torch.bfloat16, torch.int32):
+        for first, second in zip(raw, stream([SYSTEM, wide], dtype=dtype, batch_size=4), strict=True):
+            assert second["cube"].dtype == dtype
+            assert torch.equal(first["cube"].to(torch.float64), second["cube"].to(torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"epoch_size": 0}, "epoch_size must be an integer"),
+        ({"batch_size": 0}, "batch_size must be an integer"),
+        ({"signal": 0.0}, "signal must be above 0"),
+        ({"signal": math.nan}, "signal must be a finite number"),
+        ({"sbr": "high"}, "sbr must be a finite number"),
+        ({"device": "mps"}, "device must be 'cpu' or 'cuda'"),
+        ({"layout": "csr"}, "layout must be one of"),
+        ({"dtype": "float32"}, "dtype must be a torch.dtype"),
+        ({"engine": "quick"}, "engine must be one of"),
+        ({"rank": 1}, "rank and world_size go together"),
+        ({"scenes": "nowhere"}, "scenes must be one of 'room', 'random', a folder"),
+        ({"scenes": []}, "scenes must be at least one"),
+        ({"systems": 3}, "systems must be a System"),
+        ({"systems": [SYSTEM, SYSTEM.replace(bins=32)]}, "equally many bins"),
+        ({"size": 0}, "size must be an integer"),
+        ({"threads": 0}, "threads must be an integer"),
+        ({"reuse": 0}, "reuse must be an integer"),
+    ],
+)
+def test_bad_arguments(changes, told):
+    with pytest.raises((ValueError, TypeError), match=told):
+        CubeStream(**{"systems": SYSTEM, "size": 6} | changes)
+
+
+def test_bad_ranges_are_told_before_any_work():
+    with pytest.raises(ValueError, match="low must be at most high"):
+        Uniform(2, 1)
+    with pytest.raises(ValueError, match=r"low must be .* \(0"):
+        LogUniform(0, 1)
+    with pytest.raises(ValueError, match="sigma_ns must lie in"):
+        SystemRange(base=SYSTEM, sigma_ns=LogUniform(0.1, 1000))
+    with pytest.raises(ValueError, match="dead_time_ns must be above"):
+        SystemRange(base=SYSTEM, dead_time_ns=Choice([-1.0]))
+    with pytest.raises(ValueError, match="size must be at most that of every scene"):
+        next(iter(stream(SYSTEM, ml.Scene(np.ones((4, 4)), 1.0))))
+    with pytest.raises(TypeError, match="without end has no length"):
+        len(CubeStream(SYSTEM))
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="device='cuda' needs"):
+            CubeStream(SYSTEM, device="cuda")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_scenes_are_whole_and_different(seed):
+    one, again, other = (ml.Scene.example("random", 24, k) for k in (seed, seed, seed + 100))
+    np.testing.assert_array_equal(one.depth_m, again.depth_m)
+    assert not np.array_equal(one.depth_m, other.depth_m)
+    assert one.valid.all()
+    assert 0.3 < one.depth_m.min() < one.depth_m.max() < 17.5
+    assert one.reflectivity.max() > 0.02

@@ -1,0 +1,110 @@
+"""The downstream experiment, in a tiny configuration: what it writes, and that it goes on where it stopped."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from mars_lidar.cli import app
+from mars_lidar.studies import Request, downstream, downstream_data
+from mars_lidar.studies.downstream_report import spread
+
+TINY = downstream_data.CONFIGS["tiny"]
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    small = replace(TINY, arms={"poisson": (0,), "mars": (0, 1)})
+    monkeypatch.setitem(downstream_data.CONFIGS, "tiny", small)
+    said: list[str] = []
+
+    def stop(text: str) -> None:
+        said.append(text)
+        if "mars-sbr1-depth-0" in text:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        downstream.run(Request(tmp_path, quick=True, tell=stop))
+    kept = tmp_path / "downstream-tiny" / "poisson-sbr1-depth-0" / "result.json"
+    made = kept.stat().st_mtime_ns
+    done = CliRunner().invoke(app, ["study", "downstream", "--quick", "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert kept.stat().st_mtime_ns == made
+    assert "6 networks to train" in said[0].replace("6 of 6", "6")
+    text = (tmp_path / "downstream.md").read_text()
+    assert "36.49" not in text  # the paper's row of another ratio
+    assert "33.68 / 0.061" in text
+    assert "not for citing" in text
+    assert (tmp_path / "downstream_sbr1.png").stat().st_size > 5000
+    with (tmp_path / "downstream.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6
+    result = json.loads(kept.read_text())
+    row = next(row for row in rows if (row["arm"], row["target"]) == ("poisson", "depth"))
+    assert float(row["gold_rmse"]) == pytest.approx(result["gold"]["rmse"], rel=1e-5)
+    with pytest.raises(ValueError, match="another configuration"):
+        downstream.fixed(tmp_path / "downstream-tiny", replace(small, photons=2.0))
+
+
+def test_declared_configurations():
+    for config in downstream_data.CONFIGS.values():
+        spans = [range(first, first + number) for first, number in (config.train, config.validation, config.test)]
+        assert len(set().union(*spans)) == sum(map(len, spans))  # disjoint
+        assert set(config.arms) <= set(downstream_data.WORDS)
+        names = [one.name for one in downstream.runs(config)]
+        assert len(set(names)) == len(names) == 2 * len(config.sbr) * sum(map(len, config.arms.values()))
+    small = downstream_data.CONFIGS["small"]
+    assert (small.size, small.sbr) == (64, (1.0,))
+    assert [len(small.arms[arm]) for arm in ("mars", "exact", "poisson")] == [3, 3, 1]
+
+
+def test_data_mean_what_the_configuration_says():
+    scenes = [downstream_data.crop(1000 + k, TINY) for k in range(2)]
+    assert not np.array_equal(scenes[0].depth_m, scenes[1].depth_m)
+    assert np.array_equal(scenes[0].depth_m, downstream_data.crop(1000, TINY).depth_m)
+    simulators = downstream_data.Simulators(TINY)
+    cubes = {arm: simulators.cubes(arm, scenes, 1.0, 5) for arm in ("poisson", "exact", "mars", "neural")}
+    # Poisson's counts are the arrivals: S = photons x reflectivity, B of the same mean, N_r cycles
+    mean = np.mean([scene.reflectivity.mean() for scene in scenes])
+    arrivals = 2.0 * TINY.photons * mean * downstream_data.SYSTEM.cycles
+    assert cubes["poisson"].sum(-1).mean() == pytest.approx(arrivals, rel=0.01)
+    # the others have the dead time
+    exact = cubes["exact"].sum(-1).mean()
+    assert exact < 0.7 * arrivals
+    for arm in ("mars", "neural"):
+        assert cubes[arm].sum(-1).mean() == pytest.approx(exact, rel=0.01)
+    depth = downstream_data.truths(scenes, "depth", TINY) * TINY.depth_range_m
+    np.testing.assert_allclose(depth[0], scenes[0].depth_m, rtol=1e-6)
+
+
+def test_errors_leave_out_pixels_without_return():
+    scene = downstream_data.crop(1000, TINY)
+    depth = scene.depth_m.copy()
+    depth[0, 0] = np.nan
+    from mars_lidar import Scene
+
+    holed = Scene(depth, scene.reflectivity)
+    maps = downstream_data.truths([scene], "depth", TINY)
+    maps[0, 1, 1] += 0.1
+    found = downstream.errors(maps, [holed], "depth", TINY)
+    assert found["rmse"] == pytest.approx(1.0 / np.sqrt(16 * 16 - 1), rel=1e-4)
+    assert found["psnr"] == pytest.approx(20.0 * np.log10(TINY.depth_range_m / found["rmse"]), rel=1e-6)
+
+
+def test_spread():
+    assert spread([1.0], 2) == "1.00"
+    assert spread([1.0, 3.0], 1) == "2.0 ± 1.4"

@@ -44,8 +44,8 @@ def test_they_are_the_exact_ones(monkeypatch):
 @pytest.mark.parametrize(
     "wrong",
     [
-        lambda k: k + [25.0, 0, 0, 0],  # elsewhere altogether
-        lambda k: k + [1.0, 0, 0, 0],  # by a good part of the spread
+        lambda k: k + np.array([25.0, 0, 0, 0]),  # elsewhere altogether
+        lambda k: k + np.array([1.0, 0, 0, 0]),  # by a good part of the spread
         lambda k: k * [1.0, 1e-6, 1, 1],  # far too narrow
         lambda k: k * [1.0, 1e6, 1, 1],  # wider than a guess may be
     ],

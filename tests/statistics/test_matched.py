@@ -17,7 +17,7 @@ from mars_lidar.studies.report import MAX_FIGURE_BYTES
 
 PERIOD_NS = 1e3 / 7.5
 AIM = 0.002
-NEEDLESS = 0.05
+NEEDLESS = 0.06
 # one of each form: smooth, few photons, locked (binomial loss, loss and gain), mended, two integers
 FORMS = {
     "smooth": (750.0, 141.0, -60.0, 20.0),

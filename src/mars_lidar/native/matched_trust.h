@@ -20,6 +20,7 @@ constexpr double kFree = 0.25, kFreeAgree = 1.5e-3;  // variance / mean of a cou
 // sums of many parts: a skewness that explains the kurtosis, a quantile that rises well, many registrations
 constexpr double kKurtosis = 0.02, kSlope = 0.3, kSlopeReach = 4.0, kLeastMean = 16.0;
 constexpr double kNarrow = 1.5, kNarrowAgree = 1e-3, kWideAgree = 3e-3;  // variance; of laws with three cumulants
+constexpr double kCloseKurtosis = 0.01, kCloseAgree = 1.5e-3;             // below that variance, a little more room
 
 // The window of a narrow law (variance below 9), its probabilities, and other laws on the same window.
 struct Window {
@@ -79,8 +80,9 @@ inline bool trusted(const Cumulants& k, const MatchedLaw& law) {
     }
     const double skewness = k.third * k.third / (k.variance * k.variance * k.variance);
     const double kurtosis = k.fourth / (k.variance * k.variance);
-    return k.mean > kLeastMean && std::fabs(kurtosis - skewness) < kKurtosis && law.least_slope(kSlopeReach) > kSlope &&
-           window.normal(3) < (k.variance < kNarrow ? kNarrowAgree : kWideAgree);
+    const double off = std::fabs(kurtosis - skewness);
+    const double agree = k.variance >= kNarrow ? kWideAgree : off < kCloseKurtosis ? kCloseAgree : kNarrowAgree;
+    return k.mean > kLeastMean && off < kKurtosis && law.least_slope(kSlopeReach) > kSlope && window.normal(3) < agree;
 }
 
 }  // namespace mars

@@ -1,0 +1,61 @@
+"""Exact pmfs whose support is guessed from cumulants that are known but roughly."""
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from mars_lidar.statistics import _pmf
+from mars_lidar.statistics._cells import Cells
+from mars_lidar.statistics._pmf import exact_windows, guessed_windows
+from mars_lidar.statistics.exposure import refined_moments
+from mars_lidar.table.law import distance
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=120, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    detector=ml.Detector(dead_time_ns=63.75),
+)  # fmt: skip
+
+
+def cells():
+    signal, background = np.array([8.0, 3.0, 0.3, 0.001, 6.0]), np.array([0.02, 0.5, 3.0, 0.002, 0.2])
+    some = Cells.of(signal, background, SYSTEM, delay_ns=[3.0, 50.0, 60.0, 10.0, 97.0])
+    found = refined_moments(some, 1, tolerance=1e-4, threads=1)
+    return some, found.cumulants.reshape(-1, 4), found.bins.reshape(-1)
+
+
+def alone(monkeypatch):
+    """How many cells went the long way."""
+    asked = []
+    monkeypatch.setattr(_pmf, "_alone", lambda cell, threads, way=_pmf._alone: asked.append(1) or way(cell, threads))
+    return asked
+
+
+def test_they_are_the_exact_ones(monkeypatch):
+    some, cumulants, bins = cells()
+    asked, told = alone(monkeypatch), []
+    for guess, truth in zip(
+        guessed_windows(some, cumulants, bins, 1, told.append), exact_windows(some, cumulants, bins, 1), strict=True
+    ):
+        assert distance(guess, truth) < 1e-11
+    assert not asked
+    assert told[-1] == some.size
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda k: k + np.array([25.0, 0, 0, 0]),  # elsewhere altogether
+        lambda k: k + np.array([1.0, 0, 0, 0]),  # by a good part of the spread
+        lambda k: k * [1.0, 1e-6, 1, 1],  # far too narrow
+        lambda k: k * [1.0, 1e6, 1, 1],  # wider than a guess may be
+    ],
+)
+def test_a_wrong_guess_is_noticed(monkeypatch, wrong):
+    some, cumulants, bins = cells()
+    wide = np.array([1, 2, 4])  # counts of some spread: the others are all but certain
+    some, cumulants, bins = some.part(wide), cumulants[wide], bins[wide]
+    asked = alone(monkeypatch)
+    guesses = guessed_windows(some, np.asarray(wrong(cumulants)), bins, 1)
+    for guess, truth in zip(guesses, exact_windows(some, cumulants, bins, 1), strict=True):
+        assert distance(guess, truth) < 1e-6
+    assert asked

@@ -79,6 +79,7 @@ def simulate(
     dark_counts: options.DarkCounts = 0.0,
     engine: options.Engine = "exact",
     table: options.Table = None,
+    model: options.Model = None,
     count: options.Count = None,
     interpolation: options.Interpolation = None,
     table_outside: options.TableOutside = None,
@@ -158,6 +159,7 @@ def simulate(
                 overwrite=overwrite,
                 progress=progress,
                 table=_table(table, instrument),
+                model=model,
                 count=count,  # type: ignore[arg-type]  # checked there
                 interpolation=interpolation,  # type: ignore[arg-type]
                 outside=table_outside,  # type: ignore[arg-type]

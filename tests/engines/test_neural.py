@@ -166,6 +166,9 @@ def test_training_from_the_command_line(tmp_path: Path):
     flux = ml.Flux(1.0, 1.0, 5.0)
     cube = ml.simulate(flux, SMALL, engine="neural", model=path)
     assert np.array_equal(cube, ml.simulate(flux, SMALL, engine=NeuralEngine(found)))
+    told = ["simulate", "--scene", "room", "--size", "4", "--system", str(system), "--engine", "neural", "--no-picture"]
+    drawn = CliRunner().invoke(app, [*told, "--model", str(path), "-o", str(tmp_path / "cube.npz")])
+    assert drawn.exit_code == 0, drawn.output
     assert CliRunner().invoke(app, ["neural", "info", str(path)]).exit_code == 0
     again = CliRunner().invoke(app, arguments)
     assert again.exit_code == 2

@@ -49,7 +49,7 @@ def test_a_network_learns_what_the_bins_tell(tmp_path: Path):
     found = fit(net, train, test, tmp_path, replace(PLAN, steps=210, every=70, batch=4))
     after = np.abs(predict(net, test.cubes, 16.0) - test.maps).mean()
     assert before > 0.2
-    assert after < 0.05
+    assert after < 0.1  # a constant map scores 0.3
     assert found.best == pytest.approx(after, rel=1e-5)
     assert found.steps == 210
     rows = (tmp_path / LOG).read_text().splitlines()

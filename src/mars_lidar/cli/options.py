@@ -327,6 +327,14 @@ Table = Annotated[
         default="every distinct pixel is evaluated by itself, which is slow",
     ),
 ]
+Model = Annotated[
+    Path | None,
+    _option(
+        "--model", panel=_RUN,
+        help="For --engine neural: a network of this system (mars-lidar neural train).",
+        default="the package's own, for the default system",
+    ),
+]
 Count = Annotated[
     str | None,
     _option(

@@ -95,6 +95,7 @@ def simulate(
     ambient: options.Ambient = None,
     engine: options.Engine = "exact",
     table: options.Table = None,
+    model: options.Model = None,
     count: options.Count = None,
     interpolation: options.Interpolation = None,
     table_outside: options.TableOutside = None,
@@ -210,6 +211,7 @@ def simulate(
                 overwrite=overwrite,
                 progress=progress,
                 table=_table(table, instrument),
+                model=model,
                 count=count,  # type: ignore[arg-type]  # checked there
                 interpolation=interpolation,  # type: ignore[arg-type]
                 outside=table_outside,  # type: ignore[arg-type]

@@ -19,6 +19,7 @@ from mars_lidar.io.recipe import Recipe
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
+    from mars_lidar.learn.neural import NeuralMap
     from mars_lidar.table import Table
 
 Progress = Callable[[int, int], None]
@@ -80,6 +81,7 @@ def simulate_to(
     count: Literal["exact", "matched", "gaussian"] | None = None,
     interpolation: Literal["bilinear", "nearest"] | None = None,
     outside: Literal["error", "exact"] | None = None,
+    model: NeuralMap | str | Path | None = None,
 ) -> Written:
     """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
 
@@ -92,7 +94,7 @@ def simulate_to(
         The file; its suffix chooses the format.
     flux, system, engine, realizations, first_realization, pixel_index, seed, threads
         As for `mars_lidar.simulate`.
-    table, count, interpolation, outside
+    table, count, interpolation, outside, model
         As for `mars_lidar.simulate`; the file keeps the name of the engine, its settings, and a hash of the table.
     depth_m, reflectivity
         Maps (H, W) of the scene to store beside the counts; depth is c tau / 2 by default.
@@ -114,7 +116,7 @@ def simulate_to(
     WriteError, Interrupted
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
-    options = _given(table=table, count=count, interpolation=interpolation, outside=outside)
+    options = _given(table=table, count=count, interpolation=interpolation, outside=outside, model=model)
     recipe = Recipe(
         system=system,
         flux=flux,

@@ -32,6 +32,10 @@ class Request:
     config: str = "small"
 
 
+class OtherRunsError(ValueError):
+    """A folder holds the runs of another configuration."""
+
+
 Study = Callable[[Request], list[Path]]
 
 
@@ -93,4 +97,4 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _study("table")),
 }
 
-__all__ = ["STUDIES", "Request", "Study", "Tell"]
+__all__ = ["STUDIES", "OtherRunsError", "Request", "Study", "Tell"]

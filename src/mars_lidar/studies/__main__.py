@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from mars_lidar.studies import STUDIES, Request
+from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar.studies import STUDIES, OtherRunsError, Request
 from mars_lidar.studies.classifiers import MissingExtra
 
 
@@ -77,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for path in STUDIES[name][1](request):
                 print(path)
             tell(f"{name}: done in {time.monotonic() - began:.0f} s")
-    except MissingExtra as error:
+    except (MissingExtra, MissingLibraryError, OtherRunsError) as error:
         tell(str(error))
         return 1
     except KeyboardInterrupt:

@@ -179,7 +179,8 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
     seed = (settings.seed << 16) + number
     sample = draw(truth, signal, background, system, realizations=settings.realizations, seed=seed)
     # another seed: an engine must not share random numbers with the truth
-    asked = simulators(settings.sampled, seed + (1 << 40), Training(steps=settings.steps, pairs=settings.pairs))
+    training = Training(steps=settings.steps, pairs=settings.pairs, held_out=min(500, settings.pairs))
+    asked = simulators(settings.sampled, seed + (1 << 40), training)
     predictions = {one.name: one.predict(signal, background, system) for one in asked}
     cumulants = count_law(signal, background, system, "exact").cumulants
     random = np.random.default_rng([settings.seed, number])

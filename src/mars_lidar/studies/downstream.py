@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import _validate
 from mars_lidar.scene import Scene
-from mars_lidar.studies import Request, Tell
+from mars_lidar.studies import OtherRunsError, Request, Tell
 from mars_lidar.studies.downstream_data import CONFIGS, SYSTEM, WORDS, Config, Simulators, crop, examples, rgbd_scenes
 
 TARGETS = ("reflectivity", "depth")
@@ -79,7 +79,7 @@ def fixed(folder: Path, config: Config) -> None:
     record = json.dumps(asdict(config) | {"system": SYSTEM.to_dict()}, indent=2) + "\n"
     path = folder / CONFIG
     if path.exists() and path.read_text() != record:
-        raise ValueError(f"{folder} holds runs of another configuration ({CONFIG}); give another --out")
+        raise OtherRunsError(f"{folder} holds runs of another configuration ({CONFIG}); give another --out")
     _write(path, record)
 
 

@@ -72,7 +72,7 @@ _ARMS: dict[str, tuple[int, ...]] = {
 CONFIGS = {
     "small": Config(
         name="small", sbr=(1.0,), arms=_ARMS, train=(1000, 40), validation=(2000, 6), test=(3000, 8), size=64,
-        render=160, steps=600, batch=4, every=50, patience=5, stem=64, widths=(32, 64, 96), blocks=1,
+        render=160, steps=1000, batch=4, every=100, patience=4, stem=64, widths=(32, 64, 96), blocks=1,
     ),
     "full": Config(
         name="full", sbr=(0.6, 1.0), arms=dict.fromkeys(_ARMS, _THREE), train=(1000, 400), validation=(2000, 40),

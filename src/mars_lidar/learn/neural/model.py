@@ -71,7 +71,7 @@ class NeuralMap:
                 ours, theirs = ours["detector"], theirs["detector"]
             raise ValueError(
                 f"engine 'neural' draws only the system it was trained for: {name} is {theirs[name]}, trained for "
-                f"{ours[name]}; train another (mars-lidar neural train)"
+                f"{ours[name]}; train another (mars-lidar neural train) and give it as model (--model)"
             )
 
     def check_range(self, signal: FloatArray, background: FloatArray) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mars_lidar.learn.forward import armed_periods, bin_photons, expected_histogram, histogram_log_likelihood
     from mars_lidar.learn.ranges import Choice, LogUniform, SystemRange, Uniform
     from mars_lidar.learn.stored import StoredDataset
     from mars_lidar.learn.stream import CubeStream
@@ -16,6 +17,10 @@ _MODULES = {
     "StoredDataset": "stored",
     "SystemRange": "ranges",
     "Uniform": "ranges",
+    "armed_periods": "forward",
+    "bin_photons": "forward",
+    "expected_histogram": "forward",
+    "histogram_log_likelihood": "forward",
 }
 
 
@@ -27,4 +32,15 @@ def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
     return getattr(import_module(f"mars_lidar.learn.{_MODULES[name]}"), name)
 
 
-__all__ = ["Choice", "CubeStream", "LogUniform", "StoredDataset", "SystemRange", "Uniform"]
+__all__ = [
+    "Choice",
+    "CubeStream",
+    "LogUniform",
+    "StoredDataset",
+    "SystemRange",
+    "Uniform",
+    "armed_periods",
+    "bin_photons",
+    "expected_histogram",
+    "histogram_log_likelihood",
+]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mars_lidar.learn.forward import armed_periods, bin_photons, expected_histogram, histogram_log_likelihood
+    from mars_lidar.learn.inverse import LidarPhysics
     from mars_lidar.learn.ranges import Choice, LogUniform, SystemRange, Uniform
     from mars_lidar.learn.stored import StoredDataset
     from mars_lidar.learn.stream import CubeStream
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "Choice": "ranges",
     "CubeStream": "stream",
+    "LidarPhysics": "inverse",
     "LogUniform": "ranges",
     "StoredDataset": "stored",
     "SystemRange": "ranges",
@@ -35,6 +37,7 @@ def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
 __all__ = [
     "Choice",
     "CubeStream",
+    "LidarPhysics",
     "LogUniform",
     "StoredDataset",
     "SystemRange",

@@ -201,13 +201,15 @@ def histogram_log_likelihood(
     armed = armed_periods(histogram, system)
     photons = bin_photons(signal, background, delay_ns, system)
     counts = histogram.to(photons.dtype)
-    return (torch.xlogy(counts, photons) - photons * armed.to(photons.dtype)).sum(-1)
+    out: torch.Tensor = (torch.xlogy(counts, photons) - photons * armed.to(photons.dtype)).sum(-1)
+    return out
 
 
 def _cumulative(pulse: Pulse, time: torch.Tensor) -> torch.Tensor:
     """Energy before a time after the delay, differentiable."""
     if isinstance(pulse, GaussianPulse):
-        return torch.special.ndtr(time / pulse.sigma_ns)
+        below: torch.Tensor = torch.special.ndtr(time / pulse.sigma_ns)
+        return below
     assert isinstance(pulse, SampledPulse)
     knots = torch.tensor(pulse._cumulative, dtype=time.dtype, device=time.device)
     place = ((time - pulse._start_ns) / pulse.bin_ns).clamp(0.0, len(knots) - 1.0)

@@ -8,7 +8,20 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks import effects, engines, exposures, laws, memory, numpy_mars, paths, startup, storage, sweeps, waveforms
+from benchmarks import (
+    effects,
+    engines,
+    exposures,
+    laws,
+    memory,
+    numpy_mars,
+    paths,
+    startup,
+    storage,
+    stream,
+    sweeps,
+    waveforms,
+)
 from benchmarks.config import DEFAULT, FULL, QUICK, Config
 from benchmarks.floor import Bandwidth, measure_bandwidth
 from benchmarks.machine import Interference, describe_machine
@@ -31,6 +44,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "stationary": laws.stationary_distribution,
     "codecs": storage.codecs,
     "datasets": storage.datasets,
+    "stream": stream.stream,
     "memory": memory.peak_memory,
     "import": startup.import_time,
     "cli": startup.command_line,

@@ -138,3 +138,10 @@ def test_goals_are_computed():
     assert Goal("ratio", 21.0, 20.0, "", at_least=True).met
     assert "**not met**" in table([Goal("time", 4.0, 3.0, "s").row()])
     assert Section("Empty").markdown() == "## Empty"
+
+
+def test_stream_is_measured_beside_the_engine():
+    section = command.run(TINY, ("stream",)).sections[0]
+    assert [row["workers"] for row in section.rows] == 2 * [0, 0, 0, 1, 2]
+    assert all(row["cubes/s"] > 0 for row in section.rows)
+    assert [row["of the engine's rate, CPU"] for row in section.rows if row["case"] == "bare engine"] == [1.0, 1.0]

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mars_lidar.learn.fit import Examples, FitPlan, Fitted
+    from mars_lidar.learn.forward import armed_periods, bin_photons, expected_histogram, histogram_log_likelihood
+    from mars_lidar.learn.inverse import LidarPhysics
     from mars_lidar.learn.ranges import Choice, LogUniform, SystemRange, Uniform
     from mars_lidar.learn.stored import StoredDataset
     from mars_lidar.learn.stream import CubeStream
@@ -21,10 +23,15 @@ _MODULES = {
     "Examples": "fit",
     "FitPlan": "fit",
     "Fitted": "fit",
+    "LidarPhysics": "inverse",
     "LogUniform": "ranges",
     "StoredDataset": "stored",
     "SystemRange": "ranges",
     "Uniform": "ranges",
+    "armed_periods": "forward",
+    "bin_photons": "forward",
+    "expected_histogram": "forward",
+    "histogram_log_likelihood": "forward",
 }
 
 
@@ -43,8 +50,13 @@ __all__ = [
     "Examples",
     "FitPlan",
     "Fitted",
+    "LidarPhysics",
     "LogUniform",
     "StoredDataset",
     "SystemRange",
     "Uniform",
+    "armed_periods",
+    "bin_photons",
+    "expected_histogram",
+    "histogram_log_likelihood",
 ]

@@ -1,18 +1,11 @@
 // The recording of registrations, lane by lane: beside the loop of exact_runner.h, after each of its rounds.
 #pragma once
+#include "exact_step.h"
 #include "job.h"
 #include "recording_view.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
-
-// One registration of each lane.
-struct Registration {
-    Time hit;   // in frames
-    Int cycle;  // the same in laser periods
-    Float phase;
-    Mask lost;
-};
 
 // What happens to registrations before they are logged. Jitter takes its random numbers from stages that nothing else
 // uses, so that the registrations are the same with and without it.

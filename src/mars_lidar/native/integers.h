@@ -1,0 +1,12 @@
+// Integers of fixed width, also where there is no standard library: NVRTC compiles the kernels for CUDA without one.
+#pragma once
+#if defined(__CUDACC_RTC__)
+using int32_t = int;
+using uint8_t = unsigned char;
+using uint16_t = unsigned short;
+using uint32_t = unsigned int;
+using int64_t = long long;
+using uint64_t = unsigned long long;
+#else
+#include <stdint.h>
+#endif

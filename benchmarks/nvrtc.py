@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-from mars_lidar.gpu.kernels import HEADERS, OPTIONS, SOURCE, Variant
+from mars_lidar.gpu.kernels import HEADERS, OPTIONS, Variant, source
 
 
 class NotFound(RuntimeError):
@@ -52,7 +52,7 @@ def library() -> ctypes.CDLL:
 def compiled(variants: list[Variant], architecture: str) -> dict[Variant, Resources]:
     """Compile to machine code for one architecture, such as ``sm_90``; RuntimeError with the log where that fails."""
     nvrtc, program = library(), ctypes.c_void_p()
-    _check(nvrtc.nvrtcCreateProgram(ctypes.byref(program), SOURCE.encode(), b"exact.cu", 0, None, None), "")
+    _check(nvrtc.nvrtcCreateProgram(ctypes.byref(program), source().encode(), b"exact.cu", 0, None, None), "")
     try:
         for variant in variants:
             _check(nvrtc.nvrtcAddNameExpression(program, variant.expression.encode()), variant.expression)

@@ -99,7 +99,8 @@ def simulate(
     )
     shape = (task.realizations, *flux.shape, system.bins)
     if _validate.choice("device", device, ("cpu", "cuda")) == "cuda":
-        return _on_cuda(drawn_by, task, shape, out)
+        there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
+        return there
     if out is None:
         _check_memory(shape, system.histogram_dtype.itemsize, "histograms")
         out = np.empty(shape, system.histogram_dtype)
@@ -108,7 +109,8 @@ def simulate(
     drawn_by.histogram(task, out.reshape(task.items, system.bins))
     if report is not None:
         report.update(task.report)
-    return out
+    cube: NDArray[Any] = out
+    return cube
 
 
 def simulate_timestamps(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.engines.base import Records, Task
-from mars_lidar.gpu.kernels import HEADERS, OPTIONS, SOURCE, Sink, Variant, block_bytes
+from mars_lidar.gpu.kernels import HEADERS, OPTIONS, Sink, Variant, block_bytes, source
 
 _WARP = 32
 _ROW_THREADS = 128  # of a block whose histograms are not in its memory
@@ -122,6 +122,6 @@ def _kernel(variant: Variant, device: int) -> Any:
     import cupy
 
     module = cupy.RawModule(
-        code=SOURCE, options=(*OPTIONS, f"-I{HEADERS}"), backend="nvrtc", name_expressions=(variant.expression,)
+        code=source(), options=(*OPTIONS, f"-I{HEADERS}"), backend="nvrtc", name_expressions=(variant.expression,)
     )
     return module.get_function(variant.expression)

@@ -4,24 +4,34 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
+from hashlib import blake2b
 from pathlib import Path
 
 from mars_lidar import _core
 from mars_lidar.detector import MODES
 from mars_lidar.engines.base import Task
 
-SOURCE = '#include "exact_device.h"\n'
 HEADERS = Path(__file__).resolve().parent.parent / "native"
 AHEAD = 8  # registrations drawn ahead; changes speed only
 # The bits are those of the processor: no fused multiply-add, IEEE division, subnormal numbers.
 OPTIONS = (
-    "--std=c++17",
+    "-std=c++17",  # in this form: CuPy looks whether it is there
     "--fmad=false",
     "--prec-div=true",
     "--prec-sqrt=true",
     "--ftz=false",
     "--device-as-default-execution-space",
 )
+
+
+@cache
+def source() -> str:
+    """What is compiled. It tells the headers' contents, by which CuPy names what it has compiled before."""
+    contents = blake2b(digest_size=16)
+    for header in sorted(HEADERS.glob("*.h")):
+        contents.update(header.read_bytes())
+    return f'// {contents.hexdigest()}\n#include "exact_device.h"\n'
 
 
 class Sink(IntEnum):

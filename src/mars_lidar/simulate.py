@@ -37,7 +37,8 @@ def simulate(
     pixel_index: ArrayLike | None = None,
     seed: int = 0,
     threads: int | None = None,
-    out: NDArray[Any] | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
+    out: Any = None,
     progress: Progress | None = None,
     report: dict[str, float] | None = None,
     table: Table | None = None,
@@ -70,8 +71,13 @@ def simulate(
         Integer in [0, 2**64).
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
+    device
+        ``"cpu"`` (default), or ``"cuda"``: the ``"exact"`` engine on the current CUDA device and stream, with the same
+        bits (extras ``cuda12`` and ``cuda13``; docs/gpu.md). The result is then a CuPy array, which
+        ``torch.from_dlpack`` takes without a copy.
     out
-        C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill.
+        C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill; with
+        ``device="cuda"`` a CuPy array.
     progress
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
     report
@@ -92,13 +98,17 @@ def simulate(
     Returns
     -------
     NDArray
-        (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given).
+        (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
+        with ``device="cuda"``.
     """
     drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside, model=model)
     task = _task(
         flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress
     )
     shape = (task.realizations, *flux.shape, system.bins)
+    if _validate.choice("device", device, ("cpu", "cuda")) == "cuda":
+        there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
+        return there
     if out is None:
         _check_memory(shape, system.histogram_dtype.itemsize, "histograms")
         out = np.empty(shape, system.histogram_dtype)
@@ -107,7 +117,8 @@ def simulate(
     drawn_by.histogram(task, out.reshape(task.items, system.bins))
     if report is not None:
         report.update(task.report)
-    return out
+    cube: NDArray[Any] = out
+    return cube
 
 
 def simulate_timestamps(
@@ -119,12 +130,13 @@ def simulate_timestamps(
     pixel_index: ArrayLike | None = None,
     seed: int = 0,
     threads: int | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
     progress: Progress | None = None,
 ) -> Timestamps:
     """Registration times of an image in one realization.
 
-    Parameters are those of `simulate`. The histogram of the result equals
-    ``simulate(..., first_realization=realization)[0]`` of the same seed exactly.
+    Parameters are those of `simulate`; the result is in the processor's memory on every device. The histogram of the
+    result equals ``simulate(..., first_realization=realization)[0]`` of the same seed exactly.
 
     Returns
     -------
@@ -135,10 +147,16 @@ def simulate_timestamps(
     task = _task(
         flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization"
     )
-    counts = drawn_by.counts(task)
-    _check_memory((int(counts.sum()),), 16, "timestamps")
-    records = Records.allocate(counts)
-    drawn_by.timestamps(task, records)
+    if _validate.choice("device", device, ("cpu", "cuda")) == "cuda":
+        drawn_by.check_device(device, task.flux, task.system)
+        from mars_lidar.gpu import exact_records
+
+        records = exact_records(task)
+    else:
+        counts = drawn_by.counts(task)
+        _check_memory((int(counts.sum()),), 16, "timestamps")
+        records = Records.allocate(counts)
+        drawn_by.timestamps(task, records)
     times_ns = records.times
     times_ns *= system.period_ns
     return Timestamps(
@@ -153,6 +171,25 @@ def simulate_timestamps(
         system.cycles,
         {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)},
     )
+
+
+def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:
+    engine.check_device("cuda", task.flux, task.system)
+    from mars_lidar.gpu import exact_histogram
+    from mars_lidar.gpu.exact import cupy_with_device
+
+    cupy = cupy_with_device()
+    dtype = task.system.histogram_dtype
+    if out is None:
+        out = cupy.empty(shape, dtype)
+    elif not isinstance(out, cupy.ndarray):
+        raise TypeError(f"out must be a CuPy array with device='cuda', got {type(out).__name__}")
+    elif out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
+        raise ValueError(
+            f"out must be C-contiguous, of shape {shape} and dtype {dtype}, got {out.shape} and {out.dtype}"
+        )
+    exact_histogram(task, out.reshape(task.items, task.system.bins))
+    return out
 
 
 def _task(

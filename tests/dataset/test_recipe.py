@@ -64,7 +64,7 @@ def test_options_replace_values(write):
         ("seed: 3", "seed: -3", 1, "seed must be an integer in"),
         ("seed: 3", "sead: 3", 1, "unknown key 'sead'"),
         ("seed: 3", "seed: 3\nseed: 4", 2, "seed is given twice"),
-        ("example: room", "example: rome", 3, "must be one of 'room', got 'rome'"),
+        ("example: room", "example: rome", 3, "must be one of 'room', 'random', got 'rome'"),
         ("size: 16", "size: [1, 2, 3]", 4, r"scenes\[0\].size must be an integer or \[height, width\]"),
         ("count: 3}", "count: x}", 5, r"scenes\[0\].seeds.count must be an integer"),
         ("path: nyu", "paths: nyu", 6, "must give one of example and path"),

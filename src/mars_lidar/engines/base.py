@@ -151,6 +151,7 @@ class Engine(ABC):
     modes: ClassVar[tuple[Mode, ...]] = ("nonparalyzable",)  # of the detector, that the engine reproduces
     effects: ClassVar[tuple[str, ...]] = LIGHT_EFFECTS  # likewise
     any_system: ClassVar[bool] = True  # False: it draws the system that it was made for
+    devices: ClassVar[tuple[str, ...]] = ("cpu",)  # that it runs on
     options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
 
     @property
@@ -181,6 +182,17 @@ class Engine(ABC):
             return "; use " + " or ".join(repr(name) for name, engine in ENGINES.items() if effect in engine.effects)
 
         require_effects(f"engine {self.name!r}", system.detector, self.effects, instead)
+
+    def check_device(self, device: str, flux: Flux, system: System) -> None:
+        """Raise ValueError, naming what to use, for what this engine cannot do on that device."""
+        if device not in self.devices:
+            from mars_lidar.engines import ENGINES
+
+            able = " or ".join(repr(name) for name, engine in ENGINES.items() if device in engine.devices)
+            raise ValueError(
+                f"engine {self.name!r} does not run on device {device!r}, only on "
+                f"{', '.join(map(repr, self.devices))}; use engine {able}, or device 'cpu'"
+            )
 
     @abstractmethod
     def histogram(self, task: Task, out: NDArray[Any]) -> None:

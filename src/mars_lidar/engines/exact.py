@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.detector import MODES
-from mars_lidar.effects import EFFECTS
+from mars_lidar.effects import EFFECTS, LIGHT_EFFECTS, require_effects
 from mars_lidar.engines.base import Engine, Records, Task
+from mars_lidar.flux import Flux
+from mars_lidar.system import System
 
 
 class ExactEngine(Engine):
@@ -25,9 +27,20 @@ class ExactEngine(Engine):
     description = "every registered photon, nothing approximated; the default"
     modes = MODES
     effects = tuple(name for name in EFFECTS if name != "crosstalk")
+    devices = ("cpu", "cuda")
 
     def __init__(self, level: str = "") -> None:
         self.level = level
+
+    def check_device(self, device: str, flux: Flux, system: System) -> None:
+        """On a GPU: returns of a pulse, in every mode, recorded as they are registered."""
+        super().check_device(device, flux, system)
+        if device == "cpu":
+            return
+        if flux.waveform is not None:
+            raise ValueError(f"flux must have returns, not a waveform, on device {device!r}; use device 'cpu'")
+        able = tuple(effect for effect in LIGHT_EFFECTS if effect in self.effects)
+        require_effects(f"device {device!r}", system.detector, able, lambda effect: "; use device 'cpu'")
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every registration, binned as it is drawn."""

@@ -7,11 +7,11 @@
 #include <cstring>
 #include <type_traits>
 
-#include "detector_modes.h"
 #include "exact_kernel.h"
 #include "exact_recorder.h"
+#include "exact_step.h"
 #include "exact_writers.h"
-#include "pulse_view.h"
+#include "system_view.h"
 #include "trap_lanes.h"
 
 #define MARS_JOIN2(a, b) a##b
@@ -21,38 +21,13 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
-constexpr int kMaxReturns = 16;
-constexpr int kAhead = 8;                    // registrations drawn ahead
-constexpr int kPollEvery = 512;              // rounds between looks at `stop`
-constexpr int32_t kIdleFrame = 100000001;    // every exposure has ended; + kAhead (kForever + t_d) fits 32 bits
-
-SystemView view(const Job& job, const PulseTable& pulse) {
-    SystemView system{};
-    system.pulse = pulse_view(pulse);
-    system.gate = gate_view(job.gate);
-    system.cycles = job.cycles;
-    system.bins = job.bins;
-    system.returns = static_cast<int32_t>(job.returns);
-    system.dead_whole = static_cast<int32_t>(job.dead_time);
-    system.dead_fraction = static_cast<float>(job.dead_time - system.dead_whole);
-    if (system.dead_fraction >= 1.0f) {
-        system.dead_whole += 1;
-        system.dead_fraction = 0.0f;
-    }
-    return system;
-}
+constexpr int kPollEvery = 512;  // rounds between looks at `stop`
 
 // Plain memory behind the lanes, for changing single lanes.
 struct RateArray {
     float rate[kLanes], inverse[kLanes], never[kLanes];
 
-    void set(int lane, double photons) {
-        const float r = static_cast<float>(photons);
-        const bool dark = !(r >= 1e-30f);
-        rate[lane] = dark ? 0.0f : r;
-        inverse[lane] = dark ? 0.0f : 1.0f / r;
-        never[lane] = dark ? kForever : 0.0f;
-    }
+    void set(int lane, double photons) { plain_rate(photons, rate[lane], inverse[lane], never[lane]); }
 };
 
 MARS_INLINE Rate load_rate(const RateArray& from) {
@@ -89,32 +64,23 @@ public:
 private:
     MARS_INLINE void step(int k) {
         const UInt event = event_ + static_cast<uint32_t>(k);
-        Time from = armed_;
-        if constexpr (kTraps) from = search_start(event);
-        Time hit = next_registration<gaussian, whole>(system_, returns_, from, ahead_[k], key0_, key1_, event, memory_);
-        Int generation = splat(0);
-        if constexpr (kTraps) generation = earliest_arrival(hit);
-        if constexpr (mode == DetectorMode::kNonparalyzable) armed_ = rearm(system_, hit);
-        // from the frames of the first return to laser periods
-        const Float shifted = hit.phase + delay_;
-        const Int wrap = minus_if(one_if(shifted >= 1.0f), shifted < 0.0f);
-        const Int cycle = hit.frame + wrap;
-        const Float phase = shifted - to_float(wrap);
-        const Int bin = minimum(truncate(phase * static_cast<float>(system_.bins)), splat(system_.bins - 1));
-        // inside the exposure: 0 <= cycle < cycles, one unsigned comparison
-        Mask outside = as_uint(cycle) >= static_cast<uint32_t>(system_.cycles);
-        if constexpr (mode != DetectorMode::kNonparalyzable) {
-            const Mask unseen = advance<mode>(system_, hit, cycle, phase, delay_, event, armed_, memory_);
-            if constexpr (kTraps) traps_.avalanche(select(unseen, splat(1), splat(0)) == 0, hit, generation);
-            outside = outside | unseen;
-        } else if constexpr (kTraps) {
-            traps_.avalanche(splat(0) == 0, hit, generation);
+        Registration next;
+        if constexpr (kTraps) {
+            Time hit = next_registration<gaussian, whole>(system_, returns_, search_start(event), ahead_[k], key0_,
+                                                          key1_, event, memory_);
+            const Int generation = earliest_arrival(hit);
+            Mask unseen = splat(0) > 0;
+            next = register_arrival<mode>(system_, hit, delay_, event, armed_, memory_, unseen);
+            traps_.avalanche(select(unseen, splat(1), splat(0)) == 0, hit, generation);
+        } else {
+            next = register_next<mode, gaussian, whole>(system_, returns_, delay_, ahead_[k], key0_, key1_, event,
+                                                        armed_, memory_);
         }
         if constexpr (kRecords) {
-            seen_[k] = {hit, cycle, phase, outside, bin};
+            seen_[k] = {next.hit, next.cycle, next.phase, next.lost, bin_of(next.phase, system_.bins)};
             return;
         }
-        log(rows_ + k, outside, bin, cycle, phase);
+        log(rows_ + k, next.lost, bin_of(next.phase, system_.bins), next.cycle, next.phase);
     }
 
     MARS_INLINE void log(int row, Mask lost, Int bin, Int cycle, Float phase) {
@@ -216,15 +182,13 @@ private:
         background_array_.set(lane, busy ? job_.background[pixel] : 0.0);
         for (int32_t k = 0; k < system_.returns; ++k) {
             signal_array_[k].set(lane, busy ? job_.signal[k * job_.pixels + pixel] : 0.0);
-            const float apart = wrapped(job_.delay[k * job_.pixels + pixel] - job_.delay[pixel]);
-            offset_array_[k][lane] = apart < 0.5f ? apart : apart - 1.0f;
+            offset_array_[k][lane] = offset_of(job_.delay[k * job_.pixels + pixel], job_.delay[pixel]);
         }
         // the start of the exposure in the frames of the first return
         const bool warm = busy && block_.start_cycle;
-        const float start = (warm ? block_.start_phase[taken_] : 0.0f) - delay;
-        const int32_t wrap = (start >= 0.5f ? 1 : 0) - (start < -0.5f ? 1 : 0);
-        phase_array_[lane] = start - static_cast<float>(wrap);
-        frame_array_[lane] = busy ? (warm ? block_.start_cycle[taken_] : 0) + wrap : kIdleFrame;
+        start_in_frames(warm ? block_.start_cycle[taken_] : 0, warm ? block_.start_phase[taken_] : 0.0f, delay,
+                        frame_array_[lane], phase_array_[lane]);
+        if (!busy) frame_array_[lane] = kIdleFrame;
         slot_array_[lane] = busy ? taken_ : -1;
         if constexpr (kTraps)
             if (!busy) traps_.close(lane);
@@ -248,13 +212,6 @@ private:
         event_ = load<UInt>(event_array_);
         armed_ = {load<Int>(frame_array_), load<Float>(phase_array_)};
         if constexpr (kRecords) recorder_.load_lanes();
-    }
-
-    // `periods` in [0, 1).
-    static float wrapped(double periods) {
-        const double whole_periods = static_cast<double>(static_cast<int64_t>(periods));
-        const float rest = static_cast<float>(periods - whole_periods + (periods < whole_periods ? 1.0 : 0.0));
-        return rest < 1.0f ? rest : 0.0f;
     }
 
     const ExactBlock& block_;

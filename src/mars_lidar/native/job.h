@@ -1,6 +1,6 @@
 // What every engine is asked to do. Times are in laser periods, fluxes in photons per period.
 #pragma once
-#include <cstdint>
+#include "integers.h"
 
 namespace mars {
 

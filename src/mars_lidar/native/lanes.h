@@ -8,8 +8,10 @@
 // A lane type is a *pair* of hardware vectors. The chain from one registration to the next is long; with two of
 // them side by side in every statement one computes while the other waits.
 #pragma once
-#include <stdint.h>
+#include "integers.h"
+#if !defined(__CUDACC_RTC__)
 #include <string.h>
+#endif
 
 #ifndef MARS_LEVEL
 #define MARS_LEVEL portable
@@ -27,7 +29,7 @@
 #endif
 
 #if defined(__CUDACC__)
-#define MARS_INLINE __device__ inline
+#define MARS_INLINE __device__ __forceinline__
 #define MARS_NOINLINE
 #elif defined(_MSC_VER)
 #define MARS_INLINE __forceinline

@@ -107,6 +107,7 @@ NB_MODULE(_core, module) {
     mars::bind_recording(module);
     mars::bind_job(module);
     mars::bind_exact(module);
+    mars::bind_device(module);
     mars::bind_waveform(module);
     mars::bind_sequential(module);
     mars::bind_poisson(module);

@@ -1,0 +1,35 @@
+"""The kernels compile for GPUs, into registers, where there is none."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+from benchmarks.nvrtc import NotFound, compiled, library
+
+from mars_lidar.gpu.kernels import Sink, Variant
+
+try:
+    library()
+except (NotFound, OSError) as error:
+    pytest.skip(f"no NVRTC to compile with: {error}", allow_module_level=True)
+
+# free-running pixels of one return, the other modes, and the other places where registrations go
+BRIGHT = [Variant(0, gaussian, whole, True, Sink.BLOCK16) for gaussian, whole in product((True, False), repeat=2)]
+OTHERS = [Variant(mode, mode != 2, mode != 2, mode == 1, Sink.BLOCK16) for mode in (1, 2, 3)]
+SINKS = [Variant(0, True, False, False, sink) for sink in Sink if sink not in (Sink.BLOCK16, Sink.ROWS16)]
+
+
+@pytest.mark.parametrize(("architecture", "variants"), [("sm_80", BRIGHT[:2]), ("sm_90", [*BRIGHT, *OTHERS, *SINKS])])
+def test_compiles_without_spills(architecture: str, variants: list[Variant]):
+    for variant, used in compiled(variants, architecture).items():
+        assert used.spill_stores == used.spill_loads == 0, variant
+        assert used.registers <= 168, variant  # 3 warps on each of a multiprocessor's 4 schedulers
+        assert used.instructions > 500, variant
+        if variant.single:
+            assert used.stack_bytes == 0, variant
+
+
+def test_a_mistake_is_told():
+    with pytest.raises(RuntimeError, match="NVRTC failed"):
+        compiled([Variant(0, True, True, True, Sink.BLOCK16, ahead=-1)], "sm_90")

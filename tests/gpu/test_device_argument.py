@@ -1,0 +1,85 @@
+"""device="cuda": what it refuses, with or without a GPU, and its bits where there is one."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+
+FLUX = ml.Flux(np.full((2, 3), 2.0), 0.5, np.linspace(10.0, 80.0, 6).reshape(2, 3))
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=500, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=63.75)
+)
+
+
+def test_unknown_device():
+    with pytest.raises(ValueError, match=r"device must be .*'cpu'.*'cuda'.*'tpu'"):
+        ml.simulate(FLUX, SYSTEM, device="tpu")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("engine", ["feedback", "mars", "sequential"])
+def test_engines_without_a_kernel_name_what_works(engine: str):
+    with pytest.raises(ValueError, match=rf"{engine}.*device 'cuda'.*'exact'.*device 'cpu'"):
+        ml.simulate(FLUX, SYSTEM, engine=engine, device="cuda")
+
+
+def test_effects_and_waveforms_are_refused():
+    jittery = ml.System(
+        period_ns=100.0, cycles=500, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5),
+        detector=ml.Detector(dead_time_ns=63.75, jitter=ml.Jitter(sigma_ns=0.1)),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"'cuda' does not do jitter.*use device 'cpu'"):
+        ml.simulate(FLUX, jittery, device="cuda")
+    wave = ml.Flux(waveform=np.full((1, 1, 8), 0.1), background=0.1)
+    with pytest.raises(ValueError, match=r"not a waveform, on device 'cuda'; use device 'cpu'"):
+        ml.simulate_timestamps(wave, SYSTEM, device="cuda")
+
+
+def test_without_cupy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "cupy", None)
+    for call in (ml.simulate, ml.simulate_timestamps):
+        with pytest.raises(ImportError, match=r"mars-lidar\[cuda12\]"):
+            call(FLUX, SYSTEM, device="cuda")
+
+
+def _device() -> Any:
+    cupy = pytest.importorskip("cupy", reason="no CuPy: the extra cuda12 or cuda13", exc_type=ImportError)
+    from mars_lidar.gpu.exact import cupy_with_device
+
+    try:
+        return cupy_with_device()
+    except RuntimeError as error:
+        pytest.skip(f"no GPU: {error}")
+    return cupy
+
+
+@pytest.mark.parametrize("mode", ["nonparalyzable", "paralyzable", "synchronous"])
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+def test_bits_on_a_gpu(mode: str, start: str):
+    cupy = _device()
+    system = ml.System(
+        period_ns=100.0, cycles=2000, bins=1024, pulse=ml.GaussianPulse(sigma_ns=0.5), start=start,
+        detector=ml.Detector(dead_time_ns=63.75, mode=mode),
+    )  # fmt: skip
+    there = ml.simulate(FLUX, system, realizations=50, seed=3, device="cuda")
+    assert isinstance(there, cupy.ndarray)
+    np.testing.assert_array_equal(there.get(), ml.simulate(FLUX, system, realizations=50, seed=3))
+    a, b = (ml.simulate_timestamps(FLUX, system, seed=3, device=device) for device in ("cpu", "cuda"))
+    for name in ("times_ns", "cycle", "bin", "offsets"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_no_device_is_told():
+    cupy = pytest.importorskip("cupy", reason="no CuPy: the extra cuda12 or cuda13", exc_type=ImportError)
+    try:
+        number = cupy.cuda.runtime.getDeviceCount()
+    except cupy.cuda.runtime.CUDARuntimeError:
+        number = 0
+    if number:
+        pytest.skip("there is a GPU")
+    with pytest.raises(RuntimeError, match=r"no CUDA device.*device='cpu'"):
+        ml.simulate(FLUX, SYSTEM, device="cuda")

@@ -8,9 +8,32 @@
 #include <thread>
 #include <vector>
 
+#if defined(__linux__)
+#include <sched.h>
+#endif
+
 #include <nanobind/nanobind.h>
 
 namespace mars {
+
+// Puts the calling thread, the k-th of a team, on a processor of its own, from which the system may move it at once.
+// Without that two threads that begin together often share one for the 4 ms until the scheduler looks again, a quarter
+// of the time of a cube.
+inline void spread_out(int k) {
+#if defined(__linux__)
+    cpu_set_t allowed, one;
+    if (sched_getaffinity(0, sizeof allowed, &allowed) != 0) return;  // more processors than the set holds
+    const int count = CPU_COUNT(&allowed);
+    if (count < 2) return;
+    int left = k % count, cpu = 0;
+    while (!CPU_ISSET(cpu, &allowed) || left-- > 0) ++cpu;
+    CPU_ZERO(&one);
+    CPU_SET(cpu, &one);
+    if (sched_setaffinity(0, sizeof one, &one) == 0) sched_setaffinity(0, sizeof allowed, &allowed);
+#else
+    static_cast<void>(k);
+#endif
+}
 
 // Calls work(chunk, stop) for chunk = 0 .. chunks-1 on `threads` threads, in any order. The GIL is released;
 // every 50 ms the calling thread looks for Ctrl-C and calls progress(done, chunks) unless it is None. On a
@@ -26,7 +49,8 @@ void run_chunks(int64_t chunks, int threads, const nanobind::object& progress, c
     std::condition_variable wake;
     int running = 0;
 
-    auto worker = [&] {
+    auto worker = [&](int k) {
+        if (threads > 1) spread_out(k);
         try {
             while (!stop.load(std::memory_order_relaxed)) {
                 const int64_t chunk = next.fetch_add(1);
@@ -53,7 +77,7 @@ void run_chunks(int64_t chunks, int threads, const nanobind::object& progress, c
             try {
                 for (int k = 0; k < team; ++k) {
                     ++running;
-                    pool.emplace_back(worker);
+                    pool.emplace_back(worker, k);
                 }
             } catch (...) {  // no more threads to be had: carry on with those there are, if any
                 --running;

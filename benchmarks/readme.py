@@ -1,4 +1,4 @@
-"""README's table of speed, from the saved full run: ``python -m benchmarks.readme`` writes it, a test compares it."""
+"""Tables of README and docs/engines.md from the saved run: ``python -m benchmarks.readme``; a test compares them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from typing import Any
 from benchmarks.__main__ import RESULTS
 from benchmarks.report import number, table
 
-README = Path(__file__).resolve().parents[1] / "README.md"
-SAVED = RESULTS / "full.json"
-BLOCK = re.compile(r"(<!-- speed: benchmarks/results/full.json -->\n).*?(<!-- end of speed -->)", re.DOTALL)
+ROOT = Path(__file__).resolve().parents[1]
+SAVED = RESULTS / "default.json"
 
 _EXACT, _PIPELINE, _LONG = "Exact engine, canonical cube", "The paper's pipeline in NumPy", "One cube over the exposure"
 _PATHS, _LAWS, _CLI = "Paths of the exact engine", "Laws of a finite exposure", "Command line, prompt to prompt"
@@ -59,7 +58,7 @@ def _rows(saved: Saved) -> dict[str, str]:
         "the paper's pipeline in NumPy, one core": saved.ms(
             _PIPELINE, "NumPy, lookup + alignment + multinomial"
         ),
-        "waveforms / timestamps (two passes), per registration": (
+        "waveforms / timestamps (two passes), one core": (
             f"{saved.ns(_PATHS, 'waveform of 1024 samples')} / {saved.ns(_PATHS, 'timestamps (two passes)')}"
         ),
         "exact mean, variance and mean histogram of one (S, B)": f"{number(laws[0]['ms per (S, B)'])} ms",
@@ -70,24 +69,50 @@ def _rows(saved: Saved) -> dict[str, str]:
     }
 
 
-def speed(path: Path = SAVED) -> str:
-    """The table in Markdown, with a line on where it was measured."""
-    saved = Saved(json.loads(path.read_text(encoding="utf-8")))
+def speed(saved: Saved) -> str:
+    """README's table, with a line on where it was measured."""
     machine = saved.machine
     where = (
         f"{machine['processors of this process']} cores of an {machine['processor']} "
-        f"({machine['vector levels'].split(',')[0]}), {machine['date'].split()[0]}, from `python -m benchmarks --full` "
-        "([all figures](benchmarks/results/full.md)):"
+        f"({machine['vector levels'].split(',')[0]}), {machine['date'].split()[0]}, from `python -m benchmarks` "
+        "([all figures](benchmarks/results/default.md)):"
     )
     return f"{where}\n\n{table([{'': what, 'time': time} for what, time in _rows(saved).items()])}\n"
 
 
+def exposures(saved: Saved) -> str:
+    """The table of docs/engines.md: one image over the exposure."""
+    return table([_exposure(saved, 10**k) for k in range(3, 8)]) + "\n"
+
+
+def _exposure(saved: Saved, cycles: int) -> dict[str, str]:
+    row = {"laser cycles": f"{cycles:,}"}
+    for engine in ("exact", "feedback", "auto", "mars"):
+        try:
+            row[f"`{engine}`"] = saved.ms(_LONG, f"N_r = {cycles:,}", engine=engine)
+        except ValueError:
+            row[f"`{engine}`"] = "-"
+    return row
+
+
+TABLES = {"README.md": ("speed", speed), "docs/engines.md": ("exposures", exposures)}
+
+
+def filled(name: str) -> tuple[str, str]:
+    """A document as it is, and with its table made anew."""
+    what, make = TABLES[name]
+    text = ROOT.joinpath(name).read_text(encoding="utf-8")
+    block = re.compile(rf"(<!-- {what}: [^>]*-->\n).*?(<!-- end of {what} -->)", re.DOTALL)
+    if not block.search(text):
+        raise SystemExit(f"{name} has no block <!-- {what}: ... -->")
+    new = make(Saved(json.loads(SAVED.read_text(encoding="utf-8"))))
+    return text, block.sub(lambda m: m[1] + new + m[2], text)
+
+
 def main() -> None:
-    """Write it into README.md."""
-    text = README.read_text(encoding="utf-8")
-    if not BLOCK.search(text):
-        raise SystemExit("README.md has no block for the table of speed")
-    README.write_text(BLOCK.sub(lambda m: m[1] + speed() + m[2], text), encoding="utf-8")
+    """Write them."""
+    for name in TABLES:
+        ROOT.joinpath(name).write_text(filled(name)[1], encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from benchmarks import readme
+
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT.joinpath("README.md").read_text()
 
@@ -33,3 +36,9 @@ def test_commands_that_the_checks_run_are_there():
 def test_links_lead_somewhere():
     for target in re.findall(r"\]\(([^)#]+?)\)", README):
         assert target.startswith("https://") or ROOT.joinpath(target).exists(), target
+
+
+@pytest.mark.parametrize("name", readme.TABLES)
+def test_tables_of_figures_are_those_of_the_saved_run(name: str):
+    text, wanted = readme.filled(name)
+    assert text == wanted

@@ -50,8 +50,8 @@ class SparseCodec(ArrayBytesCodec):
 
     async def _decode_single(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
         packed = _bytes(chunk_data)
-        out = np.empty(chunk_spec.shape, chunk_spec.dtype.to_native_dtype())
-        await asyncio.to_thread(_core.unpack_counts, packed, out.reshape(-1))
+        out: NDArray[Any] = np.empty(chunk_spec.shape, chunk_spec.dtype.to_native_dtype())
+        await asyncio.to_thread(lambda: _core.unpack_counts(packed, out.reshape(-1)))
         return chunk_spec.prototype.nd_buffer.from_numpy_array(out)
 
 

@@ -80,11 +80,18 @@ class Examples:
                 f"cubes must be (N, H, W, bins) and maps (N, H, W), got {self.cubes.shape} and {self.maps.shape}"
             )
 
-    def batch(self, index: NDArray[np.int64], scale: float, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Normalised cubes (n, bins, H, W) and maps (n, 1, H, W)."""
-        counts = torch.from_numpy(self.cubes[index].astype(np.float32)).to(device)
-        cube = counts.mul_(1.0 / scale).sqrt_().permute(0, 3, 1, 2)  # bins innermost: channels last, no copy
-        return cube, torch.from_numpy(self.maps[index])[:, None].to(device)
+    def batch(
+        self, index: NDArray[np.int64], scale: float, device: torch.device, flipped: tuple[bool, bool] = (False, False)
+    ) -> tuple[Tensor, Tensor]:
+        """Normalised cubes (n, bins, H, W) and maps (n, 1, H, W); `flipped` from top to bottom, from left to right."""
+        side = tuple(slice(None, None, -1 if flip else 1) for flip in flipped)
+        counts = np.empty((len(index), *self.cubes.shape[1:]), np.float32)
+        for k, i in enumerate(index):
+            np.multiply(self.cubes[i][side], np.float32(1.0 / scale), out=counts[k], casting="unsafe")
+        np.sqrt(counts, out=counts)  # a tenth of the time of torch's
+        cube = torch.from_numpy(counts).permute(0, 3, 1, 2)  # bins innermost: channels last, no copy
+        maps = np.ascontiguousarray(self.maps[index][:, *side])
+        return cube.to(device), torch.from_numpy(maps)[:, None].to(device)
 
 
 @dataclass(frozen=True)
@@ -141,10 +148,8 @@ def fit(
         # drawn from the number of the step: a run that goes on makes the same steps
         random = np.random.default_rng([plan.seed, step])
         index = random.integers(0, len(training.maps), plan.batch)
-        cube, wanted = training.batch(index, plan.scale, place)
-        axes = [axis for axis in (-1, -2) if random.random() < 0.5]
-        if axes:
-            cube, wanted = cube.flip(axes), wanted.flip(axes)
+        flipped = (bool(random.random() < 0.5), bool(random.random() < 0.5))
+        cube, wanted = training.batch(index, plan.scale, place, flipped)
         network.train()
         optimizer.zero_grad()
         with torch.autocast(place.type, enabled=half):

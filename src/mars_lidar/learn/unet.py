@@ -55,7 +55,7 @@ class CubeUNet(nn.Module):
                 raise ValueError(f"widths must be multiples of 8, got {width}")
         self.target: Target = target
         self.multiple = 2 ** (len(widths) - 1)
-        self.stem = nn.Sequential(nn.Conv2d(bins, stem, 1), nn.SiLU(), nn.Conv2d(stem, widths[0], 1))
+        self.stem = nn.Sequential(_Pointwise(bins, stem), nn.SiLU(), _Pointwise(stem, widths[0]))
         self.encoder, self.decoder = nn.ModuleList(), nn.ModuleList()
         before = widths[0]
         for k, width in enumerate(widths):
@@ -71,6 +71,9 @@ class CubeUNet(nn.Module):
             self.decoder.append(nn.Sequential(*level))
             before = width
         self.head = nn.Sequential(nn.GroupNorm(8, before), nn.SiLU(), nn.Conv2d(before, 1, 3, padding=1))
+        for part in self.modules():
+            if isinstance(part, nn.Conv2d):  # as a cube has it: bins innermost
+                part.weight.data = part.weight.data.contiguous(memory_format=torch.channels_last)
 
     def forward(self, cube: Tensor) -> Tensor:
         """Maps (N, 1, H, W) in (0, 1); H and W must be multiples of `multiple`."""
@@ -92,6 +95,13 @@ class CubeUNet(nn.Module):
         return out
 
 
+class _Pointwise(nn.Linear):
+    """A 1 x 1 convolution as one matrix product: with channels innermost in memory it needs no copy."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
 class _Block(nn.Module):
     def __init__(self, inside: int, outside: int) -> None:
         super().__init__()
@@ -99,7 +109,7 @@ class _Block(nn.Module):
             nn.GroupNorm(8, inside), nn.SiLU(), nn.Conv2d(inside, outside, 3, padding=1),
             nn.GroupNorm(8, outside), nn.SiLU(), nn.Conv2d(outside, outside, 3, padding=1),
         )  # fmt: skip
-        self.past = nn.Identity() if inside == outside else nn.Conv2d(inside, outside, 1)
+        self.past = nn.Identity() if inside == outside else _Pointwise(inside, outside)
 
     def forward(self, x: Tensor) -> Tensor:
         out: Tensor = self.past(x) + self.layers(x)

@@ -118,7 +118,7 @@ def _scene_table(console: Console, found: Comparison) -> None:
     for name, s in found.scenes.items():
         percent = Estimate(100 * s.relative_bias.value, 100 * s.relative_bias.error, s.relative_bias.z)
         grid.add_row(
-            name, f"{1e3 * s.median_s:.3g}", str(len(s.seconds)), f"{s.ns_per_registration:.3g}",
+            name, _number(1e3 * s.median_s), str(len(s.seconds)), _number(s.ns_per_registration),
             f"{s.registrations:,.0f}", cell(s.bias), cell(percent), cell(s.dispersion),
             _length(1e3 * s.depth_error_m), _number(100 * s.outliers),
         )  # fmt: skip
@@ -213,4 +213,6 @@ def _length(value: float) -> str:
 
 
 def _number(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.3g}"
+    if math.isnan(value):
+        return "–"
+    return f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"

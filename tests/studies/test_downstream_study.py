@@ -12,8 +12,11 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+import mars_lidar as ml
 from mars_lidar.cli import app
+from mars_lidar.statistics import exposure_moments
 from mars_lidar.studies import Request, downstream, downstream_data
+from mars_lidar.studies.downstream_counts import count_bias
 from mars_lidar.studies.downstream_report import spread
 
 TINY = downstream_data.CONFIGS["tiny"]
@@ -49,6 +52,7 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
     assert "36.49" not in text  # the paper's row of another ratio
     assert "33.68 / 0.061" in text
     assert "not for citing" in text
+    assert "gold standard's own scatter" in text
     assert (tmp_path / "downstream_sbr1.png").stat().st_size > 5000
     with (tmp_path / "downstream.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -91,13 +95,36 @@ def test_data_mean_what_the_configuration_says():
     np.testing.assert_allclose(depth[0], scenes[0].depth_m, rtol=1e-6)
 
 
+def test_count_bias_is_that_of_the_laws():
+    config = replace(TINY, arms={"poisson": (0,), "exact": (0,)})
+    scenes = [downstream_data.crop(3000 + k, config) for k in range(2)]
+    (rows,) = count_bias(config, scenes, downstream_data.Simulators(config)).values()
+    # flux of every pixel is known: expected counts and variances, pixel by pixel
+    system, truth = downstream_data.SYSTEM, {"poisson": [], "exact": [], "variance": []}
+    for scene in scenes:
+        flux = scene.flux(system, signal=config.photons * float(scene.reflectivity.mean()), sbr=1.0)
+        truth["poisson"].append(system.cycles * (flux.signal + flux.background).ravel())
+        moments = exposure_moments(flux.signal.ravel(), flux.background.ravel(), system, delay_ns=flux.delay_ns.ravel())
+        truth["exact"].append(moments.mean)
+        truth["variance"].append(moments.variance)
+    flat = {name: np.concatenate(values) for name, values in truth.items()}
+    order = np.argsort(np.concatenate([scene.reflectivity.ravel() for scene in scenes]), kind="stable")
+    for k, part in enumerate(np.array_split(order, 4)):
+        poisson, exact, variance = (flat[name][part].mean() for name in ("poisson", "exact", "variance"))
+        error = np.sqrt(variance / len(part)) / exact
+        # 6 standard errors: one exposure over the mean of two
+        assert abs(rows["poisson"][k] + 1.0 - poisson / exact) < 6.0 * poisson / exact * np.hypot(
+            1.0 / np.sqrt(poisson * len(part)), error / np.sqrt(2.0)
+        )
+        assert abs(rows["exact"][k]) < 6.0 * np.sqrt(1.5) * error
+        assert rows["scatter"][k] == pytest.approx(np.sqrt(variance) / exact, rel=6.0 / np.sqrt(2.0 * len(part)))
+
+
 def test_errors_leave_out_pixels_without_return():
     scene = downstream_data.crop(1000, TINY)
     depth = scene.depth_m.copy()
     depth[0, 0] = np.nan
-    from mars_lidar import Scene
-
-    holed = Scene(depth, scene.reflectivity)
+    holed = ml.Scene(depth, scene.reflectivity)
     maps = downstream_data.truths([scene], "depth", TINY)
     maps[0, 1, 1] += 0.1
     found = downstream.errors(maps, [holed], "depth", TINY)

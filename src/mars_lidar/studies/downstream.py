@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from mars_lidar import _validate
 from mars_lidar.scene import Scene
 from mars_lidar.studies import OtherRunsError, Request, Tell
+from mars_lidar.studies.downstream_counts import count_bias
 from mars_lidar.studies.downstream_data import CONFIGS, SYSTEM, WORDS, Config, Simulators, crop, examples, rgbd_scenes
 
 TARGETS = ("reflectivity", "depth")
-RESULT, SHOWN, CONFIG = "result.json", "shown.npz", "config.json"
+RESULT, SHOWN, CONFIG, COUNTS = "result.json", "shown.npz", "config.json", "counts.json"
 # streams of the cubes: those of a test differ from those of the training, and gold from own
 _TRAINING, _VALIDATION, _OWN, _GOLD, _MEASURED = range(5)
 
@@ -70,7 +71,10 @@ def run(request: Request) -> list[Path]:
         told = f"downstream: {one.name} ({len(left) - done} left)"
         train_and_test(one, config, data, folder / one.name, lambda text, told=told: request.tell(f"{told}: {text}"))  # type: ignore[misc]
     found = {one: json.loads((folder / one.name / RESULT).read_text()) for one in runs(config)}
-    return write(request.out, folder, config, found)
+    if not (folder / COUNTS).exists():
+        request.tell("downstream: counts of every simulator on the test scenes")
+        _write(folder / COUNTS, json.dumps(count_bias(config, data.test, data.simulators), indent=2) + "\n")
+    return write(request.out, folder, config, found, json.loads((folder / COUNTS).read_text()))
 
 
 def fixed(folder: Path, config: Config) -> None:
@@ -93,7 +97,7 @@ class Data:
             for first, number in (config.train, config.validation, config.test)
         )
         self.measured = {} if measured is None else rgbd_scenes(measured, config)
-        self._simulators = Simulators(config)
+        self.simulators = Simulators(config)
         self._own: tuple[tuple[str, float], list[NDArray[Any]]] | None = None
         self._gold: dict[float, list[NDArray[Any]]] = {}
 
@@ -113,7 +117,7 @@ class Data:
         return self._gold[sbr]
 
     def _cubes(self, arm: str, scenes: list[Scene], sbr: float, stream: int) -> NDArray[Any]:
-        return self._simulators.cubes(arm, scenes, sbr, (self.config.seed << 8) + stream)
+        return self.simulators.cubes(arm, scenes, sbr, (self.config.seed << 8) + stream)
 
 
 def train_and_test(one: Run, config: Config, data: Data, folder: Path, tell: Tell) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mars_lidar.studies.downstream import SHOWN, TARGETS, Run, by_arm
+from mars_lidar.studies.downstream_counts import QUARTERS
 from mars_lidar.studies.downstream_data import SYSTEM, WORDS, Config, crop
 from mars_lidar.studies.machine import machine
 from mars_lidar.studies.report import Row, configuration, save_csv, save_figure, save_text, table
@@ -30,16 +31,20 @@ _SHORT = {"poisson": "Poisson", "nearest": "MaRS, nearest", "mars": "MaRS"}
 _CLAIM_DB, _CLAIM_TIMES = 10.0, 5.0  # by which the mars-trained network is to beat the Poisson-trained one
 
 
-def write(out: Path, folder: Path, config: Config, found: Mapping[Run, Any]) -> list[Path]:
+def write(
+    out: Path, folder: Path, config: Config, found: Mapping[Run, Any], counts: Mapping[str, Mapping[str, list[float]]]
+) -> list[Path]:
     """downstream.md, downstream.csv and a figure for each ratio; the `found` results are complete."""
     pictures = [
         save_figure(out / f"downstream_sbr{sbr:g}.png", picture(folder, config, found, sbr)) for sbr in config.sbr
     ]
-    text = save_text(out / "downstream.md", _text(config, found, pictures))
+    text = save_text(out / "downstream.md", _text(config, found, counts, pictures))
     return [text, save_csv(out / "downstream.csv", [_csv_row(one, result) for one, result in found.items()]), *pictures]
 
 
-def _text(config: Config, found: Mapping[Run, Any], pictures: list[Path]) -> list[str]:
+def _text(
+    config: Config, found: Mapping[Run, Any], counts: Mapping[str, Mapping[str, list[float]]], pictures: list[Path]
+) -> list[str]:
     seconds = sum(result["training"]["seconds"] for result in found.values())
     stopped = sum(bool(result["training"]["stopped"]) for result in found.values())
     return [
@@ -74,6 +79,10 @@ def _text(config: Config, found: Mapping[Run, Any], pictures: list[Path]) -> lis
         "The paper's second pair of columns at SBR 1.0 is labelled depth PSNR and depth RMSE in one summary of it; it "
         "is read here as the first pair is.",
         *_findings(found),
+        "### Why: the counts that a network meets",
+        "Mean count of a pixel on the test scenes over that of the gold standard, less 1, in %, by quarters of the "
+        "pixels in reflectivity; last, what a single count scatters by.",
+        table(_count_rows(counts)),
         "### All measures",
         table(_all(found)),
         *_measured(found),
@@ -143,6 +152,19 @@ def _findings(found: Mapping[Run, Any]) -> list[str]:
                 f"{better('mars', 'nearest', 'reflectivity'):.2f} dB and {better('nearest', 'mars', 'depth'):.4f} m."
             )
     return ["\n".join(lines)]
+
+
+def _count_rows(counts: Mapping[str, Mapping[str, list[float]]]) -> list[Row]:
+    words = {**WORDS, "scatter": "_gold standard's own scatter_"}
+    return [
+        {"SBR": sbr, "simulator": words[name]}
+        | {
+            quarter: f"{100 * value:.2f}" if name == "scatter" else f"{100 * value:+.2f}"
+            for quarter, value in zip(QUARTERS, row, strict=True)
+        }
+        for sbr, rows in counts.items()
+        for name, row in rows.items()
+    ]
 
 
 def _all(found: Mapping[Run, Any]) -> list[Row]:

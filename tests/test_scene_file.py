@@ -72,7 +72,8 @@ def test_effects_reach_compare(tmp_path):
 
 def test_a_scene_file_of_a_transient_is_its_options(transient):
     (transient / "scene.yaml").write_text(
-        "transient: t.npy\nbin_ns: 0.5\nstart_ns: 1\nchannel: 1\npulse: false\nlight: {photons_per_unit: 2e-2, sbr: 4}\n"
+        "transient: t.npy\nbin_ns: 0.5\nstart_ns: 1\nchannel: 1\npulse: false\n"
+        "light: {photons_per_unit: 2e-2, sbr: 4}\n"
     )
     out = transient / "a.npz"
     options = ["--transient", transient / "t.npy", "--transient-bin-ns", 0.5, "--transient-start-ns", 1,

@@ -10,6 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
+from mars_lidar.presets import PRESETS
+
 _SYSTEM, _RUN, _OUTPUT = "System", "Simulation", "Output"
 
 
@@ -40,7 +42,7 @@ DetectorPreset = Annotated[
     str | None,
     _option(
         "--detector", panel=_SYSTEM,
-        help="Detector by name, in place of the file's (docs/detectors.md): excelitas-spcm-aqrh.",
+        help=f"Detector by name, in place of the file's (docs/detectors.md): {', '.join(PRESETS)}.",
     ),
 ]
 DeadTimeNs = Annotated[

@@ -294,6 +294,8 @@ def test_round_trip_and_preset():
     module = ml.Detector.preset("excelitas-spcm-aqrh")
     assert ml.Detector.from_dict(module.to_dict()) == module
     assert ml.Detector.from_dict({"preset": "excelitas-spcm-aqrh", "dead_time_ns": 30.0}).dead_time_ns == 30.0
+    for name, dead, dark in (("thorlabs-spcm20a", 35.0, 25.0), ("thorlabs-spcm50a", 45.0, 150.0)):
+        assert ml.Detector.preset(name) == ml.Detector(dead_time_ns=dead, dark_count_hz=dark)
     # all of its afterpulses outlive the recovery
     assert module.afterpulsing.cumulative(module.dead_time_ns) == pytest.approx(0.0, abs=1e-12)
 

@@ -199,8 +199,8 @@ def test_view_draws_a_cube(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "the scene is one of --scene and --depth, got neither"),
-        (["--scene", "room", "--depth", "d.png"], "got both"),
+        ([], "the scene is one of --scene, --depth and --transient, got none of them"),
+        (["--scene", "room", "--depth", "d.png"], "got --scene and --depth"),
         (["--scene", "moon"], "name must be one of 'room', 'random', got 'moon'"),
         (["--scene", "room", "--image", "a.png"], "--image belongs to --depth"),
         (["--depth", "nowhere.png"], "nowhere.png"),

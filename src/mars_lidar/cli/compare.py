@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.effect_options import Effects
+from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.inspect import parsed_pixel
 from mars_lidar.cli.options import _OUTPUT, _RUN, _option
-from mars_lidar.cli.simulate import chosen_scene
-from mars_lidar.cli.system_options import build_system
+from mars_lidar.cli.scene_options import LightOptions, SceneOptions, seen
+from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
     from mars_lidar.studies.compare import Comparison
@@ -78,36 +80,13 @@ BudgetS = Annotated[
 ]
 
 
+@grouped
 def compare(
     *,
-    scene: options.Scene = None,
-    size: options.Size = None,
-    scene_seed: options.SceneSeed = 0,
-    depth: options.Depth = None,
-    image: options.Image = None,
-    depth_unit_m: options.DepthUnitM = None,
-    focal_px: options.FocalPx = None,
-    system: options.System = None,
-    period_ns: options.PeriodNs = None,
-    dead_time_ns: options.DeadTimeNs = None,
-    mode: options.Mode = None,
-    gate_start_ns: options.GateStartNs = None,
-    gate_width_ns: options.GateWidthNs = None,
-    gate_step_ns: options.GateStepNs = None,
-    gate_cycles: options.GateCycles = None,
-    cycles: options.Cycles = None,
-    bins: options.Bins = None,
-    pulse_sigma_ns: options.PulseSigmaNs = None,
-    pulse_fwhm_ns: options.PulseFwhmNs = None,
-    pulse_file: options.PulseFile = None,
-    pulse_bin_ns: options.PulseBinNs = None,
-    pulse_origin: options.PulseOrigin = None,
-    start: options.Start = None,
-    dark_count_hz: options.DarkCountHz = None,
-    signal: options.Signal = 1.0,
-    sbr: options.Sbr = 1.0,
-    attenuation: options.Attenuation = "none",
-    ambient: options.Ambient = None,
+    scene: SceneOptions,
+    instrument: SystemOptions,
+    effects: Effects,
+    light: LightOptions,
     engines: Engines = None,
     against: Against = "exact",
     realizations: Realizations = 10_000,
@@ -138,40 +117,15 @@ def compare(
                 raise FileNotFoundError(f"{file} cannot be written: there is no folder {file.parent}")
         names = _names(engines)
         places = {text.replace(" ", ""): parsed_pixel(text) for text in pixel or ()}
-        instrument = build_system(
-            system,
-            period_ns=period_ns,
-            cycles=cycles,
-            bins=bins,
-            dead_time_ns=dead_time_ns,
-            mode=mode,
-            gate_start_ns=gate_start_ns,
-            gate_width_ns=gate_width_ns,
-            gate_step_ns=gate_step_ns,
-            gate_cycles=gate_cycles,
-            dark_count_hz=dark_count_hz,
-            start=start,
-            pulse_sigma_ns=pulse_sigma_ns,
-            pulse_fwhm_ns=pulse_fwhm_ns,
-            pulse_file=pulse_file,
-            pulse_bin_ns=pulse_bin_ns,
-            pulse_origin=pulse_origin,
-        )
-        view, source = chosen_scene(scene, size, scene_seed, depth, image, depth_unit_m, focal_px)
-        flux = view.flux(
-            instrument,
-            signal=signal,
-            sbr=sbr,
-            attenuation=attenuation,  # type: ignore[arg-type]  # checked there
-            ambient=ambient,  # type: ignore[arg-type]
-        )
+        system = instrument.build(effects)
+        view = seen(scene, light, system)
         from mars_lidar.cli.compare_tables import as_data, show
         from mars_lidar.studies.compare import compare as run
 
         with progress_bar("comparing") as progress:
             found = run(
-                flux,
-                instrument,
+                view.flux,
+                system,
                 names,
                 against=against,
                 realizations=realizations,
@@ -185,7 +139,7 @@ def compare(
             )
         _draw(found, out)
         if numbers is not None:
-            _write(numbers, json.dumps({"scene": source, **as_data(found)}, indent=1, allow_nan=False) + "\n")
+            _write(numbers, json.dumps({"scene": view.source, **as_data(found)}, indent=1, allow_nan=False) + "\n")
         show(found)
         rows = [("picture", str(out)), ("time", f"{time.perf_counter() - began:.3g} s in all")]
         table(rows if numbers is None else [rows[0], ("numbers", str(numbers)), rows[1]])

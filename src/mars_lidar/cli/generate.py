@@ -11,7 +11,7 @@ import typer
 
 from mars_lidar.cli import options
 from mars_lidar.cli.console import BAD_INPUT, FAILED, progress_bar, reported, say, table
-from mars_lidar.cli.system_options import build_system
+from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
     from mars_lidar.dataset import DatasetRecipe
@@ -232,9 +232,8 @@ def _systems(files: list[Path] | None, single: dict[str, Any]) -> list[Any] | No
     """Systems of the command line: each file with the single options in place of its values."""
     if not files and all(value is None for value in single.values()):
         return None
-    others: dict[str, Any] = {"start": None, "pulse_fwhm_ns": None, "pulse_file": None, "pulse_bin_ns": None}
     bases: list[Path | None] = [*files] if files else [None]
-    return [build_system(file, **single, **others, pulse_origin=None) for file in bases]
+    return [SystemOptions(system=file, **single).build() for file in bases]
 
 
 def _light(signal: list[float] | None, sbr: list[float] | None) -> dict[str, Any] | None:

@@ -48,7 +48,7 @@ detector:
 #   gate_width_ns: 20.0  # for this long; may reach round the end of the period
 #   gate_step_ns: 0.0    # moves by this ...
 #   gate_cycles: 1       # ... every so many periods (more than 1 only with a step)
-# A published detector:  preset: excelitas-spcm-aqrh  with other fields to change
+# A published detector:  preset: thorlabs-spcm20a  (others: docs/detectors.md) with other fields to change
 # Effects, off unless given, in the order in which they act (docs/detectors.md); further lines of detector:
 #   detection_efficiency: 0.25       # then S and B are photons on the pixel, not detectable ones
 #   dark_count_hz: 100.0             # counts/s of every pixel

@@ -9,7 +9,7 @@ import typer
 
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, say, table
-from mars_lidar.cli.system_options import build_system
+from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
     from mars_lidar.learn.neural import NeuralMap
@@ -50,11 +50,10 @@ def train(
 ) -> None:
     """Train the network of a system on the Markov chain of phases, and validate it on held-out fluxes."""
     with reported():
-        instrument = build_system(
-            system, period_ns=period_ns, cycles=None, bins=bins, dead_time_ns=dead_time_ns, start=None,
-            pulse_sigma_ns=pulse_sigma_ns, pulse_fwhm_ns=pulse_fwhm_ns, pulse_file=pulse_file,
-            pulse_bin_ns=pulse_bin_ns, pulse_origin=pulse_origin,
-        )  # fmt: skip
+        instrument = SystemOptions(
+            system=system, period_ns=period_ns, bins=bins, dead_time_ns=dead_time_ns, pulse_sigma_ns=pulse_sigma_ns,
+            pulse_fwhm_ns=pulse_fwhm_ns, pulse_file=pulse_file, pulse_bin_ns=pulse_bin_ns, pulse_origin=pulse_origin,
+        ).build()  # fmt: skip
         from mars_lidar.learn.neural import FluxRange, Training
         from mars_lidar.learn.neural.model import check_target
         from mars_lidar.learn.neural.training import Point, save_curves

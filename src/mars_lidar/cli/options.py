@@ -1,4 +1,7 @@
-"""The options of `mars-lidar simulate`, each with its unit and default in its help."""
+"""Options of a system, a run and its output, each with its unit and default in its help.
+
+Those of scenes and light are in `scene_options`, those of effects in `effect_options`.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-_SCENE, _SYSTEM = "Scene (one of --scene, --depth and --transient)", "System"
-_EFFECTS = "Effects of the detector (off by default)"
-_TRANSIENT = "Rendered transient (with --transient)"
-_LIGHT, _RUN, _OUTPUT = "Light", "Simulation", "Output"
+from mars_lidar.presets import PRESETS
+
+_SYSTEM, _RUN, _OUTPUT = "System", "Simulation", "Output"
 
 
 def _option(*names: str, panel: str, help: str, default: str | None = None, **more: Any) -> Any:
@@ -23,89 +25,6 @@ Out = Annotated[
     _option(
         "-o", "--out", panel=_OUTPUT,
         help="The cube: .zarr (any size, written as it is simulated), .h5, .hdf5, .npz, .mat or .ptu.",
-    ),
-]
-Scene = Annotated[str | None, _option("--scene", panel=_SCENE, help="A built-in scene: room.")]
-Size = Annotated[
-    int | None,
-    _option(
-        "--size", panel=_SCENE, min=1,
-        help="Image size in pixels: square for --scene; the longer side, resampled, for --depth.",
-        default="128 for --scene, the file's own for --depth",
-    ),
-]
-SceneSeed = Annotated[
-    int,
-    _option("--scene-seed", panel=_SCENE, help="Arrangement of the built-in scene.", default="0"),
-]
-Depth = Annotated[
-    Path | None,
-    _option(
-        "--depth", panel=_SCENE,
-        help="Depth: 16-bit PNG or TIFF in mm, .pfm, .exr, .npy or .npz in m, NYUv2's .mat, or a Middlebury folder.",
-    ),
-]
-Image = Annotated[
-    Path | None,
-    _option("--image", panel=_SCENE, help="Image to --depth: its luminance is the reflectivity."),
-]
-DepthUnitM = Annotated[
-    float | None,
-    _option(
-        "--depth-unit-m", panel=_SCENE, help="Metres per stored unit of --depth.",
-        default="0.001 for images, 1 for arrays",
-    ),
-]
-FocalPx = Annotated[
-    float | None,
-    _option(
-        "--focal-px", panel=_SCENE,
-        help="Focal length, pixels: turns depth along the axis into range along the ray.",
-        default="depth as it is",
-    ),
-]
-Index = Annotated[
-    int | None,
-    _option("--index", panel=_SCENE, help="Frame of a NYUv2 .mat given as --depth, from 0."),
-]
-Transient = Annotated[
-    Path | None,
-    _option(
-        "--transient", panel=_SCENE,
-        help="Rendered transient (y, x, time), read in bands: .npy, .npz, .h5, .hdf5 (tal and mitransient too), .mat.",
-    ),
-]
-TransientBinNs = Annotated[
-    float | None,
-    _option("--transient-bin-ns", panel=_TRANSIENT, help="Width of its time bins, ns.", default="what the file says"),
-]
-TransientStartNs = Annotated[
-    float | None,
-    _option(
-        "--transient-start-ns", panel=_TRANSIENT, help="Travel time at its first bin, ns.",
-        default="what the file says, else 0",
-    ),
-]
-TransientName = Annotated[
-    str | None,
-    _option("--transient-name", panel=_TRANSIENT, help="Which array of the file.", default="transient"),
-]
-TransientChannel = Annotated[
-    int | None,
-    _option("--transient-channel", panel=_TRANSIENT, help="Which channel of a file (y, x, time, channel), from 0."),
-]
-TransientPulse = Annotated[
-    bool | None,
-    _option(
-        "--transient-pulse/--no-transient-pulse", panel=_TRANSIENT, default="yes",
-        help="Convolve with the system's pulse; no where the transient contains it already.",
-    ),
-]
-PhotonsPerUnit = Annotated[
-    float | None,
-    _option(
-        "--photons-per-unit", panel=_TRANSIENT,
-        help="Instead of --signal: detectable photons per period for one unit of its light.",
     ),
 ]
 System = Annotated[
@@ -123,7 +42,7 @@ DetectorPreset = Annotated[
     str | None,
     _option(
         "--detector", panel=_SYSTEM,
-        help="Detector by name, in place of the file's (docs/detectors.md): excelitas-spcm-aqrh.",
+        help=f"Detector by name, in place of the file's (docs/detectors.md): {', '.join(PRESETS)}.",
     ),
 ]
 DeadTimeNs = Annotated[
@@ -190,125 +109,6 @@ Start = Annotated[
     _option(
         "--start", panel=_SYSTEM,
         help="Pixel at the start of an exposure: armed (ready) or stationary (warmed up).", default="armed",
-    ),
-]
-DetectionEfficiency = Annotated[
-    float | None,
-    _option(
-        "--detection-efficiency", panel=_EFFECTS, default="1: --signal counts detectable photons",
-        help="Photon detection efficiency, fill factor included, in (0, 1].",
-    ),
-]
-DarkCountHz = Annotated[
-    float | None,
-    _option(
-        "--dark-count-hz", "--dark-counts", panel=_EFFECTS, default="0",
-        help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
-    ),
-]
-AfterpulseProbability = Annotated[
-    float | None,
-    _option(
-        "--afterpulse-probability", panel=_EFFECTS,
-        help="Mean number of trapped carriers that an avalanche leaves, those lost in the dead time included ...",
-        default="0",
-    ),
-]
-AfterpulseDelayNs = Annotated[
-    float | None,
-    _option("--afterpulse-delay-ns", panel=_EFFECTS, help="... and their mean delay after the avalanche, ns."),
-]
-TwilightNs = Annotated[
-    float | None,
-    _option(
-        "--twilight-ns", panel=_EFFECTS, default="0",
-        help="Arrivals this long before the end of the dead time fire at its end, ns.",
-    ),
-]
-Crosstalk = Annotated[
-    float | None,
-    _option(
-        "--crosstalk", panel=_EFFECTS, default="0",
-        help="Mean number of neighbours that an avalanche triggers; with --engine sequential.",
-    ),
-]
-CrosstalkKernel = Annotated[
-    str | None,
-    _option("--crosstalk-kernel", panel=_EFFECTS, help="Which neighbours: 4 or 8.", default="8"),
-]
-ElectronicsDeadTimeNs = Annotated[
-    float | None,
-    _option(
-        "--electronics-dead-time-ns", panel=_EFFECTS, default="0",
-        help="Dead time of the electronics after an event, ns; without effect unless longer than --dead-time-ns.",
-    ),
-]
-MaxEventsPerPeriod = Annotated[
-    int | None,
-    _option("--max-events-per-period", panel=_EFFECTS, help="Events recorded of a period.", default="no limit"),
-]
-MaxEventsPerExposure = Annotated[
-    int | None,
-    _option("--max-events-per-exposure", panel=_EFFECTS, help="Events recorded of an exposure.", default="no limit"),
-]
-JitterFwhmNs = Annotated[
-    float | None,
-    _option("--jitter-fwhm-ns", panel=_EFFECTS, help="Gaussian timing jitter: full width at half maximum, ns."),
-]
-JitterTailNs = Annotated[
-    float | None,
-    _option("--jitter-tail-ns", panel=_EFFECTS, help="Mean of the exponential tail of the jitter, ns ..."),
-]
-JitterTailFraction = Annotated[
-    float | None,
-    _option("--jitter-tail-fraction", panel=_EFFECTS, help="... and share of the events that are in it."),
-]
-JitterFile = Annotated[
-    Path | None,
-    _option("--jitter-file", panel=_EFFECTS, help="Measured jitter instead: 1-D .npy array of its density."),
-]
-JitterBinNs = Annotated[
-    float | None,
-    _option("--jitter-bin-ns", panel=_EFFECTS, help="Sample width of --jitter-file, ns."),
-]
-CodeDensityFile = Annotated[
-    Path | None,
-    _option(
-        "--code-density-file", panel=_EFFECTS,
-        help="TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins.",
-    ),
-]
-Signal = Annotated[
-    float,
-    _option(
-        "--signal", panel=_LIGHT, default="1",
-        help="Mean signal S over the pixels with a return, detectable photons per laser period.",
-    ),
-]
-SignalLevel = Annotated[
-    float | None,
-    _option(
-        "--signal", panel=_LIGHT, default="1",
-        help="Mean signal S over the pixels with a return or light, detectable photons per laser period.",
-    ),
-]
-Sbr = Annotated[
-    float,
-    _option("--sbr", panel=_LIGHT, help="Mean signal / mean ambient photons per period.", default="1"),
-]
-Attenuation = Annotated[
-    str,
-    _option(
-        "--attenuation", panel=_LIGHT, default="none",
-        help="Signal against depth z: none or inverse_square (1 / z^2).",
-    ),
-]
-Ambient = Annotated[
-    str | None,
-    _option(
-        "--ambient", panel=_LIGHT,
-        help="Ambient light over the image: uniform, reflectivity, or map (of the scene).",
-        default="map where there is one, else uniform",
     ),
 ]
 Engine = Annotated[

@@ -10,7 +10,9 @@ import typer
 
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, table
-from mars_lidar.cli.system_options import build_system
+from mars_lidar.cli.effect_options import Effects
+from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
     from mars_lidar.system import System
@@ -69,19 +71,11 @@ Out = Annotated[
 
 
 @app.command()
+@grouped
 def build(
     *,
-    system: options.System = None,
-    period_ns: options.PeriodNs = None,
-    dead_time_ns: options.DeadTimeNs = None,
-    cycles: options.Cycles = None,
-    bins: options.Bins = None,
-    pulse_sigma_ns: options.PulseSigmaNs = None,
-    pulse_fwhm_ns: options.PulseFwhmNs = None,
-    pulse_file: options.PulseFile = None,
-    pulse_bin_ns: options.PulseBinNs = None,
-    pulse_origin: options.PulseOrigin = None,
-    start: options.Start = None,
+    instrument: SystemOptions,
+    effects: Effects,
     signal: Signal = "0.01,10,256",
     background: Background = "0.01,10,100",
     method: Method = "exposure",
@@ -97,19 +91,7 @@ def build(
         began = time.perf_counter()
         if out is not None and out.exists() and not overwrite:
             raise FileExistsError(f"{out} exists already; give --overwrite or another --out")
-        instrument = build_system(
-            system,
-            period_ns=period_ns,
-            cycles=cycles,
-            bins=bins,
-            dead_time_ns=dead_time_ns,
-            start=start,
-            pulse_sigma_ns=pulse_sigma_ns,
-            pulse_fwhm_ns=pulse_fwhm_ns,
-            pulse_file=pulse_file,
-            pulse_bin_ns=pulse_bin_ns,
-            pulse_origin=pulse_origin,
-        )
+        system = instrument.build(effects)
         axes = _grid("--signal", signal), _grid("--background", background)
         from mars_lidar.table import Table, cache
 
@@ -118,9 +100,9 @@ def build(
         }  # fmt: skip
         with progress_bar("building") as progress:
             if out is None:
-                path = cache.cached_path(instrument, *axes, progress=progress, **chosen)
+                path = cache.cached_path(system, *axes, progress=progress, **chosen)
             else:
-                Table.build(instrument, *axes, progress=progress, **chosen).save(out, overwrite=overwrite)
+                Table.build(system, *axes, progress=progress, **chosen).save(out, overwrite=overwrite)
                 path = out
         table([*_rows(path), ("time", f"{time.perf_counter() - began:.3g} s in all")])
 

@@ -89,23 +89,55 @@ void expect(const char* name, const T& array, int64_t rows, int64_t columns) {
         throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
 }
 
+ExposureRate make_rate(const ExposureGrid& grid, const Vector<const double>& photons,
+                       const Matrix<const double>& rates) {
+    ExposureRate rate;
+    rate.entries = static_cast<int64_t>(photons.shape(0));
+    rate.photons = photons.data();
+    rate.rates = rates.data();
+    rate.kinds = grid.stationary ? 1 : kRateKinds;
+    rate.bins = grid.bins;
+    expect("rates", rates, rate.entries, rate.kinds * grid.bins * kRateMoments);
+    return rate;
+}
+
+void run_moments(const ExposureGrid& grid, const ExposureFlux* flux, const ExposureRate* rate, int64_t entries,
+                 const Matrix<double>& cumulants, const Matrix<double>& cumulant_rates, const Matrix<double>& histogram,
+                 const Matrix<double>& histogram_rate, const Vector<int64_t>& settled, int threads,
+                 const std::string& level_name, const nb::object& progress) {
+    expect("cumulants", cumulants, entries, kExposureOrders);
+    expect("cumulant_rates", cumulant_rates, entries, kExposureOrders);
+    expect("histogram", histogram, entries, grid.out_bins);
+    expect("histogram_rate", histogram_rate, entries, grid.out_bins);
+    if (static_cast<int64_t>(settled.shape(0)) != entries) throw nb::value_error("settled has the wrong shape");
+    const Level level = level_for(level_name, bytes_per_lane(grid, kExposureOrders + 1));
+    const int64_t batches = (entries + level.lanes - 1) / level.lanes;
+    run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
+        const int64_t first = batch * level.lanes;
+        MomentsBlock block{&grid, flux, first, std::min<int64_t>(level.lanes, entries - first), cumulants.data(),
+                           cumulant_rates.data(), histogram.data(), histogram_rate.data(), settled.data(), &stop};
+        block.rate = rate;
+        level.moments(block);
+    });
+}
+
 void moments(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
              Vector<const int32_t> shape, Matrix<const double> shapes, Matrix<double> cumulants,
              Matrix<double> cumulant_rates, Matrix<double> histogram, Matrix<double> histogram_rate,
              Vector<int64_t> settled, int threads, const std::string& level_name, const nb::object& progress) {
     const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
-    expect("cumulants", cumulants, flux.entries, kExposureOrders);
-    expect("cumulant_rates", cumulant_rates, flux.entries, kExposureOrders);
-    expect("histogram", histogram, flux.entries, grid.out_bins);
-    expect("histogram_rate", histogram_rate, flux.entries, grid.out_bins);
-    if (static_cast<int64_t>(settled.shape(0)) != flux.entries) throw nb::value_error("settled has the wrong shape");
-    const Level level = level_for(level_name, bytes_per_lane(grid, kExposureOrders + 1));
-    const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
-    run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
-        const int64_t first = batch * level.lanes;
-        level.moments({&grid, &flux, first, std::min<int64_t>(level.lanes, flux.entries - first), cumulants.data(),
-                       cumulant_rates.data(), histogram.data(), histogram_rate.data(), settled.data(), &stop});
-    });
+    run_moments(grid, &flux, nullptr, flux.entries, cumulants, cumulant_rates, histogram, histogram_rate, settled,
+                threads, level_name, progress);
+}
+
+// The same of paralyzable pixels: photons per period (entries), registrations as ExposureRate has them.
+void paralyzable_moments(const ExposureGrid& grid, Vector<const double> photons, Matrix<const double> rates,
+                         Matrix<double> cumulants, Matrix<double> cumulant_rates, Matrix<double> histogram,
+                         Matrix<double> histogram_rate, Vector<int64_t> settled, int threads,
+                         const std::string& level_name, const nb::object& progress) {
+    const ExposureRate rate = make_rate(grid, photons, rates);
+    run_moments(grid, nullptr, &rate, rate.entries, cumulants, cumulant_rates, histogram, histogram_rate, settled,
+                threads, level_name, progress);
 }
 
 // Cumulants as `moments` gives them, and their change at the edges `phase` (ascending) of the grid.
@@ -149,26 +181,44 @@ void stationary(const ExposureGrid& grid, Vector<const double> signal, Vector<co
     });
 }
 
+void run_characteristic(const ExposureGrid& grid, const ExposureFlux* flux, const ExposureRate* rate, int64_t entries,
+                        bool tilted, const Matrix<const double>& z_re, const Matrix<const double>& z_im,
+                        const Matrix<double>& re, const Matrix<double>& im, const Matrix<int64_t>& settled, int threads,
+                        const std::string& level_name, const nb::object& progress) {
+    const int64_t points = static_cast<int64_t>(z_re.shape(1));
+    expect("z_re", z_re, entries, points);
+    expect("z_im", z_im, entries, points);
+    expect("re", re, entries, points);
+    expect("im", im, entries, points);
+    expect("settled", settled, entries, points);
+    const Level level = level_for(level_name, bytes_per_lane(grid, 2));
+    const int64_t batches = (points + level.lanes - 1) / level.lanes;
+    run_chunks(entries * batches, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+        const int64_t entry = chunk / batches, first = chunk % batches * level.lanes, at = entry * points + first;
+        level.characteristic({&grid, flux, entry, std::min<int64_t>(level.lanes, points - first), tilted,
+                              z_re.data() + at, z_im.data() + at, re.data() + at, im.data() + at,
+                              settled.data() + at, &stop, rate});
+    });
+}
+
 // Row i of z holds the points of entry i; `re`, `im` and `settled` likewise.
 void characteristic(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
                     Vector<const int32_t> shape, Matrix<const double> shapes, bool tilted, Matrix<const double> z_re,
                     Matrix<const double> z_im, Matrix<double> re, Matrix<double> im, Matrix<int64_t> settled,
                     int threads, const std::string& level_name, const nb::object& progress) {
     const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
-    const int64_t points = static_cast<int64_t>(z_re.shape(1));
-    expect("z_re", z_re, flux.entries, points);
-    expect("z_im", z_im, flux.entries, points);
-    expect("re", re, flux.entries, points);
-    expect("im", im, flux.entries, points);
-    expect("settled", settled, flux.entries, points);
-    const Level level = level_for(level_name, bytes_per_lane(grid, 2));
-    const int64_t batches = (points + level.lanes - 1) / level.lanes;
-    run_chunks(flux.entries * batches, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-        const int64_t entry = chunk / batches, first = chunk % batches * level.lanes, at = entry * points + first;
-        level.characteristic({&grid, &flux, entry, std::min<int64_t>(level.lanes, points - first), tilted,
-                              z_re.data() + at, z_im.data() + at, re.data() + at, im.data() + at,
-                              settled.data() + at, &stop});
-    });
+    run_characteristic(grid, &flux, nullptr, flux.entries, tilted, z_re, z_im, re, im, settled, threads, level_name,
+                       progress);
+}
+
+// The same of paralyzable pixels.
+void paralyzable_characteristic(const ExposureGrid& grid, Vector<const double> photons, Matrix<const double> rates,
+                                bool tilted, Matrix<const double> z_re, Matrix<const double> z_im, Matrix<double> re,
+                                Matrix<double> im, Matrix<int64_t> settled, int threads,
+                                const std::string& level_name, const nb::object& progress) {
+    const ExposureRate rate = make_rate(grid, photons, rates);
+    run_characteristic(grid, nullptr, &rate, rate.entries, tilted, z_re, z_im, re, im, settled, threads, level_name,
+                       progress);
 }
 
 }  // namespace
@@ -190,6 +240,14 @@ void bind_exposure(nb::module_& module) {
             nb::arg("out_bins"), nb::arg("shift"), nb::arg("fraction"), nb::arg("stationary"), nb::arg("tolerance"))
         .def_prop_ro("bytes", [](const ExposureGrid& self) { return bytes_per_lane(self, kExposureOrders + 1); });
     module.attr("EXPOSURE_PARTS") = kExposureParts;
+    module.def("paralyzable_moments", &paralyzable_moments, nb::kw_only(), nb::arg("grid"), nb::arg("photons"),
+               nb::arg("rates"), nb::arg("cumulants"), nb::arg("cumulant_rates"), nb::arg("histogram"),
+               nb::arg("histogram_rate"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"),
+               nb::arg("progress").none());
+    module.def("paralyzable_characteristic", &paralyzable_characteristic, nb::kw_only(), nb::arg("grid"),
+               nb::arg("photons"), nb::arg("rates"), nb::arg("tilted"), nb::arg("z_re"), nb::arg("z_im"),
+               nb::arg("re"), nb::arg("im"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"),
+               nb::arg("progress").none());
     module.def("exposure_moments", &moments, nb::kw_only(), nb::arg("grid"), nb::arg("signal"), nb::arg("background"),
                nb::arg("shape"), nb::arg("shapes"), nb::arg("cumulants"), nb::arg("cumulant_rates"),
                nb::arg("histogram"), nb::arg("histogram_rate"), nb::arg("settled"), nb::arg("threads"),

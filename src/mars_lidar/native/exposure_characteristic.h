@@ -2,7 +2,9 @@
 #pragma once
 #include <cmath>
 #include <complex>
+#include <type_traits>
 
+#include "exposure_paralyzable.h"
 #include "exposure_start.h"
 
 namespace mars {
@@ -34,11 +36,15 @@ Projection project(const std::vector<Complex>& now, const std::vector<Complex>& 
     return out;
 }
 
-// E[z^N] (section 8 of docs/theory_exposure.md).
+// E[z^N] (section 8 of docs/theory_exposure.md); Pixel is Recursion, or ParalyzableRecursion.
+template <template <class, class> class Pixel>
 class CharacteristicRun {
+    static constexpr bool kParalyzable = std::is_same_v<Pixel<Complex, double>, ParalyzableRecursion<Complex, double>>;
+    using Responses = std::conditional_t<kParalyzable, RateResponses<double>, std::vector<Response<double>>>;
+
  public:
     CharacteristicRun(const CharacteristicBlock& block)
-        : block_(block), grid_(*block.grid), response_(responses(*block.flux, block.entry)) {
+        : block_(block), grid_(*block.grid), response_(responses_of(block)) {
         for (int k = 0; k < kReals; ++k) {
             set_lane(z_.re, k, block.z_re[k < block.count ? k : 0]);
             set_lane(z_.im, k, block.z_im[k < block.count ? k : 0]);
@@ -46,6 +52,32 @@ class CharacteristicRun {
     }
 
     void run() {
+        if constexpr (kParalyzable) {
+            Pixel<Complex, double> recursion(grid_, response_, z_ - Complex{splat(1.0), Real{}});
+            recursion.value.re = splat(1.0);
+            if (block_.tilted) start_units();
+            advance(recursion, recursion.value);
+        } else {
+            run_free();
+        }
+    }
+
+ private:
+    static Responses responses_of(const CharacteristicBlock& block) {
+        if constexpr (kParalyzable)
+            return responses(*block.rate, block.entry);
+        else
+            return responses(*block.flux, block.entry);
+    }
+
+    void start_units() {
+        const int64_t kept = std::min(grid_.whole + 1, grid_.cycles);
+        decays_.assign(kept, Real{});
+        totals_.assign(kept, Real{});
+        tails_.assign(kept, Real{});
+    }
+
+    void run_free() {
         Stationary start{};
         if (grid_.stationary) {
             const auto lanes = responses(*block_.flux, block_.entry, 1);
@@ -56,19 +88,21 @@ class CharacteristicRun {
                 return;
             }
         }
-        Recursion<Complex, double> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr);
+        Pixel<Complex, double> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr);
         recursion.armed.re = grid_.stationary ? splat(lane(start.armed, 0)) : splat(1.0);
         if (grid_.stationary)
             recursion.set_last({{start.bins.back().mass, Real{}}, {start.bins.back().moment, Real{}}});
-        std::vector<Complex> repeated = recursion.repeated;
         if (block_.tilted) {
-            const int64_t kept = std::min(grid_.whole + 1, grid_.cycles);
-            decays_.assign(kept, Real{});
-            totals_.assign(kept, Real{});
-            tails_.assign(kept, Real{});
+            start_units();
             for (const Registrations<Real>& r : start.bins) history_total_ += r.mass;
             history_tail_ = splat(lane(start.tail, 0));
         }
+        advance(recursion, recursion.armed);
+    }
+
+    // `state`: armed probability, or G, of the recursion, at the end of the last period.
+    void advance(Pixel<Complex, double>& recursion, Complex& state) {
+        std::vector<Complex> repeated = recursion.repeated;
         Complex value{splat(1.0), Real{}};  // E[z^N] so far, on the circle
         Complex ratio{};
         bool done[kReals]{};
@@ -79,11 +113,14 @@ class CharacteristicRun {
             Real growth{};
             const Complex before = value;
             if (block_.tilted) {  // growth as a sum of positive terms, then divided out (eq. 25)
-                totals_[slot(q)] = recursion.total.re;
-                tails_[slot(q)] = recursion.tail.re;
-                growth = recursion.armed.re + blind(q);
+                growth = state.re;
+                if constexpr (!kParalyzable) {
+                    totals_[slot(q)] = recursion.total.re;
+                    tails_[slot(q)] = recursion.tail.re;
+                    growth += blind(q);
+                }
                 decays_[slot(q)] = 1.0 / growth;
-                recursion.armed.re /= growth;
+                state.re /= growth;
                 for (int k = 0; k < kReals; ++k) set_lane(growth, k, std::log(lane(growth, k)));
                 log_value_ += growth;
             } else {  // (eq. 22)
@@ -121,7 +158,6 @@ class CharacteristicRun {
         }
     }
 
- private:
     static constexpr double kQuiet = 1e-18;  // |E z^N| is bounded by the size of the state, which never grows
 
     using Point = std::complex<double>;
@@ -145,7 +181,8 @@ class CharacteristicRun {
 
     // Weight of a registration made `ago` periods before period q.
     Complex factor(int64_t q, int64_t ago) const {
-        const Complex weight = ago <= q ? z_ : Complex{splat(1.0), Real{}};
+        // where G itself is delayed there is no weight to add
+        const Complex weight = ago <= q && !kParalyzable ? z_ : Complex{splat(1.0), Real{}};
         if (!block_.tilted) return weight;
         Real unit = splat(1.0);
         for (int64_t i = std::max<int64_t>(q - ago, 0); i < q; ++i) unit *= decays_[slot(i)];
@@ -170,7 +207,7 @@ class CharacteristicRun {
 
     const CharacteristicBlock& block_;
     const ExposureGrid grid_;
-    const std::vector<Response<double>> response_;
+    const Responses response_;
     Complex z_{};
     Real log_value_{};
     // When tilted, of the last K + 1 periods: 1 / growth, registrations, and those in the last d + f bins.

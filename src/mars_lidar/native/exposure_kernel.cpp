@@ -10,11 +10,13 @@
 
 namespace mars {
 
-void MARS_JOIN(exposure_moments_, MARS_LEVEL)(const MomentsBlock& block) { MomentsRun(block).run(); }
+void MARS_JOIN(exposure_moments_, MARS_LEVEL)(const MomentsBlock& block) {
+    block.rate ? MomentsRun<ParalyzableRecursion>(block).run() : MomentsRun<Recursion>(block).run();
+}
 
 void MARS_JOIN(exposure_phases_, MARS_LEVEL)(const PhasesBlock& block) {
     const MomentsBlock& moments = block.moments;
-    MomentsRun(moments).run();
+    MomentsRun<Recursion>(moments).run();
     if (moments.stop->load(std::memory_order_relaxed)) return;
     const auto response = responses(*moments.flux, moments.first, moments.count);
     if (moments.grid->stationary) {
@@ -26,7 +28,7 @@ void MARS_JOIN(exposure_phases_, MARS_LEVEL)(const PhasesBlock& block) {
 }
 
 void MARS_JOIN(exposure_characteristic_, MARS_LEVEL)(const CharacteristicBlock& block) {
-    CharacteristicRun(block).run();
+    block.rate ? CharacteristicRun<ParalyzableRecursion>(block).run() : CharacteristicRun<Recursion>(block).run();
 }
 
 void MARS_JOIN(exposure_stationary_, MARS_LEVEL)(const StationaryBlock& block) {

@@ -42,6 +42,22 @@ struct ExposureFlux {
     }
 };
 
+constexpr int kRateMoments = 4;
+constexpr int kRateKinds = 3;
+
+// Registrations of a paralyzable pixel per period and bin: integrals over the bin of r(t) x^m, m = 0..3, x in [-1, 1].
+struct ExposureRate {
+    int64_t entries = 0;
+    const double* photons = nullptr;  // (entries) per period
+    const double* rates = nullptr;    // (entries, kinds, n, kRateMoments)
+    int64_t kinds = 1;                // steady, and for an armed start the first period and period K: kRateKinds
+    int32_t bins = 1;                 // n
+
+    const double* moments(int64_t entry, int64_t kind, int64_t bin) const {
+        return rates + ((entry * kinds + kind) * bins + bin) * kRateMoments;
+    }
+};
+
 // What `settled` holds besides the number of periods that were needed.
 constexpr int64_t kRanToEnd = -1;   // the exposure ended first: no extrapolation, nothing lost
 constexpr int64_t kUnsettled = -2;  // max_periods was reached: no result
@@ -60,6 +76,7 @@ struct MomentsBlock {
     const int32_t* phase = nullptr;  // (phases) edges of the grid, for PhasesBlock
     int64_t phases = 0;
     double* ends = nullptr;          // (entries, phases, 4) what ending at that phase adds to the cumulants, or null
+    const ExposureRate* rate = nullptr;  // instead of `flux`: a paralyzable pixel
 };
 
 // Change of the cumulants of entries where the exposure begins, and ends, at another phase (docs/table.md).
@@ -92,6 +109,7 @@ struct CharacteristicBlock {
     double* im;
     int64_t* settled;
     const std::atomic<bool>* stop;
+    const ExposureRate* rate = nullptr;  // instead of `flux`: a paralyzable pixel
 };
 
 #define MARS_DECLARE_EXPOSURE(level)                                 \

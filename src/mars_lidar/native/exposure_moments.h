@@ -1,7 +1,9 @@
 // Cumulants of the count and mean histogram of a finite exposure.
 #pragma once
 #include <limits>
+#include <type_traits>
 
+#include "exposure_paralyzable.h"
 #include "exposure_start.h"
 
 namespace mars {
@@ -11,30 +13,50 @@ namespace {
 constexpr int kOrders = kExposureOrders + 1;  // Taylor coefficients 0..4
 using Moments = Series<kOrders>;
 
-// Cumulants by the normalised recursion of section 5.
+// Cumulants by the normalised recursion of section 5; Pixel is Recursion, or ParalyzableRecursion.
+template <template <class, class> class Pixel>
 class MomentsRun {
+    static constexpr bool kParalyzable = std::is_same_v<Pixel<Moments, Real>, ParalyzableRecursion<Moments, Real>>;
+    using Responses = std::conditional_t<kParalyzable, RateResponses<Real>, std::vector<Response<Real>>>;
+
  public:
-    MomentsRun(const MomentsBlock& block)
-        : block_(block), grid_(*block.grid), response_(responses(*block.flux, block.first, block.count)) {}
+    MomentsRun(const MomentsBlock& block) : block_(block), grid_(*block.grid), response_(responses_of(block)) {}
 
     void run() {
-        Stationary start{};
-        if (grid_.stationary) start = stationary_state(grid_, response_, block_.count, *block_.stop);
-        Recursion<Moments, Real> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr,
-                                          block_.ends != nullptr);
-        recursion.armed.c[0] = grid_.stationary ? start.armed : splat(1.0);
-        if (grid_.stationary) recursion.set_last({one(start.bins.back().mass), one(start.bins.back().moment)});
+        if constexpr (kParalyzable) {
+            Pixel<Moments, Real> recursion(grid_, response_, rise());
+            advance(recursion, Stationary{});
+        } else {
+            Stationary start{};
+            if (grid_.stationary) start = stationary_state(grid_, response_, block_.count, *block_.stop);
+            Pixel<Moments, Real> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr,
+                                           block_.ends != nullptr);
+            recursion.armed.c[0] = grid_.stationary ? start.armed : splat(1.0);
+            if (grid_.stationary) recursion.set_last({one(start.bins.back().mass), one(start.bins.back().moment)});
+            if (grid_.stationary) start_history(start);
+            advance(recursion, start);
+        }
+    }
+
+ private:
+    static Responses responses_of(const MomentsBlock& block) {
+        if constexpr (kParalyzable)
+            return responses(*block.rate, block.first, block.count);
+        else
+            return responses(*block.flux, block.first, block.count);
+    }
+
+    void advance(Pixel<Moments, Real>& recursion, const Stationary& start) {
         std::vector<Real> histogram(grid_.bins), before(grid_.bins);
         std::vector<Moments> repeated = recursion.repeated;
         const int64_t kept = std::min(grid_.whole + 1, grid_.cycles);
         increments_.assign(kept, Moments{});
         totals_.assign(kept, Moments{});
         tails_.assign(kept, Moments{});
-        if (grid_.stationary) start_history(start);
         bool done[kReals]{};
         int64_t streak[kReals]{}, left = block_.count;
         for (int k = 0; k < block_.count; ++k)
-            if (grid_.stationary && !start.settled[k]) {
+            if (!kParalyzable && grid_.stationary && !start.settled[k]) {
                 block_.settled[block_.first + k] = kUnsettled;
                 done[k] = true;
                 --left;
@@ -44,16 +66,19 @@ class MomentsRun {
             bool near = false;
             for (int k = 0; k < block_.count; ++k) near = near || (!done[k] && streak[k] + 1 >= grid_.window());
             if (near) before = histogram;
+            if constexpr (kParalyzable) recursion.value = one(splat(1.0));  // G in its own units
             recursion.period(q, factor(q, grid_.whole + 1), factor(q, grid_.whole), histogram.data());
             const Moments step = growth(recursion.total);
             cumulative_ = cumulative_ + step;
-            recursion.armed = weighted(exp_series(-1.0 * step), recursion.armed);
             increments_[slot(q)] = step;
-            totals_[slot(q)] = recursion.total;
-            tails_[slot(q)] = recursion.tail;
-            if (q % (1 + grid_.whole / 16) == 0) {  // armed + blind = 1 at every order (eq. 17)
-                recursion.armed = -1.0 * blind(q + 1);
-                recursion.armed.c[0] += 1.0;
+            if constexpr (!kParalyzable) {
+                recursion.armed = weighted(exp_series(-1.0 * step), recursion.armed);
+                totals_[slot(q)] = recursion.total;
+                tails_[slot(q)] = recursion.tail;
+                if (q % (1 + grid_.whole / 16) == 0) {  // armed + blind = 1 at every order (eq. 17)
+                    recursion.armed = -1.0 * blind(q + 1);
+                    recursion.armed.c[0] += 1.0;
+                }
             }
             const Real moved = change(recursion.repeated, repeated);
             repeated = recursion.repeated;
@@ -67,14 +92,21 @@ class MomentsRun {
                 --left;
                 if (settled || over) {
                     put(k, step, periods, settled, histogram.data(), before.data());
-                    if (block_.ends) put_ends(k, recursion, q);
+                    if constexpr (!kParalyzable)
+                        if (block_.ends) put_ends(k, recursion, q);
                 } else
                     block_.settled[block_.first + k] = kUnsettled;
             }
         }
     }
 
- private:
+    static Moments rise() {  // e^s - 1
+        constexpr double inverse_factorial[] = {0.0, 1.0, 1.0 / 2, 1.0 / 6, 1.0 / 24};
+        Moments out{};
+        for (int k = 1; k < kOrders; ++k) out.c[k] = splat(inverse_factorial[k]);
+        return out;
+    }
+
     static Moments one(const Real& x) {
         Moments out{};
         out.c[0] = x;
@@ -95,7 +127,7 @@ class MomentsRun {
     // the change of unit; without e^s where it lies before the exposure.
     Moments factor(int64_t q, int64_t ago) const {
         Moments exponent{};
-        if (ago <= q) exponent.c[1] += splat(1.0);
+        if (ago <= q && !kParalyzable) exponent.c[1] += splat(1.0);  // there G itself is delayed, not registrations
         for (int64_t i = std::max<int64_t>(q - ago, 0); i < q; ++i) exponent = exponent - increments_[slot(i)];
         return exp_series(exponent);
     }
@@ -166,7 +198,7 @@ class MomentsRun {
 
     const MomentsBlock& block_;
     const ExposureGrid grid_;
-    const std::vector<Response<Real>> response_;
+    const Responses response_;
     Moments cumulative_{};
     std::vector<Moments> increments_, totals_, tails_;  // of the last K + 1 periods, by `slot`
     Real history_total_{}, history_tail_{};             // of a period before the exposure

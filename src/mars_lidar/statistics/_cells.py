@@ -195,9 +195,12 @@ class Cells:
     def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:
         """Parts whose energies on the grid, and histograms, fit in a moderate amount of memory."""
         per_cell = 8 * (4 * bins + 2 * out_bins)
-        if self.waveform is None and np.unique(self.delay).size == 1 and self.system.detector.mode != "gated":
+        least = 64
+        if self.system.detector.mode == "paralyzable":  # kinds x moments of the rate, and what they are made of
+            per_cell, least = 8 * (40 * bins + 2 * out_bins), 1
+        elif self.waveform is None and np.unique(self.delay).size == 1 and self.system.detector.mode != "gated":
             per_cell = 16 * out_bins + 128
-        step = max(64, _CHUNK_BYTES // per_cell)
+        step = max(least, _CHUNK_BYTES // per_cell)
         for start in range(0, self.size, step):
             yield slice(start, min(start + step, self.size))
 

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 PLAIN: tuple[Mode, ...] = ("nonparalyzable",)
 _INSTEAD = {
     "nonparalyzable": "",
-    "paralyzable": "; paralyzable_moments, mean_histogram and registration_pdf have its exact statistics",
+    "paralyzable": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
     "synchronous": "; count_law, mean_histogram and registration_pdf have its exact statistics",
     "gated": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
 }

@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.statistics._paralyzable_rate import registration_rates
 
 _TAIL = 1e-12  # probability that may lie outside the support, at either end
 _TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # standard deviations of reach
@@ -158,8 +160,9 @@ def _supports(
         _MAX_LOG_GROWTH / (1.0 + 1.0 / dead),
         np.log1p(_MAX_LOG_GROWTH / np.maximum(cells.total, 1e-300)),
     )
-    tilt = _TILTS / np.maximum(spread, 1e-300)[:, None]
-    tilt = np.minimum(tilt, np.minimum(growth, _MAX_TILT)[:, None])
+    # as many deviations as fit below the limit: where counts beyond the usual one are rare, small tilts bound best
+    unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, _MAX_TILT) / _TILTS[-1])
+    tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
     log_value = _characteristic(cells, np.exp(tilt), None, bins, threads)[0]
     with np.errstate(invalid="ignore"):
@@ -201,26 +204,26 @@ def _characteristic(
     """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
     from mars_lidar import _core
 
-    energy, row = cells.energies(bins)
-    photons, flat = cells.native_flux
     re, im = np.empty(z_re.shape), np.empty(z_re.shape)
     settled = np.empty(z_re.shape, np.int64)
-    _core.exposure_characteristic(
-        grid=cells.grid(bins, 1),
-        signal=photons,
-        background=flat,
-        shape=row,
-        shapes=energy,
-        tilted=z_im is None,
-        z_re=np.ascontiguousarray(z_re),
-        z_im=np.zeros(z_re.shape) if z_im is None else np.ascontiguousarray(z_im),
-        re=re,
-        im=im,
-        settled=settled,
-        threads=threads,
-        level="",
-        progress=None,
-    )
+    points: dict[str, Any] = {
+        "tilted": z_im is None,
+        "z_re": np.ascontiguousarray(z_re),
+        "z_im": np.zeros(z_re.shape) if z_im is None else np.ascontiguousarray(z_im),
+        "re": re, "im": im, "settled": settled, "threads": threads, "level": "", "progress": None,
+    }  # fmt: skip
+    if cells.system.detector.mode == "paralyzable":
+        for part in cells.chunks(bins, 1):
+            some = cells.part(part)
+            mine = {name: x[part] if isinstance(x, np.ndarray) else x for name, x in points.items()}
+            rates = registration_rates(some, bins)
+            _core.paralyzable_characteristic(grid=some.grid(bins, 1), photons=some.total, rates=rates, **mine)
+    else:
+        energy, row = cells.energies(bins)
+        photons, flat = cells.native_flux
+        _core.exposure_characteristic(
+            grid=cells.grid(bins, 1), signal=photons, background=flat, shape=row, shapes=energy, **points
+        )
     lost = (settled == _UNSETTLED).any(-1)
     if lost.any():
         raise ConvergenceError(

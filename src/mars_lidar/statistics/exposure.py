@@ -15,16 +15,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar.detector import Mode
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.statistics._paralyzable_rate import registration_rates
 from mars_lidar.statistics._timing import Timing, is_timed
 from mars_lidar.system import System
 
 Progress = Callable[[int, int], object]
 
+_MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
 _ORDERS = 4
 _MAX_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
+_NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settled")  # what the native core fills
 _UNSETTLED = -2  # the native core's code: gave up
 
 
@@ -86,7 +90,7 @@ def exposure_moments(
 ) -> Exposure:
     """Exact cumulants of the count and mean histogram of an exposure of `System.cycles` periods.
 
-    For detectors of mode nonparalyzable, and gated with a gate that stays.
+    For detectors of mode nonparalyzable, paralyzable, and gated with a gate that stays.
 
     Parameters
     ----------
@@ -117,7 +121,7 @@ def exposure_moments(
     """
     cells = Cells.of(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what="exposure_moments", modes=("nonparalyzable", "gated"), effects=LIGHT_EFFECTS + TIMING_EFFECTS,
+        what="exposure_moments", modes=_MODES, effects=LIGHT_EFFECTS + TIMING_EFFECTS,
     )  # fmt: skip
     return recorded_moments(cells, tolerance=tolerance, threads=threads, progress=progress)
 
@@ -229,24 +233,23 @@ def _run(cells: Cells, bins: int, out_bins: int, threads: int, progress: Progres
 
     cells.check_history(bins)
     result = _blank(cells, out_bins)
+    paralyzable = cells.system.detector.mode == "paralyzable"
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
+        grid = some.grid(bins, out_bins)
+        into = {name: vars(result)[name][part] for name in _NATIVE}
+        if paralyzable:
+            rates = registration_rates(some, bins)
+            _core.paralyzable_moments(
+                grid=grid, photons=some.total, rates=rates, **into, threads=threads, level="", progress=progress
+            )
+            continue
         energy, row = some.energies(bins)
+        signal, background = some.native_flux
         _core.exposure_moments(
-            grid=some.grid(bins, out_bins),
-            signal=some.native_flux[0],
-            background=some.native_flux[1],
-            shape=row,
-            shapes=energy,
-            cumulants=result.cumulants[part],
-            cumulant_rates=result.cumulant_rates[part],
-            histogram=result.histogram[part],
-            histogram_rate=result.histogram_rate[part],
-            settled=result.settled[part],
-            threads=threads,
-            level="",
-            progress=progress,
-        )
+            grid=grid, signal=signal, background=background, shape=row, shapes=energy, **into,
+            threads=threads, level="", progress=progress,
+        )  # fmt: skip
     lost = result.settled == _UNSETTLED
     if lost.any():
         raise ConvergenceError(

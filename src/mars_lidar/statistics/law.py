@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Method = Literal["exact", "mars", "renewal", "neural", "poisson"]
 _METHODS = ("exact", "mars", "renewal", "neural", "poisson")
 _LAW_MODES: dict[str, tuple[Mode, ...]] = {
-    "exact": ("nonparalyzable", "synchronous", "gated"),
+    "exact": MODES,
     "mars": PLAIN,
     "renewal": PLAIN,
     "neural": PLAIN,
@@ -146,8 +146,8 @@ def count_law(
     system
         Laser, detector and histogram (whose bins do not matter here).
     method
-        - ``"exact"``: finite exposure, start and end included, any dead time (docs/theory_exposure.md); for
-          detectors of mode ``"nonparalyzable"``, ``"synchronous"`` and ``"gated"`` (docs/detectors.md),
+        - ``"exact"``: finite exposure, start and end included, any dead time and every mode of the detector
+          (docs/theory_exposure.md, docs/detectors.md),
         - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure,
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,

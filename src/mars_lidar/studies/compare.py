@@ -134,6 +134,11 @@ def compare(
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     if isinstance(engines, str):
         raise TypeError(f"engines must be a sequence of names, got {engines!r}; one engine: [{engines!r}]")
+    if system.detector.crosstalk is not None:
+        raise ValueError(
+            "compare draws single pixels, which crosstalk ties to their neighbours, got "
+            f"crosstalk={system.detector.crosstalk!r}; simulate whole images with engine 'sequential'"
+        )
     chosen = _engines(engines, against)
     n = _validate.integer("realizations", realizations, low=50, high=10**7)
     cubes = _validate.integer("repeats", repeats, low=1, high=1000)

@@ -1,0 +1,145 @@
+"""The exact count law of a paralyzable pixel: closed forms, its own moments, the sequential engine."""
+
+from __future__ import annotations
+
+from math import comb, factorial
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+import mars_lidar as ml
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, random_cases, two_lobes, waveform_flux
+from mars_lidar.engines import ENGINES
+from mars_lidar.statistics import exposure_moments, paralyzable_moments
+
+
+def view(dead: float, start: str = "armed", cycles: int = 40, *, sigma: float = 0.02, bins: int = 50) -> ml.System:
+    return ml.System(
+        period_ns=PERIOD_NS, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode="paralyzable"), start=start,
+    )  # fmt: skip
+
+
+def pmf_of(law: ml.CountLaw) -> np.ndarray:
+    pmf = np.zeros(law.support[-1] + 1)
+    pmf[law.support] = law.pmf
+    return pmf
+
+
+def constant_rate_pmf(rate: float, dead: float, cycles: float, start: str) -> np.ndarray:
+    """From E C(N, k): k registrations further apart than t_d, at the rate lambda e^(-lambda t_d) each.
+
+    In an armed exposure the first of them may be the first arrival of all, before t_d.
+    """
+    r, most = rate * np.exp(-rate * dead), int(cycles / dead) + 1
+
+    def ordered(k: int, room: float) -> float:
+        """Integral over k registrations in `room`, the gaps between them taken out."""
+        return r**k * max(room - (k - 1) * dead, 0.0) ** k / factorial(k) if k else 1.0
+
+    chance = [1.0]
+    for k in range(1, most + 1):
+        if start == "stationary":
+            chance.append(ordered(k, cycles))
+            continue
+        early = quad(lambda u, k=k: rate * np.exp(-rate * u) * ordered(k - 1, max(cycles - u - dead, 0.0)),
+                     0, dead, epsrel=1e-12, epsabs=1e-14)[0]  # fmt: skip
+        chance.append(early + ordered(k, cycles - dead))
+    counts = range(most + 1)
+    return np.array([sum((-1) ** (k - n) * comb(k, n) * chance[k] for k in counts[n:]) for n in counts])
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(("rate", "dead", "cycles"), [(1.3, 0.35, 5), (0.4, 2.7, 30), (4.0, 0.9, 12), (0.8, 1.0, 9)])
+def test_pmf_at_a_constant_rate(rate: float, dead: float, cycles: int, start: str):
+    expected = constant_rate_pmf(rate, dead, cycles, start)
+    found = pmf_of(ml.count_law(0.0, rate, view(dead, start, cycles), tolerance=1e-7))
+    size = min(found.size, expected.size)
+    assert expected.sum() == pytest.approx(1.0, abs=1e-9)
+    assert found[:size] == pytest.approx(expected[:size], abs=1e-8)
+    assert max(expected[size:].sum(), found[size:].sum()) < 1e-8
+
+
+@pytest.mark.parametrize("case", random_cases(24, seed=77, photons=4e5, least=1000, most=3000), ids=lambda c: c.name)
+def test_moments_are_the_closed_form_ones(case: Case):
+    pixel = ml.Detector(dead_time_ns=case.system.detector.dead_time_ns, mode="paralyzable")
+    system = case.system.replace(detector=pixel)
+    flux = pixel_of(case)
+    law = ml.count_law(system=system, tolerance=1e-5, **flux)
+    known = paralyzable_moments(system=system, **flux)
+    spread = np.sqrt(float(known.variance))
+    assert abs(float(law.mean - known.mean)) < 3e-5 * min(spread, float(known.mean)) + 1e-9
+    assert float(law.variance) == pytest.approx(float(known.variance), rel=1e-4, abs=1e-8)
+    own = exposure_moments(system=system, tolerance=1e-5, **flux)
+    assert 0.5 * np.abs(own.histogram - known.histogram).sum() < 3e-5 * float(known.mean)
+    # third and fourth cumulant came by series in s, the pmf by points on the circle
+    n = law.support - law.mean
+    third, fourth = law.pmf @ n**3, law.pmf @ n**4 - 3 * (law.pmf @ n**2) ** 2
+    assert law.cumulants[2:] == pytest.approx([third, fourth], abs=1e-6 * max(spread, 1.0) ** 4)
+
+
+def pixel_of(case: Case) -> dict[str, object]:
+    flux = case.flux
+    if flux.waveform is not None:
+        return {"signal": None, "background": flux.background[0, 0], "waveform": flux.waveform[0, 0]}
+    return {"signal": flux.signal[0, 0], "background": flux.background[0, 0], "delay_ns": flux.delay_ns[0, 0]}
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "cycles"),
+    [(3.0, 0.2, 0.3, 50), (2.0, 0.3, 1.37, 60), (4.0, 0.1, 0.9995, 200), (0.2, 0.05, 7.4, 100), (30.0, 0.05, 1e-3, 15)],
+)
+def test_law_of_the_sequential_engine(signal: float, background: float, dead: float, cycles: int, start: str):
+    system = view(dead, start, cycles)
+    case = Case(f"S {signal:g}, t_d {dead:g}, {start}", flux_of(signal, background, 0.37), system, 8000)
+    law = ml.count_law(signal, background, system, delay_ns=37.0)
+    histogram = exposure_moments(signal, background, system, delay_ns=37.0).histogram
+    check(ENGINES["sequential"], case, Law(histogram, pmf_of(law)), {COUNTS, SHAPE})
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+def test_waveform(start: str):
+    wave = two_lobes() / 12
+    system = view(0.7, start)
+    law = ml.count_law(None, 0.3, system, waveform=wave)
+    case = Case(f"waveform, {start}", waveform_flux(wave, 0.3), system, 12_000)
+    check(ENGINES["sequential"], case, Law(None, pmf_of(law)), {COUNTS})
+
+
+def test_dead_times_round_one_bin_of_the_grid():
+    """Below a bin G of the bin itself comes in, above it is a delay: no step where one becomes the other."""
+    edge = 1.0 / 128
+    dead = np.array([1e-4, 0.5 * edge, 0.999999 * edge, edge, 1.000001 * edge, 1.5 * edge])
+    for d in dead:
+        system = view(float(d), cycles=8, sigma=0.05)
+        law, known = ml.count_law(4.0, 1.0, system), paralyzable_moments(4.0, 1.0, system)
+        assert law.exposure is not None
+        assert law.exposure.bins <= 256
+        assert law.cumulants[:2] == pytest.approx([float(known.mean), float(known.variance)], rel=1e-4)
+        assert law.pmf.sum() == pytest.approx(1.0, abs=1e-9)
+
+
+def test_long_exposures_and_long_dead_times():
+    a, b, c = (ml.count_law(1.0, 0.3, view(2.4, cycles=n)) for n in (200, 201, 100_000_000))
+    assert c.cumulants == pytest.approx(a.cumulants + (b.cumulants - a.cumulants) * (100_000_000 - 200), rel=1e-6)
+    assert c.pmf @ c.support == pytest.approx(float(c.mean), rel=1e-8)
+    assert c.pmf.sum() == pytest.approx(1.0, abs=1e-5)
+    long = ml.count_law(0.01, 0.005, view(300.25, cycles=2000))
+    known = paralyzable_moments(0.01, 0.005, view(300.25, cycles=2000))
+    assert long.cumulants[:2] == pytest.approx([float(known.mean), float(known.variance)], rel=1e-5)
+    assert long.pmf @ long.support == pytest.approx(float(known.mean), rel=1e-5)
+
+
+def test_dark_blinded_and_without_dead_time():
+    dark = ml.count_law(0.0, 0.0, view(0.5))
+    assert dark.pmf[0] == 1.0
+    assert dark.mean == 0.0
+    # lambda t_d = 40: the first photon, and nothing ever after
+    blinded = ml.count_law(0.0, 80.0, view(0.5, cycles=10))
+    assert pmf_of(blinded)[1] == pytest.approx(1.0, abs=1e-9)
+    free = ml.count_law(1.0, 0.5, view(0.0))
+    assert free.variance == pytest.approx(float(free.mean), rel=1e-9)
+    cells = ml.count_law(np.array([0.0, 1.0]), 0.2, view(0.7))
+    assert cells.pmf[0] @ cells.support[0] == pytest.approx(float(ml.count_law(0.0, 0.2, view(0.7)).mean), rel=1e-8)

@@ -189,7 +189,7 @@ def test_afterpulses_take_no_random_numbers_of_the_photons(kind: str):
 @pytest.mark.parametrize("mode", ["nonparalyzable", "synchronous", "gated"])
 @pytest.mark.parametrize("kind", ["gaussian", "waveform"])
 def test_releases_within_the_dead_time_change_no_bit(kind: str, mode: str):
-    """They find the pixel blind: the bits are those of the plain pixel. A paralyzable one would stay blind for longer."""
+    """They find the pixel blind; a paralyzable one would stay so for longer."""
     flux, system = image(kind)  # t_d = 63.75 ns
     gate = {"gate_start_ns": 10.0, "gate_width_ns": 70.0} if mode == "gated" else {}
     plain = system.replace(detector=ml.Detector(dead_time_ns=63.75, mode=mode, **gate))

@@ -83,12 +83,10 @@ void run_waveform(const BoundJob& job, WaveformBlock proto, int threads, const s
             block.start_cycle = cycle.data();
             block.start_phase = phase.data();
         }
-        const std::unique_ptr<double[]> energy(new double[layout.parts + 1]);
-        const std::unique_ptr<int32_t[]> cell(new int32_t[layout.parts + 1]);
+        const std::unique_ptr<double[]> energy(new double[layout.room]);
         const std::unique_ptr<int32_t[]> edges(new int32_t[proto.team * layout.edges]);
         const std::unique_ptr<uint16_t[]> guides(new uint16_t[proto.team * layout.cells]);
         block.energy = energy.get();
-        block.cell = cell.get();
         block.edges = edges.get();
         block.guides = guides.get();
         if (!stop.load(std::memory_order_relaxed)) kernel(block);

@@ -18,8 +18,7 @@ struct WaveformBlock {
     const double* start_phase;   // in periods, [0, 1)
     Output output;
     int64_t team;            // tables that there is memory for: waveform_table.h
-    double* energy;          // to work in: (samples + 1)
-    int32_t* cell;           // likewise
+    double* energy;          // to work in
     int32_t* edges;
     uint16_t* guides;
     const std::atomic<bool>* stop;

@@ -35,6 +35,7 @@ public:
           twilight_span_(wave_span(job_.twilight, system_.parts)), log_(block.output, job_) {
         tables_.edge = block.edges;
         tables_.guide = block.guides;
+        tables_.parts = system_.parts;
         tables_.shift = layout_.shift;
         tables_.group = layout_.group;
     }
@@ -42,11 +43,16 @@ public:
     void run() {
         for (int lane = 0; lane < kLanes; ++lane) take(lane);
         load_items();
+        fetch_from(pixel_);
         for (int round = 1; running_ > 0; ++round) {
-            WaveWait ahead[kWaitsAhead];
-            for (int k = 0; k < kWaitsAhead; ++k)
-                ahead[k] = draw_wave(rates_, key0_, key1_, event_ + static_cast<uint32_t>(k));
-            for (int k = 0; k < kWaitsAhead; ++k) step(ahead[k], k);
+            // each draw beside the search of the one before it, which waits for tables
+            WaveWait wait = draw(0);
+            for (int k = 0; k < kWaitsAhead; ++k) {
+                const WaveWait next = k + 1 < kWaitsAhead ? draw(k + 1) : wait;
+                step(wait, k);
+                wait = next;
+                fetch();
+            }
             if constexpr (kRecords) record();
             event_ = event_ + static_cast<uint32_t>(kWaitsAhead);
             log_.advance(kWaitsAhead);
@@ -57,6 +63,10 @@ public:
     }
 
 private:
+    MARS_INLINE WaveWait draw(int k) const {
+        return draw_wave(rates_, key0_, key1_, event_ + static_cast<uint32_t>(k));
+    }
+
     MARS_INLINE void step(const WaveWait& wait, int k) {
         WaveTime from = from_;
         if constexpr (kTraps) from = search_start(k);
@@ -203,8 +213,24 @@ private:
         latest_ = 0;
         while (users_[latest_] > 0) ++latest_;
         photons_ = fill_table(layout_, job_.waveform + pixel * job_.samples, job_.background[pixel],
-                              {block_.energy, block_.cell}, block_.edges + latest_ * layout_.edges,
+                              block_.energy, block_.edges + latest_ * layout_.edges,
                               block_.guides + latest_ * layout_.cells);
+        fetch_from(pixel_ + 1);
+    }
+
+    // Asks for the waveform of the next pixel, a little at a time: the memory then works while the lanes do.
+    void fetch_from(int64_t pixel) {
+        const bool more = pixel < block_.pixels;
+        fetch_ = more ? job_.waveform + (block_.first_pixel + pixel) * job_.samples : nullptr;
+        fetch_end_ = more ? fetch_ + job_.samples : nullptr;
+    }
+    MARS_INLINE void fetch() {
+#if defined(__GNUC__)
+        constexpr int kLines = 32, kLine = 8;
+        if (fetch_ >= fetch_end_) return;
+        for (int line = 0; line < kLines; ++line) __builtin_prefetch(fetch_ + line * kLine, 0, 2);
+        fetch_ += kLines * kLine;
+#endif
     }
 
     void load_items() {
@@ -246,6 +272,7 @@ private:
     int32_t slot_[kLanes];  // the table of a lane
 
     int64_t pixel_ = 0, realization_ = 0;  // the next item
+    const double *fetch_ = nullptr, *fetch_end_ = nullptr;  // of its waveform, what has not been asked for
     int32_t latest_ = 0;                   // slot of the latest pixel's table ...
     double photons_ = 0.0;                 // ... and its photons per period
     int users_[kLanes + 1] = {};           // lanes that use each slot

@@ -62,6 +62,9 @@ CASES = [
     case(0.3, 0.1, dead_time_ns=0.0, afterpulsing=ml.Afterpulsing(probability=0.9, delay_ns=900.0)),
     case([1.0, 0.5], 0.2, "stationary", dead_time_ns=220.0, afterpulsing=EXPONENTIAL, twilight_ns=130.0,
          delay=[0.1, 0.93]),
+    # delays of hundreds of periods, whose fraction is drawn apart
+    case(0.02, 0.01, cycles=3000, items=1500, dead_time_ns=30.0, pulse=ml.GaussianPulse(sigma_ns=0.3),
+         afterpulsing=ml.Afterpulsing(probability=0.8, delay_ns=40_000.0)),
     case(1.0, 1.0, dead_time_ns=200.0, twilight_ns=20.0, pulse=ml.SampledPulse(two_lobes(), 0.5)),
     case(2.0, 0.5, "stationary", dead_time_ns=30.0, mode="paralyzable", afterpulsing=EXPONENTIAL),
     case(2.0, 0.5, dead_time_ns=130.0, mode="synchronous", afterpulsing=SAMPLED),
@@ -181,6 +184,22 @@ def test_afterpulses_take_no_random_numbers_of_the_photons(kind: str):
     on = system.replace(detector=replace(system.detector, afterpulsing=never))
     for engine in BOTH[:1]:
         assert np.array_equal(ml.simulate(flux, on, engine=engine), ml.simulate(flux, system, engine=engine))
+
+
+@pytest.mark.parametrize("mode", ["nonparalyzable", "synchronous", "gated"])
+@pytest.mark.parametrize("kind", ["gaussian", "waveform"])
+def test_releases_within_the_dead_time_change_no_bit(kind: str, mode: str):
+    """They find the pixel blind; a paralyzable one would stay so for longer."""
+    flux, system = image(kind)  # t_d = 63.75 ns
+    gate = {"gate_start_ns": 10.0, "gate_width_ns": 70.0} if mode == "gated" else {}
+    plain = system.replace(detector=ml.Detector(dead_time_ns=63.75, mode=mode, **gate))
+    within = ml.Afterpulsing(probability=0.9, delays=(2.0, 0.0, 1.0), bin_ns=21.25)
+    expected = ml.simulate(flux, plain, seed=3)
+    found = ml.simulate(flux, plain.replace(detector=replace(plain.detector, afterpulsing=within)), seed=3)
+    assert np.array_equal(found, expected)
+    beyond = replace(within, delays=(2.0, 0.0, 1.0, 0.5))
+    found = ml.simulate(flux, plain.replace(detector=replace(plain.detector, afterpulsing=beyond)), seed=3)
+    assert not np.array_equal(found, expected)
 
 
 ONE_WAY = [(r, c) for r in range(3) for c in range(3) if (r, c) != (1, 1)]

@@ -13,6 +13,7 @@
 #include "bindings.h"
 #include "exact_kernel.h"
 #include "exact_start.h"
+#include "levels.h"
 #include "parallel.h"
 #include "pulse_table.h"
 #include "trap_law.h"
@@ -28,23 +29,12 @@ struct Level {
 // Widest first.
 std::vector<Level> levels() {
     std::vector<Level> found;
-#if defined(MARS_HAS_avx512)
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        found.push_back({"avx512", exact_kernel_avx512, exact_modes_kernel_avx512, exact_recording_kernel_avx512,
-                         exact_avalanche_kernel_avx512});
-#endif
-#if defined(MARS_HAS_avx2)
-    if (__builtin_cpu_supports("avx2"))
-        found.push_back({"avx2", exact_kernel_avx2, exact_modes_kernel_avx2, exact_recording_kernel_avx2,
-                         exact_avalanche_kernel_avx2});
-#endif
-#if defined(MARS_HAS_vector128)
-    found.push_back({"vector128", exact_kernel_vector128, exact_modes_kernel_vector128,
-                     exact_recording_kernel_vector128, exact_avalanche_kernel_vector128});
-#endif
-    found.push_back({"scalar", exact_kernel_scalar, exact_modes_kernel_scalar, exact_recording_kernel_scalar,
-                     exact_avalanche_kernel_scalar});
+#define MARS_ADD_LEVEL(level, runs)                                                                               \
+    if (runs)                                                                                                     \
+        found.push_back({#level, exact_kernel_##level, exact_modes_kernel_##level, exact_recording_kernel_##level, \
+                         exact_avalanche_kernel_##level});
+    MARS_EACH_LEVEL(MARS_ADD_LEVEL)
+#undef MARS_ADD_LEVEL
     return found;
 }
 
@@ -96,8 +86,8 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
     if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
         throw nb::value_error("out must be (items, bins)");
     ExactBlock block{};
-    block.sink = sizeof(Count) == 2 ? Sink::kHistogram16 : Sink::kHistogram32;
-    block.out = out.data();
+    block.output.sink = sizeof(Count) == 2 ? Sink::kHistogram16 : Sink::kHistogram32;
+    block.output.out = out.data();
     run_exact(job, pulse, block, threads, level, progress);
 }
 
@@ -119,8 +109,8 @@ void bind_exact(nb::module_& module) {
            const nb::object& progress) {
             if (static_cast<int64_t>(out.shape(0)) != job.items()) throw nb::value_error("out must be (items,)");
             ExactBlock block{};
-            block.sink = Sink::kCounts;
-            block.out = out.data();
+            block.output.sink = Sink::kCounts;
+            block.output.out = out.data();
             run_exact(job, pulse, block, threads, level, progress);
         },
         nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("level") = "",
@@ -133,11 +123,11 @@ void bind_exact(nb::module_& module) {
             if (static_cast<int64_t>(offsets.shape(0)) != job.items() + 1)
                 throw nb::value_error("offsets must be (items + 1,)");
             ExactBlock block{};
-            block.sink = Sink::kTimestamps;
-            block.offsets = offsets.data();
-            block.times = times.data();
-            block.cycles = cycle.data();
-            block.bins = bin.data();
+            block.output.sink = Sink::kTimestamps;
+            block.output.offsets = offsets.data();
+            block.output.times = times.data();
+            block.output.cycles = cycle.data();
+            block.output.bins = bin.data();
             run_exact(job, pulse, block, threads, level, progress);
         },
         nb::arg("job"), nb::arg("pulse"), nb::arg("offsets"), nb::arg("times").noconvert(),

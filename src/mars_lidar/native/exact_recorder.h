@@ -18,15 +18,27 @@ struct FrameClock {
         Int bin;
     };
 
+    // The time of one lane.
+    struct Moment {
+        int32_t frame;
+        float phase;
+
+        bool operator<(const Moment& other) const {
+            return frame != other.frame ? frame < other.frame : phase < other.phase;
+        }
+    };
+
     // One time per lane as plain numbers.
     struct TimeArray {
         int32_t frame[kLanes];
         float phase[kLanes];
 
-        void forget(int lane) {
-            frame[lane] = INT32_MIN;
-            phase[lane] = 0.0f;
+        Moment get(int lane) const { return {frame[lane], phase[lane]}; }
+        void set(int lane, const Moment& time) {
+            frame[lane] = time.frame;
+            phase[lane] = time.phase;
         }
+        void forget(int lane) { set(lane, {INT32_MIN, 0.0f}); }
         void save(const Time& time) {
             store(frame, time.frame);
             store(phase, time.phase);
@@ -49,19 +61,16 @@ struct FrameClock {
         r.bin = minimum(truncate(r.phase * static_cast<float>(bins)), splat(bins - 1));
     }
 
-    template <bool timed>
-    MARS_INLINE void convert_time(const CodeTable& codes, Registration& r) const {
-        r.bin = convert<timed>(codes, bins, r.phase);
+    MARS_INLINE void convert_time(const CodeTable& codes, Registration& r, bool timed) const {
+        r.bin = convert(codes, bins, r.phase, timed);
     }
 
-    // The time of a lane as whole frames and the rest of one in [0, 1), or in units of 2^-32.
-    static int32_t whole(const TimeArray& from, int lane) { return from.frame[lane]; }
-    static double rest(const TimeArray& from, int lane) { return static_cast<double>(from.phase[lane]) + 0.5; }
-    static void put(TimeArray& to, int lane, int32_t whole, uint32_t rest) {
-        const float phase = static_cast<float>(static_cast<int64_t>(rest)) * 0x1p-32f - 0.5f;
-        to.frame[lane] = whole;
-        to.phase[lane] = phase < 0.5f ? phase : 0x1.fffffep-2f;
-    }
+    // For releases of carriers (trap_lanes.h).
+    static constexpr int32_t kNever = INT32_MAX;
+    static Moment never() { return {kNever, 0.0f}; }
+    static Time all_never() { return {splat(kNever), splat(0.0f)}; }
+    MARS_INLINE static Int period(const Time& time) { return time.frame; }
+    MARS_INLINE static Time after(const Time& time, const Wait& wait) { return later(time, wait.whole, wait.fraction); }
 
     int32_t bins, dead_whole;
     float dead_fraction;

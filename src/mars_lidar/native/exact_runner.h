@@ -4,13 +4,12 @@
 // each vector level, and for each mode of the detector, so that none pays for another; and once more with a recorder
 // (recorder.h) between registrations and log.
 #pragma once
-#include <cstring>
 #include <type_traits>
 
 #include "exact_kernel.h"
 #include "exact_recorder.h"
 #include "exact_step.h"
-#include "exact_writers.h"
+#include "lane_log.h"
 #include "system_view.h"
 #include "trap_lanes.h"
 
@@ -34,7 +33,8 @@ MARS_INLINE Rate load_rate(const RateArray& from) {
     return {load<Float>(from.rate), load<Float>(from.inverse), load<Float>(from.never)};
 }
 
-template <DetectorMode mode, bool gaussian, bool whole, Stage stage, Sink sink>
+// `timed` runners can tell the times of registrations; those with a recorder always can.
+template <DetectorMode mode, bool gaussian, bool whole, Stage stage, bool timed>
 class Runner {
     static constexpr bool kRecords = stage != Stage::kPlain, kTraps = stage == Stage::kAvalanches;
     static_assert(!(kTraps && whole && mode == DetectorMode::kNonparalyzable), "twilight moves the search");
@@ -42,8 +42,9 @@ class Runner {
 public:
     explicit Runner(const ExactBlock& block)
         : block_(block), job_(*block.job), system_(view(job_, *block.pulse)), recorder_(job_), traps_(job_),
+          twilight_(mode == DetectorMode::kNonparalyzable && job_.twilight > 0.0),
           twilight_whole_(static_cast<int32_t>(job_.twilight)),
-          twilight_fraction_(static_cast<float>(job_.twilight - twilight_whole_)), writer_(block) {}
+          twilight_fraction_(static_cast<float>(job_.twilight - twilight_whole_)), log_(block.output, job_) {}
 
     void run() {
         for (int lane = 0; lane < kLanes; ++lane) take(lane);
@@ -54,9 +55,9 @@ public:
             for (int k = 0; k < kAhead; ++k) step(k);
             if constexpr (kRecords) record();
             event_ = event_ + static_cast<uint32_t>(kAhead);
-            rows_ += kAhead;
+            log_.advance(kAhead);
             if (any(armed_.frame > system_.cycles)) exchange();
-            if (rows_ == kLog) flush();
+            if (log_.full()) log_.flush();
             if (round % kPollEvery == 0 && block_.stop->load(std::memory_order_relaxed)) return;
         }
     }
@@ -68,34 +69,35 @@ private:
         if constexpr (kTraps) {
             Time hit = next_registration<gaussian, whole>(system_, returns_, search_start(event), ahead_[k], key0_,
                                                           key1_, event, memory_);
-            const Int generation = earliest_arrival(hit);
+            Int generation;
+            const Mask carriers = traps_.take_earlier(hit, generation);
+            memory_.known = except(memory_.known, carriers);
+            if constexpr (mode == DetectorMode::kNonparalyzable)
+                if (twilight_) hit = earlier(before(hit, armed_), armed_, hit);
             Mask unseen = splat(0) > 0;
             next = register_arrival<mode>(system_, hit, delay_, event, armed_, memory_, unseen);
-            traps_.avalanche(select(unseen, splat(1), splat(0)) == 0, hit, generation);
+            traps_.avalanche(except(splat(1) > 0, unseen), hit, generation, key0_, key1_);
         } else {
             next = register_next<mode, gaussian, whole>(system_, returns_, delay_, ahead_[k], key0_, key1_, event,
                                                         armed_, memory_);
         }
-        if constexpr (kRecords) {
-            seen_[k] = {next.hit, next.cycle, next.phase, next.lost, bin_of(next.phase, system_.bins)};
-            return;
-        }
-        log(rows_ + k, next.lost, bin_of(next.phase, system_.bins), next.cycle, next.phase);
+        const Int bin = bin_of(next.phase, system_.bins);
+        if constexpr (kRecords) seen_[k] = {next.hit, next.cycle, next.phase, next.lost, bin};
+        else log(k, next.lost, bin, next.cycle, next.phase);
     }
 
-    MARS_INLINE void log(int row, Mask lost, Int bin, Int cycle, Float phase) {
-        store(log_.bin[row], select(lost, splat(-1), bin));
-        if constexpr (sink == Sink::kTimestamps) {
-            store(log_.cycle[row], cycle);
-            store(log_.phase[row], phase);
+    MARS_INLINE void log(int k, Mask lost, Int bin, Int cycle, Float phase) {
+        log_.put(k, lost, bin);
+        if constexpr (timed) {
+            log_.put_cycle(k, cycle);
+            store(log_.phase(k), phase);
         }
     }
 
     // Records the registrations of a round.
     MARS_INLINE void record() {
-        recorder_.template take<sink == Sink::kTimestamps>(seen_, key0_, key1_, event_);
-        for (int k = 0; k < kAhead; ++k)
-            log(rows_ + k, seen_[k].lost, seen_[k].bin, seen_[k].cycle, seen_[k].phase);
+        recorder_.take(seen_, key0_, key1_, event_, log_.wants_times());
+        for (int k = 0; k < kAhead; ++k) log(k, seen_[k].lost, seen_[k].bin, seen_[k].cycle, seen_[k].phase);
         if (recorder_.fills())  // nothing more can be recorded there
             armed_.frame = select(recorder_.full(), splat(kIdleFrame), armed_.frame);
     }
@@ -104,7 +106,7 @@ private:
     // released before that are lost.
     MARS_INLINE Time search_start(UInt event) {
         Time from = armed_;
-        if constexpr (mode == DetectorMode::kNonparalyzable) {
+        if (mode == DetectorMode::kNonparalyzable && twilight_) {
             const Float phase = armed_.phase - twilight_fraction_;
             const Mask wrap = phase < -0.5f;
             const Time before_armed = {minus_if(armed_.frame - twilight_whole_, wrap), plus_if(phase, wrap)};
@@ -114,56 +116,16 @@ private:
         return from;
     }
 
-    // Of the next photon and the next carrier the one that comes first is the next arrival; its generation.
-    MARS_INLINE Int earliest_arrival(Time& hit) {
-        const Time release = traps_.next();
-        const Mask first = before(release, hit);
-        Int generation = splat(0);
-        if (any(first)) {
-            hit = earlier(first, release, hit);
-            generation = select(first, traps_.generation(), generation);
-            memory_.known = memory_.known & (select(first, splat(1), splat(0)) == 0);
-            traps_.drop(first);
-        }
-        if constexpr (mode == DetectorMode::kNonparalyzable) hit = earlier(before(hit, armed_), armed_, hit);
-        return generation;
-    }
-
-    // Writes what a lane has logged for its present item, up to row `to`.
-    void flush(int lane, int to) {
-        if (slot_array_[lane] >= 0)
-            writer_.template write<1>(slot_array_ + lane, log_, lane, first_row_array_[lane], to);
-        first_row_array_[lane] = to;
-    }
-
-    // Empties the log.
-    MARS_NOINLINE void flush() {
-        constexpr int team = kLanes < 4 ? kLanes : 4;
-        for (int lane = 0; lane < kLanes; lane += team) {
-            int common = 0;
-            bool busy = true;
-            for (int i = lane; i < lane + team; ++i) {
-                if (first_row_array_[i] > common) common = first_row_array_[i];
-                busy = busy && slot_array_[i] >= 0;
-            }
-            if (!busy) common = rows_;
-            for (int i = lane; i < lane + team; ++i) flush(i, common);
-            if (busy) writer_.template write<team>(slot_array_ + lane, log_, lane, common, rows_);
-        }
-        memset(first_row_array_, 0, sizeof first_row_array_);
-        rows_ = 0;
-    }
-
     // Gives the lanes whose exposure has ended another item.
     MARS_NOINLINE void exchange() {
         store(frame_array_, armed_.frame);
         store(phase_array_, armed_.phase);
         store(event_array_, event_);
         if constexpr (kRecords) recorder_.save_lanes();
+        if constexpr (kTraps) traps_.save_lanes();
         for (int lane = 0; lane < kLanes; ++lane) {
             if (frame_array_[lane] <= system_.cycles) continue;
-            flush(lane, rows_);
-            if (slot_array_[lane] >= 0) --running_;
+            if (log_.busy(lane)) --running_;
             take(lane);
         }
         load_items();
@@ -176,7 +138,6 @@ private:
         const int64_t item = block_.first_item + (busy ? taken_ : 0), pixel = job_.pixel(item);
         event_array_[lane] = 0;
         if constexpr (kRecords) recorder_.begin(lane);
-        first_row_array_[lane] = rows_;
         const float delay = wrapped(job_.delay[pixel] + block_.pulse->centre);
         delay_array_[lane] = delay;
         background_array_.set(lane, busy ? job_.background[pixel] : 0.0);
@@ -189,15 +150,14 @@ private:
         start_in_frames(warm ? block_.start_cycle[taken_] : 0, warm ? block_.start_phase[taken_] : 0.0f, delay,
                         frame_array_[lane], phase_array_[lane]);
         if (!busy) frame_array_[lane] = kIdleFrame;
-        slot_array_[lane] = busy ? taken_ : -1;
-        if constexpr (kTraps)
-            if (!busy) traps_.close(lane);
+        if (busy) log_.clear(item);
+        log_.assign(lane, busy ? item : -1);
+        if constexpr (kTraps) traps_.close(lane);
         if (!busy) return;
         const Pair<uint32_t> key = stream_key(job_.seed, job_.realization(item), job_.pixel_index[pixel]);
         key0_array_[lane] = key.first;
         key1_array_[lane] = key.second;
         if constexpr (kTraps) traps_.open(lane, key.first, key.second);
-        writer_.open(taken_);
         ++taken_;
         ++running_;
     }
@@ -212,6 +172,7 @@ private:
         event_ = load<UInt>(event_array_);
         armed_ = {load<Int>(frame_array_), load<Float>(phase_array_)};
         if constexpr (kRecords) recorder_.load_lanes();
+        if constexpr (kTraps) traps_.load_lanes();
     }
 
     const ExactBlock& block_;
@@ -232,28 +193,24 @@ private:
     float delay_array_[kLanes], offset_array_[kMaxReturns][kLanes], phase_array_[kLanes];
     int32_t frame_array_[kLanes];
     uint32_t key0_array_[kLanes] = {}, key1_array_[kLanes] = {}, event_array_[kLanes];
-    int64_t slot_array_[kLanes];  // the item of a lane, or -1
-    int first_row_array_[kLanes];
 
     int64_t taken_ = 0;
-    int running_ = 0, rows_ = 0;
+    int running_ = 0;
     std::conditional_t<kRecords, Recorder<FrameClock>, NoRecorder> recorder_;
     FrameClock::Registration seen_[kRecords ? kAhead : 1];
     std::conditional_t<kTraps, TrapLanes<FrameClock>, NoTraps> traps_;
+    const bool twilight_;
     const int32_t twilight_whole_;
     const float twilight_fraction_;
-    Writer<sink> writer_;
-    Log<sink> log_;
+    LaneLog<float, timed> log_;
 };
 
 template <DetectorMode mode, bool gaussian, bool whole, Stage stage = Stage::kPlain>
 void run(const ExactBlock& block) {
-    switch (block.sink) {
-        case Sink::kCounts: return Runner<mode, gaussian, whole, stage, Sink::kCounts>(block).run();
-        case Sink::kHistogram16: return Runner<mode, gaussian, whole, stage, Sink::kHistogram16>(block).run();
-        case Sink::kHistogram32: return Runner<mode, gaussian, whole, stage, Sink::kHistogram32>(block).run();
-        case Sink::kTimestamps: return Runner<mode, gaussian, whole, stage, Sink::kTimestamps>(block).run();
-    }
+    const bool timed = block.output.sink == Sink::kTimestamps;
+    if constexpr (stage != Stage::kPlain) Runner<mode, gaussian, whole, stage, true>(block).run();
+    else if (timed) Runner<mode, gaussian, whole, stage, true>(block).run();
+    else Runner<mode, gaussian, whole, stage, false>(block).run();
 }
 
 }  // namespace

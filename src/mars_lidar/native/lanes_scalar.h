@@ -39,6 +39,7 @@ MARS_INLINE Float from_bits(UInt u) {
 }
 
 MARS_INLINE bool any(Mask m) { return m; }
+MARS_INLINE Mask except(Mask a, Mask b) { return a && !b; }
 template <class T>
 MARS_INLINE T select(Mask m, T yes, T no) {
     return m ? yes : no;

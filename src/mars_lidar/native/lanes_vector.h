@@ -92,6 +92,7 @@ MARS_COMPARE(UInt, uint32_t)
 #undef MARS_COMPARE
 MARS_INLINE Mask operator&(Mask a, Mask b) { return {(HardMask)(a.low & b.low), (HardMask)(a.high & b.high)}; }
 MARS_INLINE Mask operator|(Mask a, Mask b) { return {(HardMask)(a.low | b.low), (HardMask)(a.high | b.high)}; }
+MARS_INLINE Mask except(Mask a, Mask b) { return {(HardMask)(a.low & ~b.low), (HardMask)(a.high & ~b.high)}; }
 
 MARS_INLINE Float to_float(Int x) {
     return {__builtin_convertvector(x.low, HardFloat), __builtin_convertvector(x.high, HardFloat)};

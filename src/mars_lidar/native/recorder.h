@@ -42,17 +42,21 @@ public:
         in_exposure_ = load<Int>(of_exposure_);
     }
 
+    // Whether anything happens to them.
+    bool on() const { return dead_ || limited_ || jitter_.on || !recording_.codes.edges.empty(); }
+
     // Loses and moves `n` registrations in a row, the first of which has the even number `event`, and finds their bins.
-    // With `timed` their phases become what the converter tells. One copy for all runners, which are many.
-    template <bool timed, int n>
-    MARS_NOINLINE void take(Registration (&registrations)[n], const UInt& key0, const UInt& key1, const UInt& event) {
+    // If `timed`, their phases become what the converter tells. One copy for all runners, which are many.
+    template <int n>
+    MARS_NOINLINE void take(Registration (&registrations)[n], const UInt& key0, const UInt& key1, const UInt& event,
+                            bool timed) {
         if (dead_)
             for (Registration& r : registrations) lose_to_dead_time(r);
         if (limited_)
             for (Registration& r : registrations) lose_to_limits(r);
         if (jitter_.on) jitter(registrations, key0, key1, event);
         if (!recording_.codes.edges.empty())
-            for (Registration& r : registrations) clock_.template convert_time<timed>(recording_.codes, r);
+            for (Registration& r : registrations) clock_.convert_time(recording_.codes, r, timed);
         else if (jitter_.on)
             for (Registration& r : registrations) clock_.find_bin(r);
     }

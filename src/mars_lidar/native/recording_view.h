@@ -55,10 +55,9 @@ MARS_INLINE Int split_off_periods(Float& phase) {
     return whole;
 }
 
-// The bin of a phase, which becomes the phase that the converter tells: as far into its code, one bin wide, as the time
-// is into the code's width.
-template <bool timed>
-MARS_INLINE Int convert(const CodeTable& codes, int32_t bins, Float& phase) {
+// The bin of a phase, which becomes, if `timed`, the phase that the converter tells: as far into its code, one bin wide,
+// as the time is into the code's width.
+MARS_INLINE Int convert(const CodeTable& codes, int32_t bins, Float& phase, bool timed) {
     const int32_t n = static_cast<int32_t>(codes.upper.size());
     const Float x = phase * static_cast<float>(bins);
     Int pattern = minimum(truncate(x * codes.patterns_per_bin), splat(bins / n - 1));
@@ -73,7 +72,7 @@ MARS_INLINE Int convert(const CodeTable& codes, int32_t bins, Float& phase) {
         upper = gather(codes.upper.data(), code);
         beyond = inside >= upper;
     }
-    if constexpr (timed) {
+    if (timed) {
         const Float left = minimum((upper - inside) * gather(codes.codes_per_bin.data(), code), splat(1.0f));
         const Float told = (first + to_float(code)) + (1.0f - maximum(left, splat(0x1p-24f)));
         phase = minimum(told * (1.0f / static_cast<float>(bins)), splat(0x1.fffffep-1f));

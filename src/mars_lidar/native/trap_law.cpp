@@ -1,54 +1,73 @@
 #include "trap_law.h"
 
 #include <algorithm>
-#include <cmath>
 
 #include "backward.h"
 #include "elementary.h"
+#include "stationary.h"
 
 namespace mars {
 namespace {
 
-// Word 0 of an avalanche: when the next one comes, and how many carriers; words 1, 2, ...: their delays.
-Pair<uint32_t> words(const uint32_t (&key)[2], uint32_t number, int k) {
-    return threefry<13, uint32_t>(number, kStageTraps + static_cast<uint32_t>(k), key[0], key[1]);
+// P(delay < t), of sampled delays.
+double share_below(const Traps& traps, double t) {
+    const double x = std::min(t / traps.sample, static_cast<double>(traps.samples));
+    const int64_t k = std::min(static_cast<int64_t>(x), traps.samples - 1);
+    return traps.below[k] + (traps.below[k + 1] - traps.below[k]) * (x - static_cast<double>(k));
 }
-
-double open_unit(uint32_t word) { return (word + 0.5) * 0x1p-32; }
 
 }  // namespace
 
-TrapLaw::TrapLaw(const Job& job) : traps_(job.traps), none_(ieee_exp(-job.traps.mean)) {}
+TrapLaw::TrapLaw(const Job& job) : traps_(job.traps) {
+    // an arrival that finds a pixel blind does nothing to it, in all modes but one
+    least_ = job.mode == DetectorMode::kParalyzable ? 0.0 : std::max(0.0, job.dead_time - job.twilight);
+    double left = 1.0;  // P(delay >= least)
+    hidden_ = 0.0;
+    if (exponential()) {
+        left = traps_.mean > 0.0 ? ieee_exp(-least_ / traps_.mean_delay) : 0.0;
+    } else {
+        hidden_ = std::min(share_below(traps_, least_), 1.0);
+        left = 1.0 - hidden_;
+    }
+    mean_ = traps_.mean * left;
+    none_ = ieee_exp(-mean_);
+    some_ = StationaryState::one_minus_exp(mean_);
 
-int32_t TrapLaw::until_next(const uint32_t (&key)[2], uint32_t number) const {
-    // 1 + floor(E / p), E ~ Exp(1), exceeds k with probability e^(-p k): that of k avalanches without a carrier
-    const double none = std::floor(static_cast<double>(exponential(words(key, number, 0).first)) / traps_.mean);
-    return none < 2147483646.0 ? 1 + static_cast<int32_t>(none) : 2147483647;
+    generations = traps_.generations;
+    avalanches_per_carrier = on() ? static_cast<float>(std::min(1.0 / mean_, 1e38)) : 0.0f;
+    const double one = on() ? mean_ * none_ / some_ : 1.0;
+    one_below = static_cast<uint32_t>(std::min(one * 0x1p32, 0x1p32 - 1.0));
+    stretch = static_cast<float>(0x1p32 / static_cast<double>(one_below));
+    least_periods = static_cast<int32_t>(least_);
+    least_rest = static_cast<float>(least_ - static_cast<double>(least_periods));
+    scale = static_cast<float>(traps_.mean_delay);
+    rate = scale > 0.0f ? 1.0f / scale : 0.0f;
 }
 
-int TrapLaw::draw(const uint32_t (&key)[2], uint32_t number, double (&delays)[kMostCarriers]) const {
-    // Poisson(p), given that it is not 0, by inversion
-    double left = open_unit(words(key, number, 0).second) * (1.0 - none_), share = none_ * traps_.mean;
-    if (left < share) {  // one, mostly: below its share the word is uniform again, for the delay
-        delays[0] = delay(left / share);
-        return 1;
-    }
-    int carriers = 1;
+int TrapLaw::draw_several(const uint32_t (&key)[2], uint32_t number, uint32_t word,
+                          double (&delays)[kMostCarriers]) const {
+    // Poisson, given that it is not below 2, by inversion
+    double share = none_ * mean_, left = std::max((word + 0.5) * 0x1p-32 * some_ - share, 0.0);
+    share *= 0.5 * mean_;
+    int carriers = 2;
     for (; left >= share && carriers < kMostCarriers; ++carriers) {
         left -= share;
-        share *= traps_.mean / (carriers + 1.0);
+        share *= mean_ / (carriers + 1.0);
     }
-    for (int k = 0; k < carriers; ++k) delays[k] = delay(unit(words(key, number, k + 1)));
+    for (int k = 0; k < carriers; ++k)
+        delays[k] = delay(unit(threefry<13, uint32_t>(number, kStageTraps + 1u + static_cast<uint32_t>(k), key[0],
+                                                      key[1])));
     return carriers;
 }
 
 double TrapLaw::delay(double u) const {
-    if (!traps_.below)
-        return traps_.mean_delay * exponential(static_cast<uint32_t>(std::min(u * 0x1p32, 0x1.fffffffep31)));
-    const double* const edge = std::upper_bound(traps_.below + 1, traps_.below + traps_.samples, u);
+    if (exponential())
+        return least_ + traps_.mean_delay * mars::exponential(static_cast<uint32_t>(std::min(u * 0x1p32, 0x1.fffffffep31)));
+    const double level = hidden_ + u * (1.0 - hidden_);
+    const double* const edge = std::upper_bound(traps_.below + 1, traps_.below + traps_.samples, level);
     const double before = *(edge - 1), step = *edge - before;
-    const double inside = step > 0.0 ? std::min(std::max((u - before) / step, 0.0), 1.0) : 0.5;
-    return (static_cast<double>(edge - 1 - traps_.below) + inside) * traps_.sample;
+    const double inside = step > 0.0 ? std::min(std::max((level - before) / step, 0.0), 1.0) : 0.5;
+    return std::max((static_cast<double>(edge - 1 - traps_.below) + inside) * traps_.sample, least_);
 }
 
 }  // namespace mars

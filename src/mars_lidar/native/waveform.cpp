@@ -13,6 +13,7 @@
 #include <nanobind/stl/string.h>
 
 #include "bindings.h"
+#include "levels.h"
 #include "parallel.h"
 #include "trap_law.h"
 #include "waveform_kernel.h"
@@ -21,33 +22,15 @@
 namespace mars {
 namespace {
 
-struct Kernels {
-    WaveformKernel plain, recording, avalanches;
-};
-
-Kernels kernels_of(const std::string& level) {
-    const auto asked = [&](const char* name) { return level.empty() || level == name; };
-#if defined(MARS_HAS_avx512)
-    if (asked("avx512") && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        return {waveform_kernel_avx512, waveform_recording_kernel_avx512, waveform_avalanche_kernel_avx512};
-#endif
-#if defined(MARS_HAS_avx2)
-    if (asked("avx2") && __builtin_cpu_supports("avx2"))
-        return {waveform_kernel_avx2, waveform_recording_kernel_avx2, waveform_avalanche_kernel_avx2};
-#endif
-#if defined(MARS_HAS_vector128)
-    if (asked("vector128"))
-        return {waveform_kernel_vector128, waveform_recording_kernel_vector128, waveform_avalanche_kernel_vector128};
-#endif
-    if (asked("scalar"))
-        return {waveform_kernel_scalar, waveform_recording_kernel_scalar, waveform_avalanche_kernel_scalar};
-    throw std::invalid_argument("level must be one that this processor runs, got '" + level + "'");
-}
-
-WaveformKernel kernel_of(const std::string& level, const Job& job) {
-    const Kernels kernels = kernels_of(level);
-    return job.avalanches_matter() ? kernels.avalanches : job.recording ? kernels.recording : kernels.plain;
+WaveformKernel kernel_of(const std::string& asked, const Job& job) {
+#define MARS_TRY_LEVEL(level, runs)                                        \
+    if ((asked.empty() || asked == #level) && (runs))                      \
+        return job.avalanches_matter() ? waveform_avalanche_kernel_##level \
+               : job.recording         ? waveform_recording_kernel_##level \
+                                       : waveform_kernel_##level;
+    MARS_EACH_LEVEL(MARS_TRY_LEVEL)
+#undef MARS_TRY_LEVEL
+    throw std::invalid_argument("level must be one that this processor runs, got '" + asked + "'");
 }
 
 // Where the items of a block begin that are warmed up at the start of the exposure.
@@ -100,12 +83,10 @@ void run_waveform(const BoundJob& job, WaveformBlock proto, int threads, const s
             block.start_cycle = cycle.data();
             block.start_phase = phase.data();
         }
-        const std::unique_ptr<double[]> energy(new double[layout.parts + 1]);
-        const std::unique_ptr<int32_t[]> cell(new int32_t[layout.parts + 1]);
+        const std::unique_ptr<double[]> energy(new double[layout.room]);
         const std::unique_ptr<int32_t[]> edges(new int32_t[proto.team * layout.edges]);
         const std::unique_ptr<uint16_t[]> guides(new uint16_t[proto.team * layout.cells]);
         block.energy = energy.get();
-        block.cell = cell.get();
         block.edges = edges.get();
         block.guides = guides.get();
         if (!stop.load(std::memory_order_relaxed)) kernel(block);
@@ -118,8 +99,8 @@ void histogram(const BoundJob& job, Matrix<Count> out, int threads, const std::s
     if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
         throw nb::value_error("out must be (items, bins)");
     WaveformBlock block{};
-    block.sink = sizeof(Count) == 2 ? Sink::kHistogram16 : Sink::kHistogram32;
-    block.out = out.data();
+    block.output.sink = sizeof(Count) == 2 ? Sink::kHistogram16 : Sink::kHistogram32;
+    block.output.out = out.data();
     run_waveform(job, block, threads, level, progress);
 }
 
@@ -136,8 +117,8 @@ void bind_waveform(nb::module_& module) {
            const nb::object& progress) {
             if (static_cast<int64_t>(out.shape(0)) != job.items()) throw nb::value_error("out must be (items,)");
             WaveformBlock block{};
-            block.sink = Sink::kCounts;
-            block.out = out.data();
+            block.output.sink = Sink::kCounts;
+            block.output.out = out.data();
             run_waveform(job, block, threads, level, progress);
         },
         nb::arg("job"), nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("level") = "",
@@ -149,11 +130,11 @@ void bind_waveform(nb::module_& module) {
             if (static_cast<int64_t>(offsets.shape(0)) != job.items() + 1)
                 throw nb::value_error("offsets must be (items + 1,)");
             WaveformBlock block{};
-            block.sink = Sink::kTimestamps;
-            block.offsets = offsets.data();
-            block.times = times.data();
-            block.cycles = cycle.data();
-            block.bins = bin.data();
+            block.output.sink = Sink::kTimestamps;
+            block.output.offsets = offsets.data();
+            block.output.times = times.data();
+            block.output.cycles = cycle.data();
+            block.output.bins = bin.data();
             run_waveform(job, block, threads, level, progress);
         },
         nb::arg("job"), nb::arg("offsets"), nb::arg("times").noconvert(), nb::arg("cycle").noconvert(),

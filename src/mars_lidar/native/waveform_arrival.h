@@ -96,30 +96,63 @@ struct WaveTables {
     const int32_t* edge;
     const uint16_t* guide;
     Int edges, guides;  // where each lane's table begins
-    int32_t shift, group;
+    int32_t parts, shift, group;
 };
 
-// Lanes whose cell holds more than two edges: one by one.
-MARS_NOINLINE inline void walk(const WaveTables& tables, Int energy, Mask lanes, Int& part, Int& low, Int& high) {
-    alignas(64) int32_t e[kLanes], j[kLanes], begin[kLanes], on[kLanes], a[kLanes], b[kLanes];
-    spill(e, energy);
-    spill(j, part);
-    spill(a, low);
-    spill(b, high);
-    spill(begin, tables.edges);
-    spill(on, one_if(lanes));
-    for (int lane = 0; lane < kLanes; ++lane) {
-        if (!on[lane]) continue;
-        const int32_t* const edge = tables.edge + begin[lane];
-        int32_t k = j[lane];
-        while (edge[k + 1] <= e[lane]) ++k;
-        j[lane] = k;
-        a[lane] = edge[k];
-        b[lane] = edge[k + 1];
+// The part that encloses an energy, from one on whose edge is not above it. The last edge is above every energy.
+MARS_NOINLINE inline int32_t part_beyond(const int32_t* edge, int32_t parts, int32_t energy, int32_t low) {
+    int32_t step = kScan, high = low + step < parts ? low + step : parts;
+    for (; edge[high] <= energy; step *= 2) {
+        low = high;
+        high = low + 2 * step < parts ? low + 2 * step : parts;
     }
-    part = load<Int>(j);
+    while (high - low > 1) {
+        const int32_t middle = low + (high - low) / 2;
+        (edge[middle] <= energy ? low : high) = middle;
+    }
+    return low;
+}
+
+// Lanes with more edges to look at than one vector of them: one by one.
+MARS_NOINLINE inline void search_on(const WaveTables& tables, const Int& energy, Mask lanes, Int& part, Int& low,
+                                    Int& high) {
+    alignas(64) int32_t e[kLanes], k[kLanes], begin[kLanes], a[kLanes], b[kLanes];
+    store(e, energy);
+    store(k, part);
+    store(a, low);
+    store(b, high);
+    store(begin, tables.edges);
+    uint64_t left = lane_bits(lanes);
+    for (int lane = 0; left; ++lane, left >>= 1) {
+        if (!(left & 1)) continue;
+        const int32_t* const edge = tables.edge + begin[lane];
+        k[lane] = part_beyond(edge, tables.parts, e[lane], k[lane]);
+        a[lane] = edge[k[lane]];
+        b[lane] = edge[k[lane] + 1];
+    }
+    part = load<Int>(k);
     low = load<Int>(a);
     high = load<Int>(b);
+}
+
+// The part of each lane's waveform that encloses an energy, and the energies at its edges: from the guide on, as many
+// edges as a vector holds at once.
+MARS_INLINE void find_part(const WaveTables& tables, Int energy, Int& part, Int& low, Int& high) {
+    alignas(64) int32_t e[kLanes], cell[kLanes], begin[kLanes], place[kLanes];
+    spill(e, energy);
+    spill(cell, tables.guides + (energy >> tables.shift));
+    spill(begin, tables.edges);
+    const int32_t* const edge = tables.edge;
+    const uint16_t* const guide = tables.guide;
+    const int group = tables.group;
+    for (int lane = 0; lane < kLanes; ++lane) {
+        const int32_t first = begin[lane] + (guide[cell[lane]] << group);
+        place[lane] = first + count_not_above(edge + first + 1, e[lane]);
+    }
+    gather_two(edge, place, low, high);
+    part = load<Int>(place) - tables.edges;
+    const Mask more = energy >= high;
+    if (any(more)) search_on(tables, energy, more, part, low, high);
 }
 
 // C^-1(C(from) + wait).
@@ -133,16 +166,8 @@ MARS_INLINE WaveTime next_arrival(const WaveTables& tables, const WaveTime& from
     const Int turns = plus_if(wait.whole, over);
     const Int energy = minimum(as_int(sum & 0x7fffffffu), splat(kFull - 1));
 
-    Int part = gather_short(tables.guide, tables.guides + (energy >> tables.shift));
-    if (tables.group > 0) part = as_int(as_uint(part) << tables.group);
-    Int edge[4];
-    gather_four(tables.edge, tables.edges + part, edge);
-    // edges that meet enclose nothing: the last one that is not above the energy begins its part
-    const Mask one = energy >= edge[1], two = energy >= edge[2], more = energy >= edge[3];
-    part = plus_if(plus_if(part, one), two);
-    low = select(two, edge[2], select(one, edge[1], edge[0]));
-    high = select(two, edge[3], select(one, edge[2], edge[1]));
-    if (any(more)) walk(tables, energy, more, part, low, high);
+    Int part;
+    find_part(tables, energy, part, low, high);
     const Float inside = quotient(to_float(energy - low) + 0.5f, to_float(high - low));
     const WaveTime hit = {from.cycle + turns, part, minimum(inside, splat(kLastInside))};
     return earlier(before(hit, from), from, hit);  // rounding must not turn time back

@@ -1,28 +1,49 @@
-// Neighbouring integers from places of the lanes' own: loads of 64 and 128 bits, put in order by shuffles, and loads of
-// single 16-bit numbers. As in lanes_vector.h the gather instructions are left alone: they are slow where processors
-// guard against data sampling.
+// Looking things up for the lanes of waveforms: neighbouring integers from places of the lanes' own, loads of 64 bits put in
+// order by shuffles, and the place of a number among ascending ones. As in lanes_vector.h the gather instructions are left
+// alone: they are slow where processors guard against data sampling.
 #pragma once
 #include "lanes.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
 
+constexpr int kScan = 16;  // numbers that are looked at together
+
+// How many of kScan ascending numbers are not above `x`.
+MARS_INLINE int32_t count_not_above(const int32_t* numbers, int32_t x) {
+#if defined(MARS_LEVEL_avx512)
+    const uint32_t above = _mm512_cmpgt_epi32_mask(_mm512_loadu_si512(numbers), _mm512_set1_epi32(x));
+    return __builtin_ctz(above | 1u << kScan);
+#elif defined(MARS_LEVEL_avx2)
+    const __m256i bound = _mm256_set1_epi32(x);
+    const auto above = [&](const int32_t* from) {
+        const __m256i eight = _mm256_loadu_si256((const __m256i*)from);
+        return static_cast<uint32_t>(_mm256_movemask_ps((__m256)_mm256_cmpgt_epi32(eight, bound)));
+    };
+    return __builtin_ctz(above(numbers) | above(numbers + 8) << 8 | 1u << kScan);
+#elif MARS_LANES > 1 && defined(MARS_X86)
+    const __m128i bound = _mm_set1_epi32(x);
+    const auto above = [&](const int32_t* from) {
+        return _mm_cmpgt_epi32(_mm_loadu_si128((const __m128i*)from), bound);
+    };
+    const __m128i low = _mm_packs_epi32(above(numbers), above(numbers + 4));
+    const __m128i high = _mm_packs_epi32(above(numbers + 8), above(numbers + 12));
+    return __builtin_ctz(static_cast<uint32_t>(_mm_movemask_epi8(_mm_packs_epi16(low, high))) | 1u << kScan);
+#elif MARS_LANES > 1
+    int32_t count = 0;
+    for (int k = 0; k < kScan; ++k) count += numbers[k] <= x ? 1 : 0;
+    return count;
+#else
+    int32_t count = 0;
+    while (count < kScan && numbers[count] <= x) ++count;
+    return count;
+#endif
+}
+
 #if MARS_LANES > 1
 #if defined(MARS_X86)
 MARS_INLINE __m128i load_two(const int32_t* table, const int32_t* k) {
     return _mm_castpd_si128(_mm_loadh_pd(_mm_load_sd((const double*)(table + k[0])), (const double*)(table + k[1])));
-}
-MARS_INLINE __m128i load_four(const int32_t* table, int32_t k) { return _mm_loadu_si128((const __m128i*)(table + k)); }
-MARS_INLINE __m128i load_eight_short(const uint16_t* table, const int32_t* k) {
-    __m128i x = _mm_cvtsi32_si128(table[k[0]]);
-    x = _mm_insert_epi16(x, table[k[1]], 1);
-    x = _mm_insert_epi16(x, table[k[2]], 2);
-    x = _mm_insert_epi16(x, table[k[3]], 3);
-    __m128i y = _mm_cvtsi32_si128(table[k[4]]);
-    y = _mm_insert_epi16(y, table[k[5]], 1);
-    y = _mm_insert_epi16(y, table[k[6]], 2);
-    y = _mm_insert_epi16(y, table[k[7]], 3);
-    return _mm_unpacklo_epi64(x, y);
 }
 #endif
 
@@ -41,21 +62,6 @@ MARS_INLINE void gather_two(const int32_t* table, const int32_t* k, HardInt& a, 
     a = (HardInt)_mm512_permutex2var_epi32(low, even, high);
     b = (HardInt)_mm512_permutex2var_epi32(low, odd, high);
 }
-MARS_INLINE void gather_four(const int32_t* t, const int32_t* k, HardInt (&to)[4]) {
-    __m512i row[4];  // lanes n, n + 4, n + 8, n + 12
-    for (int n = 0; n < 4; ++n)
-        row[n] = join(load_four(t, k[n]), load_four(t, k[n + 4]), load_four(t, k[n + 8]), load_four(t, k[n + 12]));
-    const __m512i a = _mm512_unpacklo_epi32(row[0], row[1]), b = _mm512_unpacklo_epi32(row[2], row[3]);
-    const __m512i c = _mm512_unpackhi_epi32(row[0], row[1]), d = _mm512_unpackhi_epi32(row[2], row[3]);
-    to[0] = (HardInt)_mm512_unpacklo_epi64(a, b);
-    to[1] = (HardInt)_mm512_unpackhi_epi64(a, b);
-    to[2] = (HardInt)_mm512_unpacklo_epi64(c, d);
-    to[3] = (HardInt)_mm512_unpackhi_epi64(c, d);
-}
-MARS_INLINE HardInt gather_short(const uint16_t* table, const int32_t* k) {
-    const __m128i low = load_eight_short(table, k), high = load_eight_short(table, k + 8);
-    return (HardInt)_mm512_cvtepu16_epi32(_mm256_inserti128_si256(_mm256_castsi128_si256(low), high, 1));
-}
 #elif defined(MARS_LEVEL_avx2)
 MARS_INLINE __m256i join(__m128i a, __m128i b) { return _mm256_inserti128_si256(_mm256_castsi128_si256(a), b, 1); }
 MARS_INLINE void gather_two(const int32_t* table, const int32_t* k, HardInt& a, HardInt& b) {
@@ -64,19 +70,6 @@ MARS_INLINE void gather_two(const int32_t* table, const int32_t* k, HardInt& a, 
     a = (HardInt)_mm256_shuffle_ps(low, high, 0x88);
     b = (HardInt)_mm256_shuffle_ps(low, high, 0xdd);
 }
-MARS_INLINE void gather_four(const int32_t* t, const int32_t* k, HardInt (&to)[4]) {
-    __m256i row[4];  // lanes n, n + 4
-    for (int n = 0; n < 4; ++n) row[n] = join(load_four(t, k[n]), load_four(t, k[n + 4]));
-    const __m256i a = _mm256_unpacklo_epi32(row[0], row[1]), b = _mm256_unpacklo_epi32(row[2], row[3]);
-    const __m256i c = _mm256_unpackhi_epi32(row[0], row[1]), d = _mm256_unpackhi_epi32(row[2], row[3]);
-    to[0] = (HardInt)_mm256_unpacklo_epi64(a, b);
-    to[1] = (HardInt)_mm256_unpackhi_epi64(a, b);
-    to[2] = (HardInt)_mm256_unpacklo_epi64(c, d);
-    to[3] = (HardInt)_mm256_unpackhi_epi64(c, d);
-}
-MARS_INLINE HardInt gather_short(const uint16_t* table, const int32_t* k) {
-    return (HardInt)_mm256_cvtepu16_epi32(load_eight_short(table, k));
-}
 #else
 MARS_INLINE void gather_two(const int32_t* table, const int32_t* k, HardInt& a, HardInt& b) {
     for (int lane = 0; lane < kHardwareLanes; ++lane) {
@@ -84,49 +77,26 @@ MARS_INLINE void gather_two(const int32_t* table, const int32_t* k, HardInt& a, 
         b[lane] = table[k[lane] + 1];
     }
 }
-MARS_INLINE void gather_four(const int32_t* table, const int32_t* k, HardInt (&to)[4]) {
-    for (int lane = 0; lane < kHardwareLanes; ++lane)
-        for (int n = 0; n < 4; ++n) to[n][lane] = table[k[lane] + n];
-}
-MARS_INLINE HardInt gather_short(const uint16_t* table, const int32_t* k) {
-    HardInt x;
-    for (int lane = 0; lane < kHardwareLanes; ++lane) x[lane] = table[k[lane]];
-    return x;
-}
 #endif
 
-// Entries i and i + 1; i to i + 3; i.
-MARS_INLINE void gather_two(const int32_t* table, Int index, Int& a, Int& b) {
-    alignas(64) int32_t k[kLanes];
-    spill(k, index);
+// Entries k and k + 1 of each lane.
+MARS_INLINE void gather_two(const int32_t* table, const int32_t (&k)[kLanes], Int& a, Int& b) {
     gather_two(table, k, a.low, b.low);
     gather_two(table, k + kHardwareLanes, a.high, b.high);
 }
-MARS_INLINE void gather_four(const int32_t* table, Int index, Int (&to)[4]) {
-    alignas(64) int32_t k[kLanes];
-    spill(k, index);
-    HardInt low[4], high[4];
-    gather_four(table, k, low);
-    gather_four(table, k + kHardwareLanes, high);
-    for (int n = 0; n < 4; ++n) to[n] = {low[n], high[n]};
-}
-MARS_INLINE Int gather_short(const uint16_t* table, Int index) {
-    alignas(64) int32_t k[kLanes];
-    spill(k, index);
-    return {gather_short(table, k), gather_short(table, k + kHardwareLanes)};
-}
 MARS_INLINE Float quotient(Float a, Float b) { return {a.low / b.low, a.high / b.high}; }
 #else
-MARS_INLINE void gather_two(const int32_t* table, Int index, Int& a, Int& b) {
-    a = table[index];
-    b = table[index + 1];
+MARS_INLINE void gather_two(const int32_t* table, const int32_t (&k)[kLanes], Int& a, Int& b) {
+    a = table[k[0]];
+    b = table[k[0] + 1];
 }
-MARS_INLINE void gather_four(const int32_t* table, Int index, Int (&to)[4]) {
-    for (int n = 0; n < 4; ++n) to[n] = table[index + n];
-}
-MARS_INLINE Int gather_short(const uint16_t* table, Int index) { return table[index]; }
 MARS_INLINE Float quotient(Float a, Float b) { return a / b; }
 #endif
+MARS_INLINE void gather_two(const int32_t* table, Int index, Int& a, Int& b) {
+    alignas(64) int32_t k[kLanes];
+    spill(k, index);
+    gather_two(table, k, a, b);
+}
 
 }  // namespace MARS_LEVEL
 }  // namespace mars

@@ -16,15 +16,9 @@ struct WaveformBlock {
     int64_t first_realization, realizations;  // relative to the job's first
     const int32_t* start_cycle;  // (pixels, realizations) where the search begins, or null: armed at 0
     const double* start_phase;   // in periods, [0, 1)
-    Sink sink;
-    void* out;               // of the job: counts int64 (items); histograms (items, bins), not yet zeroed
-    const int64_t* offsets;  // timestamps: first record of each item
-    double* times;           // timestamps, in periods; likewise below
-    int32_t* cycles;
-    int32_t* bins;
+    Output output;
     int64_t team;            // tables that there is memory for: waveform_table.h
-    double* energy;          // to work in: (samples + 1)
-    int32_t* cell;           // likewise
+    double* energy;          // to work in
     int32_t* edges;
     uint16_t* guides;
     const std::atomic<bool>* stop;
@@ -32,25 +26,14 @@ struct WaveformBlock {
 
 using WaveformKernel = void (*)(const WaveformBlock&);
 
-#ifdef MARS_HAS_scalar
-void waveform_kernel_scalar(const WaveformBlock& block);
-void waveform_recording_kernel_scalar(const WaveformBlock& block);
-void waveform_avalanche_kernel_scalar(const WaveformBlock& block);
-#endif
-#ifdef MARS_HAS_vector128
-void waveform_kernel_vector128(const WaveformBlock& block);
-void waveform_recording_kernel_vector128(const WaveformBlock& block);
-void waveform_avalanche_kernel_vector128(const WaveformBlock& block);
-#endif
-#ifdef MARS_HAS_avx2
-void waveform_kernel_avx2(const WaveformBlock& block);
-void waveform_recording_kernel_avx2(const WaveformBlock& block);
-void waveform_avalanche_kernel_avx2(const WaveformBlock& block);
-#endif
-#ifdef MARS_HAS_avx512
-void waveform_kernel_avx512(const WaveformBlock& block);
-void waveform_recording_kernel_avx512(const WaveformBlock& block);
-void waveform_avalanche_kernel_avx512(const WaveformBlock& block);
-#endif
+#define MARS_DECLARE_WAVEFORM(level)                                 \
+    void waveform_kernel_##level(const WaveformBlock& block);           \
+    void waveform_recording_kernel_##level(const WaveformBlock& block); \
+    void waveform_avalanche_kernel_##level(const WaveformBlock& block);
+
+MARS_DECLARE_WAVEFORM(scalar)
+MARS_DECLARE_WAVEFORM(vector128)
+MARS_DECLARE_WAVEFORM(avx2)
+MARS_DECLARE_WAVEFORM(avx512)
 
 }  // namespace mars

@@ -21,16 +21,29 @@ struct PartClock {
         alignas(64) double phase[kLanes];
     };
 
+    // The time of one lane.
+    struct Moment {
+        int32_t cycle, part;
+        float inside;
+
+        bool operator<(const Moment& other) const {
+            if (cycle != other.cycle) return cycle < other.cycle;
+            return part != other.part ? part < other.part : inside < other.inside;
+        }
+    };
+
     // One time per lane as plain numbers.
     struct TimeArray {
         int32_t cycle[kLanes], part[kLanes];
         float inside[kLanes];
 
-        void forget(int lane) {
-            cycle[lane] = INT32_MIN;
-            part[lane] = 0;
-            inside[lane] = 0.0f;
+        Moment get(int lane) const { return {cycle[lane], part[lane], inside[lane]}; }
+        void set(int lane, const Moment& time) {
+            cycle[lane] = time.cycle;
+            part[lane] = time.part;
+            inside[lane] = time.inside;
         }
+        void forget(int lane) { set(lane, {INT32_MIN, 0, 0.0f}); }
         void save(const Time& time) {
             store(cycle, time.cycle);
             store(part, time.part);
@@ -68,26 +81,28 @@ struct PartClock {
     }
 
     // `convert` of recording_view.h in double precision.
-    template <bool timed>
-    MARS_INLINE void convert_time(const CodeTable& codes, Registration& r) const {
+    MARS_INLINE void convert_time(const CodeTable& codes, Registration& r, bool timed) const {
         alignas(64) int32_t bin[kLanes];
         for (int lane = 0; lane < kLanes; ++lane) {
             const double told = converted(codes, r.phase[lane], bin[lane]);
-            if constexpr (timed) r.phase[lane] = told;
+            if (timed) r.phase[lane] = told;
         }
         r.bin = load<Int>(bin);
     }
 
-    // The time of a lane as whole periods and the rest of one in [0, 1), or in units of 2^-32.
-    static int32_t whole(const TimeArray& from, int lane) { return from.cycle[lane]; }
-    double rest(const TimeArray& from, int lane) const {
-        return (static_cast<double>(from.part[lane]) + static_cast<double>(from.inside[lane])) / parts;
-    }
-    void put(TimeArray& to, int lane, int32_t whole, uint32_t rest) const {
-        const uint64_t at = static_cast<uint64_t>(rest) * static_cast<uint64_t>(parts);
-        to.cycle[lane] = whole;
-        to.part[lane] = static_cast<int32_t>(at >> 32);
-        to.inside[lane] = static_cast<float>(static_cast<int32_t>((at & 0xffffffffu) >> 8)) * 0x1p-24f;
+    // For releases of carriers (trap_lanes.h).
+    static constexpr int32_t kNever = INT32_MAX;
+    static Moment never() { return {kNever, 0, 0.0f}; }
+    static Time all_never() { return {splat(kNever), splat(0), splat(0.0f)}; }
+    MARS_INLINE static Int period(const Time& time) { return time.cycle; }
+    MARS_INLINE Time after(const Time& time, const Wait& wait) const {
+        UInt part, inside;  // of the fraction, in units of 2^-24 period, times T
+        multiply(as_uint(truncate(wait.fraction * 0x1p24f)) << 8, static_cast<uint32_t>(parts), part, inside);
+        const Float sum = time.inside + to_float(as_int(inside >> 8)) * 0x1p-24f;
+        const Mask carry = sum >= 1.0f;
+        const Int sum_part = plus_if(time.part + as_int(part), carry);
+        const Mask turn = sum_part >= parts;
+        return {plus_if(time.cycle + wait.whole, turn), select(turn, sum_part - parts, sum_part), minus_if(sum, carry)};
     }
 
     static constexpr double kLastPhase = 1.0 - 0x1p-53;

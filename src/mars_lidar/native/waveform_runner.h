@@ -5,7 +5,7 @@
 #include <cstring>
 #include <type_traits>
 
-#include "exact_writers.h"
+#include "lane_log.h"
 #include "trap_lanes.h"
 #include "waveform_kernel.h"
 #include "waveform_modes.h"
@@ -22,68 +22,20 @@ constexpr int kWaitsAhead = 8;             // registrations drawn ahead
 constexpr int kRoundsToPoll = 512;         // between looks at `stop`
 constexpr int32_t kIdleCycle = 100000001;  // every exposure has ended; + kWaitsAhead (kForever + t_d) fits 32 bits
 
-// What is logged for timestamps: phases in double precision, finer than those of exact_writers.h.
-template <Sink sink>
-struct WaveLog : Log<sink> {};
-template <>
-struct WaveLog<Sink::kTimestamps> {
-    alignas(64) int32_t bin[kLog][kLanes], cycle[kLog][kLanes];
-    alignas(64) double phase[kLog][kLanes];
-};
-
-ExactBlock output_of(const WaveformBlock& block) {
-    ExactBlock output{};
-    output.job = block.job;
-    output.out = block.out;
-    return output;
-}
-
-// Writes the rows of single lanes, slots being items of the job.
-template <Sink sink>
-struct WaveWriter {
-    ExactBlock output;
-    Writer<sink> writer;
-
-    explicit WaveWriter(const WaveformBlock& block) : output(output_of(block)), writer(output) {}
-    void open(int, int64_t item) { writer.open(item); }
-    template <int n>
-    void write(const int64_t* items, const WaveLog<sink>& log, int lane, int from, int to) {
-        writer.template write<n>(items, log, lane, from, to);
-    }
-};
-
-template <>
-struct WaveWriter<Sink::kTimestamps> {
-    const WaveformBlock& block;
-    int64_t next[kLanes];
-
-    explicit WaveWriter(const WaveformBlock& b) : block(b) {}
-    void open(int lane, int64_t item) { next[lane] = block.offsets[item]; }
-    template <int n>
-    void write(const int64_t*, const WaveLog<Sink::kTimestamps>& log, int first, int from, int to) {
-        for (int lane = first; lane < first + n; ++lane)
-            for (int k = from; k < to; ++k) {
-                if (log.bin[k][lane] < 0) continue;
-                const int64_t record = next[lane]++;
-                block.times[record] = static_cast<double>(log.cycle[k][lane]) + log.phase[k][lane];
-                block.cycles[record] = log.cycle[k][lane];
-                block.bins[record] = log.bin[k][lane];
-            }
-    }
-};
-
-template <DetectorMode mode, Stage stage, Sink sink>
+// `timed` runners can tell the times of registrations; those with a recorder always can.
+template <DetectorMode mode, Stage stage, bool timed>
 class WaveRunner {
     static constexpr bool kRecords = stage != Stage::kPlain, kTraps = stage == Stage::kAvalanches;
-    static constexpr bool kTimed = sink == Sink::kTimestamps;
 
 public:
     explicit WaveRunner(const WaveformBlock& block)
         : block_(block), job_(*block.job), system_(wave_system(job_)), layout_(job_.samples),
           bins_per_part_(static_cast<double>(job_.bins) / static_cast<double>(job_.samples)), recorder_(job_),
-          traps_(job_), twilight_(wave_span(job_.twilight, system_.parts)), writer_(block) {
+          traps_(job_), twilight_(mode == DetectorMode::kNonparalyzable && job_.twilight > 0.0),
+          twilight_span_(wave_span(job_.twilight, system_.parts)), log_(block.output, job_) {
         tables_.edge = block.edges;
         tables_.guide = block.guides;
+        tables_.parts = system_.parts;
         tables_.shift = layout_.shift;
         tables_.group = layout_.group;
     }
@@ -91,57 +43,67 @@ public:
     void run() {
         for (int lane = 0; lane < kLanes; ++lane) take(lane);
         load_items();
+        fetch_from(pixel_);
         for (int round = 1; running_ > 0; ++round) {
-            WaveWait ahead[kWaitsAhead];
-            for (int k = 0; k < kWaitsAhead; ++k)
-                ahead[k] = draw_wave(rates_, key0_, key1_, event_ + static_cast<uint32_t>(k));
-            for (int k = 0; k < kWaitsAhead; ++k) step(ahead[k], k);
+            // each draw beside the search of the one before it, which waits for tables
+            WaveWait wait = draw(0);
+            for (int k = 0; k < kWaitsAhead; ++k) {
+                const WaveWait next = k + 1 < kWaitsAhead ? draw(k + 1) : wait;
+                step(wait, k);
+                wait = next;
+                fetch();
+            }
             if constexpr (kRecords) record();
             event_ = event_ + static_cast<uint32_t>(kWaitsAhead);
-            rows_ += kWaitsAhead;
+            log_.advance(kWaitsAhead);
             if (any(from_.cycle >= system_.cycles)) exchange();
-            if (rows_ == kLog) flush();
+            if (log_.full()) log_.flush();
             if (round % kRoundsToPoll == 0 && block_.stop->load(std::memory_order_relaxed)) return;
         }
     }
 
 private:
+    MARS_INLINE WaveWait draw(int k) const {
+        return draw_wave(rates_, key0_, key1_, event_ + static_cast<uint32_t>(k));
+    }
+
     MARS_INLINE void step(const WaveWait& wait, int k) {
         WaveTime from = from_;
         if constexpr (kTraps) from = search_start(k);
         WaveTime hit = next_arrival(tables_, from, wait);
-        Int generation = splat(0);
-        if constexpr (kTraps) generation = earliest_arrival(hit);
+        Int generation;
+        if constexpr (kTraps) {
+            traps_.take_earlier(hit, generation);
+            if (mode == DetectorMode::kNonparalyzable && twilight_) hit = earlier(before(hit, from_), from_, hit);
+        }
         // inside the exposure: 0 <= cycle < cycles, one unsigned comparison
         const Mask outside = as_uint(hit.cycle) >= static_cast<uint32_t>(system_.cycles);
         const Mask unseen = advance<mode>(system_, hit, from_, memory_);
-        if constexpr (kTraps) traps_.avalanche(select(unseen, splat(1), splat(0)) == 0, hit, generation);
+        if constexpr (kTraps) traps_.avalanche(except(splat(1) > 0, unseen), hit, generation, key0_, key1_);
         if constexpr (kRecords) {
             const Int bin = place<true>(hit, seen_[k].phase);
             seen_[k].hit = hit;
             seen_[k].cycle = hit.cycle;
             seen_[k].lost = outside | unseen;
             seen_[k].bin = bin;
-        } else if constexpr (kTimed) {
-            const Int bin = place<true>(hit, log_.phase[rows_ + k]);
-            log(rows_ + k, outside | unseen, bin, hit.cycle);
         } else {
-            log(rows_ + k, outside | unseen, place<false>(hit, nullptr), hit.cycle);
+            if constexpr (timed) log_.put_cycle(k, hit.cycle);
+            log_.put(k, outside | unseen, place<timed>(hit, log_.phase(k)));
         }
     }
 
     // The bin of a time and, where asked for, its phase in periods.
-    template <bool timed>
+    template <bool told>
     MARS_INLINE Int place(const WaveTime& hit, double* phase) const {
         Int bin = hit.part;
-        if (timed || system_.bins != system_.parts) {
+        if (told || system_.bins != system_.parts) {
             alignas(64) int32_t part[kLanes];
             alignas(64) float inside[kLanes];
             store(part, hit.part);
             store(inside, hit.inside);
             for (int lane = 0; lane < kLanes; ++lane) {
                 const double x = static_cast<double>(part[lane]) + static_cast<double>(inside[lane]);
-                if constexpr (timed) phase[lane] = x / system_.parts;
+                if constexpr (told) phase[lane] = x / system_.parts;
                 part[lane] = static_cast<int32_t>(x * bins_per_part_);
             }
             if (system_.bins != system_.parts) bin = minimum(load<Int>(part), splat(system_.bins - 1));
@@ -149,17 +111,13 @@ private:
         return bin;
     }
 
-    MARS_INLINE void log(int row, Mask lost, Int bin, Int cycle) {
-        if constexpr (kTimed) store(log_.cycle[row], cycle);
-        store(log_.bin[row], select(lost, splat(-1), bin));
-    }
-
     // Records the registrations of a round.
     MARS_INLINE void record() {
-        recorder_.template take<kTimed>(seen_, key0_, key1_, event_);
+        recorder_.take(seen_, key0_, key1_, event_, log_.wants_times());
         for (int k = 0; k < kWaitsAhead; ++k) {
-            if constexpr (kTimed) memcpy(log_.phase[rows_ + k], seen_[k].phase, sizeof seen_[k].phase);
-            log(rows_ + k, seen_[k].lost, seen_[k].bin, seen_[k].cycle);
+            log_.put(k, seen_[k].lost, seen_[k].bin);
+            log_.put_cycle(k, seen_[k].cycle);
+            memcpy(log_.phase(k), seen_[k].phase, sizeof seen_[k].phase);
         }
         if (recorder_.fills())  // nothing more can be recorded there
             from_.cycle = select(recorder_.full(), splat(kIdleCycle), from_.cycle);
@@ -168,50 +126,12 @@ private:
     // Where the search for the next arrival begins, as in exact_runner.h; carriers released before that are lost.
     MARS_INLINE WaveTime search_start(int k) {
         WaveTime from = from_;
-        if constexpr (mode == DetectorMode::kNonparalyzable) {
+        if (mode == DetectorMode::kNonparalyzable && twilight_) {
             const Mask after_another = event_ + static_cast<uint32_t>(k) > 0u;
-            from = earlier(after_another, sooner(from_, twilight_, system_.parts), from_);
+            from = earlier(after_another, sooner(from_, twilight_span_, system_.parts), from_);
         }
         traps_.lose(from);
         return from;
-    }
-
-    // Of the next photon and the next carrier the one that comes first is the next arrival; its generation.
-    MARS_INLINE Int earliest_arrival(WaveTime& hit) {
-        const WaveTime release = traps_.next();
-        const Mask first = before(release, hit);
-        Int generation = splat(0);
-        if (any(first)) {
-            hit = earlier(first, release, hit);
-            generation = select(first, traps_.generation(), generation);
-            traps_.drop(first);
-        }
-        if constexpr (mode == DetectorMode::kNonparalyzable) hit = earlier(before(hit, from_), from_, hit);
-        return generation;
-    }
-
-    // Writes what a lane has logged for its present item, up to row `to`.
-    void flush(int lane, int to) {
-        if (items_[lane] >= 0) writer_.template write<1>(items_ + lane, log_, lane, first_row_[lane], to);
-        first_row_[lane] = to;
-    }
-
-    // Empties the log, several lanes at once where all have work.
-    MARS_NOINLINE void flush() {
-        constexpr int team = kLanes < 4 ? kLanes : 4;
-        for (int lane = 0; lane < kLanes; lane += team) {
-            int common = 0;
-            bool busy = true;
-            for (int i = lane; i < lane + team; ++i) {
-                if (first_row_[i] > common) common = first_row_[i];
-                busy = busy && items_[i] >= 0;
-            }
-            if (!busy) common = rows_;
-            for (int i = lane; i < lane + team; ++i) flush(i, common);
-            if (busy) writer_.template write<team>(items_ + lane, log_, lane, common, rows_);
-        }
-        memset(first_row_, 0, sizeof first_row_);
-        rows_ = 0;
     }
 
     // Gives the lanes whose exposure has ended another item.
@@ -226,10 +146,10 @@ private:
             store(ready_inside_, memory_.ready.inside);
         }
         if constexpr (kRecords) recorder_.save_lanes();
+        if constexpr (kTraps) traps_.save_lanes();
         for (int lane = 0; lane < kLanes; ++lane) {
             if (cycle_[lane] < system_.cycles) continue;
-            flush(lane, rows_);
-            if (items_[lane] >= 0) {
+            if (log_.busy(lane)) {
                 --running_;
                 --users_[slot_[lane]];
             }
@@ -243,8 +163,7 @@ private:
         events_[lane] = 0;
         if constexpr (kRecords) recorder_.begin(lane);
         if constexpr (kTraps) traps_.close(lane);
-        first_row_[lane] = rows_;
-        items_[lane] = -1;
+        log_.assign(lane, -1);
         slot_[lane] = 0;
         rates_.total[lane] = rates_.inverse[lane] = 0.0;
         cycle_[lane] = kIdleCycle;
@@ -259,7 +178,7 @@ private:
             while (realization_ < block_.realizations) {
                 const int64_t place = pixel_ * block_.realizations + realization_;
                 const int64_t r = block_.first_realization + realization_++, item = r * job_.pixels + pixel;
-                writer_.open(lane, item);
+                log_.clear(item);
                 if (!(photons_ >= 1e-30)) continue;
                 begin(lane, place);
                 rates_.total[lane] = photons_;
@@ -269,7 +188,7 @@ private:
                 key0s_[lane] = key.first;
                 key1s_[lane] = key.second;
                 if constexpr (kTraps) traps_.open(lane, key.first, key.second);
-                items_[lane] = item;
+                log_.assign(lane, item);
                 slot_[lane] = latest_;
                 ++users_[latest_];
                 ++running_;
@@ -294,8 +213,24 @@ private:
         latest_ = 0;
         while (users_[latest_] > 0) ++latest_;
         photons_ = fill_table(layout_, job_.waveform + pixel * job_.samples, job_.background[pixel],
-                              {block_.energy, block_.cell}, block_.edges + latest_ * layout_.edges,
+                              block_.energy, block_.edges + latest_ * layout_.edges,
                               block_.guides + latest_ * layout_.cells);
+        fetch_from(pixel_ + 1);
+    }
+
+    // Asks for the waveform of the next pixel, a little at a time: the memory then works while the lanes do.
+    void fetch_from(int64_t pixel) {
+        const bool more = pixel < block_.pixels;
+        fetch_ = more ? job_.waveform + (block_.first_pixel + pixel) * job_.samples : nullptr;
+        fetch_end_ = more ? fetch_ + job_.samples : nullptr;
+    }
+    MARS_INLINE void fetch() {
+#if defined(__GNUC__)
+        constexpr int kLines = 32, kLine = 8;
+        if (fetch_ >= fetch_end_) return;
+        for (int line = 0; line < kLines; ++line) __builtin_prefetch(fetch_ + line * kLine, 0, 2);
+        fetch_ += kLines * kLine;
+#endif
     }
 
     void load_items() {
@@ -312,6 +247,7 @@ private:
         from_ = {load<Int>(cycle_), load<Int>(part_), load<Float>(inside_)};
         memory_.ready = {load<Int>(ready_cycle_), load<Int>(ready_part_), load<Float>(ready_inside_)};
         if constexpr (kRecords) recorder_.load_lanes();
+        if constexpr (kTraps) traps_.load_lanes();
     }
 
     const WaveformBlock& block_;
@@ -333,31 +269,28 @@ private:
     float inside_[kLanes], ready_inside_[kLanes];
     int32_t ready_cycle_[kLanes], ready_part_[kLanes];
     uint32_t key0s_[kLanes] = {}, key1s_[kLanes] = {}, events_[kLanes];
-    int64_t items_[kLanes];  // of the job, or -1
-    int32_t slot_[kLanes];   // the table of a lane
-    int first_row_[kLanes];
+    int32_t slot_[kLanes];  // the table of a lane
 
     int64_t pixel_ = 0, realization_ = 0;  // the next item
+    const double *fetch_ = nullptr, *fetch_end_ = nullptr;  // of its waveform, what has not been asked for
     int32_t latest_ = 0;                   // slot of the latest pixel's table ...
     double photons_ = 0.0;                 // ... and its photons per period
     int users_[kLanes + 1] = {};           // lanes that use each slot
-    int running_ = 0, rows_ = 0;
+    int running_ = 0;
     std::conditional_t<kRecords, Recorder<PartClock>, NoRecorder> recorder_;
     PartClock::Registration seen_[kRecords ? kWaitsAhead : 1];
     std::conditional_t<kTraps, TrapLanes<PartClock>, NoTraps> traps_;
-    const WaveSpan twilight_;
-    WaveWriter<sink> writer_;
-    WaveLog<sink> log_;
+    const bool twilight_;
+    const WaveSpan twilight_span_;
+    LaneLog<double, timed> log_;
 };
 
 template <DetectorMode mode, Stage stage>
 void run(const WaveformBlock& block) {
-    switch (block.sink) {
-        case Sink::kCounts: return WaveRunner<mode, stage, Sink::kCounts>(block).run();
-        case Sink::kHistogram16: return WaveRunner<mode, stage, Sink::kHistogram16>(block).run();
-        case Sink::kHistogram32: return WaveRunner<mode, stage, Sink::kHistogram32>(block).run();
-        case Sink::kTimestamps: return WaveRunner<mode, stage, Sink::kTimestamps>(block).run();
-    }
+    const bool timed = block.output.sink == Sink::kTimestamps;
+    if constexpr (stage != Stage::kPlain) WaveRunner<mode, stage, true>(block).run();
+    else if (timed) WaveRunner<mode, stage, true>(block).run();
+    else WaveRunner<mode, stage, false>(block).run();
 }
 
 template <Stage stage>

@@ -16,14 +16,6 @@ from mars_lidar.learn.unet import CubeUNet
 PLAN = FitPlan(steps=12, batch=2, every=4, patience=9, rate=5e-3)
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def examples(number: int, seed: int) -> Examples:
     """Maps of two halves, told by which of the bins is bright."""
     random = np.random.default_rng(seed)

@@ -235,6 +235,52 @@ def test_buffers_are_not_given_out_while_they_are_held():
     assert len(freed) <= 6  # memory is used again
 
 
+def _half(example):
+    return example["cube"][:32], {"own": example["cube"].sum(), "index": example["index"]}
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.parametrize("settings", [{"batch_size": 2}, {}, {"batch_size": 2, "axes": "HWT", "dtype": None}])
+def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
+    """Views, arrays and whole batches, of more batches than a worker has pieces of memory; and their memory comes back.
+
+    As PyTorch sees them they are ordinary tensors, also where the loader stacks them, and after a transform.
+    """
+    dataset = stream(SYSTEM, epoch_size=40, **settings)
+    held = [(one["cube"][..., :3].numpy(), one) for one in loader(dataset, 2, batch_size=None)]
+    for (part, one), alone in zip(held, dataset, strict=True):
+        assert type(one["cube"]) is torch.Tensor
+        assert_same(one, alone)
+        assert np.array_equal(part, alone["cube"][..., :3].numpy())
+        one["cube"].zero_()  # it is the receiver's own
+    again = [one["cube"].data_ptr() for one in loader(dataset, 1, batch_size=None)]
+    assert len(set(again)) <= 6
+    changed = [one for one in loader(stream(SYSTEM, epoch_size=4, transform=_half), 1, batch_size=None)]
+    for (part, rest), alone in zip(changed, stream(SYSTEM, epoch_size=4), strict=True):
+        assert torch.equal(part, alone["cube"][:32])
+        assert float(rest["own"]) == float(alone["cube"].sum())
+    stacked = list(loader(stream(SYSTEM, epoch_size=4), 2, batch_size=2))
+    assert sorted(stacked[0]["index"].tolist() + stacked[1]["index"].tolist()) == [0, 1, 2, 3]
+    assert type(stacked[0]["cube"]) is torch.Tensor
+    assert stacked[0]["cube"].shape == (2, 64, 6, 6)
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+def test_memory_of_workers_is_given_back():
+    from mars_lidar.learn import passing
+
+    if not passing.ABLE:
+        pytest.skip("slots need memfd (Linux)")
+    for _ in range(2):
+        batches = iter(loader(stream(SYSTEM, epoch_size=60, batch_size=2), 2, batch_size=None))
+        held = list(itertools.islice(batches, 24))  # more than workers use again
+        assert len(passing._mapped) <= 2 * passing._KEPT  # of this loader: the last one's have ended
+        del held
+        for _ in batches:
+            pass
+        del batches
+
+
 def test_mixed_counts_and_types():
     wide = SYSTEM.replace(detector=ml.Detector(dead_time_ns=0.0))
     assert wide.histogram_dtype == np.uint32

@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mars_lidar.learn.fit import Examples, FitPlan, Fitted
-    from mars_lidar.learn.forward import armed_periods, bin_photons, expected_histogram, histogram_log_likelihood
+    from mars_lidar.learn.forward import expected_histogram
     from mars_lidar.learn.inverse import LidarPhysics
+    from mars_lidar.learn.light import bin_photons
+    from mars_lidar.learn.likelihood import armed_periods, histogram_log_likelihood
     from mars_lidar.learn.ranges import Choice, LogUniform, SystemRange, Uniform
     from mars_lidar.learn.stored import StoredDataset
     from mars_lidar.learn.stream import CubeStream
+    from mars_lidar.learn.tabulated import HistogramTable
     from mars_lidar.learn.unet import CubeUNet
 
 _MODULES = {
@@ -23,15 +26,16 @@ _MODULES = {
     "Examples": "fit",
     "FitPlan": "fit",
     "Fitted": "fit",
+    "HistogramTable": "tabulated",
     "LidarPhysics": "inverse",
     "LogUniform": "ranges",
     "StoredDataset": "stored",
     "SystemRange": "ranges",
     "Uniform": "ranges",
-    "armed_periods": "forward",
-    "bin_photons": "forward",
+    "armed_periods": "likelihood",
+    "bin_photons": "light",
     "expected_histogram": "forward",
-    "histogram_log_likelihood": "forward",
+    "histogram_log_likelihood": "likelihood",
 }
 
 
@@ -50,6 +54,7 @@ __all__ = [
     "Examples",
     "FitPlan",
     "Fitted",
+    "HistogramTable",
     "LidarPhysics",
     "LogUniform",
     "StoredDataset",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mars_lidar import _validate
 from mars_lidar._memory import check_memory
 from mars_lidar.engines import Engine
+from mars_lidar.learn.passing import ABLE, Slot, Slots
 from mars_lidar.learn.sample import Sample
 from mars_lidar.simulate import simulate
 from mars_lidar.system import System
@@ -37,7 +38,7 @@ class CubeMaker:
             raise TypeError(f"dtype must be a torch.dtype, or None for the counts as they are, got {dtype!r}")
         self._counts = max((system.histogram_dtype for system in systems), key=lambda dtype: dtype.itemsize)
         self._dtype = dtype
-        self._buffers = Buffers()
+        self._buffers, self._slots = Buffers(), Slots()
         self.device = torch.device(device)
         if self.device.type not in ("cpu", "cuda"):
             raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
@@ -49,36 +50,42 @@ class CubeMaker:
         """Whether cubes are made on a GPU."""
         return self.device.type == "cuda"
 
-    def cubes(self, samples: Sequence[Sample], threads: int, shared: bool) -> torch.Tensor:
-        """(samples, T, H, W) or (samples, H, W, T); `shared`: for another process."""
+    def cubes(self, samples: Sequence[Sample], threads: int, shared: bool) -> tuple[torch.Tensor, Slot | None]:
+        """(samples, T, H, W) or (samples, H, W, T); `shared`: for another process, and the slot that it is in."""
         shapes = {sample.flux.shape for sample in samples}
         if len(shapes) > 1:
             raise ValueError(f"scenes must be of one size to be stacked, got {sorted(shapes)}; give size")
         shape = (len(samples), *shapes.pop(), samples[0].system.bins)
         if self.on_gpu:
             counts = torch.stack([self._simulated_on_gpu(sample) for sample in samples])
-            return self._finished(counts if self._layout == "dense" else counts.to_sparse())
+            return self._finished(counts if self._layout == "dense" else counts.to_sparse()), None
         check_memory(int(np.prod(shape)) * self._counts.itemsize, f"cubes of shape {shape}", "use a smaller batch_size")
         kind = _UNSIGNED[self._counts]
         wanted = kind if self._dtype is None else self._dtype
         if self._layout == "sparse":
-            counts = self._room(shape, kind, shared=False)
+            counts = self._buffers.take(shape, kind)
             for place, sample in enumerate(samples):
                 self._simulated(sample, counts[place : place + 1].numpy(), threads)
-            return self._finished(_sparse(counts.numpy()))
-        cube = self._room(shape, wanted, shared)
+            return self._finished(_sparse(counts.numpy())), None
+        slot: Slot | None = None
+        if shared and ABLE:
+            cube, slot = self._slots.take(shape, wanted)
+        elif shared:
+            cube = _shared(shape, wanted)
+        else:
+            cube = self._buffers.take(shape, wanted)
         for place, sample in enumerate(samples):
             part = cube[place : place + 1]
             if wanted == kind:
                 self._simulated(sample, part.numpy(), threads)
                 continue
-            counts = self._room((1, *shape[1:]), kind, shared=False)  # converted while it is still in the cache
+            counts = self._buffers.take((1, *shape[1:]), kind)  # converted while it is still in the cache
             self._simulated(sample, counts.numpy(), threads)
             if wanted == torch.bfloat16:  # which NumPy does not know
                 part.copy_(counts)
             else:  # by this thread: those of torch would spin for longer than this takes
                 np.copyto(part.numpy(), counts.numpy(), casting="unsafe")
-        return self._turned(cube)
+        return self._turned(cube), slot
 
     def _simulated(self, sample: Sample, out: NDArray[Any], threads: int) -> None:
         own = sample.system.histogram_dtype == self._counts
@@ -88,14 +95,6 @@ class CubeMaker:
         )  # fmt: skip
         if not own:
             out[:] = made
-
-    def _room(self, shape: tuple[int, ...], dtype: torch.dtype, shared: bool) -> torch.Tensor:
-        """A tensor to fill: in shared memory where it leaves for another process, else where an earlier one was."""
-        if shared:
-            fresh: torch.Tensor = torch.empty(shape, dtype=dtype)
-            fresh.share_memory_()  # type: ignore[no-untyped-call]
-            return fresh
-        return self._buffers.take(shape, dtype)
 
     def _finished(self, cube: torch.Tensor) -> torch.Tensor:
         return self._turned(cube if self._dtype is None else cube.to(self._dtype))
@@ -112,6 +111,13 @@ class CubeMaker:
             made = simulate(sample.flux, sample.system, engine=self._engine, seed=sample.seed, **options)
         tensor: torch.Tensor = torch.utils.dlpack.from_dlpack(made)[0]
         return tensor
+
+
+def _shared(shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+    """In PyTorch's shared memory, from the beginning: to move a tensor there is to write it twice."""
+    size = int(np.prod(shape)) * dtype.itemsize
+    memory = torch.UntypedStorage._new_shared(size)  # type: ignore[no-untyped-call]
+    return torch.empty(0, dtype=dtype).set_(memory).view(shape)
 
 
 def _sparse(counts: NDArray[Any]) -> torch.Tensor:

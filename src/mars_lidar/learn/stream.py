@@ -22,6 +22,7 @@ except ImportError as _error:
 from mars_lidar.engines import Engine, find_engine
 from mars_lidar.io.scan import SceneFile
 from mars_lidar.learn.cubes import CubeMaker
+from mars_lidar.learn.passing import forget, passed
 from mars_lidar.learn.places import rank_of, worker_of
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.sample import Recipe, Sample, maps_of, numbers_of
@@ -206,6 +207,8 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         info = get_worker_info()
         if info is not None and self._maker.on_gpu:
             raise ValueError("device='cuda' simulates in the process of the loader: use num_workers=0")
+        if info is not None:
+            forget()
         threads = self._threads or max(1, _processors() // workers)
         self._given = 0
         for place, indices in enumerate(self._batches(start)):
@@ -229,7 +232,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
 
     def _example(self, samples: list[Sample], threads: int, shared: bool) -> dict[str, Any]:
         device = self._maker.device
-        cube = self._maker.cubes(samples, threads, shared)
+        cube, slot = self._maker.cubes(samples, threads, shared)
         maps = [maps_of(one) for one in samples]
         stacked = {
             name: torch.from_numpy(np.stack([one[name] for one in maps]).astype(np.float32)).to(device)
@@ -247,7 +250,9 @@ class CubeStream(IterableDataset[dict[str, Any]]):
             "index": torch.tensor([one.index for one in samples]),
             "seed": torch.tensor([one.seed for one in samples]),
         }
-        return example if self._batch is not None else _first(example)
+        if self._batch is None:
+            example = _first(example)
+        return passed(example, example["cube"], slot) if shared else example
 
 
 def _first(example: Any) -> Any:

@@ -104,6 +104,17 @@ def test_random_system(case: Case):
     check(ENGINES["exact"], case, ENGINES["sequential"], EVERYTHING)
 
 
+@pytest.mark.parametrize("pulse", ["gaussian", "sampled"])
+@pytest.mark.parametrize("mode", ["synchronous", "gated"])
+def test_armed_at_the_middle_of_the_pulse(mode: str, pulse: str):
+    """The clock or the gate arms the pixel exactly there, period after period, where the sampler's tables have a jump."""
+    pixel, at = (gate(0.25, 0.25, 0.0), 0.25) if mode == "gated" else (detector(mode, 0.0), 0.0)
+    shape = GaussianPulse(sigma_ns=2.0) if pulse == "gaussian" else SampledPulse(np.hanning(42)[1:-1], 0.5)
+    case = pulsed(1.0, 0.5, pixel, pulse=shape)
+    case = replace(case, name=f"{case.name}, {pulse}, armed at the pulse", flux=flux_of(1.0, 0.5, at))
+    check(ENGINES["exact"], case, ENGINES["sequential"], EVERYTHING)
+
+
 @pytest.mark.parametrize("mode", MODES[1:])
 @pytest.mark.parametrize(
     ("signal", "dead", "cycles", "start"),

@@ -102,6 +102,7 @@ void build_forward(PulseTable& table, const std::vector<double>& early, const st
     const int cells = static_cast<int>(early.size()) - 1;
     table.cells = cells;
     table.split = static_cast<float>(early[split]);
+    table.late_cell = split + 1;  // behind the guard cell
     table.forward.assign(2 * (cells + 2), 0.0f);  // one guard cell without energy at either end
     for (int k = 0; k < cells; ++k) {
         const double begin = k < split ? early[k] : late[k];
@@ -136,7 +137,6 @@ void build_gaussian(PulseTable& table) {
     table.centre = 0.0;
     table.low = static_cast<float>(-half);
     table.cells_per_period = static_cast<float>(1.0 / width);
-    table.median = 0.0f;
     build_forward(table, early, late, half_cells);
 
     auto density = [&](double v) {
@@ -186,7 +186,6 @@ void build_sampled(PulseTable& table) {
     table.centre = shape.start + half;
     table.low = static_cast<float>(-half);
     table.cells_per_period = static_cast<float>(1.0 / shape.width);
-    table.median = static_cast<float>(split * shape.width - half);
     std::vector<double> late(knots.size());
     for (size_t k = 0; k < knots.size(); ++k) late[k] = knots[k] - 1.0;
     build_forward(table, knots, late, split);

@@ -21,7 +21,7 @@ struct PulseTable {
     float low = 0.0f;              // first cell edge, relative to the centre; likewise below
     float cells_per_period = 0.0f;
     int32_t cells = 0;
-    float median = 0.0f;           // the late half begins here ...
+    int32_t late_cell = 0;         // of `forward`: the late half begins with it ...
     float split = 0.5f;            // ... where the energy F has this value
     std::vector<float> forward;    // (cells + 2, 2): signed energy at the cell's start, and its increase
 

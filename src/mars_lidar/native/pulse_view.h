@@ -16,10 +16,10 @@ inline PulseView pulse_view(const PulseTable& pulse) {
     view.periods_per_energy = pulse.periods_per_energy.data();
     view.low = pulse.low;
     view.cells_per_period = pulse.cells_per_period;
-    view.median = pulse.median;
     view.split = pulse.split;
     view.last_cell = static_cast<float>(pulse.cells + 1);
     view.guides = pulse.guides;
+    view.late_cell = pulse.late_cell;
     view.last_early = pulse.last_early;
     view.last_late = pulse.last_late;
     view.octave_shift = kOctaveShift;

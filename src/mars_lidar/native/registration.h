@@ -33,8 +33,8 @@ struct PulseView {
     const float* upper;
     const float* end;
     const float* periods_per_energy;
-    float low, cells_per_period, last_cell, median, split;
-    int32_t guides, last_early, last_late, octave_shift, octave_base;
+    float low, cells_per_period, last_cell, split;
+    int32_t late_cell, guides, last_early, last_late, octave_shift, octave_base;
 };
 
 // Positions of the gate in units of 2^-64 period, which add up and wrap exactly.
@@ -135,7 +135,8 @@ MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask 
     Float here, slope;
     gather_pair(pulse.forward, cell, here, slope);
     here = here + slope * (x - to_float(cell));
-    Mask late = from.phase >= pulse.median;
+    // by the cell, not the phase: rounding may put a phase at the median into either cell, and only its own sign counts
+    Mask late = cell >= pulse.late_cell;
     if constexpr (whole) {
         here = select(known, energy, here);
         late = select(known, energy, select(late, splat(-1.0f), splat(0.0f))) < 0.0f;

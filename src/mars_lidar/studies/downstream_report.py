@@ -213,7 +213,7 @@ def picture(folder: Path, config: Config, found: Mapping[Run, Any], sbr: float) 
     scene = crop(config.test[0], config)
     arms = list(config.arms)
     with style():
-        figure = Figure(figsize=(1.05 * (len(arms) + 1), 4.7), dpi=110, layout="constrained")
+        figure = Figure(figsize=(1.05 * (len(arms) + 1), 4.7), dpi=90, layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots(4, len(arms) + 1, squeeze=False)
         for half, target in enumerate(TARGETS):

@@ -16,6 +16,8 @@ from benchmarks.workload import EngineRun, Workload, maps, system
 
 GOAL_JITTER = 1.3
 GOAL_AFTERPULSING = 2.0
+SHARES = (0.02, 0.2)  # carriers of an avalanche
+DELAY_NS = 60.0  # of their release, mean
 _IDEAL = "ideal pixel (reference)"
 _JITTER = "jitter, Gaussian"
 _AFTERPULSING = "afterpulsing, {:g} carriers an avalanche"
@@ -23,7 +25,8 @@ _NOTE = (
     "One thread, widest level, warm memory. Every row draws the same registrations but for those of the efficiency and "
     "of afterpulses; "
     "with the electronics' dead time and the limits fewer of them are recorded. The sampled jitter has 60 samples, the "
-    "tail takes a tenth of the records, 64 codes repeat."
+    "tail takes a tenth of the records, 64 codes repeat. Carriers are released after 60 ns in the mean, 24 % of them "
+    "after the dead time of 85 ns; the preset's data are those of detectors.md."
 )
 
 
@@ -46,8 +49,8 @@ def detector_effects(config: Config, bandwidth: Bandwidth) -> Section:
     detectors["all that act on records"] = {
         name: value for effects in list(detectors.values())[2:] for name, value in effects.items()
     } | {"jitter": ml.Jitter(sigma_ns=0.05, tail_ns=0.2, tail_fraction=0.1)}
-    for share in (0.02, 0.2):
-        detectors[_AFTERPULSING.format(share)] = {"afterpulsing": ml.Afterpulsing(probability=share, delay_ns=60.0)}
+    for share in SHARES:
+        detectors[_AFTERPULSING.format(share)] = {"afterpulsing": ml.Afterpulsing(probability=share, delay_ns=DELAY_NS)}
     detectors["preset of a module: afterpulses, twilight pulses"] = {
         name: getattr(ml.Detector.preset("excelitas-spcm-aqrh"), name) for name in ("afterpulsing", "twilight_ns")
     }
@@ -62,11 +65,10 @@ def detector_effects(config: Config, bandwidth: Bandwidth) -> Section:
     for row in section.rows:  # the work is that of the registrations, recorded or not
         row["registrations"] = ideal.registrations
         row["ns/reg/core"] = 1e9 * times[row["case"]].cpu_median / ideal.registrations
-    cost = times[_JITTER].cpu_median / times[_IDEAL].cpu_median
-    section.goals.append(Goal("exact with Gaussian jitter: time over that of the ideal pixel", cost, GOAL_JITTER, ""))
-    rare = _AFTERPULSING.format(0.02)
-    cost = times[rare].cpu_median / times[_IDEAL].cpu_median
-    section.goals.append(Goal(f"exact with {rare}: time over that of the ideal pixel", cost, GOAL_AFTERPULSING, ""))
+    goals = {_JITTER: GOAL_JITTER} | {_AFTERPULSING.format(share): GOAL_AFTERPULSING for share in SHARES}
+    for name, goal in goals.items():
+        cost = times[name].cpu_median / times[_IDEAL].cpu_median
+        section.goals.append(Goal(f"exact with {name}: time over that of the ideal pixel", cost, goal, ""))
     return section
 
 

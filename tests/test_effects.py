@@ -169,7 +169,9 @@ def test_jitter_has_its_law_and_moves_nothing_else(engine: str, jitter: Jitter |
     assert away.sum() > 20_000
     p = stats.kstest(shift, jitter.cumulative).pvalue
     pairs = stats.spearmanr(shift[:-1], shift[1:]).pvalue  # two records share a draw
-    require({"jitter": p, "independence": pairs}, f"{engine}, {jitter}")
+    size = np.abs(shift - np.median(shift))
+    sizes = stats.spearmanr(size[:-1], size[1:]).pvalue  # and Gaussian ones a radius
+    require({"jitter": p, "independence": pairs, "independence of sizes": sizes}, f"{engine}, {jitter}")
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,8 @@ struct FrameClock {
         r.cycle = r.cycle + split_off_periods(r.phase);
     }
 
-    MARS_INLINE void find_bin(Registration& r) const {
+    MARS_INLINE void find_phase(Registration&) const {}  // it comes with the registration
+    MARS_INLINE void find_bin(Registration& r, bool) const {
         r.bin = minimum(truncate(r.phase * static_cast<float>(bins)), splat(bins - 1));
     }
 

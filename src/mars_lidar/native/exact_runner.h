@@ -81,9 +81,8 @@ private:
             next = register_next<mode, gaussian, whole>(system_, returns_, delay_, ahead_[k], key0_, key1_, event,
                                                         armed_, memory_);
         }
-        const Int bin = bin_of(next.phase, system_.bins);
-        if constexpr (kRecords) seen_[k] = {next.hit, next.cycle, next.phase, next.lost, bin};
-        else log(k, next.lost, bin, next.cycle, next.phase);
+        if constexpr (kRecords) seen_[k] = {next.hit, next.cycle, next.phase, next.lost, splat(0)};
+        else log(k, next.lost, bin_of(next.phase, system_.bins), next.cycle, next.phase);
     }
 
     MARS_INLINE void log(int k, Mask lost, Int bin, Int cycle, Float phase) {

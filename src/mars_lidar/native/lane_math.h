@@ -60,6 +60,22 @@ MARS_INLINE Float inverse_root(Float x) {
     return y;
 }
 
+// Two independent standard normal numbers of two words, by a radius and an angle: G. E. P. Box, M. E. Muller, "A note on
+// the generation of random normal deviates", Ann. Math. Statist. 29 (1958). Two bits of the second word are the signs, the
+// others an angle pi/4 + a in the first quadrant, whose cosine and sine are (cos a -+ sin a) / sqrt(2). Polynomials of S. L.
+// Moshier's Cephes library, absolute errors below 1e-7.
+MARS_INLINE Pair<Float> normal_pair(Pair<UInt> words) {
+    const Float radius = square_root(exponential(words.first));  // that of two normal numbers, over sqrt(2)
+    const Float a = (to_float(as_int(words.second << 2)) + 2.0f) * (0x1p-32f * 1.57079632679f);
+    const Float z = a * a;
+    const Float sine = a + a * z * ((z * -1.9515295891e-4f + 8.3321608736e-3f) * z - 1.6666654611e-1f);
+    const Float cosine =
+        (1.0f - 0.5f * z) + z * z * ((z * 2.443315711809948e-5f - 1.388731625493765e-3f) * z + 4.166664568298827e-2f);
+    const UInt sign = splat(0x80000000u);
+    return {from_bits(bits(radius * (cosine - sine)) ^ (words.second & sign)),
+            from_bits(bits(radius * (cosine + sine)) ^ ((words.second << 1) & sign))};
+}
+
 // A standard normal number, by inversion: sqrt(2) erfinv, single-precision approximation of M. Giles,
 // "Approximating the erfinv function", GPU Computing Gems Jade Edition (2011) 109-116. The lowest bit of the
 // word is the sign, the others the tail's probability.

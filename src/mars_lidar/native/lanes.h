@@ -10,6 +10,7 @@
 #pragma once
 #include "integers.h"
 #if !defined(__CUDACC_RTC__)
+#include <math.h>
 #include <string.h>
 #endif
 

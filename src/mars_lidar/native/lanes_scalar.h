@@ -49,6 +49,13 @@ MARS_INLINE Int minus_if(Int x, Mask m) { return m ? x - 1 : x; }
 MARS_INLINE Float plus_if(Float x, Mask m) { return m ? x + 1.0f : x; }
 MARS_INLINE Float minus_if(Float x, Mask m) { return m ? x - 1.0f : x; }
 
+MARS_INLINE Float square_root(Float x) {
+#if defined(__CUDACC__)
+    return __fsqrt_rn(x);
+#else
+    return sqrtf(x);
+#endif
+}
 MARS_INLINE Float minimum(Float a, Float b) { return a < b ? a : b; }
 MARS_INLINE Float maximum(Float a, Float b) { return a > b ? a : b; }
 MARS_INLINE Int minimum(Int a, Int b) { return a < b ? a : b; }

@@ -165,6 +165,19 @@ MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return (HardFloat)_mm256_
 MARS_INLINE HardFloat least(HardFloat a, HardFloat b) { return a < b ? a : b; }
 MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return a > b ? a : b; }
 #endif
+MARS_INLINE HardFloat square_root(HardFloat x) {
+#if defined(MARS_LEVEL_avx512)
+    return (HardFloat)_mm512_sqrt_ps((__m512)x);
+#elif defined(MARS_LEVEL_avx2)
+    return (HardFloat)_mm256_sqrt_ps((__m256)x);
+#elif defined(MARS_X86)
+    return (HardFloat)_mm_sqrt_ps((__m128)x);
+#else
+    for (int k = 0; k < kHardwareLanes; ++k) x[k] = sqrtf(x[k]);
+    return x;
+#endif
+}
+MARS_INLINE Float square_root(Float x) { return {square_root(x.low), square_root(x.high)}; }
 MARS_INLINE Float minimum(Float a, Float b) { return {least(a.low, b.low), least(a.high, b.high)}; }
 MARS_INLINE Float maximum(Float a, Float b) { return {most(a.low, b.low), most(a.high, b.high)}; }
 MARS_INLINE Int minimum(Int a, Int b) { return select(a < b, a, b); }

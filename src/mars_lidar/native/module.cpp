@@ -21,6 +21,7 @@ void bind_recording(nb::module_& module) {
                 self->most_per_period = most_per_period;
                 self->most_per_exposure = most_per_exposure;
                 self->jitter = jitter;
+                if (jitter && !jitter->shape.gaussian()) self->jitter_table.set(jitter->shape);
                 self->tail = tail;
                 self->tail_fraction = tail_fraction;
                 if (code_edges) self->codes.set({code_edges->data(), code_edges->data() + code_edges->shape(0)});

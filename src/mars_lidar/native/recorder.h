@@ -42,23 +42,23 @@ public:
         in_exposure_ = load<Int>(of_exposure_);
     }
 
-    // Whether anything happens to them.
-    bool on() const { return dead_ || limited_ || jitter_.on || !recording_.codes.edges.empty(); }
-
     // Loses and moves `n` registrations in a row, the first of which has the even number `event`, and finds their bins.
     // If `timed`, their phases become what the converter tells. One copy for all runners, which are many.
     template <int n>
     MARS_NOINLINE void take(Registration (&registrations)[n], const UInt& key0, const UInt& key1, const UInt& event,
                             bool timed) {
+        const bool coded = !recording_.codes.edges.empty();
         if (dead_)
             for (Registration& r : registrations) lose_to_dead_time(r);
         if (limited_)
             for (Registration& r : registrations) lose_to_limits(r);
+        if (timed || coded || jitter_.on)
+            for (Registration& r : registrations) clock_.find_phase(r);
         if (jitter_.on) jitter(registrations, key0, key1, event);
-        if (!recording_.codes.edges.empty())
+        if (coded)
             for (Registration& r : registrations) clock_.convert_time(recording_.codes, r, timed);
-        else if (jitter_.on)
-            for (Registration& r : registrations) clock_.find_bin(r);
+        else
+            for (Registration& r : registrations) clock_.find_bin(r, jitter_.on);
     }
 
     // Lanes with as many records as an exposure may have.
@@ -94,10 +94,13 @@ private:
         for (int k = 0; k < n; k += 2) {
             const UInt pair = (event >> 1) + static_cast<uint32_t>(k / 2);
             const Pair<UInt> place = threefry<13>(pair, splat(kStageJitter), key0, key1);
-            Pair<UInt> late = place;
-            if constexpr (tail) late = threefry<13>(pair, splat(kStageJitter + 1), key0, key1);
-            clock_.move(registrations[k], jitter_of<gaussian, tail>(jitter_, place.first, late.first));
-            clock_.move(registrations[k + 1], jitter_of<gaussian, tail>(jitter_, place.second, late.second));
+            Pair<Float> moved = jitter_of<gaussian>(jitter_, place);
+            if constexpr (tail) {
+                const Pair<UInt> late = threefry<13>(pair, splat(kStageJitter + 1), key0, key1);
+                moved = {moved.first + tail_of(jitter_, late.first), moved.second + tail_of(jitter_, late.second)};
+            }
+            clock_.move(registrations[k], moved.first);
+            clock_.move(registrations[k + 1], moved.second);
         }
     }
 

@@ -5,6 +5,8 @@
 #include <utility>
 #include <vector>
 
+#include "jitter_table.h"
+
 namespace mars {
 
 struct PulseTable;
@@ -43,6 +45,7 @@ struct Recording {
     double electronics_dead_time = 0.0;
     int32_t most_per_period = INT32_MAX, most_per_exposure = INT32_MAX;
     const PulseTable* jitter = nullptr;  // density of the jitter but for its tail, or null
+    JitterTable jitter_table;            // of a sampled one
     double tail = 0.0, tail_fraction = 0.0;
     CodeTable codes;
 };

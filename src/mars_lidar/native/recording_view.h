@@ -2,16 +2,21 @@
 #pragma once
 #include <algorithm>
 
-#include "pulse_view.h"
+#include "lane_math.h"
+#include "pulse_table.h"
 #include "recording.h"
+#include "registration.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
 
 struct JitterView {
-    PulseView shape;
     bool on = false, gaussian = false;
-    float centre = 0.0f, tail = 0.0f;
+    float sigma = 0.0f;
+    const float* bound = nullptr;  // of a JitterTable; likewise below
+    const float* line = nullptr;
+    uint32_t samples = 0;
+    float tail = 0.0f;
     uint32_t tail_below = 0;  // of a 32-bit word; the tail takes no record where 0
     float tail_scale = 0.0f;  // spreads the words below that over 31 bits
 };
@@ -19,32 +24,42 @@ struct JitterView {
 inline JitterView jitter_view(const Recording& recording) {
     JitterView view{};
     if (!recording.jitter) return view;
-    view.shape = pulse_view(*recording.jitter);
     view.on = true;
     view.gaussian = recording.jitter->shape.gaussian();
-    view.centre = static_cast<float>(recording.jitter->centre);
+    view.sigma = static_cast<float>(recording.jitter->shape.sigma);
+    view.bound = recording.jitter_table.bound.data();
+    view.line = recording.jitter_table.line.data();
+    view.samples = static_cast<uint32_t>(recording.jitter_table.bound.size());
     view.tail = static_cast<float>(recording.tail);
     view.tail_below = static_cast<uint32_t>(std::min(recording.tail_fraction * 0x1p32, 0x1p32 - 1.0));
     view.tail_scale = view.tail_below ? static_cast<float>(1.0 / recording.tail_fraction) : 0.0f;
     return view;
 }
 
-// The jitter of a record from two words; the second is used by the tail only. The energy of the shape below it is kept
-// signed, as in pulse_table.h: the first word is a uniform number on (0, 1) that is relatively fine at both ends.
-template <bool gaussian, bool tail>
-MARS_INLINE Float jitter_of(const JitterView& jitter, UInt place, UInt late) {
-    const Int n = as_int(place >> 1);
-    const Float u = (to_float(n) + 0.5f) * 0x1p-31f, rest = (to_float(0x7fffffff - n) + 0.5f) * -0x1p-31f;
-    const Float p = select(u < jitter.shape.split, u, rest);
-    Float x = quantile<gaussian>(jitter.shape, p);
-    if constexpr (!gaussian) x = x + jitter.centre;
-    if constexpr (tail) {
-        // given that it is below the bound the word is uniform again, for an exponential number of its own
-        const Float stretched = minimum(to_float(as_int(late >> 1)) * jitter.tail_scale, splat(2147483520.0f));
-        const Float delay = exponential(as_uint(truncate(stretched)) << 1) * jitter.tail;
-        x = x + select(late < splat(jitter.tail_below), delay, splat(0.0f));
-    }
-    return x;
+// The jitter of a record from a word, for sampled densities.
+MARS_INLINE Float sampled_jitter(const JitterView& jitter, UInt word) {
+    UInt column, place;
+    multiply(word, jitter.samples, column, place);
+    const Float v = to_float(as_int(place >> 1)) * 0x1p-31f;
+    const Int other = one_if(v >= gather(jitter.bound, as_int(column)));
+    Float first, slope;
+    gather_pair(jitter.line, as_int(column << 1) + other, first, slope);
+    return first + slope * v;
+}
+
+// The jitter of two records from two words.
+template <bool gaussian>
+MARS_INLINE Pair<Float> jitter_of(const JitterView& jitter, Pair<UInt> words) {
+    if constexpr (!gaussian) return {sampled_jitter(jitter, words.first), sampled_jitter(jitter, words.second)};
+    const Pair<Float> normal = normal_pair(words);
+    return {normal.first * jitter.sigma, normal.second * jitter.sigma};
+}
+
+// The exponential tail of some records: given that it is below the bound the word is uniform again.
+MARS_INLINE Float tail_of(const JitterView& jitter, UInt word) {
+    const Float stretched = minimum(to_float(as_int(word >> 1)) * jitter.tail_scale, splat(2147483520.0f));
+    const Float delay = exponential(as_uint(truncate(stretched)) << 1) * jitter.tail;
+    return select(word < splat(jitter.tail_below), delay, splat(0.0f));
 }
 
 // Whole periods of a time, which becomes its phase in [0, 1).

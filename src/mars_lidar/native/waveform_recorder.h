@@ -8,6 +8,43 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
+// Where times lie in the period: their phases in double precision, and bins.
+struct WavePlaces {
+    explicit WavePlaces(const Job& job)
+        : bins(job.bins), parts(static_cast<int32_t>(job.samples)),
+          bins_per_part(static_cast<double>(bins) / static_cast<double>(parts)),
+          inverse((parts & (parts - 1)) == 0 ? 1.0 / static_cast<double>(parts) : 0.0) {}
+
+    MARS_INLINE void find_phase(const WaveTime& time, double (&phase)[kLanes]) const {
+        alignas(64) int32_t part[kLanes];
+        alignas(64) float inside[kLanes];
+        store(part, time.part);
+        store(inside, time.inside);
+        for (int lane = 0; lane < kLanes; ++lane)
+            phase[lane] = static_cast<double>(part[lane]) + static_cast<double>(inside[lane]);
+        if (inverse > 0.0)  // the same, and quicker
+            for (double& x : phase) x *= inverse;
+        else
+            for (double& x : phase) x /= static_cast<double>(parts);
+    }
+
+    MARS_INLINE Int bin(const WaveTime& time) const {
+        if (bins == parts) return time.part;
+        alignas(64) int32_t part[kLanes];
+        alignas(64) float inside[kLanes];
+        store(part, time.part);
+        store(inside, time.inside);
+        for (int lane = 0; lane < kLanes; ++lane) {
+            const double x = static_cast<double>(part[lane]) + static_cast<double>(inside[lane]);
+            part[lane] = static_cast<int32_t>(x * bins_per_part);
+        }
+        return minimum(load<Int>(part), splat(bins - 1));
+    }
+
+    int32_t bins, parts;
+    double bins_per_part, inverse;  // of T, if that is a power of two
+};
+
 // Parts of the waveform; what is recorded in double precision, lane by lane.
 struct PartClock {
     using Time = WaveTime;
@@ -53,27 +90,31 @@ struct PartClock {
     };
 
     explicit PartClock(const Job& job)
-        : bins(job.bins), cycles(job.cycles), parts(static_cast<int32_t>(job.samples)),
+        : places(job), bins(job.bins), parts(static_cast<int32_t>(job.samples)),
           dead(wave_span(job.recording->electronics_dead_time, parts)) {}
 
     MARS_INLINE Time recovered(const Time& hit) const { return later(hit, dead, parts); }
 
+    MARS_INLINE void find_phase(Registration& r) const { places.find_phase(r.hit, r.phase); }
+
     MARS_INLINE void move(Registration& r, Float jitter) const {
         alignas(64) float jitters[kLanes];
-        alignas(64) int32_t cycle[kLanes];
+        alignas(64) int32_t whole[kLanes];
         store(jitters, jitter);
-        store(cycle, r.cycle);
         for (int lane = 0; lane < kLanes; ++lane) {
             const double moved = r.phase[lane] + static_cast<double>(jitters[lane]);
-            int32_t whole = static_cast<int32_t>(moved);
-            whole -= moved < static_cast<double>(whole) ? 1 : 0;
-            r.phase[lane] = std::min(moved - static_cast<double>(whole), kLastPhase);
-            cycle[lane] = round_exposure(cycle[lane] + whole, cycles);
+            const int32_t toward = static_cast<int32_t>(moved);
+            whole[lane] = toward - (moved < static_cast<double>(toward) ? 1 : 0);
+            r.phase[lane] = std::min(moved - static_cast<double>(whole[lane]), kLastPhase);
         }
-        r.cycle = load<Int>(cycle);
+        r.cycle = r.cycle + load<Int>(whole);
     }
 
-    MARS_INLINE void find_bin(Registration& r) const {
+    MARS_INLINE void find_bin(Registration& r, bool moved) const {
+        if (!moved) {
+            r.bin = places.bin(r.hit);
+            return;
+        }
         alignas(64) int32_t bin[kLanes];
         for (int lane = 0; lane < kLanes; ++lane)
             bin[lane] = static_cast<int32_t>(r.phase[lane] * static_cast<double>(bins));
@@ -107,7 +148,8 @@ struct PartClock {
 
     static constexpr double kLastPhase = 1.0 - 0x1p-53;
 
-    int32_t bins, cycles, parts;
+    WavePlaces places;
+    int32_t bins, parts;
     WaveSpan dead;
 
 private:

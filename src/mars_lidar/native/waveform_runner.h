@@ -30,7 +30,7 @@ class WaveRunner {
 public:
     explicit WaveRunner(const WaveformBlock& block)
         : block_(block), job_(*block.job), system_(wave_system(job_)), layout_(job_.samples),
-          bins_per_part_(static_cast<double>(job_.bins) / static_cast<double>(job_.samples)), recorder_(job_),
+          places_(job_), recorder_(job_),
           traps_(job_), twilight_(mode == DetectorMode::kNonparalyzable && job_.twilight > 0.0),
           twilight_span_(wave_span(job_.twilight, system_.parts)), log_(block.output, job_) {
         tables_.edge = block.edges;
@@ -81,34 +81,16 @@ private:
         const Mask unseen = advance<mode>(system_, hit, from_, memory_);
         if constexpr (kTraps) traps_.avalanche(except(splat(1) > 0, unseen), hit, generation, key0_, key1_);
         if constexpr (kRecords) {
-            const Int bin = place<true>(hit, seen_[k].phase);
             seen_[k].hit = hit;
             seen_[k].cycle = hit.cycle;
             seen_[k].lost = outside | unseen;
-            seen_[k].bin = bin;
         } else {
-            if constexpr (timed) log_.put_cycle(k, hit.cycle);
-            log_.put(k, outside | unseen, place<timed>(hit, log_.phase(k)));
-        }
-    }
-
-    // The bin of a time and, where asked for, its phase in periods.
-    template <bool told>
-    MARS_INLINE Int place(const WaveTime& hit, double* phase) const {
-        Int bin = hit.part;
-        if (told || system_.bins != system_.parts) {
-            alignas(64) int32_t part[kLanes];
-            alignas(64) float inside[kLanes];
-            store(part, hit.part);
-            store(inside, hit.inside);
-            for (int lane = 0; lane < kLanes; ++lane) {
-                const double x = static_cast<double>(part[lane]) + static_cast<double>(inside[lane]);
-                if constexpr (told) phase[lane] = x / system_.parts;
-                part[lane] = static_cast<int32_t>(x * bins_per_part_);
+            if constexpr (timed) {
+                log_.put_cycle(k, hit.cycle);
+                places_.find_phase(hit, log_.phase(k));
             }
-            if (system_.bins != system_.parts) bin = minimum(load<Int>(part), splat(system_.bins - 1));
+            log_.put(k, outside | unseen, places_.bin(hit));
         }
-        return bin;
     }
 
     // Records the registrations of a round.
@@ -254,7 +236,7 @@ private:
     const Job& job_;
     const WaveSystem system_;
     const TableLayout layout_;
-    const double bins_per_part_;
+    const WavePlaces places_;
 
     // the lanes
     WaveTables tables_;

@@ -4,7 +4,7 @@
 // energy to 2^-31 of the period's, which as many registrations as a pixel may have cannot tell from the truth, and a
 // part without light has none at all; energies add up and carry over without rounding. The inverse finds its part by
 // a guide table (H.-C. Chen, Y. Asau, "On generating random variates from an empirical distribution", AIIE
-// Transactions 6, 1974): the period's energy cut into equal cells, and for each cell the part at its beginning.
+// Transactions 6, 1974): the energy of the period in equal cells, and for each the group of parts where it begins.
 #pragma once
 #include <cstdint>
 

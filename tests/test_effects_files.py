@@ -84,14 +84,19 @@ def test_statistics_refuse_what_they_do_not_know(name):
     if name not in TIMING_EFFECTS:
         with pytest.raises(ValueError, match=f"joint_law.*{name}"):
             ml.joint_law(1.0, 0.5, one)
-        with pytest.raises(ValueError, match=f"count_law.*{name}"):
-            ml.count_law(1.0, 0.5, one)
+        with pytest.raises(ValueError, match=f"exposure_moments.*{name}"):
+            ml.statistics.exposure_moments(1.0, 0.5, one)
+        if name != "electronics_dead_time_ns":
+            with pytest.raises(ValueError, match=f"count_law.*{name}"):
+                ml.count_law(1.0, 0.5, one)
     with pytest.raises(ValueError, match=f"a table does not do {name}"):
         ml.Table.build(one, [0.5, 1.0], [0.5, 1.0])
 
 
 def test_electronics_dead_time_has_statistics_for_some_modes_only():
     gated = Detector(dead_time_ns=20.0, electronics_dead_time_ns=60.0, mode="paralyzable")
+    with pytest.raises(ValueError, match="count_law of method 'exact' does not do electronics_dead_time_ns"):
+        ml.count_law(1.0, 0.5, system(gated))
     with pytest.raises(ValueError, match="mean_histogram does not do electronics_dead_time_ns"):
         ml.statistics.mean_histogram(1.0, 0.5, system(gated))
     alike = Detector(dead_time_ns=60.0, electronics_dead_time_ns=60.0)

@@ -79,6 +79,16 @@ def test_moments_are_the_closed_form_ones(case: Case):
     assert law.cumulants[2:] == pytest.approx([third, fourth], abs=1e-6 * max(spread, 1.0) ** 4)
 
 
+@pytest.mark.parametrize("bins", [1, 50, 200, 1000])
+def test_the_grid_of_the_histogram_is_not_the_one_of_the_moments(bins: int):
+    """However many bins the histogram has, `paralyzable_moments` keeps its tolerance."""
+    system = view(0.45, cycles=500, sigma=0.01, bins=bins)
+    found = paralyzable_moments(1.0, 1.0, system, delay_ns=37.0)
+    known = exposure_moments(1.0, 1.0, system.replace(bins=1), delay_ns=37.0, tolerance=1e-7)
+    assert float(found.mean) == pytest.approx(float(known.mean), rel=1e-5)
+    assert float(found.variance) == pytest.approx(float(known.variance), rel=1e-5)
+
+
 def pixel_of(case: Case) -> dict[str, object]:
     flux = case.flux
     if flux.waveform is not None:

@@ -14,6 +14,7 @@ from mars_lidar import _validate
 from mars_lidar.detector import MODES, Mode
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics._electronics_law import record_windows
 from mars_lidar.statistics._gate import PLAIN
 from mars_lidar.statistics._pmf import Window, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics._timing import recorded
@@ -147,7 +148,8 @@ def count_law(
         Laser, detector and histogram (whose bins do not matter here).
     method
         - ``"exact"``: finite exposure, start and end included, any dead time and every mode of the detector
-          (docs/theory_exposure.md, docs/detectors.md),
+          (docs/theory_exposure.md, docs/detectors.md); with electronics dead time for modes ``"nonparalyzable"`` and
+          ``"gated"``, to 1e-3 (see `electronics_moments`),
         - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure,
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
@@ -179,9 +181,13 @@ def count_law(
     _model(model, method)
     cells = Cells.of(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what=f"count_law of method {method!r}", modes=_LAW_MODES[method], effects=LIGHT_EFFECTS + TIMING_EFFECTS,
+        what=f"count_law of method {method!r}", modes=_LAW_MODES[method], effects=_law_effects(method, system),
     )  # fmt: skip
     team = thread_count(threads)
+    if method == "exact" and "electronics_dead_time_ns" in cells.system.detector.effects:
+        windows = record_windows(cells, max(tolerance, 1e-3), team)
+        found = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
+        return CountLaw(method, found, lambda: windows)
     if method == "exact" and system.detector.mode == "synchronous":
         windows = synchronous_windows(cells)
         found = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
@@ -266,6 +272,10 @@ def registration_pdf(
     dark = total == 0.0
     shape = np.where(dark, 1.0 / system.bins, shape / np.where(dark, 1.0, total))
     return np.asarray(shape.reshape(*cells.shape, system.bins), dtype=np.float64)
+
+
+def _law_effects(method: str, system: System) -> tuple[str, ...]:
+    return histogram_effects(system) if method == "exact" else LIGHT_EFFECTS + TIMING_EFFECTS
 
 
 def _shape_effects(method: str, system: System) -> tuple[str, ...]:

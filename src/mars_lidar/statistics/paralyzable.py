@@ -99,6 +99,8 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
     for k in range(cells.size):
         cell = cells.part(slice(k, k + 1))
         n = cell.first_bins(system.bins)
+        if n // 2 < system.bins:  # every grid has the edges of the histogram: with no others two grids are the same
+            n *= 2
         coarse = _Grid(cell, n // 2, with_variance)
         while True:
             fine = _Grid(cell, n, with_variance)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.flux import Flux
 from mars_lidar.plot.data import law_arguments
-from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments, joint_law
+from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments, joint_law, mean_histogram
 from mars_lidar.studies.compare_sample import FloatArray, Moments
 from mars_lidar.studies.distance import Pmf
 from mars_lidar.system import System
@@ -80,7 +80,7 @@ def pixel_law(
     try:
         arguments = law_arguments(flux, system, y, x)
         law = count_law(system=system, threads=threads, **arguments)
-        histogram = exposure_moments(system=system, threads=threads, **arguments).histogram
+        histogram = mean_histogram(system=system, threads=threads, **arguments)
         pmf = Pmf(int(law.support[0]), law.pmf)
     except (ConvergenceError, ValueError) as error:
         return str(error)

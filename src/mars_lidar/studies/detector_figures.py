@@ -64,16 +64,11 @@ def _histogram(ax: Axes, each: Outcome, colour: str) -> None:
 
 
 def _counts(ax: Axes, each: Outcome, colour: str) -> None:
-    from scipy.stats import norm
-
     number = np.bincount(each.counts) / each.counts.size
     n = np.flatnonzero(number)
     ax.plot(n, number[n], ".", ms=2.0, color=colour)
     if each.law is not None:
         ax.plot(n, np.pad(each.law, (0, max(0, number.size - each.law.size)))[n], color=colour, lw=0.9)
-    elif each.moments is not None:  # of a paralyzable pixel the first two moments are known: their Gaussian
-        mean, variance = each.moments
-        ax.plot(n, norm.pdf(n, mean, variance**0.5), color=colour, lw=0.9, ls="--")
 
 
 def _intervals(ax: Axes, each: Outcome, colour: str) -> None:

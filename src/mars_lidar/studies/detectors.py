@@ -17,7 +17,7 @@ from mars_lidar.effects import AVALANCHE_EFFECTS
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate_timestamps
-from mars_lidar.statistics import count_law, electronics_moments, mean_histogram, paralyzable_moments
+from mars_lidar.statistics import count_law, mean_histogram
 from mars_lidar.studies import Request
 from mars_lidar.studies.report import configuration, save_csv, save_text, table
 from mars_lidar.system import System
@@ -92,13 +92,12 @@ def run(request: Request) -> list[Path]:
     parts = [
         "# Detector modes, compared",
         "The same pixel seen by detectors of every mode (definitions and closed forms: "
-        "[detectors.md](../detectors.md)). Simulated with the exact engine; predicted by `mean_histogram`, `count_law` "
-        "and `paralyzable_moments`. `z mean` and `z variance` are differences in standard errors of the simulation, "
-        "`worst z of a bin` is the largest of the histogram.",
+        "[detectors.md](../detectors.md)). Simulated with the exact engine; predicted by `mean_histogram` and "
+        "`count_law`. `z mean` and `z variance` are differences in standard errors of the simulation, `worst z of a "
+        "bin` is the largest of the histogram, `p of the law` is that of a chi-squared test of the counts.",
         configuration(_settings(outcomes[0].system, exposures)),
         table(rows),
-        "In the figures dots are simulated and lines predicted; the dashed count law is the Gaussian of the predicted "
-        "mean and variance. Inter-registration times are simulated.",
+        "In the figures dots are simulated and lines predicted. Inter-registration times are simulated.",
         *(f"![{path.stem}]({path.name})" for path in figures),
     ]
     text = save_text(request.out / "detectors.md", parts)
@@ -135,12 +134,6 @@ def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] |
     if system.detector.gate_moves or set(system.detector.effects) & set(_SIMULATED_ONLY):
         return None, None, None
     expected = mean_histogram(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
-    if "electronics_dead_time_ns" in system.detector.effects:
-        recorded = electronics_moments(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
-        return expected, (float(recorded.mean), float(recorded.variance)), None
-    if system.detector.mode == "paralyzable":
-        found = paralyzable_moments(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
-        return expected, (float(found.mean), float(found.variance)), None
     law = count_law(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
     pmf = np.zeros(int(law.support[-1]) + 1)
     pmf[law.support] = law.pmf
@@ -160,8 +153,9 @@ def row(each: Outcome) -> dict[str, Any]:
         "z mean": "-",
         "z variance": "-",
         "worst z of a bin": "-",
+        "p of the law": "-",
     }
-    if each.moments is None or each.expected is None:
+    if each.moments is None or each.expected is None or each.law is None:
         return line
     fourth = float(np.mean((each.counts - mean) ** 4))
     seen = each.histogram_error > 0
@@ -172,7 +166,21 @@ def row(each: Outcome) -> dict[str, Any]:
         "z mean": (mean - each.moments[0]) / math.sqrt(each.moments[1] / n),
         "z variance": (variance - each.moments[1]) / math.sqrt((fourth - variance**2) / n),
         "worst z of a bin": float(np.abs(z).max()),
+        "p of the law": _fit(each.counts, each.law),
     }
+
+
+def _fit(counts: NDArray[np.int64], law: FloatArray) -> float:
+    """Chi-squared test of counts against their law; neighbours are merged until at least 10 are expected."""
+    from scipy.stats import chisquare
+
+    size = max(int(counts.max()) + 1, law.size)
+    expected = np.pad(law, (0, size - law.size)) * counts.size
+    group = np.minimum((np.cumsum(expected) / 10.0).astype(np.int64), int(expected.sum() / 10.0) - 1)
+    group = np.unique(group, return_inverse=True)[1]
+    seen = np.bincount(group, np.bincount(counts, minlength=size))
+    wanted = np.bincount(group, expected)
+    return float(chisquare(seen, wanted * (seen.sum() / wanted.sum())).pvalue)
 
 
 def of_figure(outcomes: Sequence[Outcome], figure: str) -> list[Outcome]:

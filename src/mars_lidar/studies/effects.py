@@ -72,8 +72,9 @@ def run(request: Request) -> list[Path]:
         "The same free-running pixel with each effect of its detector alone (definitions, typical values and sources: "
         "[detectors.md](../detectors.md)). Simulated with the exact engine, crosstalk with the sequential one, whose "
         "exposures are the pixels of one image; predicted where there is a law. `z mean` and `z variance` are "
-        "differences in standard errors of the simulation, `worst z of a bin` is the largest of the histogram. Values "
-        "are larger than those of real modules, so that the figures show what an effect does.",
+        "differences in standard errors of the simulation, `worst z of a bin` is the largest of the histogram, `p of "
+        "the law` is that of a chi-squared test of the counts. Values are larger than those of real modules, so that "
+        "the figures show what an effect does.",
         configuration(_settings(outcomes[0].system, exposures)),
         table(rows),
         "In the figures dots are simulated and lines predicted. Inter-registration times are simulated.",

@@ -1,0 +1,111 @@
+"""The exact law of the number of records behind electronics with a dead time: closed forms, the sequential engine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, two_lobes, waveform_flux
+from mars_lidar.engines import ENGINES
+from mars_lidar.statistics import electronics_moments, mean_histogram
+
+
+def view(dead: float, electronics: float, start: str = "armed", cycles: int = 40, **detector: Any) -> ml.System:
+    return ml.System(
+        period_ns=PERIOD_NS, cycles=cycles, bins=50, pulse=ml.GaussianPulse(sigma_ns=3.0), start=start,
+        detector=ml.Detector(
+            dead_time_ns=dead * PERIOD_NS, electronics_dead_time_ns=electronics * PERIOD_NS, **detector
+        ),
+    )  # fmt: skip
+
+
+def pmf_of(law: ml.CountLaw) -> np.ndarray:
+    pmf = np.zeros(law.support[-1] + 1)
+    pmf[law.support] = law.pmf
+    return pmf
+
+
+def test_law_at_a_constant_rate():
+    """For t_d < t_e < 2 t_d at most one avalanche goes unseen between two records.
+
+    So the time between them is t_e + E, if none is, or U + t_d + E with U the time of the unseen one, exponential from
+    t_d on and before t_e; E is exponential, and the first record is E after an armed start.
+    """
+    rate, dead, electronics, cycles = 1.4, 0.7, 1.2, 12
+    parts = 4096  # of a period
+    edges = np.arange(cycles * parts + 1) / parts
+    wait = np.diff(-np.exp(-rate * edges))
+    unseen = np.diff(-np.exp(-rate * np.clip(edges - dead, 0.0, electronics - dead)))
+    none = np.zeros_like(wait)
+    none[round(electronics * parts)] = np.exp(-rate * (electronics - dead))
+    # a sum of k numbers that are anywhere in their parts is k / 2 parts larger than the sum of the parts
+    size = 2 * wait.size
+    between = np.fft.rfft(np.roll(unseen, round(dead * parts)) + none, size) * np.fft.rfft(wait, size)
+    step = np.fft.irfft(between, size)[: wait.size]
+    record, reached = wait, []
+    while record.sum() > 1e-12:
+        reached.append(record.sum())
+        record = np.fft.irfft(np.fft.rfft(record, size) * np.fft.rfft(step, size), size)[: wait.size]
+    expected = -np.diff([1.0, *reached, 0.0])
+    found = pmf_of(ml.count_law(0.0, rate, view(dead, electronics, cycles=cycles)))
+    assert found[: expected.size] == pytest.approx(expected[: found.size], abs=2e-3)
+    assert found.sum() == pytest.approx(1.0, abs=1e-12)
+    mean = expected @ np.arange(expected.size)
+    assert found @ np.arange(found.size) == pytest.approx(mean, abs=3e-3)
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "electronics", "cycles", "detector"),
+    [
+        (2.0, 0.3, 0.4, 1.3, 60, {}),
+        (3.0, 0.2, 0.1, 0.35, 60, {}),
+        (1.0, 0.3, 1.7, 2.05, 100, {}),
+        (0.3, 0.1, 0.3, 5.05, 100, {}),
+        (1.5, 0.1, 0.95, 1.9, 100, {}),
+        (1.5, 0.8, 0.3, 0.9, 60, {"mode": "gated", "gate_start_ns": 20.0, "gate_width_ns": 40.0}),
+        (1.5, 0.5, 0.3, 0.9, 60, {"dark_count_hz": 1e6, "jitter": ml.Jitter(sigma_ns=1.0)}),
+    ],
+)  # fmt: skip
+def test_law_of_the_sequential_engine(
+    signal: float, background: float, dead: float, electronics: float, cycles: int, detector: dict[str, Any], start: str
+):
+    system = view(dead, electronics, start, cycles, **detector)
+    case = Case(f"t_d {dead:g}, t_e {electronics:g}, {start}", flux_of(signal, background, 0.37), system, 4000)
+    law = ml.count_law(signal, background, system, delay_ns=37.0)
+    histogram = mean_histogram(signal, background, system, delay_ns=37.0)
+    check(ENGINES["sequential"], case, Law(histogram, pmf_of(law)), {COUNTS, SHAPE})
+    known = electronics_moments(signal, background, system, delay_ns=37.0)
+    spread = float(np.sqrt(known.variance))
+    assert abs(float(law.mean - known.mean)) < 1e-3 * spread
+    assert float(law.variance) == pytest.approx(float(known.variance), rel=1e-3)
+
+
+def test_waveform():
+    wave = two_lobes() / 12
+    system = view(0.3, 0.8)
+    law = ml.count_law(None, 0.3, system, waveform=wave)
+    case = Case("waveform", waveform_flux(wave, 0.3), system, 8000)
+    check(ENGINES["sequential"], case, Law(None, pmf_of(law)), {COUNTS})
+
+
+@pytest.mark.parametrize(("dead", "electronics"), [(0.7, 0.5), (0.7, 0.7), (0.0, 0.6)])
+def test_where_one_of_the_two_has_no_effect(dead: float, electronics: float):
+    plain = view(max(dead, electronics), 0.0)
+    found, expected = (ml.count_law(2.0, 0.3, system) for system in (view(dead, electronics), plain))
+    assert found.cumulants == pytest.approx(expected.cumulants, rel=1e-7)
+    assert pmf_of(found) == pytest.approx(pmf_of(expected), abs=1e-12)
+
+
+def test_long_exposures_and_cells():
+    a, b, c = (ml.count_law(2.0, 0.3, view(0.4, 1.3, cycles=n)) for n in (400, 401, 1_000_000))
+    slope = b.cumulants - a.cumulants
+    assert c.cumulants[:2] == pytest.approx((a.cumulants + slope * (1_000_000 - 400))[:2], rel=1e-3)
+    assert c.pmf @ c.support == pytest.approx(float(c.mean), rel=1e-9)
+    both = ml.count_law(np.array([0.0, 2.0]), np.array([0.0, 0.3]), view(0.4, 1.3, cycles=400))
+    assert both.mean == pytest.approx([0.0, float(a.mean)], abs=1e-6)
+    assert both.pmf[0, 0] == 1.0
+    assert pmf_of(ml.count_law(1e-9, 1e-9, view(0.4, 1.3)))[0] == pytest.approx(1.0, abs=1e-6)

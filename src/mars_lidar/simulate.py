@@ -108,6 +108,8 @@ def simulate(
     shape = (task.realizations, *flux.shape, system.bins)
     if _validate.choice("device", device, ("cpu", "cuda")) == "cuda":
         there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
+        if report is not None:
+            report.update(task.report)
         return there
     if out is None:
         _check_memory(shape, system.histogram_dtype.itemsize, "histograms")
@@ -175,8 +177,7 @@ def simulate_timestamps(
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:
     engine.check_device("cuda", task.flux, task.system)
-    from mars_lidar.gpu import exact_histogram
-    from mars_lidar.gpu.exact import cupy_with_device
+    from mars_lidar.gpu.machine import cupy_with_device
 
     cupy = cupy_with_device()
     dtype = task.system.histogram_dtype
@@ -188,7 +189,7 @@ def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> An
         raise ValueError(
             f"out must be C-contiguous, of shape {shape} and dtype {dtype}, got {out.shape} and {out.dtype}"
         )
-    exact_histogram(task, out.reshape(task.items, task.system.bins))
+    engine.histogram_on_cuda(task, out.reshape(task.items, task.system.bins))
     return out
 
 

@@ -21,9 +21,9 @@ def test_unknown_device():
         ml.simulate(FLUX, SYSTEM, device="tpu")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("engine", ["feedback", "mars", "sequential"])
+@pytest.mark.parametrize("engine", ["auto", "renewal", "sequential"])
 def test_engines_without_a_kernel_name_what_works(engine: str):
-    with pytest.raises(ValueError, match=rf"{engine}.*device 'cuda'.*'exact'.*device 'cpu'"):
+    with pytest.raises(ValueError, match=rf"{engine}.*device 'cuda'.*'exact' or 'feedback' or 'mars'.*device 'cpu'"):
         ml.simulate(FLUX, SYSTEM, engine=engine, device="cuda")
 
 
@@ -73,6 +73,21 @@ def test_bits_on_a_gpu(mode: str, start: str):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
+@pytest.mark.parametrize("dead_ns", [63.75, 101.0])
+@pytest.mark.parametrize("cycles", [500, 50_000, 200_000])
+@pytest.mark.parametrize("engine", ["feedback", "mars"])
+def test_bits_of_other_engines_on_a_gpu(engine: str, cycles: int, dead_ns: float):
+    _device()
+    system = SYSTEM.replace(cycles=cycles, bins=1024, detector=ml.Detector(dead_time_ns=dead_ns))
+    options: dict[str, Any] = {}
+    if engine == "mars":
+        options["table"] = ml.Table.build(system, (0.05, 3.0, 9), (0.05, 3.0, 9))
+    told = ml.simulate(FLUX, system, engine=engine, realizations=20, seed=3, device="cuda", **options)
+    np.testing.assert_array_equal(
+        told.get(), ml.simulate(FLUX, system, engine=engine, realizations=20, seed=3, **options)
+    )
+
+
 def test_no_device_is_told():
     cupy = pytest.importorskip("cupy", reason="no CuPy: the extra cuda12 or cuda13", exc_type=ImportError)
     try:
@@ -81,5 +96,6 @@ def test_no_device_is_told():
         number = 0
     if number:
         pytest.skip("there is a GPU")
-    with pytest.raises(RuntimeError, match=r"no CUDA device.*device='cpu'"):
-        ml.simulate(FLUX, SYSTEM, device="cuda")
+    for engine in ("exact", "feedback"):
+        with pytest.raises(RuntimeError, match=r"no CUDA device.*device='cpu'"):
+            ml.simulate(FLUX, SYSTEM, engine=engine, device="cuda")

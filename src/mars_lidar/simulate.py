@@ -72,8 +72,9 @@ def simulate(
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     device
-        ``"cpu"`` (default), or ``"cuda"``: the ``"exact"`` engine on the current CUDA device and stream, with the same
-        bits (extras ``cuda12`` and ``cuda13``; docs/gpu.md). The result is then a CuPy array, which
+        ``"cpu"`` (default), or ``"cuda"``: ``"exact"``, ``"feedback"`` and, with a table, ``"mars"`` on CuPy's current
+        device and stream, with the same bits (extras ``cuda12`` and ``cuda13``; docs/gpu.md). The result is then a
+        CuPy array, which
         ``torch.from_dlpack`` takes without a copy.
     out
         C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill; with

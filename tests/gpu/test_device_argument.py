@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import mars_lidar as ml
+from mars_lidar.cli import app
 
 FLUX = ml.Flux(np.full((2, 3), 2.0), 0.5, np.linspace(10.0, 80.0, 6).reshape(2, 3))
 SYSTEM = ml.System(
@@ -44,6 +47,19 @@ def test_without_cupy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
     for call in (ml.simulate, ml.simulate_timestamps):
         with pytest.raises(ImportError, match=r"mars-lidar\[cuda12\]"):
             call(FLUX, SYSTEM, device="cuda")
+
+
+def test_the_command_line_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setitem(sys.modules, "cupy", None)
+    out = tmp_path / "room.zarr"
+    arguments = ["simulate", "--scene", "room", "--size", "4", "--cycles", "200", "--device", "cuda", "--out", str(out)]
+    done = CliRunner().invoke(app, [*arguments, "--engine", "feedback"])
+    assert done.exit_code == 2
+    assert "mars-lidar[cuda12]" in done.stderr
+    done = CliRunner().invoke(app, [*arguments, "--engine", "mars"])
+    assert done.exit_code == 2
+    assert "table must be given for engine 'mars' on device 'cuda'" in done.stderr
+    assert not out.exists()
 
 
 def _device() -> Any:

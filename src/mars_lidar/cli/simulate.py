@@ -102,6 +102,7 @@ def simulate(
     realizations: options.Realizations = 1,
     seed: options.Seed = 0,
     threads: options.Threads = None,
+    device: options.Device = "cpu",
     out: options.Out,
     overwrite: options.Overwrite = False,
     picture: options.Picture = True,
@@ -205,6 +206,7 @@ def simulate(
                 realizations=realizations,
                 seed=seed,
                 threads=threads,
+                device=device,  # type: ignore[arg-type]  # checked there
                 depth_m=depth_m,
                 reflectivity=reflectivity,
                 source=source,

@@ -13,20 +13,28 @@ from mars_lidar.gpu.kernels import HEADERS, OPTIONS, Kernel, source
 _PLAIN_SHARED = 48 << 10  # bytes that a block gets without asking
 
 
+class NoCupyError(ImportError):
+    """CuPy is not installed."""
+
+
+class NoDeviceError(RuntimeError):
+    """There is no GPU that CuPy can use."""
+
+
 def cupy_with_device() -> Any:
     """CuPy, where it can compute; ImportError or RuntimeError that says what is missing."""
     try:
         import cupy
     except ImportError as error:
-        raise ImportError(
+        raise NoCupyError(
             "device='cuda' needs CuPy: pip install 'mars-lidar[cuda12]' or 'mars-lidar[cuda13]', as your driver has it"
         ) from error
     try:
         number = cupy.cuda.runtime.getDeviceCount()
     except cupy.cuda.runtime.CUDARuntimeError as error:
-        raise RuntimeError(f"device='cuda' found no CUDA device ({error}); use device='cpu'") from error
+        raise NoDeviceError(f"device='cuda' found no CUDA device ({error}); use device='cpu'") from error
     if number == 0:
-        raise RuntimeError("device='cuda' found no CUDA device; use device='cpu'")
+        raise NoDeviceError("device='cuda' found no CUDA device; use device='cpu'")
     return cupy
 
 

@@ -29,7 +29,7 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 _LAW_LANES = 64
-_LANES = 128  # threads that share a pixel
+LANES = 128  # threads that share a pixel
 _MOST_COUNTS = 2**24  # registrations of a bin that single precision counts
 _RUNS_EACH = 8  # runs for each block that is in flight, at least, where there are realizations enough
 _HOST_BYTES = 256 << 20  # of histograms that the processor draws, at a time
@@ -172,7 +172,7 @@ class _Launches:
         if work > machine.shared_bytes:
             shared = 0
         kernel = mars_histograms(out.dtype.itemsize == 4)
-        blocks = machine.resident(kernel, _LANES, shared)
+        blocks = machine.resident(kernel, LANES, shared)
         # realizations of a pixel share its shape, but no block should be without work
         parts = min(task.realizations, max(1, -(-_RUNS_EACH * blocks // pixels.size)))
         deep = -(-task.realizations // parts)
@@ -189,7 +189,7 @@ class _Launches:
             "frame_cells": frame.cells, "runs": runs, "parts": parts, "deep": deep,
             "work_bytes": (work + 63) // 64 * 64,
         }  # fmt: skip
-        machine.launch(kernel, blocks, _LANES, _core.mars_task(self._addresses(), numbers), shared)
+        machine.launch(kernel, blocks, LANES, _core.mars_task(self._addresses(), numbers), shared)
         if out.dtype.itemsize == 2 and self._may_overflow() and int(machine.host(self.arrays["full"])[0]):
             raise overflow(out.dtype.itemsize)
 
@@ -229,6 +229,7 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
     for name, axis in axes.items():
         here |= {f"{name}.{part}": array for part, array in _core.table_axis(axis).items()}
     there = TableThere(cycles, axes, {name: machine.array(array) for name, array in here.items()})
+    machine.host(there.arrays["energy"])  # all is there, for other streams too
     kept[key] = there
     return there
 
@@ -240,6 +241,7 @@ def _on_host(engine: MarsEngine, task: Task, out: Any, machine: Machine, pixels:
     alone, every, bins = MarsEngine(), task.pixel_index.size, task.system.bins
     alone.count = engine.count
     cube = out.reshape(task.realizations, every, bins)
+    where = machine.array(pixels)
     number = max(1, _HOST_BYTES // (pixels.size * bins * out.dtype.itemsize))
     for first in range(0, task.realizations, number):
         some = min(number, task.realizations - first)
@@ -249,5 +251,5 @@ def _on_host(engine: MarsEngine, task: Task, out: Any, machine: Machine, pixels:
         )  # fmt: skip
         rows = np.empty((part.items, bins), out.dtype)
         alone.histogram(part, rows)
-        cube[first : first + some, pixels] = machine.array(rows.reshape(some, pixels.size, bins))
+        cube[first : first + some, where] = machine.array(rows.reshape(some, pixels.size, bins))
     task.report["pixels_evaluated"] = float(pixels.size)

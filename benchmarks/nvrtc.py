@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-from mars_lidar.gpu.kernels import HEADERS, OPTIONS, Variant, source
+from mars_lidar.gpu.kernels import HEADERS, OPTIONS, Kernel, source
 
 
 class NotFound(RuntimeError):
@@ -49,13 +49,23 @@ def library() -> ctypes.CDLL:
     return ctypes.CDLL(str(main[0]))
 
 
-def compiled(variants: list[Variant], architecture: str) -> dict[Variant, Resources]:
+def compiled(kernels: list[Kernel], architecture: str) -> dict[Kernel, Resources]:
     """Compile to machine code for one architecture, such as ``sm_90``; RuntimeError with the log where that fails."""
+    headers = dict.fromkeys(kernel.header for kernel in kernels)
+    found: dict[Kernel, Resources] = {}
+    for header in headers:
+        some = {kernel.expression: kernel for kernel in kernels if kernel.header == header}
+        found |= {some[name]: used for name, used in compiled_code(source(header), list(some), architecture).items()}
+    return found
+
+
+def compiled_code(code: str, expressions: list[str], architecture: str) -> dict[str, Resources]:
+    """The same of kernels of one source, by their names in C++."""
     nvrtc, program = library(), ctypes.c_void_p()
-    _check(nvrtc.nvrtcCreateProgram(ctypes.byref(program), source().encode(), b"exact.cu", 0, None, None), "")
+    _check(nvrtc.nvrtcCreateProgram(ctypes.byref(program), code.encode(), b"kernel.cu", 0, None, None), "")
     try:
-        for variant in variants:
-            _check(nvrtc.nvrtcAddNameExpression(program, variant.expression.encode()), variant.expression)
+        for expression in expressions:
+            _check(nvrtc.nvrtcAddNameExpression(program, expression.encode()), expression)
         words = (*OPTIONS, f"-I{HEADERS}", f"--gpu-architecture={architecture}", "--ptxas-options=-v")
         options = [word.encode() for word in words]
         result = nvrtc.nvrtcCompileProgram(program, len(options), (ctypes.c_char_p * len(options))(*options))
@@ -63,11 +73,11 @@ def compiled(variants: list[Variant], architecture: str) -> dict[Variant, Resour
         _check(result, log)
         cubin = _text(nvrtc, program, "CUBIN")
         found = {}
-        for variant in variants:
+        for expression in expressions:
             name = ctypes.c_char_p()
-            _check(nvrtc.nvrtcGetLoweredName(program, variant.expression.encode(), ctypes.byref(name)), log)
+            _check(nvrtc.nvrtcGetLoweredName(program, expression.encode(), ctypes.byref(name)), log)
             assert name.value is not None
-            found[variant] = _resources(log, cubin, name.value.decode())
+            found[expression] = _resources(log, cubin, name.value.decode())
         return found
     finally:
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))

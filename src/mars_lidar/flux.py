@@ -136,6 +136,12 @@ class Flux:
             return self
         return self._scaled(share, dark)
 
+    def delay_periods(self, period_ns: float) -> FloatArray:
+        """Delays of the returns (K, H * W) within the period, in periods: [0, 1); 0 where there is no return."""
+        pixels = self.background.size
+        delay = np.ascontiguousarray(self.returns_delay_ns.reshape(-1, pixels)) / period_ns
+        return np.nan_to_num(delay - np.floor(delay), nan=0.0)
+
     def with_dark_counts(self, rate_hz: ArrayLike, system: System) -> Flux:
         """This flux with dark counts at `rate_hz`, counts/s: scalar or (H, W), such as `dark_count_map` draws.
 

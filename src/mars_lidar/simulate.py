@@ -72,8 +72,9 @@ def simulate(
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     device
-        ``"cpu"`` (default), or ``"cuda"``: the ``"exact"`` engine on the current CUDA device and stream, with the same
-        bits (extras ``cuda12`` and ``cuda13``; docs/gpu.md). The result is then a CuPy array, which
+        ``"cpu"`` (default), or ``"cuda"``: ``"exact"``, ``"feedback"`` and, with a table, ``"mars"`` on CuPy's current
+        device and stream, with the same bits (extras ``cuda12`` and ``cuda13``; docs/gpu.md). The result is then a
+        CuPy array, which
         ``torch.from_dlpack`` takes without a copy.
     out
         C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill; with
@@ -108,6 +109,8 @@ def simulate(
     shape = (task.realizations, *flux.shape, system.bins)
     if _validate.choice("device", device, ("cpu", "cuda")) == "cuda":
         there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
+        if report is not None:
+            report.update(task.report)
         return there
     if out is None:
         _check_memory(shape, system.histogram_dtype.itemsize, "histograms")
@@ -175,8 +178,7 @@ def simulate_timestamps(
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:
     engine.check_device("cuda", task.flux, task.system)
-    from mars_lidar.gpu import exact_histogram
-    from mars_lidar.gpu.exact import cupy_with_device
+    from mars_lidar.gpu.machine import cupy_with_device
 
     cupy = cupy_with_device()
     dtype = task.system.histogram_dtype
@@ -188,7 +190,7 @@ def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> An
         raise ValueError(
             f"out must be C-contiguous, of shape {shape} and dtype {dtype}, got {out.shape} and {out.dtype}"
         )
-    exact_histogram(task, out.reshape(task.items, task.system.bins))
+    engine.histogram_on_cuda(task, out.reshape(task.items, task.system.bins))
     return out
 
 

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 from benchmarks.nvrtc import NotFound, compiled, library
 
-from mars_lidar.gpu.kernels import Sink, Variant
+from mars_lidar.gpu.kernels import MARS_LAWS, Kernel, Sink, Variant, feedback_histograms, mars_histograms
 
 try:
     library()
@@ -22,7 +22,9 @@ SINKS = [Variant(0, True, False, False, sink) for sink in Sink if sink not in (S
 
 @pytest.mark.parametrize(("architecture", "variants"), [("sm_80", BRIGHT[:2]), ("sm_90", [*BRIGHT, *OTHERS, *SINKS])])
 def test_compiles_without_spills(architecture: str, variants: list[Variant]):
-    for variant, used in compiled(variants, architecture).items():
+    found = compiled([variant.kernel for variant in variants], architecture)
+    for variant in variants:
+        used = found[variant.kernel]
         assert used.spill_stores == used.spill_loads == 0, variant
         assert used.registers <= 168, variant  # 3 warps on each of a multiprocessor's 4 schedulers
         assert used.instructions > 500, variant
@@ -30,6 +32,20 @@ def test_compiles_without_spills(architecture: str, variants: list[Variant]):
             assert used.stack_bytes == 0, variant
 
 
+@pytest.mark.parametrize(
+    ("architecture", "kernels"),
+    [
+        ("sm_80", [mars_histograms(True), feedback_histograms(True)]),
+        ("sm_90", [MARS_LAWS, mars_histograms(False), feedback_histograms(False)]),
+    ],
+)
+def test_the_other_engines_compile_without_spills(architecture: str, kernels: list[Kernel]):
+    for kernel, used in compiled(kernels, architecture).items():
+        assert used.spill_stores == used.spill_loads == 0, kernel
+        assert used.registers <= 168, kernel
+        assert used.instructions > 500, kernel
+
+
 def test_a_mistake_is_told():
     with pytest.raises(RuntimeError, match="NVRTC failed"):
-        compiled([Variant(0, True, True, True, Sink.BLOCK16, ahead=-1)], "sm_90")
+        compiled([Variant(0, True, True, True, Sink.BLOCK16, ahead=-1).kernel], "sm_90")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import mars_lidar as ml
+from mars_lidar.cli import app
 
 FLUX = ml.Flux(np.full((2, 3), 2.0), 0.5, np.linspace(10.0, 80.0, 6).reshape(2, 3))
 SYSTEM = ml.System(
@@ -21,9 +24,9 @@ def test_unknown_device():
         ml.simulate(FLUX, SYSTEM, device="tpu")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("engine", ["feedback", "mars", "sequential"])
+@pytest.mark.parametrize("engine", ["auto", "renewal", "sequential"])
 def test_engines_without_a_kernel_name_what_works(engine: str):
-    with pytest.raises(ValueError, match=rf"{engine}.*device 'cuda'.*'exact'.*device 'cpu'"):
+    with pytest.raises(ValueError, match=rf"{engine}.*device 'cuda'.*'exact' or 'feedback' or 'mars'.*device 'cpu'"):
         ml.simulate(FLUX, SYSTEM, engine=engine, device="cuda")
 
 
@@ -44,6 +47,19 @@ def test_without_cupy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
     for call in (ml.simulate, ml.simulate_timestamps):
         with pytest.raises(ImportError, match=r"mars-lidar\[cuda12\]"):
             call(FLUX, SYSTEM, device="cuda")
+
+
+def test_the_command_line_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setitem(sys.modules, "cupy", None)
+    out = tmp_path / "room.zarr"
+    arguments = ["simulate", "--scene", "room", "--size", "4", "--cycles", "200", "--device", "cuda", "--out", str(out)]
+    done = CliRunner().invoke(app, [*arguments, "--engine", "feedback"])
+    assert done.exit_code == 2
+    assert "mars-lidar[cuda12]" in done.stderr
+    done = CliRunner().invoke(app, [*arguments, "--engine", "mars"])
+    assert done.exit_code == 2
+    assert "table must be given for engine 'mars' on device 'cuda'" in done.stderr
+    assert not out.exists()
 
 
 def _device() -> Any:
@@ -73,6 +89,21 @@ def test_bits_on_a_gpu(mode: str, start: str):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
+@pytest.mark.parametrize("dead_ns", [63.75, 101.0])
+@pytest.mark.parametrize("cycles", [500, 50_000, 200_000])
+@pytest.mark.parametrize("engine", ["feedback", "mars"])
+def test_bits_of_other_engines_on_a_gpu(engine: str, cycles: int, dead_ns: float):
+    _device()
+    system = SYSTEM.replace(cycles=cycles, bins=1024, detector=ml.Detector(dead_time_ns=dead_ns))
+    options: dict[str, Any] = {}
+    if engine == "mars":
+        options["table"] = ml.Table.build(system, (0.05, 3.0, 9), (0.05, 3.0, 9))
+    told = ml.simulate(FLUX, system, engine=engine, realizations=20, seed=3, device="cuda", **options)
+    np.testing.assert_array_equal(
+        told.get(), ml.simulate(FLUX, system, engine=engine, realizations=20, seed=3, **options)
+    )
+
+
 def test_no_device_is_told():
     cupy = pytest.importorskip("cupy", reason="no CuPy: the extra cuda12 or cuda13", exc_type=ImportError)
     try:
@@ -81,5 +112,6 @@ def test_no_device_is_told():
         number = 0
     if number:
         pytest.skip("there is a GPU")
-    with pytest.raises(RuntimeError, match=r"no CUDA device.*device='cpu'"):
-        ml.simulate(FLUX, SYSTEM, device="cuda")
+    for engine in ("exact", "feedback"):
+        with pytest.raises(RuntimeError, match=r"no CUDA device.*device='cpu'"):
+            ml.simulate(FLUX, SYSTEM, engine=engine, device="cuda")

@@ -166,6 +166,10 @@ Threads = Annotated[
     int | None,
     _option("--threads", panel=_RUN, help="Threads; the counts do not depend on it.", default="all cores"),
 ]
+Device = Annotated[
+    str,
+    _option("--device", panel=_RUN, help="cpu, or cuda: the current GPU, with the same counts.", default="cpu"),
+]
 Overwrite = Annotated[
     bool,
     _option("--overwrite", panel=_OUTPUT, help="Replace an existing cube and picture."),

@@ -55,6 +55,7 @@ def simulate(
     realizations: options.Realizations = 1,
     seed: options.Seed = 0,
     threads: options.Threads = None,
+    device: options.Device = "cpu",
     out: options.Out,
     overwrite: options.Overwrite = False,
     picture: options.Picture = True,
@@ -84,6 +85,7 @@ def simulate(
                 realizations=realizations,
                 seed=seed,
                 threads=threads,
+                device=device,  # type: ignore[arg-type]  # checked there
                 depth_m=view.depth_m,
                 reflectivity=view.reflectivity,
                 source=view.source,

@@ -67,14 +67,12 @@ class Task:
 
         flux, pixels = self.flux, self.pixel_index.size
         signal = np.ascontiguousarray(flux.returns_signal.reshape(-1, pixels))
-        delay = np.ascontiguousarray(flux.returns_delay_ns.reshape(-1, pixels)) / self.system.period_ns
-        delay = np.nan_to_num(delay - np.floor(delay), nan=0.0)
         wave = flux.waveform
         detector = self.system.detector
         start, step, width = detector.gate_periods(self.system.period_ns)
         return _core.Job(
             signal=signal,
-            delay=delay,
+            delay=flux.delay_periods(self.system.period_ns),
             background=np.ascontiguousarray(flux.background.reshape(-1)),
             waveform=None if wave is None else np.ascontiguousarray(wave.reshape(pixels, -1)),
             pixel_index=self.pixel_index,
@@ -193,6 +191,10 @@ class Engine(ABC):
                 f"engine {self.name!r} does not run on device {device!r}, only on "
                 f"{', '.join(map(repr, self.devices))}; use engine {able}, or device 'cpu'"
             )
+
+    def histogram_on_cuda(self, task: Task, out: Any) -> None:
+        """`histogram` of a checked task into a CuPy array, on CuPy's current device and stream."""
+        raise ValueError(f"engine {self.name!r} does not run on device 'cuda'; use device 'cpu'")
 
     @abstractmethod
     def histogram(self, task: Task, out: NDArray[Any]) -> None:

@@ -42,6 +42,12 @@ class ExactEngine(Engine):
         able = tuple(effect for effect in LIGHT_EFFECTS if effect in self.effects)
         require_effects(f"device {device!r}", system.detector, able, lambda effect: "; use device 'cpu'")
 
+    def histogram_on_cuda(self, task: Task, out: Any) -> None:
+        """One exposure a thread."""
+        from mars_lidar.gpu import exact_histogram
+
+        exact_histogram(task, out)
+
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every registration, binned as it is drawn."""
         if task.flux.waveform is not None:

@@ -46,9 +46,39 @@ class FeedbackEngine(Engine):
 
     name = "feedback"
     description = "whole histograms with their joint law, at a cost independent of the exposure"
+    devices = ("cpu", "cuda")
 
     def __init__(self, level: str = "") -> None:
         self.level = level
+
+    def check_device(self, device: str, flux: Flux, system: System) -> None:
+        """On a GPU: pixels with a dead time; without one they are Poisson numbers, which no kernel draws."""
+        super().check_device(device, flux, system)
+        if device == "cpu":
+            return
+        if system.dead_time_periods == 0.0:
+            raise ValueError(
+                f"dead_time_ns must be > 0 for engine 'feedback' on device {device!r}; use engine 'exact' there, or "
+                "device 'cpu'"
+            )
+
+    def histogram_on_cuda(self, task: Task, out: Any) -> None:
+        """One pixel a thread; what the sweeps refuse is drawn by the exact engine, there or, a waveform, here."""
+        from mars_lidar.gpu.feedback import feedback_histogram
+        from mars_lidar.gpu.machine import Cuda
+
+        machine = Cuda()
+
+        def draw_exactly(part: Task, rows: Any) -> None:
+            if part.flux.waveform is None:
+                ExactEngine().histogram_on_cuda(part, rows)
+                return
+            here = np.empty((part.items, part.system.bins), rows.dtype)
+            ExactEngine(self.level).histogram(part, here)
+            rows[...] = machine.array(here)
+
+        able = np.flatnonzero(_in_range(task.flux, task.system))
+        task.report["pixels given to exact"] = float(feedback_histogram(task, out, able, machine, draw_exactly))
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Poisson numbers, feedback, or the exact engine, pixel by pixel."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,8 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.engines.base import Records, Task
-from mars_lidar.gpu.kernels import HEADERS, OPTIONS, Sink, Variant, block_bytes, source
+from mars_lidar.gpu.kernels import Sink, Variant, block_bytes
+from mars_lidar.gpu.machine import compiled, cupy_with_device
 
 _WARP = 32
 _ROW_THREADS = 128  # of a block whose histograms are not in its memory
@@ -18,21 +18,7 @@ _LAUNCH_ITEMS = 1 << 22
 _LEAST_WARPS = 3  # of histograms that must fit into a multiprocessor, else they are counted in the device's memory
 
 
-def cupy_with_device() -> Any:
-    """CuPy, where it can compute; ImportError or RuntimeError that says what is missing."""
-    try:
-        import cupy
-    except ImportError as error:
-        raise ImportError(
-            "device='cuda' needs CuPy: pip install 'mars-lidar[cuda12]' or 'mars-lidar[cuda13]', as your driver has it"
-        ) from error
-    try:
-        number = cupy.cuda.runtime.getDeviceCount()
-    except cupy.cuda.runtime.CUDARuntimeError as error:
-        raise RuntimeError(f"device='cuda' found no CUDA device ({error}); use device='cpu'") from error
-    if number == 0:
-        raise RuntimeError("device='cuda' found no CUDA device; use device='cpu'")
-    return cupy
+__all__ = ["cupy_with_device", "exact_histogram", "exact_records", "host_arrays"]
 
 
 def exact_histogram(task: Task, out: Any, *, in_block: bool | None = None) -> None:
@@ -73,10 +59,9 @@ def exact_records(task: Task) -> Records:
 def host_arrays(task: Task) -> dict[str, NDArray[Any]]:
     """What the kernel reads, by name: flux, tables of the pulse, order of the pixels, starts of the exposures."""
     flux, pixels = task.flux, task.pixel_index.size
-    delay = np.ascontiguousarray(flux.returns_delay_ns.reshape(-1, pixels)) / task.system.period_ns
     arrays: dict[str, NDArray[Any]] = {
         "signal": np.ascontiguousarray(flux.returns_signal.reshape(-1, pixels)),
-        "delay": np.nan_to_num(delay - np.floor(delay), nan=0.0),
+        "delay": flux.delay_periods(task.system.period_ns),
         "background": np.ascontiguousarray(flux.background.reshape(-1)),
         "pixel_index": task.pixel_index,
         # the threads of a warp wait for each other, and the longest exposures should begin first
@@ -96,7 +81,7 @@ def _arrays(cupy: Any, task: Task) -> dict[str, Any]:
 def _run(cupy: Any, task: Task, sink: Sink, to: dict[str, Any], arrays: dict[str, Any] | None = None) -> None:
     every = {**(_arrays(cupy, task) if arrays is None else arrays), **to}
     addresses = {name: int(array.data.ptr) for name, array in every.items() if array.size}
-    kernel = _kernel(Variant.of(task, sink), int(cupy.cuda.Device().id))
+    kernel = compiled(Variant.of(task, sink).kernel, int(cupy.cuda.Device().id))
     in_block = sink in (Sink.BLOCK16, Sink.BLOCK32)
     lanes = _WARP if in_block else _ROW_THREADS
     shared = block_bytes(task.system.bins, lanes) if in_block else 0
@@ -115,13 +100,3 @@ def _run(cupy: Any, task: Task, sink: Sink, to: dict[str, Any], arrays: dict[str
 
 def _shared_bytes(cupy: Any) -> int:
     return int(cupy.cuda.Device().attributes["MaxSharedMemoryPerBlockOptin"])
-
-
-@lru_cache(maxsize=64)
-def _kernel(variant: Variant, device: int) -> Any:
-    import cupy
-
-    module = cupy.RawModule(
-        code=source(), options=(*OPTIONS, f"-I{HEADERS}"), backend="nvrtc", name_expressions=(variant.expression,)
-    )
-    return module.get_function(variant.expression)

@@ -26,12 +26,33 @@ OPTIONS = (
 
 
 @cache
-def source() -> str:
+def source(header: str) -> str:
     """What is compiled. It tells the headers' contents, by which CuPy names what it has compiled before."""
     contents = blake2b(digest_size=16)
-    for header in sorted(HEADERS.glob("*.h")):
-        contents.update(header.read_bytes())
-    return f'// {contents.hexdigest()}\n#include "exact_device.h"\n'
+    for file in sorted(HEADERS.glob("*.h")):
+        contents.update(file.read_bytes())
+    return f'// {contents.hexdigest()}\n#include "{header}"\n'
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """One kernel: the header of `native` that has it, and its name in C++."""
+
+    header: str
+    expression: str
+
+
+MARS_LAWS = Kernel("mars_device.h", "mars::mars_laws")
+
+
+def mars_histograms(wide: bool) -> Kernel:
+    """The kernel that draws, into histograms of uint32 or uint16."""
+    return Kernel("mars_device.h", f"mars::mars_histograms<{str(wide).lower()}>")
+
+
+def feedback_histograms(wide: bool) -> Kernel:
+    """The engine "feedback", into histograms of uint32 or uint16."""
+    return Kernel("feedback_device.h", f"mars::feedback_histograms<{str(wide).lower()}>")
 
 
 class Sink(IntEnum):
@@ -68,10 +89,24 @@ class Variant:
         )
 
     @property
+    def kernel(self) -> Kernel:
+        """As it is compiled."""
+        return Kernel("exact_device.h", self.expression)
+
+    @property
     def expression(self) -> str:
         """Its name in C++."""
         flags = ", ".join(str(flag).lower() for flag in (self.gaussian, self.whole, self.single))
         return f"mars::exact_items<{self.mode}, {flags}, {int(self.sink)}, {self.ahead}>"
+
+
+def overflow(itemsize: int) -> OverflowError:
+    """What the engines raise where a bin exceeds its type."""
+    most = 2 ** (8 * itemsize) - 1
+    return OverflowError(
+        f"a histogram bin exceeds {most} counts: use fewer cycles, less flux"
+        + (", or an output of uint32" if itemsize < 4 else "")
+    )
 
 
 def block_bytes(bins: int, lanes: int) -> int:

@@ -72,6 +72,7 @@ def simulate_to(
     pixel_index: ArrayLike | None = None,
     seed: int = 0,
     threads: int | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
     depth_m: ArrayLike | None = None,
     reflectivity: ArrayLike | None = None,
     source: str = "",
@@ -92,8 +93,8 @@ def simulate_to(
     ----------
     path
         The file; its suffix chooses the format.
-    flux, system, engine, realizations, first_realization, pixel_index, seed, threads
-        As for `mars_lidar.simulate`.
+    flux, system, engine, realizations, first_realization, pixel_index, seed, threads, device
+        As for `mars_lidar.simulate`; blocks from a GPU are copied from there, and the file does not tell.
     table, count, interpolation, outside, model
         As for `mars_lidar.simulate`; the file keeps the name of the engine, its settings, and a hash of the table.
     depth_m, reflectivity
@@ -135,7 +136,7 @@ def simulate_to(
     check_output(target, recipe, overwrite=overwrite)
     if isinstance(engine, str):  # every pixel, before the blocks one by one
         find_engine(engine, **options).check(flux, system)
-    _try_brightest_pixel(recipe, threads)
+    _try_brightest_pixel(recipe, threads, device)
     try:
         writer = create(target, recipe, overwrite=overwrite)
     except OSError as error:
@@ -147,7 +148,8 @@ def simulate_to(
         for images, rows in recipe.blocks(writer.chunks):
             began = time.perf_counter()
             told: dict[str, float] = {}
-            block = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows), told)
+            tell = _of_the_whole(progress, recipe, images, rows)
+            block = _simulate(recipe, images, rows, threads, tell, told, device)
             ended = time.perf_counter()
             writer.write(images, rows, block)
             registrations += int(block.sum(dtype=np.uint64))
@@ -225,12 +227,14 @@ def _simulate(
     threads: int | None,
     progress: Progress | None,
     report: dict[str, float] | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
 ) -> NDArray[Any]:
     from mars_lidar import simulate
 
     part = recipe.part(images, rows)
-    counts: NDArray[Any] = simulate(**part, threads=threads, progress=progress, report=report)
-    return counts
+    counts: Any = simulate(**part, threads=threads, device=device, progress=progress, report=report)
+    here: NDArray[Any] = counts if device == "cpu" else counts.get()
+    return here
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -266,7 +270,7 @@ def _grid(record: dict[str, Any]) -> str:
     return f"method {record['method']!r}, {axes}, hash {record['hash']}"
 
 
-def _try_brightest_pixel(recipe: Recipe, threads: int | None) -> None:
+def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["cpu", "cuda"]) -> None:
     """Let the simulator check its arguments before anything on disk is touched."""
     y, x = (int(k) for k in np.unravel_index(np.argmax(recipe.flux.total), recipe.flux.shape))
     one = recipe.replace(
@@ -276,7 +280,7 @@ def _try_brightest_pixel(recipe: Recipe, threads: int | None) -> None:
         depth_m=recipe.depth_m[:1, :1],
         reflectivity=None,
     )
-    _simulate(one, slice(0, 1), slice(0, 1), threads, None)
+    _simulate(one, slice(0, 1), slice(0, 1), threads, None, device=device)
 
 
 def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:

@@ -29,6 +29,8 @@ struct BoundRecording : Recording {
 void bind_pulse(nb::module_& module);
 void bind_exact(nb::module_& module);
 void bind_device(nb::module_& module);
+void bind_mars_device(nb::module_& module);
+void bind_feedback_device(nb::module_& module);
 void bind_waveform(nb::module_& module);
 void bind_sequential(nb::module_& module);
 void bind_poisson(nb::module_& module);

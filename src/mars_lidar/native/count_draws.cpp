@@ -1,20 +1,13 @@
 // Numbers of registrations of exposures, one word each: a pure function of (seed, realization, pixel).
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-
 #include "bindings.h"
-#include "elementary.h"
-#include "matched_law.h"
+#include "count_laws.h"
 #include "parallel.h"
 #include "poisson_sampler.h"
 
 namespace mars {
 namespace {
 
-constexpr uint64_t kCountDomain = 0x436f756e74730000u;  // "Counts": not another engine's numbers at one seed
 constexpr int64_t kChunkPixels = 4096;
-constexpr double kMostCounts = 9007199254740992.0;  // 2^53
 
 struct Draws {
     Vector<const uint32_t> pixel_index;
@@ -44,31 +37,6 @@ void draw(const Draws& draws, int threads, const Make& make) {
                    }
                });
 }
-
-// The normal law rounded to integers, what lies below 0 put at 0.
-struct RoundedNormal {
-    double mean, deviation;
-    int64_t operator()(const EventStream& stream) const {
-        const double x = std::nearbyint(mean + deviation * normal_quantile(open_uniform(stream.word(0, 0))));
-        return static_cast<int64_t>(std::clamp(x, 0.0, kMostCounts));
-    }
-};
-
-// The law with four given cumulants.
-struct Matched {
-    MatchedLaw law;
-    int64_t operator()(const EventStream& stream) const { return law.draw(open_uniform(stream.word(0, 0))); }
-};
-
-// A tabulated distribution function: the first count whose P(N <= n) exceeds the uniform number.
-struct Tabulated {
-    const double *begin, *end;
-    int64_t first;
-    int64_t operator()(const EventStream& stream) const {
-        const double u = open_uniform(stream.word(0, 0));
-        return first + std::min<int64_t>(std::upper_bound(begin, end, u) - begin, end - begin - 1);
-    }
-};
 
 struct Poisson {
     PoissonSampler sampler;

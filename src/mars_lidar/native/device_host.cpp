@@ -8,6 +8,7 @@
 #include <nanobind/stl/string.h>
 
 #include "bindings.h"
+#include "device_fields.h"
 #include "exact_device.h"
 #include "exact_start.h"
 #include "parallel.h"
@@ -104,14 +105,6 @@ void run_on_host(const BoundJob& job, const PulseTable& pulse, const nb::dict& a
             kernel(task);
         }
     });
-}
-
-template <class T>
-nb::object copied(const std::vector<T>& from) {
-    T* data = new T[from.size()];
-    std::copy(from.begin(), from.end(), data);
-    nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, T, nb::ndim<1>>(data, {from.size()}, owner));
 }
 
 }  // namespace

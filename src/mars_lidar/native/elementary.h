@@ -1,13 +1,11 @@
 // Elementary functions by IEEE arithmetic alone: the same bits on every machine, whatever its libm.
 #pragma once
-#include <cmath>
-#include <cstdint>
-#include <cstring>
+#include "standard.h"
 
 namespace mars {
 
 // e^x for x <= 700; 0 below -708. x = k log 2 + r, Taylor series to r^13 for |r| <= log(2)/2 (error 1e-16).
-inline double ieee_exp(double x) {
+MARS_APART inline double ieee_exp(double x) {
     if (!(x > -708.0)) return 0.0;
     constexpr double kLog2High = 0x1.62e42fefa39efp-1, kLog2Low = 0x1.abc9e3b39803fp-56;
     constexpr double kInverse[] = {1.0,     1.0,     1.0 / 2, 1.0 / 3,  1.0 / 4,  1.0 / 5,  1.0 / 6,
@@ -17,32 +15,28 @@ inline double ieee_exp(double x) {
     double sum = 1.0;
     for (int n = 13; n >= 1; --n) sum = 1.0 + sum * r * kInverse[n];
     const uint64_t word = static_cast<uint64_t>(static_cast<int64_t>(k) + 1023) << 52;
-    double scale;
-    std::memcpy(&scale, &word, sizeof scale);
-    return sum * scale;
+    return sum * bits_double(word);
 }
 
 // log x of a positive normal number. x = m 2^e, m in [sqrt(1/2), sqrt(2)): log m = 2 artanh((m-1)/(m+1)).
-inline double ieee_log(double x) {
-    uint64_t word;
-    std::memcpy(&word, &x, sizeof word);
+MARS_APART inline double ieee_log(double x) {
+    uint64_t word = double_bits(x);
     constexpr uint64_t kRootHalf = 0x3fe6a09e667f3bcdu;
     const int64_t shifted = static_cast<int64_t>(word - kRootHalf);
     const int64_t e = shifted >> 52;
     word -= static_cast<uint64_t>(e) << 52;
-    double m;
-    std::memcpy(&m, &word, sizeof m);
+    const double m = bits_double(word);
     const double s = (m - 1.0) / (m + 1.0), q = s * s;
     double sum = 1.0 / 23;
-    for (const double c : {1.0 / 21, 1.0 / 19, 1.0 / 17, 1.0 / 15, 1.0 / 13, 1.0 / 11, 1.0 / 9, 1.0 / 7, 1.0 / 5,
-                           1.0 / 3})
-        sum = sum * q + c;
+    constexpr double kOdd[] = {1.0 / 21, 1.0 / 19, 1.0 / 17, 1.0 / 15, 1.0 / 13,
+                               1.0 / 11, 1.0 / 9,  1.0 / 7,  1.0 / 5,  1.0 / 3};
+    for (const double c : kOdd) sum = sum * q + c;
     return static_cast<double>(e) * 0x1.62e42fefa39efp-1 + (2.0 * s + 2.0 * s * q * sum);
 }
 
 // Quantile of the standard normal law for u in (0, 1), relative error 1e-16: algorithm AS 241 (PPND16) of
 // M. J. Wichura, "The percentage points of the normal distribution", Applied Statistics 37 (1988).
-inline double normal_quantile(double u) {
+MARS_APART inline double normal_quantile(double u) {
     const double q = u - 0.5;
     if (q <= 0.425 && q >= -0.425) {
         const double r = 0.180625 - q * q;

@@ -9,7 +9,7 @@
 
 #include "bindings.h"
 #include "feedback_grid.h"
-#include "feedback_photons.h"
+#include "pulse_energy.h"
 #include "histogram_output.h"
 #include "parallel.h"
 #include "pulse_table.h"
@@ -51,7 +51,7 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
     if (number == 0) return;
     const Kernel kernel = kernel_of(level);
     const CellGrid cells(job, merge, parts, narrow.data());
-    const PulseEnergy energy(pulse.shape);
+    const PulseEnergyTables energy(pulse.shape);
     Count* const cube = out.data();
 
     // A stream is every `splits`-th realization of one pixel; a batch is kTeam streams.
@@ -60,6 +60,7 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
     std::vector<uint8_t> refused(static_cast<size_t>(streams), 0);
     run_chunks((streams + kTeam - 1) / kTeam, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
         thread_local std::vector<unsigned char> memory;
+        thread_local std::vector<double> lit;
         int64_t lane_pixel[kTeam];
         int32_t draws[kTeam];
         uint32_t index[kTeam], realization[kTeam];
@@ -75,14 +76,19 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
             realization[i] = job.first_realization + static_cast<uint32_t>(part);
             rows[i] = cube + (part * job.pixels + pixel) * job.bins;
         }
-        const LanePhotons photons(job, energy, cells, lane_pixel);
+        lit.resize(std::max(lit.size(), static_cast<size_t>(cells.grid.cells) * kTeam));
+        const LanePhotons photons(job, energy.energy, cells.grid, lane_pixel, lit.data(), kTeam);
+        const int64_t bytes = feedback_bytes(cells.grid.cells, photons.lit_end - photons.lit_begin);
+        memory.resize(std::max(memory.size(), static_cast<size_t>(bytes)));
         FeedbackBatch batch{};
         batch.grid = &cells.grid;
         batch.first_bin = photons.first_bin;
         batch.dark_photons = photons.dark;
         batch.lit_begin = photons.lit_begin;
         batch.lit_end = photons.lit_end;
-        batch.lit_photons = photons.lit.data();
+        batch.lit_photons = lit.data();
+        batch.lit_row = kTeam;
+        batch.lit_room = photons.lit_end - photons.lit_begin;
         batch.pixel_index = index;
         batch.realization = realization;
         batch.realization_step = static_cast<uint32_t>(splits);
@@ -92,7 +98,7 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
         batch.row_step = splits * job.pixels * job.bins;
         batch.wide = sizeof(Count) == 4;
         batch.status = lane_status;
-        batch.memory = &memory;
+        batch.memory = memory.data();
         batch.stop = &stop;
         if (!kernel(batch)) throw_full<Count>();
         for (int i = 0; i < kTeam && chunk * kTeam + i < streams; ++i)

@@ -12,13 +12,12 @@ namespace mars {
 class CellGrid {
 public:
     FeedbackGrid grid;
-    double widths[2];  // of the wide and the narrow cells, in periods
 
     // `narrow` (bins * merge): base cells that are cut into `parts`.
     CellGrid(const Job& job, int32_t merge, int32_t parts, const uint8_t* narrow) {
         const int32_t base = job.bins * merge;
-        widths[0] = 1.0 / base;
-        widths[1] = widths[0] / parts;
+        grid.width[0] = 1.0 / base;
+        grid.width[1] = grid.width[0] / parts;
         for (int32_t b = 0; b < base; ++b) {
             if (b % merge == 0) bin_cell_.push_back(static_cast<int32_t>(place_.size()));
             first_.push_back(static_cast<int32_t>(place_.size()));
@@ -51,6 +50,11 @@ public:
     }
     CellGrid(const CellGrid&) = delete;
     CellGrid& operator=(const CellGrid&) = delete;
+
+    const std::vector<int32_t>& bin_cell() const { return bin_cell_; }
+    const std::vector<double>& place() const { return place_; }
+    const std::vector<uint8_t>& narrow() const { return narrow_; }
+    const std::vector<FeedbackEdge>& edge() const { return edge_; }
 
 private:
     void set_edges(int32_t base, double rest) {

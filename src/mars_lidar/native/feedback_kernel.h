@@ -1,13 +1,21 @@
 // The feedback engine's inner loops, one function per vector level (feedback_kernel.cpp is compiled once for each).
 // Symbols and steps are those of docs/feedback.md.
 #pragma once
+#include "integers.h"
+#if !defined(__CUDACC_RTC__)
 #include <atomic>
-#include <cstdint>
-#include <vector>
+#endif
+
+#ifndef MARS_FEEDBACK_TEAM
+#define MARS_FEEDBACK_TEAM 32
+#endif
 
 namespace mars {
 
-constexpr int kTeam = 32;  // lanes of a batch at every level: two vectors of AVX-512
+// Lanes of a batch: at every level of the processor two vectors of AVX-512; on a GPU the one of a thread.
+constexpr int kTeam = MARS_FEEDBACK_TEAM;
+constexpr int kRow = 32;              // lanes of a row in memory: a batch's, or those of a warp's threads
+constexpr int kTeams = kRow / kTeam;  // batches side by side in it
 
 // What lies one dead time (without whole periods) before an edge of the internal grid: the cell from edge `early` to
 // edge `late`, `turns` periods ago, and the share f of it that comes after that instant. RA = C_late - f (C_late -
@@ -28,6 +36,7 @@ struct FeedbackGrid {
     const double* place;       // (n + 1) of the edges, in periods
     const int32_t* bin_cell;   // (bins + 1) cell that each bin of the histogram begins with
     const uint8_t* narrow;     // (n) 1: a cell of the finer kind
+    double width[2];           // of the wide and the narrow cells, in periods
     double dead_time;          // in periods
     int32_t cycles;
     bool stationary;
@@ -47,6 +56,8 @@ struct FeedbackBatch {
     const double* dark_photons;   // (2, kTeam): per period in a cell without signal, of the wide and the narrow kind
     int32_t lit_begin, lit_end;   // cells that may have signal ...
     const double* lit_photons;    // ... (lit_end - lit_begin, kTeam): theirs, background included
+    int64_t lit_row;              // from cell to cell of these
+    int32_t lit_room;             // cells that scratch has room for: the same for batches that share rows
     const uint32_t* pixel_index;  // (kTeam)
     const uint32_t* realization;  // (kTeam): of the first draw
     uint32_t realization_step;    // from draw to draw
@@ -56,15 +67,29 @@ struct FeedbackBatch {
     int64_t row_step;             // counts from draw to draw
     bool wide;                    // uint32 counts, else uint16
     FeedbackStatus* status;       // (kTeam)
-    std::vector<unsigned char>* memory;  // scratch, kept between batches
+    unsigned char* memory;        // `feedback_bytes` of scratch
+    int32_t lane;                 // of the rows in there: the batch's first
+#if defined(__CUDACC_RTC__)
+    bool stopped() const { return false; }
+#else
     const std::atomic<bool>* stop;
+    bool stopped() const { return stop && stop->load(std::memory_order_relaxed); }
+#endif
 };
 
+// Scratch of a batch, or of as many as share rows: `lit` cells may have signal.
+inline int64_t feedback_bytes(int64_t cells, int64_t lit) {
+    const int64_t row = kRow, rows = cells * row;
+    return 4 * (4 * row + 2 * lit * row + 8 * (rows + row)) + 2 * rows + 4 * cells * kTeams + 64 * 32;  // room to align
+}
+
+#if !defined(__CUDACC_RTC__)
 // Returns false where a count does not fit into its histogram bin.
 #define MARS_DECLARE_FEEDBACK(level) bool feedback_kernel_##level(const FeedbackBatch& batch);
 MARS_DECLARE_FEEDBACK(scalar)
 MARS_DECLARE_FEEDBACK(vector128)
 MARS_DECLARE_FEEDBACK(avx2)
 MARS_DECLARE_FEEDBACK(avx512)
+#endif
 
 }  // namespace mars

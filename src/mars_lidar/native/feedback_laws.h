@@ -1,8 +1,7 @@
 // Laws of a pixel that its sweeps need: rates, means, variance of the count, blind time at the ends of the exposure.
 #pragma once
-#include <utility>
-
 #include "feedback_sweeps.h"
+#include "standard.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -12,9 +11,9 @@ MARS_INLINE double floor_of(double x) {
     return whole > x ? whole - 1.0 : whole;
 }
 
-// p = 1 - e^-l and q = 1 - p / l: Taylor series at l / 64, then six times 1 - e^-2x = p (2 - p).
-MARS_NOINLINE void set_rates(const double* photons, size_t number, float* fire, float* refire) {
-    for (size_t i = 0; i < number; ++i) {
+// A row of p = 1 - e^-l and q = 1 - p / l: Taylor series at l / 64, then six times 1 - e^-2x = p (2 - p).
+MARS_NOINLINE void set_rates(const double* photons, float* fire, float* refire) {
+    for (int i = 0; i < kTeam; ++i) {
         const double l = photons[i] < 40.0 ? photons[i] : 40.0, x = l * 0x1p-6;
         double p = 1.0;
         p = 1.0 - p * x * (1.0 / 12);
@@ -74,7 +73,7 @@ public:
     MARS_INLINE void next(int32_t j) {
         const FeedbackEdge& edge = edge_[j + 1];
         mean_row(rates_.fire(j), rates_.refire(j), history_.at(edge), edge.part,
-                 sums_ + static_cast<int64_t>(j) * kTeam, scale_, re_, mean, variance, armed);
+                 sums_ + static_cast<int64_t>(j) * kRow, scale_, re_, mean, variance, armed);
     }
 
     // A bit per lane that has less than `few` exposures armed and a mean above `counts`.
@@ -109,9 +108,9 @@ MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const Rates& rates, c
     for (int i = 0; i < kTeam; ++i) {
         total[i] = old[i];
         sum[i] = moved[i] = 0.0f;
-        fresh[static_cast<int64_t>(n) * kTeam + i] = 0.0f;
+        fresh[static_cast<int64_t>(n) * kRow + i] = 0.0f;
     }
-    auto row = [](auto* rows, int32_t j) { return rows + static_cast<int64_t>(j) * kTeam; };
+    auto row = [](auto* rows, int32_t j) { return rows + static_cast<int64_t>(j) * kRow; };
     auto source = [&](int32_t e) {  // cell one dead time before edge e, e counted on through the periods
         const int32_t turns = e / n;
         const FeedbackEdge& edge = grid.edge[e - turns * n];
@@ -153,14 +152,14 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, 
     alignas(64) float moved[kTeam];
     bool done[kTeam] = {};
     for (int i = 0; i < kTeam; ++i) {
-        old[static_cast<int64_t>(n) * kTeam + i] = 0.0f;
+        old[static_cast<int64_t>(n) * kRow + i] = 0.0f;
         result[i] = 0.0;
     }
     for (int32_t j = n - 1; j >= 0; --j)
         for (int i = 0; i < kTeam; ++i) {
-            const int64_t at = static_cast<int64_t>(j) * kTeam + i;
+            const int64_t at = static_cast<int64_t>(j) * kRow + i;
             values[at] = 1.0f;
-            old[at] = old[at + kTeam] + rates.fire(j)[i];
+            old[at] = old[at + kRow] + rates.fire(j)[i];
         }
     for (int sweep = 1; sweep <= sweeps; ++sweep) {
         adjoint_sweep(grid, rates, old, fresh, values, moved);
@@ -171,7 +170,7 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, 
             done[i] = !(moved[i] > 1e-3f) || sweep == sweeps;
             some = some || !done[i];
             for (int32_t j = 0; done[i] && j < n; ++j) {
-                const int64_t at = static_cast<int64_t>(j) * kTeam + i;
+                const int64_t at = static_cast<int64_t>(j) * kRow + i;
                 const double y = static_cast<double>(values[at]);
                 result[i] += y * y * static_cast<double>(variance[at]);
             }
@@ -182,12 +181,12 @@ MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, 
 
 // Blind time rho at a period's edge in the stationary state: returns its whole periods, and in `cells` how many cells
 // of the period begin within the rest. Registrations in the last y before the edge number R(y) per period; R(y) = u
-// gives the last one, and rho = t_d - y. `sums`: prefix sums of the mean at K = 0, of one lane (stride kTeam), `total`
+// gives the last one, and rho = t_d - y. `sums`: prefix sums of the mean at K = 0, of one lane (stride kRow), `total`
 // in all; `share` = 1 / (1 + K total); the period begins with the lane's cell `edge`.
 MARS_NOINLINE int32_t blind_cells(const FeedbackGrid& grid, const float* sums, double total, double share, int32_t edge,
                                   double u, int32_t& cells) {
     const int32_t n = grid.cells;
-    auto before = [sums](int32_t j) { return static_cast<double>(sums[static_cast<int64_t>(j) * kTeam]); };
+    auto before = [sums](int32_t j) { return static_cast<double>(sums[static_cast<int64_t>(j) * kRow]); };
     // the last j in [0, n) at which a rising function is not yet above `target`
     auto search = [n](auto rising, double target) {
         int32_t low = 0, high = n;

@@ -3,23 +3,29 @@
 // Only + - * / and sqrt, which IEEE 754 rounds correctly: every vector width gives the same bits. All functions are
 // free of branches, so that loops over lanes vectorise.
 #pragma once
-#include <cstdint>
-#include <cstring>
-
 #include "random.h"
+#include "standard.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
 
 MARS_INLINE uint32_t float_bits(float x) {
+#if defined(__CUDACC_RTC__)
+    return __float_as_uint(x);
+#else
     uint32_t u;
     memcpy(&u, &x, sizeof u);
     return u;
+#endif
 }
 MARS_INLINE float bits_float(uint32_t u) {
+#if defined(__CUDACC_RTC__)
+    return __uint_as_float(u);
+#else
     float x;
     memcpy(&x, &u, sizeof x);
     return x;
+#endif
 }
 
 // log(x), x > 0 and normal: x = m 2^e, m in [sqrt(1/2), sqrt(2)); log(1 + t) = t - t^2/2 + t^3 P(t), the polynomial
@@ -66,8 +72,13 @@ MARS_INLINE float exp_of(float x) {
     return s * bits_float(static_cast<uint32_t>(k + 127) << 23);
 }
 
+#if defined(__CUDACC_RTC__)
+MARS_INLINE float root(float x) { return __fsqrt_rn(x); }
+MARS_INLINE double root(double x) { return __dsqrt_rn(x); }
+#else
 MARS_INLINE float root(float x) { return __builtin_sqrtf(x); }
 MARS_INLINE double root(double x) { return __builtin_sqrt(x); }
+#endif
 
 // A uniform number from a word, as its lesser tail r in (0, 1/2], and which tail that is.
 MARS_INLINE float tail_of(uint32_t word) {

@@ -6,9 +6,29 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
+// One lane alone: a bin after another.
+template <class Count>
+MARS_NOINLINE bool write_lane(const FeedbackBatch& batch, const int32_t* sums, bool drawing, int32_t draw) {
+    const FeedbackGrid& grid = *batch.grid;
+    if (!drawing) return true;
+    Count* const out = static_cast<Count*>(batch.rows[0]) + static_cast<int64_t>(draw) * batch.row_step;
+    uint32_t largest = 0, before = static_cast<uint32_t>(sums[static_cast<int64_t>(grid.bin_cell[0]) * kRow]);
+    int32_t to = batch.first_bin[0];
+    for (int32_t b = 0; b < grid.bins; ++b) {
+        const uint32_t after = static_cast<uint32_t>(sums[static_cast<int64_t>(grid.bin_cell[b + 1]) * kRow]);
+        const uint32_t counts = after - before;
+        largest = counts > largest ? counts : largest;
+        out[to] = static_cast<Count>(counts);
+        before = after;
+        if (++to == grid.bins) to = 0;
+    }
+    return sizeof(Count) == 4 || largest <= 0xffffu;
+}
+
 // 32 bins of all lanes at a time, so that both sides stay in the first-level cache. False if a count does not fit.
 template <class Count>
 MARS_NOINLINE bool write_counts(const FeedbackBatch& batch, const int32_t* sums, const bool* drawing, int32_t draw) {
+    if constexpr (kTeam == 1) return write_lane<Count>(batch, sums, drawing[0], draw);
     constexpr int32_t kBlock = 32;
     const FeedbackGrid& grid = *batch.grid;
     const int32_t bins = grid.bins;
@@ -17,8 +37,8 @@ MARS_NOINLINE bool write_counts(const FeedbackBatch& batch, const int32_t* sums,
     for (int32_t first = 0; first < bins; first += kBlock) {
         const int32_t count = bins - first < kBlock ? bins - first : kBlock;
         for (int32_t b = 0; b < count; ++b) {
-            const int32_t* from = sums + static_cast<int64_t>(grid.bin_cell[first + b]) * kTeam;
-            const int32_t* to = sums + static_cast<int64_t>(grid.bin_cell[first + b + 1]) * kTeam;
+            const int32_t* from = sums + static_cast<int64_t>(grid.bin_cell[first + b]) * kRow;
+            const int32_t* to = sums + static_cast<int64_t>(grid.bin_cell[first + b + 1]) * kRow;
             for (int i = 0; i < kTeam; ++i) {
                 const uint32_t counts = static_cast<uint32_t>(to[i]) - static_cast<uint32_t>(from[i]);
                 largest = drawing[i] && counts > largest ? counts : largest;

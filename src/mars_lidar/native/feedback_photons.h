@@ -1,69 +1,50 @@
 // Expected photons per period in the internal cells of a batch's pixels.
 #pragma once
-#include <algorithm>
-#include <cmath>
-#include <vector>
-
-#include "feedback_grid.h"
+#include "feedback_kernel.h"
 #include "job.h"
-#include "pulse.h"
+#include "sampled_pulse.h"
+#include "standard.h"
+
+#ifndef MARS_LEVEL
+#define MARS_LEVEL portable
+#endif
 
 namespace mars {
+inline namespace MARS_LEVEL {
 
 // Energy of one pulse between two times. Gaussian: the distribution function from a table by cubic Hermite
 // interpolation, from the nearer tail so that small energies keep their digits (relative error 2e-7 at 6 sigma).
-class PulseEnergy {
-public:
-    explicit PulseEnergy(const PulseShape& shape) : shape_(shape) {
-        if (!shape.gaussian()) return;
-        scale_ = 1.0 / shape.sigma;
-        constexpr int cells = static_cast<int>(kReach * kCells) + 2;
-        for (int k = 0; k <= cells; ++k) {
-            const double x = k / kCells;
-            tail_.push_back(normal_cumulative(-x));
-            density_.push_back(0.3989422804014326779 * exponential(0.5 * x * x));
-        }
-    }
+// Tables by the host (`PulseEnergyTables`).
+struct PulseEnergy {
+    static constexpr double kReach = 8.5, kCells = 64.0;  // of the table: standard deviations; cells of each
 
-    double low() const { return shape_.low(); }
-    double high() const { return shape_.high(); }
+    SampledPulse sampled;          // without knots: a Gaussian
+    const double *tail, *density;  // at x = k / kCells: of the normal law above x, and at x
+    double scale;                  // 1 / sigma
+    double low, high;              // extent
+
+    bool gaussian() const { return sampled.knots == nullptr; }
 
     // Energy before a time relative to the delay, no wrapping; of a Gaussian 1 less from the delay on.
     double below(double time) const {
-        if (!shape_.gaussian()) return shape_.cumulative(time);
-        const double x = time * scale_;
-        return x < 0.0 ? tail(-x) : -tail(x);
+        if (!gaussian()) return sampled.cumulative(time);
+        const double x = time * scale;
+        return x < 0.0 ? above(-x) : -above(x);
     }
     // Energy from one time to a later one, given what `below` says there.
     double between(double from, double to, double below_from, double below_to) const {
-        return below_to - below_from + (shape_.gaussian() && from < 0.0 && to >= 0.0 ? 1.0 : 0.0);
+        return below_to - below_from + (gaussian() && from < 0.0 && to >= 0.0 ? 1.0 : 0.0);
     }
 
 private:
-    static constexpr double kReach = 8.5, kCells = 64.0;
-
-    // e^-x without libm: Taylor series at x / 2^k, squared k times.
-    static double exponential(double x) {
-        int halvings = 0;
-        for (; x > 0.125; ++halvings) x *= 0.5;
-        double e = 1.0;
-        for (int n = 12; n >= 1; --n) e = 1.0 - e * x / n;
-        for (; halvings > 0; --halvings) e *= e;
-        return e;
-    }
-
-    double tail(double x) const {
+    double above(double x) const {
         if (x >= kReach) return 0.0;
         const double place = x * kCells;
-        const size_t k = static_cast<size_t>(place);
+        const int64_t k = static_cast<int64_t>(place);
         const double s = place - static_cast<double>(k), h = 1.0 / kCells, r = 1.0 - s;
-        return r * r * ((1.0 + 2.0 * s) * tail_[k] - s * h * density_[k]) +
-               s * s * ((3.0 - 2.0 * s) * tail_[k + 1] + r * h * density_[k + 1]);
+        return r * r * ((1.0 + 2.0 * s) * tail[k] - s * h * density[k]) +
+               s * s * ((3.0 - 2.0 * s) * tail[k + 1] + r * h * density[k + 1]);
     }
-
-    const PulseShape& shape_;
-    double scale_ = 0.0;  // 1 / sigma
-    std::vector<double> tail_, density_;
 };
 
 // The lanes' photons as FeedbackBatch wants them. Each lane begins half a period before its strongest return.
@@ -72,19 +53,20 @@ public:
     int32_t first_bin[kTeam];
     double dark[2 * kTeam];
     int32_t lit_begin, lit_end;
-    std::vector<double> lit;  // (lit_end - lit_begin, kTeam)
 
-    LanePhotons(const Job& job, const PulseEnergy& energy, const CellGrid& cells, const int64_t* pixels)
-        : grid_(cells.grid), low_(energy.low()), high_(energy.high()) {
+    // `lit` has room for all cells, `row` from one to the next.
+    LanePhotons(const Job& job, const PulseEnergy& energy, const FeedbackGrid& grid, const int64_t* pixels, double* lit,
+                int64_t row)
+        : grid_(grid), low_(energy.low), high_(energy.high), lit_(lit), row_(row) {
         for (int i = 0; i < kTeam; ++i) {
             first_bin[i] = place(job, pixels[i]);
-            dark[i] = job.background[pixels[i]] * cells.widths[0];
-            dark[kTeam + i] = job.background[pixels[i]] * cells.widths[1];
+            dark[i] = job.background[pixels[i]] * grid.width[0];
+            dark[kTeam + i] = job.background[pixels[i]] * grid.width[1];
         }
         set_range(job, pixels);
         for (int32_t j = lit_begin; j < lit_end; ++j) {
             const double* level = dark + kTeam * grid_.narrow[j];
-            lit.insert(lit.end(), level, level + kTeam);
+            for (int i = 0; i < kTeam; ++i) lit_[(j - lit_begin) * row_ + i] = level[i];
         }
         for (int i = 0; i < kTeam; ++i) {
             for (int64_t k = 0; k < job.returns; ++k) {
@@ -151,7 +133,7 @@ private:
         while (turn + grid_.place[j] < end) {
             const double to = turn + grid_.place[j + 1] - at, next = energy.below(to);
             const double more = photons * energy.between(from, to, below, next);
-            if (more > 0.0) lit[static_cast<size_t>((j - lit_begin) * kTeam + lane)] += more;
+            if (more > 0.0) lit_[(j - lit_begin) * row_ + lane] += more;
             from = to;
             below = next;
             if (++j == grid_.cells) {
@@ -170,12 +152,15 @@ private:
             double sum = 0.0;
             for (int64_t k = static_cast<int64_t>(from); k < job.samples && static_cast<double>(k) < to; ++k)
                 sum += photons[k] * (std::min(to, k + 1.0) - std::max(from, static_cast<double>(k)));
-            lit[static_cast<size_t>(j) * kTeam + lane] += std::max(0.0, sum);
+            lit_[j * row_ + lane] += std::max(0.0, sum);
         }
     }
 
     const FeedbackGrid& grid_;
     const double low_, high_;  // extent of the pulse
+    double* const lit_;        // photons of the cells from lit_begin on
+    const int64_t row_;
 };
 
+}  // namespace MARS_LEVEL
 }  // namespace mars

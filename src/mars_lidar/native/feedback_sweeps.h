@@ -21,8 +21,8 @@ struct Rates {
 
 private:
     MARS_INLINE const float* pick(int32_t j, const float* dark, const float* lit) const {
-        return j >= lit_begin && j < lit_end ? lit + static_cast<int64_t>(j - lit_begin) * kTeam
-                                             : dark + static_cast<int64_t>(narrow[j]) * kTeam;
+        return j >= lit_begin && j < lit_end ? lit + static_cast<int64_t>(j - lit_begin) * kRow
+                                             : dark + static_cast<int64_t>(narrow[j]) * kRow;
     }
 };
 
@@ -45,7 +45,7 @@ struct History {
     History(const Number* o, const Number* f, int32_t cells) : old(o), fresh(f) {
         for (int i = 0; i < kTeam; ++i) {
             less[0][i] = 0;
-            less[1][i] = old[static_cast<int64_t>(cells) * kTeam + i];
+            less[1][i] = old[static_cast<int64_t>(cells) * kRow + i];
             less[2][i] = plus(less[1][i], less[1][i]);
         }
     }
@@ -55,7 +55,7 @@ struct History {
     };
     MARS_INLINE Rows at(const FeedbackEdge& edge) const {
         const Number* sums = edge.turns ? old : fresh;
-        return {sums + static_cast<int64_t>(edge.late) * kTeam, sums + static_cast<int64_t>(edge.early) * kTeam,
+        return {sums + static_cast<int64_t>(edge.late) * kRow, sums + static_cast<int64_t>(edge.early) * kRow,
                 less[edge.turns]};
     }
 };
@@ -110,9 +110,9 @@ MARS_NOINLINE void real_sweep(const FeedbackGrid& grid, const Rates& rates, cons
     for (int32_t j = 0; j < n; ++j) {
         const float *p = rates.fire(j), *q = rates.refire(j), part = grid.edge[j + 1].part;
         const auto back = history.at(grid.edge[j + 1]);
-        const int64_t row = static_cast<int64_t>(j) * kTeam;
-        const float* before = old + row + kTeam;
-        float* after = fresh + row + kTeam;
+        const int64_t row = static_cast<int64_t>(j) * kRow;
+        const float* before = old + row + kRow;
+        float* after = fresh + row + kRow;
         for (int i = 0; i < kTeam; ++i) {
             const float next = rearmed_before(back, part, i);
             float h = p[i] * (armed[i] - (c[i] - re[i])) + q[i] * (next - re[i]);
@@ -141,7 +141,7 @@ struct Exposure {
 struct Quantiles {
     const float *alpha, *beta;
     const uint16_t* dither;  // in 2^-16
-    const uint32_t* exact;   // (cells)
+    const uint32_t* exact;   // (cells, kTeams)
     const uint32_t *key0, *key1;
 };
 
@@ -194,11 +194,11 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
     for (int32_t j = 0; j < n; ++j) {
         const float *p = rates.fire(j), *q = rates.refire(j), part = grid.edge[j + 1].part;
         const auto back = history.at(grid.edge[j + 1]);
-        const int64_t row = static_cast<int64_t>(j) * kTeam;
+        const int64_t row = static_cast<int64_t>(j) * kRow;
         const float *alpha = quantiles.alpha + row, *beta = quantiles.beta + row;
-        const uint16_t* lot = dither + (j + 1 < n ? row + kTeam : 0);
-        const int32_t* before = old + row + kTeam;
-        int32_t* after = fresh + row + kTeam;
+        const uint16_t* lot = dither + (j + 1 < n ? row + kRow : 0);
+        const int32_t* before = old + row + kRow;
+        int32_t* after = fresh + row + kRow;
         const double golden = 0.61803398874989485 * j;  // evenly over the cells and over [0, 1)
         const float turn = static_cast<float>(golden - static_cast<double>(static_cast<int64_t>(golden)));
         auto quantise = [&](int i) {
@@ -222,9 +222,9 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
             c[i] = kept ^ ((moved ^ kept) & exposure.active[i]);
             after[i] = c[i];
         };
-        if (quantiles.exact[j]) {
+        if (const uint32_t anew = quantiles.exact[static_cast<int64_t>(j) * kTeams]) {
             for (int i = 0; i < kTeam; ++i) quantise(i);
-            take_exactly(quantiles, j, quantiles.exact[j], p, q, armed, rearmed, count);
+            take_exactly(quantiles, j, anew, p, q, armed, rearmed, count);
             for (int i = 0; i < kTeam; ++i) add(i);
         } else {
             for (int i = 0; i < kTeam; ++i) {

@@ -1,11 +1,16 @@
 // Rates and scratch of a batch of the feedback engine.
 #pragma once
-#include <type_traits>
-
 #include "feedback_laws.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
+
+template <class T>
+struct Plain { using Type = T; };
+template <class T>
+struct Plain<T&> { using Type = T; };
+template <class T>
+using Pointer = typename Plain<T>::Type;
 
 struct Workspace {
     Rates rates;
@@ -14,37 +19,37 @@ struct Workspace {
     float *alpha, *beta;       // (n, kTeam)
     float *noise, *more_sums;  // (n, kTeam), (n + 1, kTeam): for slow sweeps only
     uint16_t* dither;          // (n, kTeam)
-    uint32_t* exact;           // (n)
+    uint32_t* exact;           // (n, kTeams)
 
     explicit Workspace(const FeedbackBatch& batch) {
-        const size_t cells = static_cast<size_t>(batch.grid->cells), rows = cells * kTeam;
-        const size_t lit = static_cast<size_t>(batch.lit_end - batch.lit_begin) * kTeam;
-        const size_t bytes = 4 * (4 * kTeam + 2 * lit + 8 * (rows + kTeam)) + 2 * rows + 4 * cells;
-        if (batch.memory->size() < bytes + 64 * 32) batch.memory->resize(bytes + 64 * 32);  // room to align every array
-        unsigned char* at = batch.memory->data();
-        auto take = [&at](auto*& pointer, size_t count) {
-            at += (64 - reinterpret_cast<uintptr_t>(at) % 64) % 64;
-            pointer = reinterpret_cast<std::remove_reference_t<decltype(pointer)>>(at);
-            at += count * sizeof(*pointer);
+        const int64_t cells = batch.grid->cells, rows = cells * kRow, row = kRow;
+        const int64_t lit = batch.lit_end - batch.lit_begin;
+        unsigned char* at = batch.memory;
+        auto take = [&](auto*& pointer, int64_t count) {
+            at += (64 - reinterpret_cast<uint64_t>(at) % 64) % 64;
+            pointer = reinterpret_cast<Pointer<decltype(pointer)>>(at) + batch.lane;
+            at += count * static_cast<int64_t>(sizeof(*pointer));
         };
         float *dark_fire, *dark_refire, *lit_fire, *lit_refire;
-        take(dark_fire, 2 * kTeam);
-        take(dark_refire, 2 * kTeam);
-        take(lit_fire, lit);
-        take(lit_refire, lit);
-        set_rates(batch.dark_photons, 2 * kTeam, dark_fire, dark_refire);
-        set_rates(batch.lit_photons, lit, lit_fire, lit_refire);
+        take(dark_fire, 2 * row);
+        take(dark_refire, 2 * row);
+        take(lit_fire, batch.lit_room * row);
+        take(lit_refire, batch.lit_room * row);
+        for (int k = 0; k < 2; ++k)
+            set_rates(batch.dark_photons + k * kTeam, dark_fire + k * row, dark_refire + k * row);
+        for (int64_t k = 0; k < lit; ++k)
+            set_rates(batch.lit_photons + k * batch.lit_row, lit_fire + k * row, lit_refire + k * row);
         rates = {batch.grid->narrow, batch.lit_begin, batch.lit_end, dark_fire, dark_refire, lit_fire, lit_refire};
-        take(sums, rows + kTeam);
-        take(spare_sums, rows + kTeam);
-        take(history[0], rows + kTeam);
-        take(history[1], rows + kTeam);
+        take(sums, rows + kRow);
+        take(spare_sums, rows + kRow);
+        take(history[0], rows + kRow);
+        take(history[1], rows + kRow);
         take(alpha, rows);
         take(beta, rows);
         take(dither, rows);
-        take(exact, cells);
+        take(exact, cells * kTeams);
         take(noise, rows);
-        take(more_sums, rows + kTeam);
+        take(more_sums, rows + kRow);
     }
 };
 
@@ -58,7 +63,7 @@ MARS_INLINE int32_t wrapped(float x) {
 // Integer prefix sums from scale * sums + more, more null or of the lanes in `moved`.
 MARS_NOINLINE void round_sums(int32_t cells, const float* sums, const float* scale, const float* more,
                               const int32_t* moved, int32_t* __restrict__ history) {
-    for (int64_t row = 0; row <= static_cast<int64_t>(cells) * kTeam; row += kTeam)
+    for (int64_t row = 0; row <= static_cast<int64_t>(cells) * kRow; row += kRow)
         for (int i = 0; i < kTeam; ++i) {
             const float deviation = more && moved[i] ? more[row + i] : 0.0f;
             const float x = sums[row + i] * scale[i] + deviation;

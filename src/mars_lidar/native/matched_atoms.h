@@ -6,10 +6,6 @@
 // Mean, variance and third cumulant set X and Y at each c; the fourth chooses c. A polynomial of degree 4
 // times the base, orthogonal to it (Charlier's and Gram's series with this base), mends what is left.
 #pragma once
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-
 #include "elementary.h"
 
 namespace mars {
@@ -42,7 +38,7 @@ inline void judge(const Cumulants& k, GainLoss& law) {
 
 // X and Y for N = offset + sign (X - Y) from three cumulants: gain - loss = D, gain ratio + loss = v and
 // gain ratio (2 ratio - 1) - loss = k3 give 2 (v - loss)^2 = (k3 + v) (loss + D).
-inline bool solve(const Cumulants& k, double offset, double sign, GainLoss& law) {
+MARS_APART inline bool solve(const Cumulants& k, double offset, double sign, GainLoss& law) {
     const double v = k.variance, w = sign * k.third + v, d = sign * (k.mean - offset), b = 4.0 * v + w;
     const double under = b * b - 16.0 * v * v + 8.0 * w * d;
     if (!(w > 0.0 && under >= 0.0 && offset >= 0.0)) return false;
@@ -58,7 +54,7 @@ inline bool solve(const Cumulants& k, double offset, double sign, GainLoss& law)
 }
 
 // The best of the offsets that three cumulants leave open; misfit infinite if there is none.
-inline GainLoss best_gain_loss(const Cumulants& k) {
+MARS_APART inline GainLoss best_gain_loss(const Cumulants& k) {
     GainLoss best{0.0, 1.0, 0.0, 1.0, 0.0, HUGE_VAL}, law;
     const double v = k.variance, plain = v / k.mean;
     if (plain > kLeastRatio && plain < kMostRatio) {  // few photons: no offset, no loss
@@ -66,12 +62,14 @@ inline GainLoss best_gain_loss(const Cumulants& k) {
         judge(k, best);
         if (best.misfit < 1e-9) return best;
     }
-    for (const double sign : {1.0, -1.0}) {
+    constexpr double kSigns[] = {1.0, -1.0};
+    for (const double sign : kSigns) {
         const double w = sign * k.third + v;
         if (!(w > 1e-9 * v)) continue;
         const double bare = k.mean - sign * 2.0 * v * v / w;  // the offset without loss
         const double middle = std::floor(k.mean - k.third + 0.5), low = std::floor(bare);
-        for (const double c : {low, low + 1.0, middle - 1.0, middle, middle + 1.0})
+        const double offsets[] = {low, low + 1.0, middle - 1.0, middle, middle + 1.0};
+        for (const double c : offsets)
             if (solve(k, c, sign, law) && law.misfit < best.misfit) best = law;
     }
     return best;
@@ -85,7 +83,7 @@ inline double log_nothing(double gain, double ratio) {
 }
 
 // Weights of the counts first .. first + size - 1.
-inline void base(const GainLoss& law, double first, int size, double* weight) {
+MARS_APART inline void base(const GainLoss& law, double first, int size, double* weight) {
     constexpr int kGains = 2 * kMost;
     double gains[kGains], losses[kMost];
     int most_loss = 0;
@@ -116,7 +114,7 @@ inline void base(const GainLoss& law, double first, int size, double* weight) {
 
 // Weights of a rounded normal law, no narrower than lets five integers carry weight: the density's integral
 // over each integer's cell, by Gauss's rule with three points in each half.
-inline void normal_base(const Cumulants& k, double first, int size, double* weight) {
+MARS_APART inline void normal_base(const Cumulants& k, double first, int size, double* weight) {
     constexpr double kPoint[] = {0.05635083268962915, 0.25, 0.44364916731037085}, kWeight[] = {5.0, 8.0, 5.0};
     const double scale = -0.5 / std::max(k.variance - 1.0 / 12, 0.06);
     for (int i = 0; i < size; ++i) {
@@ -139,7 +137,7 @@ inline bool normalise(int size, double* weight) {
 // Multiplies the weights by the polynomial of a degree up to 4 that gives them as many of the cumulants: their
 // moments in the orthonormal polynomials of the weights. Returns the probability that came out negative and
 // was cut.
-inline double mend_once(const Cumulants& k, int degrees, double first, int size, double* weight) {
+MARS_APART inline double mend_once(const Cumulants& k, int degrees, double first, int size, double* weight) {
     const double unit = std::sqrt(std::max(k.variance, 0.25)), scale = 1.0 / unit;
     const double v = k.variance * scale * scale;
     const double moments[] = {1.0, 0.0, v, k.third * scale * scale * scale,
@@ -192,7 +190,7 @@ inline double mend_once(const Cumulants& k, int degrees, double first, int size,
 
 // Repeated while cutting what is negative moves the cumulants again; cumulants that no law has never settle.
 // False if mean and variance did not come out: weights on too few integers, or on the wrong ones.
-inline bool mend(const Cumulants& k, int degrees, double first, int size, double* weight) {
+MARS_APART inline bool mend(const Cumulants& k, int degrees, double first, int size, double* weight) {
     if (!normalise(size, weight)) return false;
     for (int round = 0; round < 6; ++round)
         if (!(mend_once(k, degrees, first, size, weight) > 1e-9)) break;

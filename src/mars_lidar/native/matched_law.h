@@ -5,12 +5,8 @@
 // take out what rounding adds. *Atoms*: probabilities on up to 64 integers, matched_atoms.h. *Pair*: the two
 // integers about the mean, where the variance is the least that an integer can have, or less.
 #pragma once
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-
 #include "matched_atoms.h"
-#include "pulse.h"
+#include "normal_law.h"
 
 namespace mars {
 
@@ -18,16 +14,20 @@ class MatchedLaw {
 public:
     enum class Form { pair, atoms, smooth };
 
+    MatchedLaw() = default;
     // Any numbers are taken; cumulants that no count has give a law nearby.
-    explicit MatchedLaw(const Cumulants& k) {
-        if (!(k.mean > 0.0)) {
-            set_pair(0.0);
-            trusted_ = k.mean == 0.0;
-        } else if (k.variance >= kAtomsBelow) {
-            set_smooth(k);
-        } else {
-            set_narrow(k);
-        }
+    explicit MatchedLaw(const Cumulants& k) { choose(k); }
+
+    // The same in memory that holds anything.
+    void set(const Cumulants& k) {
+        form_ = Form::pair;
+        trusted_ = true;
+        size_ = 0;
+        first_ = 0;
+        centre_ = spread_ = c0_ = c1_ = c2_ = c3_ = 0.0;
+        low_ = -kReach;
+        high_ = kReach;
+        choose(k);
     }
 
     // Count of a uniform number u on (0, 1).
@@ -98,6 +98,17 @@ private:
     static constexpr double kReach = 8.3;         // no word of 52 bits is beyond
     static constexpr double kNeeded = 1.5;        // where the quantile must rise for the law to be any good
 
+    void choose(const Cumulants& k) {
+        if (!(k.mean > 0.0)) {
+            set_pair(0.0);
+            trusted_ = k.mean == 0.0;
+        } else if (k.variance >= kAtomsBelow) {
+            set_smooth(k);
+        } else {
+            set_narrow(k);
+        }
+    }
+
     double cubic(double z) const { return c0_ + z * (c1_ + z * (c2_ + z * c3_)); }
 
     int64_t draw_at(double z) const {
@@ -108,7 +119,7 @@ private:
     // E. A. Cornish and R. A. Fisher, Rev. Inst. Int. Stat. 5 (1938): z + g1 (z^2 - 1) / 6 +
     // g2 (z^3 - 3 z) / 24 - g1^2 (2 z^3 - 5 z) / 36, of the cumulants before rounding: 1/12 off the variance,
     // -1/120 off the fourth (W. F. Sheppard, Proc. Lond. Math. Soc. 29, 1898).
-    void set_smooth(const Cumulants& k) {
+    MARS_APART void set_smooth(const Cumulants& k) {
         form_ = Form::smooth;
         const double variance = std::max(k.variance - 1.0 / 12, 0.06), inverse = 1.0 / variance;
         spread_ = std::sqrt(variance);
@@ -145,14 +156,15 @@ private:
         if (!(under > 0.0)) return;
         // zeros of c1 + 2 c2 z + 3 c3 z^2 as c1 / (-c2 -+ root), which has them at infinity for c3 = 0
         const double root = std::sqrt(under);
-        for (const double q : {-c2_ + root, -c2_ - root}) {
+        const double both[] = {-c2_ + root, -c2_ - root};
+        for (const double q : both) {
             const double zero = c1_ / q;
             if (zero < 0.0) low_ = std::max(low_, zero);
             if (zero > 0.0) high_ = std::min(high_, zero);
         }
     }
 
-    double inverse_cubic(double y) const {
+    MARS_APART double inverse_cubic(double y) const {
         double from = low_, to = high_, z = std::min(std::max(y, from), to);
         for (int step = 0; step < 80; ++step) {
             const double error = cubic(z) - y;
@@ -165,7 +177,7 @@ private:
         return z;
     }
 
-    void set_narrow(const Cumulants& k) {
+    MARS_APART void set_narrow(const Cumulants& k) {
         const double fraction = k.mean - std::floor(k.mean);
         if (!(k.variance > fraction * (1.0 - fraction) * (1.0 + 1e-7))) {
             trusted_ = k.variance > fraction * (1.0 - fraction) * (1.0 - 1e-3);
@@ -198,7 +210,7 @@ private:
     }
 
     // Probabilities of the smooth law, and a little of a normal one where it has none: what `mend` needs.
-    void round_smooth(const Cumulants& k, double first) {
+    MARS_APART void round_smooth(const Cumulants& k, double first) {
         constexpr double kNormal = 6e-2;
         atoms::normal_base(k, first, size_, below_);
         atoms::normalise(size_, below_);

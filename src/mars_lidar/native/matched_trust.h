@@ -5,10 +5,6 @@
 // is drawn from: where they are, what the cumulants leave open does not matter. Thresholds by a study of exact
 // laws (docs/studies/matched.md). For tables and engines once a pixel, not for drawing.
 #pragma once
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-
 #include "matched_law.h"
 
 namespace mars {
@@ -37,7 +33,7 @@ struct Window {
     }
 
     // Total variation to the law with as many of the cumulants as `degrees` on the base in `other`, spoilt here.
-    double distance(int degrees, double* other) const {
+    MARS_APART double distance(int degrees, double* other) const {
         if (!atoms::mend(k, degrees, first, size, other)) return 1.0;
         double sum = 0.0;
         for (int i = 0; i < size; ++i) sum += std::fabs(weight[i] - other[i]);
@@ -64,7 +60,7 @@ struct Window {
 
 }  // namespace trust
 
-inline bool trusted(const Cumulants& k, const MatchedLaw& law) {
+MARS_APART inline bool trusted(const Cumulants& k, const MatchedLaw& law) {
     using namespace trust;
     if (law.trusted() || !(k.variance > 0.0 && k.variance < 9.0) || law.form() == MatchedLaw::Form::pair)
         return law.trusted();

@@ -109,6 +109,8 @@ NB_MODULE(_core, module) {
     mars::bind_job(module);
     mars::bind_exact(module);
     mars::bind_device(module);
+    mars::bind_mars_device(module);
+    mars::bind_feedback_device(module);
     mars::bind_waveform(module);
     mars::bind_sequential(module);
     mars::bind_poisson(module);

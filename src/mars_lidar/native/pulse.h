@@ -3,6 +3,9 @@
 #include <cstdint>
 #include <vector>
 
+#include "normal_law.h"
+#include "sampled_pulse.h"
+
 namespace mars {
 
 // Shape of one pulse around its delay, in periods. Exactly one of `sigma` and `knots` is used.
@@ -13,15 +16,13 @@ struct PulseShape {
     double start = 0.0;          // sampled: first edge relative to the delay
 
     bool gaussian() const { return knots.empty(); }
+    SampledPulse sampled() const { return {knots.data(), static_cast<int64_t>(knots.size()) - 1, width, start}; }
     double low() const;                        // support
     double high() const;
     double cumulative(double t) const;         // energy before t, one pulse, not wrapped
     double periodic(double t) const;           // energy of the pulse train up to t: grows by 1 a period
     double equivalent_width() const;           // 1 / integral of s^2
 };
-
-// Standard normal distribution function, relatively accurate in the lower tail, by IEEE arithmetic alone.
-double normal_cumulative(double x);
 
 // Shape and tables; bound to Python as `PulseTable`.
 struct PulseTable;

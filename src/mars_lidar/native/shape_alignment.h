@@ -6,11 +6,10 @@
 // 2). Between edges A follows the depletion by the bin's own photons. A shift of the binned values themselves
 // would smear a narrow pulse over another bin.
 #pragma once
-#include <cmath>
-#include <cstdint>
-
+#include "elementary.h"
 #include "lane_math.h"
-#include "shape_kernel.h"
+#include "shape_job.h"
+#include "team.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -31,20 +30,20 @@ struct Bump {  // hands out parts of a block of memory
     }
 };
 
+template <class Team>
 class Alignment {
 public:
-    Alignment(const ShapeJob& job, Bump& memory) : job_(job), n_(job.bins) {
+    Alignment(const ShapeJob& job, Bump& memory, const Team& team) : job_(job), team_(team), n_(job.bins) {
         mixture_ = memory.take<float>(padded_bins(n_) + 32) + 16;  // room for the bins before and behind
         past_ = memory.take<float>(padded_bins(n_) + 16) + 16;
         shape = memory.take<float>(padded_bins(n_));
-        for (int64_t j = n_; j < padded_bins(n_); ++j) shape[j] = 0.0f;
         const PulseFrame& frame = job.frame;
-        const int64_t wide = (frame.size + kLanes) / kLanes * kLanes + 1;  // whole lanes, and one more
-        here_ = memory.take<float>(wide);
-        old_ = memory.take<float>(wide);
-        armed_ = memory.take<float>(wide);
-        moved_ = memory.take<float>(wide);
-        for (int64_t i = 0; i < wide; ++i) here_[i] = armed_[i] = 0.0f;
+        wide_ = (frame.size + kLanes) / kLanes * kLanes + 1;  // whole lanes, and one more
+        here_ = memory.take<float>(wide_);
+        old_ = memory.take<float>(wide_);
+        armed_ = memory.take<float>(wide_);
+        moved_ = memory.take<float>(wide_);
+        if (!Team::kAlone) sums_ = memory.take<double>(kSums);
         const double whole = std::floor(job.dead_time), back = (job.dead_time - whole) * n_;
         whole_ = whole;
         back_ = static_cast<int64_t>(back);
@@ -60,6 +59,14 @@ public:
         }
     }
 
+    // Once, before anything else.
+    void clear() {
+        const int64_t n = n_;
+        float *const to = shape, *const here = here_, *const armed = armed_;
+        team_.each(padded_bins(n) - n, [=](int64_t j) { to[n + j] = 0.0f; });
+        team_.each(wide_, [=](int64_t i) { here[i] = armed[i] = 0.0f; });
+    }
+
     float* shape;  // (padded_bins), zeros behind the last bin; sums to what the rows do
 
     void set(int64_t pixel) {
@@ -71,14 +78,16 @@ public:
             return;
         }
         mix(pixel, 0, n_, mixture_);
-        mixture_[-1] = mixture_[n_ - 1];
-        mixture_[n_] = mixture_[0];
+        team_.once([&] {
+            mixture_[-1] = mixture_[n_ - 1];
+            mixture_[n_] = mixture_[0];
+        });
         const float late = static_cast<float>(part);
         if (job_.signal[pixel] + job_.background[pixel] < kBright)
             past_even(late);
         else
             past_sloped(late);
-        past_[-1] = past_[n_ - 1];
+        team_.once([&] { past_[-1] = past_[n_ - 1]; });
         move(0, shape + whole, n_ - whole);
         move(n_ - whole, shape, whole);
         if (part > 0.0 && has_pulse(pixel)) correct(pixel, whole, part);
@@ -113,16 +122,20 @@ public:
             arm(job_.rate[pixel], blind);
             cut_bins(pixel, part);
         } else {
-            for (int32_t i = 0; i < frame.size; ++i) moved_[i] = static_cast<float>(part) * here_[i];
+            const float late = static_cast<float>(part), *const here = here_;
+            float* const moved = moved_;
+            team_.each(frame.size, [=](int64_t i) { moved[i] = late * here[i]; });
         }
-        double before = 0.0, total = 0.0;
-        for (int32_t i = 0; i < frame.size; ++i) {
-            out[i] = static_cast<double>(here_[i] - moved_[i]) + before;
-            before = static_cast<double>(moved_[i]);
-            total += out[i];
-        }
-        out[frame.size] = before;
-        return total + before;
+        return team_.agreed([&] {
+            double before = 0.0, total = 0.0;
+            for (int32_t i = 0; i < frame.size; ++i) {
+                out[i] = static_cast<double>(here_[i] - moved_[i]) + before;
+                before = static_cast<double>(moved_[i]);
+                total += out[i];
+            }
+            out[frame.size] = before;
+            return total + before;
+        });
     }
 
 private:
@@ -132,25 +145,28 @@ private:
 
     // What leaves each bin for the next, if its registrations are spread evenly,
     void past_even(float part) {
-        for (int64_t j = 0; j < n_; ++j) past_[j] = part * mixture_[j];
+        const float* const mixture = mixture_;
+        float* const past = past_;
+        team_.each(n_, [=](int64_t j) { past[j] = part * mixture[j]; });
     }
 
     // or with the slope of the neighbours (van Leer's monotonised central one, J. Comput. Phys. 23, 1977): where
     // many registrations re-arm at once, bright background registers with a step outside of the frame too.
     void past_sloped(float part) {
-        const float half = 0.5f * part * (1.0f - part);
-        for (int64_t j = 0; j < n_; ++j) {
-            const float up = mixture_[j + 1] - mixture_[j], down = mixture_[j] - mixture_[j - 1];
+        const float half = 0.5f * part * (1.0f - part), *const mixture = mixture_;
+        float* const past = past_;
+        team_.each(n_, [=](int64_t j) {
+            const float up = mixture[j + 1] - mixture[j], down = mixture[j] - mixture[j - 1];
             const float central = 0.5f * (up + down), steep = up < 0.0f ? -up : up, gentle = down < 0.0f ? -down : down;
             const float most = 2.0f * (steep < gentle ? steep : gentle);
             const float limited = central > most ? most : central < -most ? -most : central;
-            past_[j] = part * mixture_[j] + half * (up * down > 0.0f ? limited : 0.0f);
-        }
+            past[j] = part * mixture[j] + half * (up * down > 0.0f ? limited : 0.0f);
+        });
     }
 
     void move(int64_t first, float* to, int64_t n) const {
         const float *mixture = mixture_ + first, *past = past_ + first;
-        for (int64_t j = 0; j < n; ++j) to[j] = (mixture[j] - past[j]) + past[j - 1];
+        team_.each(n, [=](int64_t j) { to[j] = (mixture[j] - past[j]) + past[j - 1]; });
     }
 
     void mix_cyclic(int64_t pixel, int64_t first, int64_t count, float* to) const {
@@ -160,10 +176,9 @@ private:
     }
 
     void copy_cyclic(int64_t first, int64_t count, float* to) const {
-        for (int64_t i = 0; i < count; ++i) {
-            to[i] = mixture_[first];
-            if (++first == n_) first = 0;
-        }
+        const float* const mixture = mixture_;
+        const int64_t n = n_;
+        team_.each(count, [=](int64_t i) { to[i] = mixture[first + i < n ? first + i : first + i - n]; });
     }
 
     void mix(int64_t pixel, int64_t first, int64_t count, float* to) const {
@@ -178,12 +193,11 @@ private:
         }
         for (; used < 4; ++used) row[used] = row[0], weight[used] = 0.0f;
         const float *a = row[0], *b = row[1], *c = row[2], *d = row[3];
-        if (weight[1] == 0.0f) {
-            for (int64_t j = 0; j < count; ++j) to[j] = weight[0] * a[j];
-        } else {
-            for (int64_t j = 0; j < count; ++j)
-                to[j] = (weight[0] * a[j] + weight[1] * b[j]) + (weight[2] * c[j] + weight[3] * d[j]);
-        }
+        const float v = weight[0], w = weight[1], x = weight[2], y = weight[3];
+        if (w == 0.0f)
+            team_.each(count, [=](int64_t j) { to[j] = v * a[j]; });
+        else
+            team_.each(count, [=](int64_t j) { to[j] = (v * a[j] + w * b[j]) + (x * c[j] + y * d[j]); });
     }
 
     int64_t wrap(int64_t bin) const {
@@ -193,6 +207,7 @@ private:
 
     // Sum of the mixture over `count` <= bins bins from `first` on, cyclic; sixteen sums side by side.
     double sum(int64_t first, int64_t count) const {
+        if constexpr (!Team::kAlone) return shared_sum(first, count);
         double sums[16] = {};
         double total = 0.0;
         while (count > 0) {
@@ -209,38 +224,63 @@ private:
         return total;
     }
 
+    // The same sums, each by one thread; the last thread has what is left of a row of sixteen.
+    double shared_sum(int64_t first, int64_t count) const {
+        const int64_t here = count < n_ - first ? count : n_ - first, there = count - here;
+        team_.each(kSums, [&](int64_t k) {
+            double total = 0.0;
+            for (int part = 0; part < 2; ++part) {
+                const float* from = mixture_ + (part ? 0 : first);
+                const int64_t number = part ? there : here, rows = number / 16 * 16;
+                for (int64_t j = k < 16 ? k : rows; j < (k < 16 ? rows : number); j += k < 16 ? 16 : 1)
+                    total += static_cast<double>(from[j]);
+            }
+            sums_[k] = total;
+        });
+        return team_.agreed([&] {
+            double total = sums_[16];
+            for (int k = 0; k < 16; ++k) total += sums_[k];
+            return total;
+        });
+    }
+
     // The frame's bins again, with what the pulse leaves behind each cut.
     void correct(int64_t pixel, int64_t whole, double part) {
         const PulseFrame& frame = job_.frame;
         const double rate = job_.rate[pixel];
         copy_cyclic(frame.first, frame.size, here_);
         copy_cyclic(first_old(), frame.size + 1, old_);
-        arm(rate, sum(wrap(frame.first - back_), back_) + part_ * old_[0]);
+        const double until = sum(wrap(frame.first - back_), back_);
+        arm(rate, team_.agreed([&] { return until + part_ * old_[0]; }));
         if (frame.cells > 1)
             cut_cells(pixel, part, rate);
         else
             cut_bins(pixel, part);
-        int64_t to = wrap(frame.first + whole);
-        float before = frame.size == n_ ? moved_[n_ - 1] : past_[frame.first - 1];
-        for (int32_t i = 0; i < frame.size; ++i) {
-            shape[to] = here_[i] - moved_[i] + before;
-            before = moved_[i];
-            if (++to == n_) to = 0;
-        }
-        const int64_t behind = wrap(frame.first + frame.size);
-        if (frame.size < n_) shape[to] = mixture_[behind] - past_[behind] + before;
+        const int64_t first = wrap(frame.first + whole), size = frame.size, n = n_;
+        const int64_t behind = wrap(frame.first + size);
+        const float *const here = here_, *const moved = moved_;
+        const float* const ahead = size == n ? moved_ + n - 1 : past_ + frame.first - 1;
+        float* const out = shape;
+        team_.each(size, [=](int64_t i) {
+            const int64_t to = first + i < n ? first + i : first + i - n;
+            out[to] = here[i] - moved[i] + (i > 0 ? moved[i - 1] : *ahead);
+        });
+        if (size < n)
+            team_.once([&] { shape[wrap(first + size)] = mixture_[behind] - past_[behind] + moved_[size - 1]; });
     }
 
     // Mean armed fraction at the frame's edges, from the mixture's sum over the dead time before it.
     void arm(double rate, double blind) {
         const int32_t size = job_.frame.size;
-        for (int32_t i = 0;; ++i) {
-            const double armed = 1.0 - rate * (whole_ + blind);
-            armed_[i] = static_cast<float>(armed > kLeastArmed ? armed : kLeastArmed);
-            if (i == size) return;
-            const double leaving = old_[i + 1], next = old_[i];
-            blind += static_cast<double>(here_[i]) - leaving + part_ * (leaving - next);
-        }
+        team_.once([&] {
+            for (int32_t i = 0;; ++i) {
+                const double armed = 1.0 - rate * (whole_ + blind);
+                armed_[i] = static_cast<float>(armed > kLeastArmed ? armed : kLeastArmed);
+                if (i == size) return;
+                const double leaving = old_[i + 1], next = old_[i];
+                blind += static_cast<double>(here_[i]) - leaving + part_ * (leaving - next);
+            }
+        });
     }
 
     // Registrations of a bin behind the cut at 1 - part of it; A from edge to edge as the bin's photons deplete it:
@@ -255,13 +295,16 @@ private:
         const float* low = frame.energy + static_cast<int64_t>(p) * frame.size;
         const float* high = low + frame.size;
         const float* all = frame.energy + static_cast<int64_t>(frame.parts) * frame.size;
-        for (int32_t i = 0; i < frame.size; i += kLanes) {
-            const int32_t left = frame.size - i;
+        const int32_t size = frame.size;
+        const float *const armed = armed_, *const all_here = here_;
+        float* const moved = moved_;
+        team_.lanes(size, [=](int64_t i) {
+            const int32_t left = size - static_cast<int32_t>(i);
             const Float head = load_some(low + i, left);
             const Float photons = load_some(all + i, left) * signal + dark;
             const Float until = (head + (load_some(high + i, left) - head) * between) * signal + early;
-            const Float from = load<Float>(armed_ + i), to = load<Float>(armed_ + i + 1), drop = from - to;
-            const Float here = load<Float>(here_ + i);
+            const Float from = load<Float>(armed + i), to = load<Float>(armed + i + 1), drop = from - to;
+            const Float here = load<Float>(all_here + i);
             const Float x = minimum(maximum(photons, splat(kFewPhotons)), splat(80.0f)), u = minimum(until, x);
             const Float slope = drop / one_minus_exp(x, exp_minus(x));
             const Float depleted =
@@ -270,8 +313,8 @@ private:
             const Float straight = share * (from - 0.5f * (share * drop)) / (from - 0.5f * drop);
             const Float ahead = select(photons < kFewPhotons, straight, depleted);
             const Float kept = minimum(maximum(ahead, splat(0.0f)), splat(1.0f));
-            store(moved_ + i, here - here * kept);
-        }
+            store(moved + i, here - here * kept);
+        });
     }
 
     // The first of them, and zeros.
@@ -291,18 +334,19 @@ private:
         const int64_t bins = frame.size + 2 * reach_;
         const int32_t step = frame.parts / frame.cells;
         const double signal = job_.signal[pixel], dark = job_.background[pixel] / n_ / static_cast<double>(k);
-        for (int64_t b = 0; b < bins; ++b) {
+        team_.each(bins, [&](int64_t b) {
             const double each = rate * mixture_[wrap(frame.first - reach_ + b)] / static_cast<double>(k);
             for (int64_t c = 0; c < k; ++c) mass_[b * k + c] = each;
-        }
-        for (int64_t c = 0; c <= inside; ++c)
+        });
+        team_.each(inside + 1, [&](int64_t c) {
             fine_[c] = armed_[c / k] +
                        (c < inside ? static_cast<double>(armed_[c / k + 1] - armed_[c / k]) * (c % k) / k : 0.0);
+        });
         for (int sweep = 0;; ++sweep) {
-            int64_t bin = frame.first;
-            for (int32_t i = 0; i < frame.size; ++i) {
+            team_.each(frame.size, [&](int64_t i) {
                 double* mass = mass_ + first + i * k;
                 const double* armed = fine_ + i * k;
+                const int64_t bin = frame.first + i < n_ ? frame.first + i : frame.first + i - n_;
                 double total = 0.0;
                 for (int64_t c = 0; c < k; ++c) {
                     const float* energy = frame.energy + c * step * frame.size + i;
@@ -313,40 +357,46 @@ private:
                 const double scale = total > 0.0 ? rate * mixture_[bin] / total : 0.0;
                 for (int64_t c = 0; c < k; ++c)
                     mass[c] = total > 0.0 ? mass[c] * scale : rate * mixture_[bin] / static_cast<double>(k);
-                if (++bin == n_) bin = 0;
-            }
+            });
             if (sweep == kSweeps) break;
-            below_[0] = 0.0;
-            for (int64_t c = 0; c < bins * k; ++c) below_[c + 1] = below_[c] + mass_[c];
+            team_.once([&] {
+                below_[0] = 0.0;
+                for (int64_t c = 0; c < bins * k; ++c) below_[c + 1] = below_[c] + mass_[c];
+            });
             const double back = offset_ * static_cast<double>(k);
-            for (int64_t c = 0; c <= inside; ++c) {
+            team_.each(inside + 1, [&](int64_t c) {
                 const double place = static_cast<double>(first + c) - back;
                 const int64_t cell = static_cast<int64_t>(place);
                 const double then = below_[cell] + (place - static_cast<double>(cell)) * mass_[cell];
                 const double armed = 1.0 - nearest_ * rate - (below_[first + c] - then);
                 fine_[c] = armed > kLeastArmed ? armed : kLeastArmed;
-            }
+            });
         }
         const double place = (1.0 - part) * static_cast<double>(k);
         const int64_t cut = place < static_cast<double>(k) ? static_cast<int64_t>(place) : k - 1;
-        for (int32_t i = 0; i < frame.size; ++i) {
+        team_.each(frame.size, [&](int64_t i) {
             const double* mass = mass_ + first + i * k;
             double behind = mass[cut] * (1.0 - (place - static_cast<double>(cut)));
             for (int64_t c = cut + 1; c < k; ++c) behind += mass[c];
             const double most = mixture_[wrap(frame.first + i)];
             moved_[i] = static_cast<float>(behind / rate < most ? behind / rate : most);
-        }
+        });
     }
 
     // Mean of an exponential that goes from a to b.
     static double between(double a, double b) {
         const double ratio = (b - a) / a;
         if (std::fabs(ratio) < 1e-3) return a + 0.5 * (b - a) - (b - a) * ratio / 12.0;
-        return (b - a) / std::log(b / a);
+        return (b - a) / ieee_log(b / a);
     }
 
+    static constexpr int64_t kSums = 17;
+
     const ShapeJob& job_;
+    const Team team_;
     const int64_t n_;
+    int64_t wide_;
+    double* sums_ = nullptr;
     float *mixture_, *past_;  // (-1 .. bins]; what leaves each bin for the next
     float *here_, *old_;     // the mixture in the frame; a dead time before it
     float *armed_, *moved_;  // A at its edges; moved to the next bin

@@ -186,6 +186,24 @@ void guide(BoundShapeJob& job, Matrix<float> guides, size_t rows, int threads) {
     job.arrays = nb::make_tuple(job.arrays, guides);
 }
 
+// Guides (rows, 64) of all rows, for a device.
+nb::object all_guides(Matrix<const float> shapes, double dead_time, int32_t first, int32_t size) {
+    ShapeJob job{};
+    job.bins = static_cast<int32_t>(shapes.shape(1));
+    job.shapes = shapes.data();
+    job.dead_time = dead_time;
+    if (first < 0 || first >= job.bins || size < 0 || size > job.bins)
+        throw nb::value_error("the pulse's frame must lie in the period");
+    job.frame.first = first;
+    job.frame.size = size;
+    const size_t rows = shapes.shape(0), width = sizeof(RowGuide) / sizeof(float);
+    float* const data = new float[rows * width]();
+    nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<float*>(p); });
+    for (size_t row = 0; row < rows && size < job.bins; ++row)
+        look_at(job, static_cast<int64_t>(row), reinterpret_cast<RowGuide*>(data)[row]);
+    return nb::cast(nb::ndarray<nb::numpy, float, nb::ndim<2>>(data, {rows, width}, owner));
+}
+
 void aligned(const BoundShapeJob& job, Matrix<double> out, const std::string& level) {
     if (static_cast<int64_t>(out.shape(0)) != job.pixels || static_cast<int64_t>(out.shape(1)) != job.bins)
         throw nb::value_error("out must be (pixels, bins)");
@@ -260,6 +278,8 @@ void bind_shape_sampler(nb::module_& module) {
             [](BoundShapeJob& self, Matrix<float> guides, int threads) { guide(self, guides, self.row_count, threads); },
             nb::kw_only(), nb::arg("guides").noconvert(), nb::arg("threads"),
             "Let moderate counts be drawn photon by photon: `guides` (rows, 64), zeros at first, are filled as needed.");
+    module.def("shape_guides", &all_guides, nb::arg("shapes"), nb::kw_only(), nb::arg("dead_time"), nb::arg("first"),
+               nb::arg("size"), "Guides (rows, 64) to all rows of canonical delay, as `ShapeJob.guide` fills them.");
     module.def("shape_aligned", &aligned, nb::arg("job"), nb::arg("out").noconvert(), nb::arg("level"),
                "Shapes out (pixels, bins) from which a job's histograms are drawn: for its tests.");
     const char* about = "Histograms out (realizations * image, bins) of counts (realizations, pixels).";

@@ -255,7 +255,7 @@ def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
         one["cube"].zero_()  # it is the receiver's own
     again = [one["cube"].data_ptr() for one in loader(dataset, 1, batch_size=None)]
     assert len(set(again)) <= 6
-    changed = [one for one in loader(stream(SYSTEM, epoch_size=4, transform=_half), 1, batch_size=None)]
+    changed = list(loader(stream(SYSTEM, epoch_size=4, transform=_half), 1, batch_size=None))
     for (part, rest), alone in zip(changed, stream(SYSTEM, epoch_size=4), strict=True):
         assert torch.equal(part, alone["cube"][:32])
         assert float(rest["own"]) == float(alone["cube"].sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import pickle
 import sys
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch.utils.data import DataLoader
 
 import mars_lidar as ml
 from mars_lidar.learn import Choice, CubeStream, LogUniform, SystemRange, Uniform
+from mars_lidar.learn.shared import SharedScenes
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=60, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
@@ -246,6 +248,30 @@ def test_arrays_are_scenes(tmp_path):
     ):
         with pytest.raises((ValueError, TypeError), match=told):
             stream(SYSTEM, wrong)
+
+
+def test_scenes_of_other_workers_are_whole_or_none():
+    """A scene in another's place, a torn one, and a number that does not belong to it are not taken."""
+    shared = SharedScenes((5, 6))
+    scenes = {number: ml.Scene.example("random", (5, 6), number) for number in (3, 67, 2**64 - 1)}
+    assert shared.get(3) is None
+    for number, scene in scenes.items():
+        shared.put(number, scene)
+        found = shared.get(number)
+        np.testing.assert_array_equal(found.depth_m, scene.depth_m)
+        np.testing.assert_array_equal(found.reflectivity, scene.reflectivity)
+    assert shared.get(3) is None  # 67 took its place
+    place = 67 % 64
+    shared._heads[place, 0] = 3
+    assert shared.get(3) is None
+    shared._heads[place, 0] = 67
+    assert shared.get(67) is not None
+    shared._maps[place, 0, 2, 2] += 1e-9
+    assert shared.get(67) is None
+    copy = pickle.loads(pickle.dumps(shared))  # which shares nothing: no process is being started
+    assert copy.get(2**64 - 1) is None
+    copy.put(3, scenes[3])
+    assert copy.get(3) is None
 
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch.utils.data import get_worker_info
 
 from mars_lidar import _validate
 from mars_lidar.io.scan import SceneFile, scan
+from mars_lidar.learn.shared import SharedScenes
 from mars_lidar.scene import Scene
 
 POOL = 16  # ray-cast scenes that are in use at a time
@@ -64,6 +66,7 @@ class RayCast(SceneSource):
         super().__init__()
         self._name, self._reuse = name, reuse
         self._size = size if reuse == 1 else (round(_MARGIN * size[0]), round(_MARGIN * size[1]))
+        self._shared = SharedScenes(self._size) if reuse > 1 else None
 
     def number(self, seed: int, epoch: int, sample: int) -> int:
         """A seed of 64 bits."""
@@ -75,8 +78,14 @@ class RayCast(SceneSource):
         )
 
     def load(self, number: int) -> Scene:
-        """Cast it."""
-        return Scene.example(self._name, self._size, number)
+        """Cast it, or take it from another worker."""
+        shared = None if get_worker_info() is None else self._shared
+        found = None if shared is None else shared.get(number)
+        if found is None:
+            found = Scene.example(self._name, self._size, number)
+            if shared is not None:
+                shared.put(number, found)
+        return found
 
 
 class Given(SceneSource):

@@ -55,6 +55,8 @@ def _rows(section: Section, bins: int, config: Config, bandwidth: Bandwidth) -> 
         at = [torch.tensor(one, dtype=dtype) for one in (s, b, tau)]
         cases[name] = lambda model=model, at=at: model(*at)
         cases[name + ", gradient"] = lambda model=model, at=at: _gradient(model, at)
+    for case in cases.values():  # what PyTorch and SciPy load when they are first needed
+        case()
     timings = in_turn(cases, config)
     floor = bandwidth.seconds(4 * PIXELS * bins, threads=1, fresh=False) / PIXELS
     for name in ("mean_histogram", *models):

@@ -89,33 +89,48 @@ def _numbers(processors: int) -> list[int]:
 
 
 def _measured(one: CubeStream, workers: int, config: Config) -> tuple[float | None, float | None, float]:
-    """CPU seconds a cube of this process and of all, and wall seconds, once memory and scenes are at hand.
+    """CPU seconds a cube of this process and of all, and wall seconds: the least of several stretches.
 
-    Time between batches, some of which are made ahead: as many as at the beginning.
+    A stretch begins and ends with all workers idle, as many batches made ahead: it holds the work of what was taken.
     """
     batches: Any = iter(DataLoader(one, batch_size=None, num_workers=workers))
-    for _ in range(4 * workers):
+    known = [os.getpid(), *(worker.pid for worker in batches._workers)]
+    number, began, found = 4 * workers, time.perf_counter(), []
+    for _ in range(number):  # memory is taken, scenes are cast
         next(batches)
-    processes = [os.getpid(), *(worker.pid for worker in batches._workers)]
-    before = [_seconds(process) for process in processes]
-    start, number = time.perf_counter(), 0
-    while number < 4 * workers or time.perf_counter() - start < config.seconds / 4:
-        next(batches)
-        number += 1
-    wall = (time.perf_counter() - start) / (number * BATCH)
-    spent = [_seconds(process) - known for process, known in zip(processes, before, strict=True)]
-    if math.isnan(sum(spent)):
-        return None, None, wall
-    return spent[0] / (number * BATCH), sum(spent) / (number * BATCH), wall
+    while len(found) < 2 or time.perf_counter() - began < config.seconds / 2:
+        _idle(known[1:])
+        before, start = [_seconds(process) for process in known], time.perf_counter()
+        for _ in range(number):
+            next(batches)
+        _idle(known[1:])
+        wall = (time.perf_counter() - start) / (number * BATCH)
+        cpu = [(_seconds(process) - spent) / (number * BATCH) for process, spent in zip(known, before, strict=True)]
+        found.append((sum(cpu), cpu[0], wall))
+    total, received, _ = min(found)
+    wall = min(one[2] for one in found)
+    return (None, None, wall) if math.isnan(total) else (received, total, wall)
+
+
+def _idle(processes: list[int]) -> None:
+    """Wait until they sleep, which they do not in the midst of simulating."""
+    quiet = 0
+    while quiet < 3:
+        time.sleep(0.005)
+        quiet = quiet + 1 if all(_fields(process)[:1] in (["S"], []) for process in processes) else 0
 
 
 def _seconds(process: int) -> float:
     """CPU seconds of a process, all its threads; NaN where the system does not tell."""
+    fields = _fields(process)
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else math.nan
+
+
+def _fields(process: int) -> list[str]:
     try:
-        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     except OSError:
-        return math.nan
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return []
 
 
 _NOTE = (

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import math
+import os
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +16,7 @@ from torch.utils.data import DataLoader
 import mars_lidar as ml
 from benchmarks.config import Config
 from benchmarks.floor import Bandwidth
-from benchmarks.report import Goal, Section
+from benchmarks.report import Goal, Row, Section
 from benchmarks.timing import in_turn
 from mars_lidar.learn import CubeStream
 from mars_lidar.learn.sample import Sample
@@ -48,40 +52,91 @@ def stream(config: Config, bandwidth: Bandwidth) -> Section:
             next(one)  # its memory is taken
             cases[name] = lambda one=one: [None for _ in itertools.islice(one, 4)]
         timings = in_turn(cases, config)
-        engine = min(timings["bare engine"].cpu)
+        engine = min(timings["bare engine"].cpu) / (4 * BATCH)
         for name, timing in timings.items():
-            cpu = min(timing.cpu)
-            section.rows.append({
-                "case": name, "S": level, "workers": 0, "CPU ms per cube": 1e3 * cpu / (4 * BATCH),
-                "cubes/s": 4 * BATCH / min(timing.wall), "of the engine's rate, CPU": engine / cpu,
-                "write floor ms": 1e3 * floor,
-            })  # fmt: skip
+            cpu, wall = (min(seconds) / (4 * BATCH) for seconds in (timing.cpu, timing.wall))
+            section.rows.append(_row(name, level, 0, cpu, 0.0, wall, engine, floor))
+        shares = [section.rows[-2]["of the engine's rate, CPU"]]
+        for dtype in (None, torch.float32)[: 1 + (level == 1.0)]:
+            name = "loader, counts" if dtype is None else "loader, float32"
+            for workers in _numbers(config.threads):
+                received, cpu, wall = _measured(made(dtype), workers, config)
+                section.rows.append(_row(name, level, workers, cpu, received, wall, engine, floor))
+                if dtype is None:
+                    shares.append(section.rows[-1]["of the engine's rate, CPU"])
         if level == 1.0:
-            share = engine / min(timings["stream, counts"].cpu)
-            section.goals.append(Goal("stream over bare engine, S = 1, rate by CPU", share, GOAL_SHARE, "", True))
-        for workers in (1, 2):
-            section.rows.append({
-                "case": "loader, counts", "S": level, "workers": workers, "CPU ms per cube": None,
-                "cubes/s": _rate(made(None), workers, config), "of the engine's rate, CPU": None,
-                "write floor ms": 1e3 * floor,
-            })  # fmt: skip
+            told = [one for one in shares if one is not None]
+            what = "stream over bare engine, S = 1, rate by CPU, worst number of workers"
+            section.goals.append(Goal(what, min(told), GOAL_SHARE, "", True))
     return section
 
 
-def _rate(one: CubeStream, workers: int, config: Config) -> float:
-    """Cubes per second between the first batches and the last ones."""
-    batches = iter(DataLoader(one, batch_size=None, num_workers=workers))
-    for _ in range(2 * workers):
+def _row(
+    case: str, level: float, workers: int, cpu: float | None, received: float | None, wall: float, engine: float,
+    floor: float,
+) -> Row:  # fmt: skip
+    return {
+        "case": case, "S": level, "workers": workers, "CPU ms per cube": None if cpu is None else 1e3 * cpu,
+        "of it the receiver's": None if received is None else 1e3 * received, "wall ms per cube": 1e3 * wall,
+        "cubes/s": 1.0 / wall, "of the engine's rate, CPU": None if cpu is None else engine / cpu,
+        "of so many engines' rate, wall": engine / max(1, workers) / wall, "write floor ms": 1e3 * floor,
+    }  # fmt: skip
+
+
+def _numbers(processors: int) -> list[int]:
+    """1, 2, 4, .. workers, and as many as there are processors."""
+    return sorted({2**k for k in range(processors.bit_length()) if 2**k < processors} | {processors})
+
+
+def _measured(one: CubeStream, workers: int, config: Config) -> tuple[float | None, float | None, float]:
+    """CPU seconds a cube of this process and of all, and wall seconds: the least of several stretches.
+
+    A stretch begins and ends with all workers idle, as many batches made ahead: it holds the work of what was taken.
+    """
+    batches: Any = iter(DataLoader(one, batch_size=None, num_workers=workers))
+    known = [os.getpid(), *(worker.pid for worker in batches._workers)]
+    number, began, found = 4 * workers, time.perf_counter(), []
+    for _ in range(number):  # memory is taken, scenes are cast
         next(batches)
-    start, number = time.perf_counter(), 0
-    while number < 4 or time.perf_counter() - start < config.seconds / 4:
-        next(batches)
-        number += 1
-    return number * BATCH / (time.perf_counter() - start)
+    while len(found) < 2 or time.perf_counter() - began < config.seconds / 2:
+        _idle(known[1:])
+        before, start = [_seconds(process) for process in known], time.perf_counter()
+        for _ in range(number):
+            next(batches)
+        _idle(known[1:])
+        wall = (time.perf_counter() - start) / (number * BATCH)
+        cpu = [(_seconds(process) - spent) / (number * BATCH) for process, spent in zip(known, before, strict=True)]
+        found.append((sum(cpu), cpu[0], wall))
+    total, received, _ = min(found)
+    wall = min(one[2] for one in found)
+    return (None, None, wall) if math.isnan(total) else (received, total, wall)
+
+
+def _idle(processes: list[int]) -> None:
+    """Wait until they sleep, which they do not in the midst of simulating."""
+    quiet = 0
+    while quiet < 3:
+        time.sleep(0.005)
+        quiet = quiet + 1 if all(_fields(process)[:1] in (["S"], []) for process in processes) else 0
+
+
+def _seconds(process: int) -> float:
+    """CPU seconds of a process, all its threads; NaN where the system does not tell."""
+    fields = _fields(process)
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else math.nan
+
+
+def _fields(process: int) -> list[str]:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return []
 
 
 _NOTE = (
     "{side} × {side} × {bins}, SBR 1, built-in random scenes, each used 16 times, batches of 8; one thread a process. "
     "The bare engine draws the same kind of samples, prepared beforehand, into one buffer. Counts: uint16, not "
-    "converted. Loader: cubes go through shared memory; wall time."
+    "converted. Loader: as many workers as told, of one thread each; CPU time is that of all processes, the receiver's "
+    "that of the one which takes the cubes. So many engines: as many as workers, each on a processor of its own at the "
+    "bare engine's CPU time, which no machine with other work beside reaches."
 )

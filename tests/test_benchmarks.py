@@ -142,6 +142,16 @@ def test_goals_are_computed():
 
 def test_stream_is_measured_beside_the_engine():
     section = command.run(TINY, ("stream",)).sections[0]
-    assert [row["workers"] for row in section.rows] == 2 * [0, 0, 0, 1, 2]
+    workers = [row["workers"] for row in section.rows]
+    assert set(workers) == {0, 1, TINY.threads} | {2**k for k in range(10) if 2**k < TINY.threads}
     assert all(row["cubes/s"] > 0 for row in section.rows)
     assert [row["of the engine's rate, CPU"] for row in section.rows if row["case"] == "bare engine"] == [1.0, 1.0]
+
+
+def test_forward_models_are_measured_with_their_gradients():
+    section = command.run(TINY, ("forward",)).sections[0]
+    assert {row["bins"] for row in section.rows} == {64}
+    for row in section.rows:
+        value, both = row["value, CPU us a pixel"], row["value and gradient"]
+        assert value > 0.0
+        assert (both is None) == (row["case"] == "mean_histogram")

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
+import runpy
 from pathlib import Path
 
-import torch
+PATH = Path(__file__).parents[2] / "examples" / "train_depth.py"
 
 
 def test_train_depth():
-    path = Path(__file__).parents[2] / "examples" / "train_depth.py"
-    spec = importlib.util.spec_from_file_location("train_depth", path)
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        net, losses = example.train(steps=30, size=12)
-        shares = example.within_a_bin(net, size=12)
-    finally:
-        torch.set_num_threads(threads)
+    example = runpy.run_path(str(PATH))
+    net, losses = example["train"](30, 12)
     assert len(losses) == 30
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
-    assert set(shares) == {"network", "argmax", "matched filter"}
-    assert 0.3 < shares["argmax"] <= 1.0  # chance is 0.03
-    assert 0.3 < shares["matched filter"] <= 1.0
+    shares = example["within_a_bin"](net, 12)
+    assert set(shares) == {"network", "matched filter"}
+    assert 0.3 < shares["matched filter"] <= 1.0  # chance is 0.03
+    assert 0.1 < shares["network"] <= 1.0
+
+
+def test_it_is_as_short_as_the_issue_wants():
+    """The stream, the network and its training: code, without imports, blank lines and what measures and plots."""
+    text = PATH.read_text()
+    core = text[text.index("PULSE") : text.index("def within_a_bin")]
+    assert len([line for line in core.splitlines() if line.strip()]) <= 22

@@ -170,6 +170,8 @@ def test_batches_types_and_bad_arguments():
         expected_histogram(1.0, *maps[1:], one)
     with pytest.raises(ValueError, match="must be >= 0"):
         expected_histogram(-maps[0], *maps[1:], one)
+    with pytest.raises(ValueError, match=r"must broadcast, got shapes \(2, 3, 4\), \(5,\), \(\)"):
+        expected_histogram(maps[0], torch.rand(5), maps[2], one)
     with pytest.raises(ValueError, match="histogram must be a tensor"):
         histogram_log_likelihood(torch.zeros(3), *maps, one)
     with pytest.raises(ValueError, match="mode 'synchronous'"):

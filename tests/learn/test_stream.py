@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import pickle
 import sys
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch.utils.data import DataLoader
 
 import mars_lidar as ml
 from mars_lidar.learn import Choice, CubeStream, LogUniform, SystemRange, Uniform
+from mars_lidar.learn.shared import SharedScenes
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=60, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
@@ -224,6 +226,110 @@ def test_given_scenes_all_come_before_any_again(tmp_path):
     assert orders[0] == orders[1]
 
 
+def test_arrays_are_scenes(tmp_path):
+    """NumPy, PyTorch and a memory map: each map once, and the same as its Scene."""
+    random = np.random.default_rng(0)
+    depth, reflectivity = random.uniform(1, 9, (5, 6, 7)), random.uniform(0.1, 1, (5, 6, 7))
+    np.save(tmp_path / "depth.npy", depth)
+    maps = {"depth": np.load(tmp_path / "depth.npy", mmap_mode="r"), "reflectivity": torch.from_numpy(reflectivity)}
+    scenes = [ml.Scene(*one) for one in zip(depth, reflectivity, strict=True)]
+    for first, second in zip(stream(SYSTEM, maps, epoch_size=10), stream(SYSTEM, scenes, epoch_size=10), strict=True):
+        assert_same(first, second)
+    whole = [one["depth"] for one in stream(SYSTEM, depth, size=None, flips=False, epoch_size=5)]
+    assert sorted(float(one[0, 0]) for one in whole) == sorted(depth[:, 0, 0].astype(np.float32).tolist())
+    assert next(iter(stream(SYSTEM, depth[0], size=None)))["cube"].shape == (64, 6, 7)
+    assert float(next(iter(stream(SYSTEM, depth)))["reflectivity"].min()) == 1.0
+    for wrong, told in (
+        ({"depth": depth, "reflectivity": reflectivity[:4]}, "maps of one shape"),
+        ({"depths": depth}, "maps 'depth'"),
+        (depth[None], r"depth map \(n, H, W\)"),
+        (-depth, "depth_m must be in"),
+        ((depth, reflectivity), "dictionary of arrays"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=told):
+            stream(SYSTEM, wrong)
+
+
+def test_scenes_of_other_workers_are_whole_or_none():
+    """A scene in another's place, a torn one, and a number that does not belong to it are not taken."""
+    shared = SharedScenes((5, 6))
+    scenes = {number: ml.Scene.example("random", (5, 6), number) for number in (3, 67, 2**64 - 1)}
+    assert shared.get(3) is None
+    for number, scene in scenes.items():
+        shared.put(number, scene)
+        found = shared.get(number)
+        np.testing.assert_array_equal(found.depth_m, scene.depth_m)
+        np.testing.assert_array_equal(found.reflectivity, scene.reflectivity)
+    assert shared.get(3) is None  # 67 took its place
+    place = 67 % 64
+    shared._heads[place, 0] = 3
+    assert shared.get(3) is None
+    shared._heads[place, 0] = 67
+    assert shared.get(67) is not None
+    shared._maps[place, 0, 2, 2] += 1e-9
+    assert shared.get(67) is None
+    copy = pickle.loads(pickle.dumps(shared))  # which shares nothing: no process is being started
+    assert copy.get(2**64 - 1) is None
+    copy.put(3, scenes[3])
+    assert copy.get(3) is None
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+def test_maps_of_a_dataset_are_scenes(tmp_path):
+    """Of one that `generate` wrote: seen again by other instruments, whoever makes the cubes."""
+    light = {"signal": 1.0}
+    scenes = {"example": "room", "size": [6, 8], "seeds": [0, 1, 2]}
+    ml.generate({"scenes": scenes, "systems": [SYSTEM.replace(bins=16)], "light": light}, tmp_path / "set.zarr")
+    maps = ml.dataset.open_dataset(tmp_path / "set.zarr").maps
+    dataset = stream(SYSTEMS, tmp_path / "set.zarr", epoch_size=6, flips=False, size=None)
+    alone = list(dataset)
+    depths = sorted(float(one[0, 0]) for one in maps["depth"][:])
+    assert sorted(float(one["depth"][0, 0]) for one in alone[:3]) == pytest.approx(depths, rel=1e-6)
+    for first, second in zip(alone, loader(dataset, 2, batch_size=None), strict=True):
+        assert_same(first, second)
+
+
+def test_bad_files_are_left_out_and_told(tmp_path):
+    for k in range(3):
+        np.savez(tmp_path / f"{k}.npz", depth=np.full((6, 6), 1.0 + k))
+    np.savez(tmp_path / "dark.npz", depth=np.full((6, 6), np.nan))
+    (tmp_path / "torn.npz").write_bytes((tmp_path / "0.npz").read_bytes()[:60])
+    dataset = stream(SYSTEM, tmp_path, epoch_size=10)
+    with pytest.warns(UserWarning, match="left out of the stream") as told:
+        depths = [float(one["depth"][0, 0]) for one in dataset]
+    assert len(told) == 2  # each once
+    assert {"dark.npz" in str(one.message) for one in told} == {True, False}
+    assert set(depths) == {1.0, 2.0, 3.0}
+    for k in range(3):
+        (tmp_path / f"{k}.npz").unlink()
+    none = pytest.raises(ValueError, match="none of the 2 files of scenes can be read")
+    with pytest.warns(UserWarning, match="left out"), none:
+        next(iter(stream(SYSTEM, tmp_path)))
+
+
+def test_crops_find_the_only_return():
+    """One pixel of 2500 in a corner: every crop holds it, at all places in turn."""
+    depth = np.full((50, 50), np.nan)
+    depth[49, 0] = 3.0
+    depth[20, 30] = 4.0
+    seen = [np.argwhere(np.isfinite(one["depth"].numpy())) for one in stream(SYSTEM, depth, epoch_size=40, flips=False)]
+    assert {len(one) for one in seen} == {1}
+    assert len({tuple(one[0]) for one in seen}) > 5
+    with pytest.raises(ValueError, match="a scene must have a pixel with a return"):
+        next(iter(stream(SYSTEM, np.full((8, 8), np.nan))))
+
+
+def test_ranks_of_torchrun(monkeypatch):
+    """Told by the environment before any process group exists: else every rank would train on the same samples."""
+    for rank in range(2):
+        monkeypatch.setenv("RANK", str(rank))
+        monkeypatch.setenv("WORLD_SIZE", "2")
+        assert [int(one["index"]) for one in stream(epoch_size=5)] == [rank, rank + 2]
+        assert [int(one["index"]) for one in stream(epoch_size=2, rank=0, world_size=1)] == [0, 1]
+    monkeypatch.delenv("RANK")
+    assert len(stream(epoch_size=5)) == 5
+
+
 def test_buffers_are_not_given_out_while_they_are_held():
     dataset = stream(SYSTEM, batch_size=2, epoch_size=40)
     held = [one["cube"][0] for one in dataset]  # a view keeps the memory
@@ -255,7 +361,7 @@ def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
         one["cube"].zero_()  # it is the receiver's own
     again = [one["cube"].data_ptr() for one in loader(dataset, 1, batch_size=None)]
     assert len(set(again)) <= 6
-    changed = [one for one in loader(stream(SYSTEM, epoch_size=4, transform=_half), 1, batch_size=None)]
+    changed = list(loader(stream(SYSTEM, epoch_size=4, transform=_half), 1, batch_size=None))
     for (part, rest), alone in zip(changed, stream(SYSTEM, epoch_size=4), strict=True):
         assert torch.equal(part, alone["cube"][:32])
         assert float(rest["own"]) == float(alone["cube"].sum())
@@ -299,7 +405,9 @@ def test_mixed_counts_and_types():
         ({"batch_size": 0}, "batch_size must be an integer"),
         ({"signal": 0.0}, "signal must be above 0"),
         ({"signal": math.nan}, "signal must be a finite number"),
-        ({"sbr": "high"}, "sbr must be a finite number"),
+        ({"sbr": "high"}, "sbr must be a number, Uniform"),
+        ({"signal": (0.1, 1.0)}, "signal must be a number, Uniform"),
+        ({"scenes": None}, "scenes must be a name, a folder"),
         ({"device": "mps"}, "device must be 'cpu' or 'cuda'"),
         ({"layout": "csr"}, "layout must be one of"),
         ({"dtype": "float32"}, "dtype must be a torch.dtype"),

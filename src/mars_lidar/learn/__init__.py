@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mars_lidar.learn.fit import Examples, FitPlan, Fitted
     from mars_lidar.learn.forward import expected_histogram
-    from mars_lidar.learn.inverse import LidarPhysics
+    from mars_lidar.learn.inverse import LidarPhysics as LidarPhysics
     from mars_lidar.learn.light import bin_photons
     from mars_lidar.learn.likelihood import armed_periods, histogram_log_likelihood
     from mars_lidar.learn.ranges import Choice, LogUniform, SystemRange, Uniform
@@ -47,7 +47,7 @@ def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
     return getattr(import_module(f"mars_lidar.learn.{_MODULES[name]}"), name)
 
 
-__all__ = [
+__all__ = [  # but LidarPhysics: `import *` would ask for deepinv
     "Choice",
     "CubeStream",
     "CubeUNet",
@@ -55,7 +55,6 @@ __all__ = [
     "FitPlan",
     "Fitted",
     "HistogramTable",
-    "LidarPhysics",
     "LogUniform",
     "StoredDataset",
     "SystemRange",

@@ -68,7 +68,11 @@ def inputs(*given: torch.Tensor) -> list[torch.Tensor]:
             raise TypeError(f"{name} must be a tensor of floating point numbers, got {one!r}")
     if not (bool((given[0] >= 0).all()) and bool((given[1] >= 0).all()) and bool(torch.isfinite(given[2]).all())):
         raise ValueError("signal and background must be >= 0 and delay_ns finite")
-    return list(torch.broadcast_tensors(*given))  # type: ignore[no-untyped-call]
+    try:
+        return list(torch.broadcast_tensors(*given))  # type: ignore[no-untyped-call]
+    except RuntimeError:
+        told = ", ".join(str(tuple(one.shape)) for one in given)
+        raise ValueError(f"signal, background and delay_ns must broadcast, got shapes {told}") from None
 
 
 def check_detector(system: System) -> None:

@@ -84,6 +84,8 @@ _DRAWN = ("cycles", "period_ns", "dead_time_ns", "sigma_ns")
 
 def as_range(name: str, value: float | Range, *, low: float = 0.0, infinite: bool = False) -> Range:
     """A range, or a number as a range of one; everything in it is above `low`."""
+    if isinstance(value, list | tuple | str | bytes | bool) or value is None:
+        raise TypeError(f"{name} must be a number, Uniform, LogUniform or Choice, got {value!r}")
     given = value if isinstance(value, Uniform | LogUniform | Choice) else Choice((_number(name, value),))
     for end in given.ends:
         if not end > low or (math.isinf(end) and not infinite):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch.utils.data import get_worker_info
 
 from mars_lidar import _validate
 from mars_lidar.io.scan import SceneFile, scan
+from mars_lidar.learn.shared import SharedScenes
 from mars_lidar.scene import Scene
 
 POOL = 16  # ray-cast scenes that are in use at a time
@@ -63,6 +66,7 @@ class RayCast(SceneSource):
         super().__init__()
         self._name, self._reuse = name, reuse
         self._size = size if reuse == 1 else (round(_MARGIN * size[0]), round(_MARGIN * size[1]))
+        self._shared = SharedScenes(self._size) if reuse > 1 else None
 
     def number(self, seed: int, epoch: int, sample: int) -> int:
         """A seed of 64 bits."""
@@ -74,8 +78,14 @@ class RayCast(SceneSource):
         )
 
     def load(self, number: int) -> Scene:
-        """Cast it."""
-        return Scene.example(self._name, self._size, number)
+        """Cast it, or take it from another worker."""
+        shared = None if get_worker_info() is None else self._shared
+        found = None if shared is None else shared.get(number)
+        if found is None:
+            found = Scene.example(self._name, self._size, number)
+            if shared is not None:
+                shared.put(number, found)
+        return found
 
 
 class Given(SceneSource):
@@ -84,24 +94,74 @@ class Given(SceneSource):
     def __init__(self, scenes: Sequence[Scene | SceneFile]) -> None:
         super().__init__()
         self._scenes = list(scenes)
+        self._told: set[SceneFile] = set()
         self._order: tuple[tuple[int, int, int], np.ndarray[Any, Any]] | None = None
         if not self._scenes:
             raise ValueError("scenes must be at least one, got none")
         for one in self._scenes:
             if not isinstance(one, Scene | SceneFile):
-                raise TypeError(f"scenes must be Scene or SceneFile objects, got a {type(one).__name__}")
+                raise TypeError(
+                    "scenes must be Scene or SceneFile objects, or a dictionary of arrays 'depth' and 'reflectivity', "
+                    f"got a {type(one).__name__}"
+                )
+
+    def __len__(self) -> int:
+        return len(self._scenes)
 
     def number(self, seed: int, epoch: int, sample: int) -> int:
         """Its place in the list."""
-        turn, place = divmod(sample, len(self._scenes))
+        turn, place = divmod(sample, len(self))
         if self._order is None or self._order[0] != (seed, epoch, turn):
-            self._order = (seed, epoch, turn), generator(3, seed, epoch, turn).permutation(len(self._scenes))
+            self._order = (seed, epoch, turn), generator(3, seed, epoch, turn).permutation(len(self))
         return int(self._order[1][place])
 
     def load(self, number: int) -> Scene:
-        """Read it, where it is a file."""
-        one = self._scenes[number]
-        return one if isinstance(one, Scene) else one.load()
+        """Read it, where it is a file; instead of one that cannot be read, the next that can."""
+        for place in range(number, number + len(self._scenes)):
+            one = self._scenes[place % len(self._scenes)]
+            if isinstance(one, Scene):
+                return one
+            try:
+                scene = one.load()
+                if (scene.reflectivity[scene.valid] > 0.0).any():
+                    return scene
+                why = f"{one.depth}: no pixel with a return"
+            except (ValueError, OSError) as error:
+                why = str(error)
+            if one not in self._told:
+                self._told.add(one)
+                warnings.warn(f"left out of the stream: {why}", UserWarning, stacklevel=2)
+        raise ValueError(f"none of the {len(self._scenes)} files of scenes can be read; the last: {why}")
+
+
+class Arrays(Given):
+    """Maps (n, H, W) of n scenes, or (H, W) of one; a scene is taken out of them when it is needed."""
+
+    def __init__(self, maps: Mapping[str, Any]) -> None:
+        SceneSource.__init__(self)
+        given = {name: one for name, one in maps.items() if one is not None}
+        names = ("depth", "reflectivity", "background")
+        if "depth" not in given or not set(given) <= set(names):
+            raise ValueError(f"scenes must have maps 'depth' and perhaps {names[1:]}, got {list(maps)}")
+        shape = tuple(getattr(given["depth"], "shape", ()))
+        if len(shape) not in (2, 3) or 0 in shape:
+            raise ValueError(f"scenes must have a depth map (n, H, W) or (H, W), got shape {shape}")
+        for name, one in given.items():
+            if tuple(getattr(one, "shape", ())) != shape:
+                told = tuple(getattr(one, "shape", ())) or repr(one)
+                raise ValueError(f"scenes must have maps of one shape, {shape} of depth, got {name} {told}")
+        self._maps = {name: one if len(shape) == 3 else one[None] for name, one in given.items()}
+        self._number = shape[0] if len(shape) == 3 else 1
+        self._order = None
+        self.load(0)  # what is wrong with all of them is told at once
+
+    def __len__(self) -> int:
+        return self._number
+
+    def load(self, number: int) -> Scene:
+        """One of the maps each; without reflectivity everything is white."""
+        one = {name: np.asarray(maps[number]) for name, maps in self._maps.items()}
+        return Scene(one["depth"], one.get("reflectivity", 1.0), one.get("background"))
 
 
 def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSource:
@@ -113,12 +173,21 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
         if not Path(scenes).exists():
             names = ", ".join(map(repr, Scene.example_names()))
             raise ValueError(f"scenes must be one of {names}, a folder that exists, or Scenes, got {str(scenes)!r}")
+        if (Path(scenes) / "zarr.json").is_file():
+            from mars_lidar.dataset.store import open_dataset
+
+            maps = open_dataset(scenes).maps
+            return Arrays({name: maps[name] for name in ("depth", "reflectivity")})
         files, problems = scan(scenes, check=False)
         if not files:
             raise ValueError(f"{scenes}: no scene found" + "".join(f"; {one}" for one in problems[:3]))
         return Given(files)
     if isinstance(scenes, Scene | SceneFile):
         return Given([scenes])
+    if isinstance(scenes, Mapping):
+        return Arrays(scenes)
     if isinstance(scenes, Sequence):
         return Given(scenes)
-    raise TypeError(f"scenes must be a name, a folder, or Scenes, got a {type(scenes).__name__}")
+    if hasattr(scenes, "shape"):
+        return Arrays({"depth": scenes})
+    raise TypeError(f"scenes must be a name, a folder, Scenes, or arrays, got a {type(scenes).__name__}")

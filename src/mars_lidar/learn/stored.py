@@ -59,7 +59,8 @@ class StoredDataset(IterableDataset[dict[str, Any]]):
     transform
         Called on each example; what it returns is given out.
     rank, world_size
-        Of a distributed run; default: those of torch.distributed where it is initialised, else 0 of 1.
+        Of a distributed run; default: those of torch.distributed where it is initialised, else of the environment
+        (RANK and WORLD_SIZE, as torchrun sets them), else 0 of 1.
 
     Raises
     ------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,8 +53,11 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         A System, several (one is drawn for each sample), or a `SystemRange`.
     scenes
         ``"random"`` (default) or ``"room"``: built-in scenes without end. A folder of RGB-D data, whatever
-        `mars_lidar.io.scan` finds in it; or Scenes and `mars_lidar.io.SceneFile` objects: in random order, each
-        once before any comes again.
+        `mars_lidar.io.scan` finds in it; a dataset of `mars_lidar.generate`, for its maps; Scenes and
+        `mars_lidar.io.SceneFile` objects; or arrays: depths (n, H, W) in m, or a dictionary of ``depth``,
+        ``reflectivity``, ``background`` (NumPy, PyTorch, or what gives one when it is indexed: memory maps, Zarr). In
+        random order, each once before any comes again. A file that cannot be read, or without any return, is told by a
+        warning, and the next one taken.
     size
         (H, W), or one number for a square: random crops of that size. None: 64 for built-in scenes, else scenes as
         they are.
@@ -91,8 +94,9 @@ class CubeStream(IterableDataset[dict[str, Any]]):
     transform
         Called on each example; what it returns is given out.
     rank, world_size
-        Of a distributed run; default: those of torch.distributed where it is initialised, else 0 of 1. All ranks
-        give equally many samples of an epoch, so that up to ``world_size - 1`` are left out.
+        Of a distributed run; default: those of torch.distributed where it is initialised, else of the environment
+        (RANK and WORLD_SIZE, as torchrun sets them), else 0 of 1. All ranks give equally many samples of an epoch, so
+        that up to ``world_size - 1`` are left out.
 
     Raises
     ------
@@ -103,7 +107,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
     def __init__(
         self,
         systems: System | Sequence[System] | SystemRange,
-        scenes: str | Path | Scene | SceneFile | Sequence[Scene | SceneFile] = "random",
+        scenes: str | Path | Scene | SceneFile | Sequence[Scene | SceneFile] | Mapping[str, Any] | Any = "random",
         *,
         size: int | tuple[int, int] | None = None,
         epoch_size: int | None = None,

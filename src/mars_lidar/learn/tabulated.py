@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from mars_lidar.io.optional import MissingLibraryError
 
 try:
     import torch
-    from torch.utils.checkpoint import checkpoint
 except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
@@ -87,10 +87,7 @@ class HistogramTable(torch.nn.Module):
         flat = [one.reshape(-1).to(self.histograms.dtype) for one in given]
         some = max(1, _BLOCK // self.system.bins)
         parts = zip(*(torch.split(one, some) for one in flat), strict=True)
-        if torch.is_grad_enabled() and any(one.requires_grad for one in flat):  # else a graph of twenty maps is kept
-            out = [checkpoint(self._expected, *rows, use_reentrant=False) for rows in parts]
-        else:
-            out = [self._expected(*rows) for rows in parts]
+        out = [_Again.apply(self._expected, *rows) for rows in parts]  # type: ignore[no-untyped-call]
         found: torch.Tensor = torch.cat(out) if out else self.histograms.new_empty((0, self.system.bins))
         return found.reshape(*given[0].shape, self.system.bins).to(given[0].dtype)
 
@@ -146,6 +143,23 @@ class HistogramTable(torch.nn.Module):
         times = (torch.stack([left.expand(len(part), -1), left + part]) / n - 0.5) * system.period_ns
         start, stop = wrapped_energy(system, times).unbind(0)
         return torch.nn.functional.pad((stop - start).clamp_min(0.0), (low, n - high))
+
+
+class _Again(torch.autograd.Function):
+    """A function whose gradient evaluates it again: else twenty maps as large as the result would be kept for it."""
+
+    @staticmethod
+    def forward(ctx: Any, function: Callable[..., torch.Tensor], *given: torch.Tensor) -> torch.Tensor:
+        ctx.function = function
+        ctx.save_for_backward(*given)
+        return function(*given)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        with torch.enable_grad():
+            leaves = [one.detach().requires_grad_() for one in ctx.saved_tensors]
+            return None, *torch.autograd.grad(ctx.function(*leaves), leaves, gradient)
 
 
 def _cell(axis: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

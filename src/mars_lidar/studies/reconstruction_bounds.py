@@ -46,7 +46,11 @@ def line(system: System, signal: float, pixels: int) -> dict[str, Any]:
 
 
 def _bounds(
-    cube: NDArray[Any], system: System, truth: tuple[float, float, float], information: NDArray[np.float64], least: float
+    cube: NDArray[Any],
+    system: System,
+    truth: tuple[float, float, float],
+    information: NDArray[np.float64],
+    least: float,
 ) -> dict[str, float]:
     """Bounds from the scores of simulated histograms: the first derivatives, and with the second ones.
 

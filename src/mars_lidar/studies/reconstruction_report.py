@@ -56,7 +56,8 @@ def write(
         "dead time took; the covariance of the exact likelihood's score says what that costs any estimate. *Second "
         "order*: no unbiased estimate reaches the bound in so short an exposure; Bhattacharyya's bound, with second "
         "derivatives, is nearer to what can be reached. And the *bias* of a maximum of likelihood. All in units of the "
-        f"Cramer-Rao bound of {PLAIN.cycles} cycles (of 20,000 cycles for the long exposures), pulse at 50 ns; by simulation, to 2 %.",
+        f"Cramer-Rao bound of {PLAIN.cycles} cycles (of 20,000 cycles for the long exposures), pulse at 50 ns; by "
+        "simulation, to 2 %.",
         table(near),
         "## Why dead time must be modelled",
         f"![Depth of a bright room]({maps.name})",
@@ -108,7 +109,8 @@ def _finding(rows: Sequence[Row]) -> str:
         raw = [r for r in rows if r["detector"] == detector and r["method"] == "matched_filter"][-1]
         told.append(
             f"{_TITLE[detector].capitalize()}: from S = {sure[0]['signal']:.3g} to {sure[-1]['signal']:.3g} "
-            f"(no outliers, no saturated pixels, at the bright end a bound below {KNOWN:g} % of S) maximum likelihood has "
+            "(no outliers, no saturated pixels, and for bright pixels a bound below "
+            f"{KNOWN:g} % of S) maximum likelihood has "
             f"{min(depth):.2f} to {max(depth):.2f} times the bound in depth and "
             f"{min(signal):.2f} to {max(signal):.2f} times in signal. "
             f"At S = {raw['signal']:.3g} the matched filter on raw counts is {raw['depth bias mm']:.1f} mm off and has "

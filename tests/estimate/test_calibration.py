@@ -13,7 +13,6 @@ from scipy import stats
 import mars_lidar as ml
 from harness import ledger
 from mars_lidar.estimate import calibration_bound, rapp_total, recovery
-from mars_lidar.studies.hardware_detectors import Faults, detect
 
 PERIOD = 1e3 / 7.5
 DELAY = 40.0
@@ -140,14 +139,13 @@ def test_rapp_s_total_is_unbiased_with_its_error():
 
 def test_a_hold_off_keeps_out_what_the_model_does_not_have():
     """Electronics that are dead longer than the detector, and afterpulses: told, and kept out by a hold-off."""
-    made_by = system(300_000, 0.0)
+    made_by = system(300_000)
     pulse = made_by.pulse
-    for faults, background, dead, wide, sign in (
-        (Faults(electronics_ns=85.0), 1.0, 50.0, 135.0, "only"),
-        (Faults(afterpulse=0.05), 0.1, 85.0, 600.0, "afterpulses"),
-    ):
-        raw = stream(ml.Flux(0.8, background, DELAY), made_by, seed=9)
-        times = bare(detect(raw, dead, faults, seed=10))
+    two = ml.Detector(dead_time_ns=50.0, electronics_dead_time_ns=85.0)
+    traps = ml.Detector(dead_time_ns=85.0, afterpulsing=ml.Afterpulsing(probability=0.05, delay_ns=100.0))
+    for detector, background, wide, sign in ((two, 1.0, 135.0, "only"), (traps, 0.1, 600.0, "afterpulses")):
+        light = ml.Flux(0.8, background, DELAY)
+        times = bare(stream(light, made_by.replace(detector=detector), seed=9))
         wrong = ml.calibrate(times, pulse=pulse, dead_time_ns=85.0)
         assert abs(wrong.background - background) > 5 * wrong.errors["background"]
         right = ml.calibrate(times, pulse=pulse, dead_time_ns=85.0, hold_off_ns=wide)
@@ -157,7 +155,7 @@ def test_a_hold_off_keeps_out_what_the_model_does_not_have():
         found = recovery(times, right.rate, 85.0, hold_off_ns=wide, reach_ns=wide + 50.0)
         assert found.p_value < 1e-9
         assert any(sign in text for text in found.findings())
-    clean = detect(raw, 85.0, Faults(), seed=11)
+    clean = stream(light, made_by, seed=11)
     good = ml.calibrate(bare(clean), pulse=pulse, dead_time_ns=85.0)
     found = recovery(clean, good.rate, 85.0)
     ledger.require({"recovery": found.p_value}, "a clean detector")

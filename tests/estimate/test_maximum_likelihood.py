@@ -10,7 +10,8 @@ from scipy import stats
 
 import mars_lidar as ml
 from harness import require
-from mars_lidar import estimate
+from mars_lidar import _core, estimate
+from mars_lidar.estimate.recording import recording_of
 
 PERIOD = 100.0
 PLAIN = ml.System(
@@ -70,11 +71,19 @@ def test_unbiased_and_at_the_bound(name):
     require(outcomes, f"maximum likelihood, {name}")
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+# few passes are left at the pulse, so that it matters what the ends of the exposure leave of them
+ENDS = {
+    "ends": (with_dead(75.0, cycles=1000), 10.0, 10.0, 50.013),
+    "ends, stationary": (with_dead(75.0, start="stationary", cycles=1000), 10.0, 10.0, 50.013),
+    "ends, two periods": (with_dead(185.0, cycles=600), 10.0, 1.0, 50.013),
+}
+
+
+@pytest.mark.parametrize("name", [*SYSTEMS, *ENDS])
 def test_derivatives(name):
     """Gradient by finite differences; information as the variance of the gradient, and of other code's formula."""
-    system, signal, background, delay = SYSTEMS[name]
-    pixels = 600
+    system, signal, background, delay = (SYSTEMS | ENDS)[name]
+    pixels = 4000 if name in ENDS else 600
     cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), background, delay), system, seed=11)[0, 0]
     at = np.array([1.1 * signal, 0.9 * background, delay + 0.07])
     h = cube[0]
@@ -87,7 +96,7 @@ def test_derivatives(name):
         assert slope == pytest.approx(gradient[k], abs=2e-3 * scale, rel=1e-5)
     scores = np.array([estimate.log_likelihood(h, system, signal, background, delay)[1] for h in cube])
     information = np.mean(
-        [estimate.log_likelihood(h, system, signal, background, delay)[2] for h in cube[:50]], axis=0
+        [estimate.log_likelihood(h, system, signal, background, delay)[2] for h in cube[:100]], axis=0
     )
     unit = np.sqrt(np.diag(information))
     whitened = np.linalg.solve(np.linalg.cholesky(information / np.outer(unit, unit)), (scores / unit).T)
@@ -97,6 +106,25 @@ def test_derivatives(name):
         p = (stats.chi2.sf(square / 1.06, pixels), stats.chi2.cdf(square * 1.06, pixels))
         outcomes[f"score {k}"] = min(1.0, 2 * float(min(p)))
     require(outcomes, f"likelihood's gradient, {name}")
+
+
+@pytest.mark.parametrize(
+    ("dead", "background", "gate"),
+    [(75.0, 30.0, {}), (20.3, 90.0, {}), (75.0, 30.0, {"mode": "gated", "gate_start_ns": 20.1, "gate_width_ns": 60.0})],
+)
+def test_background_in_one_sum_is_that_of_its_bins(dead: float, background: float, gate: dict):
+    """The series of the bins without a pulse against each of them: up to a constant, at any delay and brightness."""
+    system = with_dead(dead, **gate)
+    record = recording_of(system)
+    h = ml.simulate(ml.Flux(3.0, background, [[37.0]]), system, seed=3)[0, 0, 0].astype(float)
+    places = ((s, f * background, d) for s in (0.5, 4.0) for f in (0.9, 1.05) for d in (2.0, 37.01, 97.0))
+    at = np.array(list(places)) / [1.0, 1.0, PERIOD]
+    series, whole = np.empty((2, len(at), 13))
+    _core.histogram_log_likelihood(record, h, at, series, whole=False)
+    _core.histogram_log_likelihood(record, h, at, whole, whole=True)
+    assert (series[:, 0] - series[0, 0]) == pytest.approx(whole[:, 0] - whole[0, 0], abs=2e-5)
+    scale = np.sqrt(np.maximum(whole[:, [4, 8, 12]], 1e-9))  # of a gradient: the root of its information
+    assert (series[:, 1:4] - whole[:, 1:4]) / scale == pytest.approx(np.zeros((len(at), 3)), abs=1e-6)
 
 
 def test_delay_wherever_the_pulse_is_narrow_or_wide():

@@ -1,4 +1,4 @@
-"""The study of hardware in its quick form, and the detector that it draws photon by photon."""
+"""The study of hardware in its quick form."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ import csv
 import h5py
 import numpy as np
 import pytest
-from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.studies.__main__ import main
 from mars_lidar.studies.hardware import joined, system_of
-from mars_lidar.studies.hardware_detectors import Faults, detect
 from mars_lidar.studies.report import MAX_FIGURE_BYTES
 
 
@@ -43,39 +41,6 @@ def test_quick(tmp_path):
             assert abs(float(row["signal"]) - 0.8) < 5 * float(row["signal_error"])
     with pytest.raises(SystemExit):
         main(["hardware", "--quick", "--out", str(out), "--stream", str(tmp_path / "none.mat")])
-
-
-def test_the_faulty_detector_is_what_it_says():
-    """Without faults the engine's law; with electronics, jitter and afterpulses what each is defined by."""
-    arrivals = ml.simulate_timestamps(ml.Flux(0.8, 0.5, 40.0), system_of(60_000, 0.0), seed=1)
-    t = arrivals.times_ns
-    kept, ready = [], 0.0
-    for photon in t:
-        if photon >= ready:
-            kept.append(photon)
-            ready = photon + 85.0
-    assert np.array_equal(detect(arrivals, 85.0, Faults(), 2).times_ns, kept)
-    kept, ready, recorded = [], 0.0, 0.0
-    for photon in t:
-        if photon >= ready:
-            ready = photon + 50.0
-            if photon >= recorded:
-                kept.append(photon)
-                recorded = photon + 85.0
-    assert np.array_equal(detect(arrivals, 50.0, Faults(electronics_ns=85.0), 2).times_ns, kept)
-    clean = detect(arrivals, 85.0, Faults(), 2).times_ns
-    blurred = detect(arrivals, 85.0, Faults(jitter_ns=0.3), 2).times_ns
-    assert stats.kstest(blurred - clean, "norm", args=(0.0, 0.3)).pvalue > 1e-4
-    few = ml.simulate_timestamps(ml.Flux(0.0, 0.001, 0.0), system_of(5_000_000, 0.0), seed=4)
-    more = detect(few, 20.0, Faults(afterpulse=0.5, afterpulse_ns=100.0), 5)
-    # released after the dead time: 0.5 e^-0.2 of each avalanche, whose own afterpulses follow
-    p = 0.5 * np.exp(-0.2)
-    expected = len(few) / (1 - p)
-    assert abs(len(more) - expected) < 5 * np.sqrt(len(few) * p / (1 - p) ** 3)
-    late = np.diff(more.times_ns)
-    late = late[(late < 600.0)] - 20.0
-    assert late.min() > 0
-    assert abs(late.mean() / 100.0 - 1.0) < 0.15
 
 
 def test_recordings_are_joined():

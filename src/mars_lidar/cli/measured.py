@@ -14,6 +14,7 @@ from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
 from mars_lidar.cli.options import _OUTPUT, _SYSTEM, _option
 
 if TYPE_CHECKING:
+    from mars_lidar.detector import Detector
     from mars_lidar.estimate import Calibration
     from mars_lidar.pulse import Pulse
     from mars_lidar.system import System as SystemObject
@@ -82,7 +83,7 @@ HoldOffNs = Annotated[
     ),
 ]
 System = Annotated[
-    Path | None, _option("--system", panel=_SYSTEM, help="YAML or JSON file with the pulse and the dead time.")
+    Path | None, _option("--system", panel=_SYSTEM, help="YAML or JSON file with pulse and detector, effects too.")
 ]
 PulseSigmaNs = Annotated[
     float | None,
@@ -96,6 +97,12 @@ Returns = Annotated[int, _option("--returns", panel=_SYSTEM, help="Returns (surf
 Cycles = Annotated[
     int,
     _option("--cycles", panel=_STREAM, help="Laser periods of a realization: the stream is cut into such pieces."),
+]
+Simulated = Annotated[
+    int,
+    _option(
+        "--simulated", panel=_STREAM, help="Realizations to simulate for what no law predicts (effects of --system)."
+    ),
 ]
 Picture = Annotated[Path | None, _option("-o", "--out", panel=_OUTPUT, help="A picture: .png, .pdf or .svg.")]
 SystemOut = Annotated[
@@ -201,6 +208,7 @@ def validate(
     pulse_origin: options.PulseOrigin = None,
     free: Free = False,
     returns: Returns = 1,
+    simulated: Simulated = 4000,
     out: Picture = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -217,10 +225,11 @@ def validate(
             times, system, dead_time_ns, hold_off_ns, free, returns,
             (pulse_sigma_ns, pulse_fwhm_ns, pulse_file, pulse_bin_ns, pulse_origin),
         )  # fmt: skip
-        found = compared(times, light, cycles=cycles)
+        found = compared(times, light, cycles=cycles, detector=_with_effects(system), simulated=simulated)
         rows += clock_rows(light) + light_rows(light)
         mean, high = found.total_variation_floor
         rows += [
+            ("prediction", found.prediction.words),
             ("realizations", f"{found.realizations:,} of {cycles:,} cycles, {found.counts.mean():,.6g} counts each"),
             ("count law", f"total variation {found.total_variation:.4g}, sampling floor {mean:.4g} (99 %: {high:.4g})"),
             ("", f"KL {found.kl:.4g} nats, sampling floor {found.kl_floor[0]:.4g} (99 %: {found.kl_floor[1]:.4g})"),
@@ -306,6 +315,17 @@ def _calibrated(
     if not found.converged:
         say("warning: the likelihood was not maximised; what is printed is where it stopped")
     return found
+
+
+def _with_effects(system: Path | None) -> Detector | None:
+    """The detector of the system file, where it is more than a dead time."""
+    if system is None:
+        return None
+    from mars_lidar.estimate.detector_model import is_plain
+    from mars_lidar.system import System as SystemOf
+
+    detector = SystemOf.load(system).detector
+    return None if is_plain(detector) else detector
 
 
 def _check_system_out(out: Path | None, free: bool, overwrite: bool) -> None:

@@ -58,6 +58,9 @@ def light_rows(found: Calibration) -> list[tuple[str, str]]:
             rows.append((f"delay{which}", f"{delay:.7g} ± {errors[f'delay_ns{tail}']:.2g} ns, {depth:.6g} m"))
         width = f", sigma ± {errors['sigma_ns']:.2g} ns (fitted)" if "sigma_ns" in errors else ""
         rows.append(("pulse", f"{found.pulse!r}{width}"))
+    if found.simulated:
+        longer = f"streams {found.simulated:.3g} times as long"
+        rows.append(("by simulation", f"bias by the detector's effects taken off, by {longer}"))
     rapp = found.rapp
     split = "" if rapp.signal != rapp.signal else f"; by shape B {rapp.background:.5g}, S {rapp.signal:.5g}"
     rows.append(("by Rapp", f"Lambda {rapp.total:.6g} ± {rapp.total_error:.2g}, above {found.total:.6g} ± "

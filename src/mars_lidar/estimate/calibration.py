@@ -12,6 +12,7 @@ import numpy as np
 from mars_lidar import _validate
 from mars_lidar.estimate.calibration_fit import Light, covariance, fit, initial
 from mars_lidar.estimate.calibration_rapp import RappEstimate, split, total_of
+from mars_lidar.estimate.detector_model import is_plain, pulse_of_the_light, recorded_pulse, stream_detector, watched
 from mars_lidar.estimate.intervals import ArmedTime, FloatArray, Stream, Summary, armed_time, stream_of, summary_of
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
@@ -55,6 +56,9 @@ class Calibration:
         The stream in numbers.
     converged
         Whether the likelihood was maximised.
+    simulated
+        For a detector with effects: how many times longer than this one the simulated stream is by which the bias
+        of the likelihood was taken off; else 0.
     """
 
     background: float
@@ -72,6 +76,7 @@ class Calibration:
     armed: ArmedTime
     summary: Summary
     converged: bool
+    simulated: float = 0.0
 
     @property
     def signal(self) -> float:
@@ -120,15 +125,16 @@ class Calibration:
         assert self.pulse is not None
         return self.pulse
 
-    def flux(self) -> Flux:
-        """The light of one pixel, to simulate with."""
+    def flux(self, pixels: int = 1) -> Flux:
+        """The light of one pixel, to simulate with; or of a row of so many alike."""
+        row = np.ones((1, pixels))
         if self.waveform is not None:
-            return Flux(waveform=self.waveform, background=0.0)
-        parts = zip(self.returns_signal.tolist(), self.returns_delay_ns.tolist(), strict=True)
-        one = [Flux(s, 0.0, tau) for s, tau in parts]
-        return Flux.multi(*one, Flux(0.0, self.background, 0.0)) if len(one) > 1 else Flux(
-            float(self.returns_signal[0]), self.background, self.delay_ns
-        )
+            return Flux(waveform=row[..., None] * self.waveform, background=0.0)
+        lights = zip(self.returns_signal.tolist(), self.returns_delay_ns.tolist(), strict=True)
+        each = [Flux(s * row, 0.0, tau) for s, tau in lights]
+        if len(each) > 1:
+            return Flux.multi(*each, Flux(0.0 * row, self.background, 0.0))
+        return Flux(float(self.returns_signal[0]) * row, self.background, self.delay_ns)
 
     def system(self, cycles: int, bins: int, start: Literal["armed", "stationary"] = "stationary") -> System:
         """The instrument, to simulate and predict with; a stretch cut from a running stream is ``stationary``."""
@@ -168,12 +174,17 @@ def calibrate(
     The likelihood is that of the point process itself, sum log lambda(x_k) - integral of lambda over the armed time:
     no assumption on the exposure, the start, or the stationarity, and no correction of pile-up is needed.
 
+    That is exact for a detector with one dead time. For one with effects (of `system`), and one return of a known
+    pulse, the bias is taken off by simulation: the light is sought whose streams by the exact engine give the same
+    estimate.
+
     Parameters
     ----------
     times
         The stream of one pixel (`Timestamps.load`, `Timestamps.pixel`), or a sequence of such recordings.
     system
-        Where pulse and dead time are taken from; default: the system that the stream tells (a simulated one).
+        Where pulse (blurred by a Gaussian jitter of the detector), dead time and the hold-off of its electronics are
+        taken from; default: the system that the stream tells (a simulated one).
     pulse
         - a `Pulse`: its shape is known,
         - ``"gaussian"``: a Gaussian whose sigma is fitted too; the default where no system tells the pulse,
@@ -182,7 +193,8 @@ def calibrate(
         Dead time, ns. Default: that of `system`, else the smallest interval, which is the maximum of the likelihood,
         less its mean excess.
     hold_off_ns
-        Leave out what happens within this time after a registration, ns; default: the dead time. A longer one costs
+        Leave out what happens within this time after a registration, ns; default: the dead time, or that of the
+        electronics and the pixel's where `system` has both. A longer one costs
         data but keeps out what the model does not have: afterpulses, a second dead time (t_e + t_d of electronics,
         Rapp et al. 2019), a slow recovery.
     returns
@@ -211,7 +223,10 @@ def calibrate(
             f"{stream.registrations}"
         )
     counted = summary_of(stream)
-    given = dead_time_ns if dead_time_ns is not None or told is None else told.detector.dead_time_ns
+    given = dead_time_ns
+    if given is None and told is not None:
+        given, rest = watched(told.detector)
+        hold_off_ns = rest if hold_off_ns is None else hold_off_ns
     estimated = given is None
     dead = counted.smallest_ns[0] if given is None else _validate.real("dead_time_ns", given, low=0.0)
     hold = dead if hold_off_ns is None else _validate.real("hold_off_ns", hold_off_ns, low=0.0)
@@ -222,8 +237,21 @@ def calibrate(
         # the smallest of n intervals exceeds t_d by 1 / (sum of the rates at re-arming) in the mean
         excess = stream.period_ns / max(stream.registrations * _rate_after(stream, base), 1e-300)
         error = math.hypot(excess, stream.unit_ns)
-        base = replace(base, dead_time_ns=max(base.dead_time_ns - excess, 0.0), dead_time_error_ns=error)
-    return base
+        return replace(base, dead_time_ns=max(base.dead_time_ns - excess, 0.0), dead_time_error_ns=error)
+    if told is None or is_plain(told.detector) or isinstance(shape, str) or number != 1:
+        return base
+    from mars_lidar.estimate.indirect import indirect
+
+    detector = stream_detector(told.detector)
+    model = told.replace(
+        period_ns=stream.period_ns, detector=detector, pulse=pulse_of_the_light(shape, detector)
+    )  # fmt: skip
+
+    def calibrated(stream_made: Timestamps) -> Calibration:
+        made = stream_of(stream_made, pooled=True)
+        return _fitted(made, summary_of(made), shape, float(dead), float(hold), 1)
+
+    return indirect(base, model, calibrated)
 
 
 def _system_of(times: Timestamps | Sequence[Timestamps]) -> System | None:
@@ -235,7 +263,7 @@ def _shape(
     pulse: Pulse | str | None, told: System | None, returns: int, period_ns: float
 ) -> Pulse | Literal["gaussian", "free"]:
     if pulse is None:
-        return "gaussian" if told is None else told.pulse
+        return "gaussian" if told is None else recorded_pulse(told)
     if isinstance(pulse, Pulse):
         pulse.check(period_ns)
         return pulse

@@ -77,6 +77,18 @@ class Recovery:
         number = int(judged.sum())
         return float(chi2.sf(float((self.score[judged] ** 2).sum()), number)) if number else 1.0
 
+    def p_against(self, other: Recovery) -> float:
+        """Of all ages against those of another stream in the same light, by chi-square."""
+        from scipy.stats import chi2
+
+        seen, expected = self.observed + other.observed, self.expected + other.expected
+        ratio = np.where(expected > 0, seen / np.where(expected > 0, expected, 1.0), 0.0)
+        judged = np.minimum(self.expected, other.expected) * ratio >= _LEAST
+        mine, theirs = np.maximum(self.expected, 1e-300), np.maximum(other.expected, 1e-300)
+        off = self.observed / mine - other.observed / theirs
+        square = off[judged] ** 2 / (ratio * (1.0 / mine + 1.0 / theirs))[judged]
+        return float(chi2.sf(float(square.sum()), int(judged.sum()))) if judged.any() else 1.0
+
     @property
     def recovered_ns(self) -> float:
         """Age from which on the rate is that of the light: the end of the last age, in one run from the dead time

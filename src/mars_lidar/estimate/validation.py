@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _validate
+from mars_lidar.detector import Detector
 from mars_lidar.estimate.calibration import Calibration, _free_bins, calibrate
-from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
+from mars_lidar.estimate.detector_model import stream_detector
+from mars_lidar.estimate.intervals import FloatArray, stream_of
+from mars_lidar.estimate.prediction import Prediction, cut, predict, system_of
 from mars_lidar.estimate.recovery import Recovery, recovery_of
-from mars_lidar.statistics import JointLaw, count_law, joint_law
-from mars_lidar.studies.distance import KL_FLOOR, Pmf, g_test, kl_divergence, total_variation
+from mars_lidar.studies.distance import KL_FLOOR, Pmf, g_test, kl_divergence, total_variation, two_sample_g_test
 from mars_lidar.system import System
 from mars_lidar.timestamps import Timestamps
 
 _BOOTSTRAPS = 400
-_WINDOWS = 64  # of the period, in which the mean histogram is tested with its exact covariance
-_WINDOW_SIGMAS = 3.0
 _LEAST_REALIZATIONS = 20
-_BATCH = 64  # realizations whose scatter gives the errors of variances
+_LEAST_SIMULATED = 200
 
 
 @dataclass(frozen=True)
@@ -63,20 +63,20 @@ class Validation:
         Number of stretches of ``system.cycles`` periods.
     counts
         (realizations,) registrations of each.
-    measured, predicted
-        Law of the count: frequencies, and the exact finite-exposure pmf.
+    prediction
+        What was predicted, by which law or by how many simulated realizations.
+    measured
+        Frequencies of the counts.
     total_variation, total_variation_floor
-        Of the count law, and the mean and 99 % quantile of samples of this size from the predicted law.
+        Of the count law, and the mean and 99 % quantile of samples of this size from the predicted law (and of the
+        simulated size from it, where the prediction is simulated).
     kl, kl_floor
         KL(measured || predicted) in nats, and the same of its floor.
-    histogram, histogram_law
-        (bins,) mean measured and predicted registrations of a realization.
+    histogram
+        (bins,) mean measured registrations of a realization.
     shape_variation, shape_floor
         Total variation of the normalised histograms, and what sampling alone makes of it in the mean, by the exact
         variances of the bins.
-    window
-        (bins,) weights of the signal window, +-3 sigma about the strongest return (an eighth of the period about
-        the largest bin, with a free shape).
     checks
         All tests; `consistent` is their verdict.
     recovery
@@ -89,20 +89,35 @@ class Validation:
     system: System
     realizations: int
     counts: NDArray[np.int64]
+    prediction: Prediction
     measured: Pmf
-    predicted: Pmf
     total_variation: float
     total_variation_floor: tuple[float, float]
     kl: float
     kl_floor: tuple[float, float]
     histogram: FloatArray
-    histogram_law: FloatArray
     shape_variation: float
     shape_floor: float
-    window: NDArray[np.bool_]
     checks: tuple[Check, ...]
     recovery: Recovery
     level: float
+
+    @property
+    def predicted(self) -> Pmf:
+        """Law of the count: the exact finite-exposure pmf, or frequencies of a simulation."""
+        return self.prediction.count
+
+    @property
+    def histogram_law(self) -> FloatArray:
+        """(bins,) mean predicted registrations of a realization."""
+        return self.prediction.histogram
+
+    @property
+    def window(self) -> NDArray[np.bool_]:
+        """(bins,) the bins of the signal window, +-3 sigma about the strongest return (an eighth of the period about
+        the largest bin, with a free shape).
+        """
+        return self.prediction.window
 
     @property
     def failed(self) -> tuple[Check, ...]:
@@ -112,7 +127,8 @@ class Validation:
     @property
     def consistent(self) -> bool:
         """Whether the stream could be one of the model's."""
-        return not self.failed and self.calibration.too_short == 0
+        short = self.calibration.too_short and self.prediction.recovery is None  # a jitter makes some, as simulated
+        return not self.failed and not short
 
 
 def validate(
@@ -120,6 +136,8 @@ def validate(
     calibration: Calibration | None = None,
     *,
     cycles: int,
+    detector: Detector | None = None,
+    simulated: int = 4000,
     level: float = 0.01,
     pooled: bool = False,
 ) -> Validation:
@@ -133,6 +151,13 @@ def validate(
         What `calibrate` found, from this stream or another; default: from this one, with its defaults.
     cycles
         Laser periods of a realization; at least 20 must fit in the stream. What is left at its end is not used.
+    detector
+        What the prediction is made for: free-running, paralyzable too, with effects. Efficiency and dark counts are
+        taken as part of the calibrated light, a Gaussian jitter as part of its pulse. Default: a pixel with the
+        calibrated dead time and nothing more.
+    simulated
+        Realizations to simulate, at least 200, for what no law predicts: the exact engine draws the model's stream,
+        which is cut as the measured one. Their own sampling error is part of every floor and test.
     level
         False-alarm probability of the verdict: a stream of the model's fails this often.
 
@@ -149,6 +174,9 @@ def validate(
     """
     number = _validate.integer("cycles", cycles, low=1, high=10**8)
     alpha = _validate.real("level", level, low=0.0, high=0.5, strict_low=True)
+    drawn = _validate.integer("simulated", simulated, low=_LEAST_SIMULATED, high=10**7)
+    if detector is not None:
+        detector = stream_detector(detector)
     if calibration is None:
         calibration = calibrate(times, pooled=pooled)
     elif not isinstance(calibration, Calibration):
@@ -159,86 +187,49 @@ def validate(
             f"times must have the period that was calibrated, {calibration.summary.period_ns:g} ns, "
             f"got {stream.period_ns:g}"
         )
-    bins = _free_bins(stream.bins)
-    system = calibration.system(number, bins)
-    law = joint_law(**calibration.light_arguments(), system=system)
-    window = _window(calibration, system, law)
-    counts, inside, histogram = _cut(stream, system, window)
-    size = counts.size
+    size = sum(int((piece.end_ns / stream.period_ns + 1e-9) // number) for piece in stream.pieces)
     if size < _LEAST_REALIZATIONS:
         raise ValueError(
             f"cycles must leave at least {_LEAST_REALIZATIONS} realizations of a stream of {stream.cycles:,} periods, "
             f"got {number:,}: {size}"
         )
-    exact = count_law(**calibration.light_arguments(), system=system)
-    predicted = Pmf(int(exact.support[0]), exact.pmf)
+    system = system_of(calibration, detector, number, _free_bins(stream.bins))
+    law = predict(calibration, system, drawn)
+    label = 2 * law.groups + law.window
+    table, histogram = cut(stream, system, label)
+    counts, inside = table.sum(1), table[:, 1::2].sum(1)
     measured = Pmf.of_counts(counts)
-    floors = _floors(predicted, size)
-    mean_error = math.sqrt(max(float(exact.variance), 1e-300) / size)
+    floors = _floors(law, measured, size)
+    # a calibration by simulation has an error of its own, which makes no difference to the spread
+    fitted = 0.0 if calibration.simulated == 0.0 else 1.0 / (calibration.simulated * size)
+    count, joint = 1.0 / size + law.noise("count"), 1.0 / size + law.noise("joint")
     checks = [
-        Check("counts, G-test", math.nan, math.nan, math.nan, g_test(predicted, measured, size)),
-        _check("mean count", float(counts.mean()), float(exact.mean), mean_error),
-        _check("count variance", *_variance(counts, float(exact.variance))),
-        _check("window variance", *_variance(inside, float(law.window(window)[1]))),
+        Check("counts, G-test", math.nan, math.nan, math.nan, _count_test(law, measured, size)),
+        _check("mean count", float(counts.mean()), law.mean, math.sqrt(max(law.variance, 1e-300) * (count + fitted))),
+        _check("count variance", *_variance(counts, law.variance, count * size)),
+        _check("window variance", *_variance(inside, law.window_variance, joint * size)),
     ]
-    shape_floor = math.nan
-    variance = law.variance
+    expected, shape = law.histogram, 1.0 / size + law.noise("histogram") + fitted
     # E |x| of a normal of variance v is sqrt(2 v / pi)
-    shape_floor = 0.5 * float(np.sqrt(2.0 / math.pi * variance / size).sum() / law.mean.sum())
+    shape_floor = 0.5 * float(np.sqrt(2.0 / math.pi * law.bin_variance * shape).sum() / expected.sum())
     if calibration.waveform is None:
-        checks.append(_shape_check(law, histogram, size, len(calibration.names)))
+        checks.append(_shape_check(law, histogram, shape, len(calibration.names)))
     found = recovery_of(stream, calibration.rate, calibration.dead_time_ns, calibration.hold_off_ns)
-    checks.append(Check("recovery, chi²", math.nan, math.nan, math.nan, found.p_value))
-    expected = law.mean
+    p = found.p_value if law.recovery is None else found.p_against(law.recovery)
+    checks.append(Check("recovery, chi²", math.nan, math.nan, math.nan, p))
     return Validation(
-        calibration, system, size, counts, measured, predicted, total_variation(measured, predicted), floors[0],
-        _kl(measured, predicted), floors[1], histogram, expected,
-        0.5 * float(np.abs(histogram / histogram.sum() - expected / expected.sum()).sum()), shape_floor, window,
+        calibration, system, size, counts, law, measured, total_variation(measured, law.count), floors[0],
+        _kl(measured, law.count), floors[1], histogram,
+        0.5 * float(np.abs(histogram / histogram.sum() - expected / expected.sum()).sum()), shape_floor,
         tuple(checks), found, alpha,
     )  # fmt: skip
 
 
-def _cut(
-    stream: Stream, system: System, window: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Counts (r,) of all bins and of those in the window, and the mean histogram (bins,)."""
-    counts: list[NDArray[np.int64]] = []
-    inside: list[NDArray[np.int64]] = []
-    total = np.zeros(system.bins)
-    for piece in stream.pieces:
-        number = int((piece.end_ns / stream.period_ns + 1e-9) // system.cycles)
-        both = np.zeros((2, number), np.int64)
-        for start in range(0, piece.times_ns.size, 2**20):
-            x = piece.times_ns[start : start + 2**20] / stream.period_ns
-            cycle = np.floor(x)
-            place = np.minimum(((x - cycle) * system.bins).astype(np.int64), system.bins - 1)
-            item = (cycle / system.cycles).astype(np.int64)
-            kept = item < number
-            item, place = item[kept], place[kept]
-            if item.size:
-                first = int(item[0])
-                length = int(item[-1]) - first + 1
-                both[0, first : first + length] += np.bincount(item - first, minlength=length)
-                marked = window[place]
-                both[1, first : first + length] += np.bincount(item[marked] - first, minlength=length)
-                total += np.bincount(place, minlength=system.bins)
-        counts.append(both[0])
-        inside.append(both[1])
-    all_counts = np.concatenate(counts)
-    return all_counts, np.concatenate(inside), total / max(all_counts.size, 1)
-
-
-def _window(calibration: Calibration, system: System, law: JointLaw) -> NDArray[np.bool_]:
-    """The bins of the signal window."""
-    if calibration.pulse is None:
-        centre, half = float(np.argmax(law.mean)) + 0.5, system.bins / 16
-    else:
-        low, high = calibration.pulse.support_ns()
-        sigma = getattr(calibration.pulse, "sigma_ns", (high - low) / (2.0 * _WINDOW_SIGMAS))
-        centre = calibration.delay_ns / system.bin_ns
-        half = _WINDOW_SIGMAS * sigma / system.bin_ns
-    away = (np.arange(system.bins) + 0.5 - centre + 0.5 * system.bins) % system.bins - 0.5 * system.bins
-    return np.asarray(np.abs(away) <= max(half, 0.5))
+def _count_test(law: Prediction, measured: Pmf, size: int) -> float:
+    """Of the counts against their law, or against simulated ones."""
+    if "count" in law.exact:
+        return g_test(law.count, measured, size)
+    return two_sample_g_test(measured, size, law.count, law.simulated)
 
 
 def _check(name: str, measured: float, predicted: float, error: float) -> Check:
@@ -249,41 +240,50 @@ def _check(name: str, measured: float, predicted: float, error: float) -> Check:
     return Check(name, measured, predicted, error, float(2.0 * norm.sf(abs(measured - predicted) / error)))
 
 
-def _variance(counts: NDArray[np.int64], predicted: float) -> tuple[float, float, float]:
-    """Sample variance, the predicted one, and the standard error by the fourth moment of the sample."""
+def _variance(counts: NDArray[np.int64], predicted: float, more: float) -> tuple[float, float, float]:
+    """Sample variance, the predicted one, and the standard error by the fourth moment of the sample.
+
+    `more`: how much larger the error's square is than that of the sample, by the prediction's own.
+    """
     x = counts - counts.mean()
     measured = float((x**2).sum() / (counts.size - 1))
     fourth = float((x**4).mean())
-    return measured, predicted, math.sqrt(max(fourth - measured**2, 2.0 * measured**2 / counts.size) / counts.size)
+    square = max(fourth - measured**2, 2.0 * measured**2 / counts.size) / counts.size
+    return measured, predicted, math.sqrt(square * more)
 
 
-def _shape_check(law: JointLaw, histogram: FloatArray, size: int, parameters: int) -> Check:
-    """Chi-square of the mean histogram in windows of equal expected counts, with the exact covariance of them."""
+def _shape_check(law: Prediction, histogram: FloatArray, share: float, parameters: int) -> Check:
+    """Chi-square of the mean histogram in groups of equal expected counts, with `share` of their covariance."""
     from scipy.stats import chi2
 
-    windows = min(_WINDOWS, law.mean.size)
-    share = np.cumsum(law.mean) / law.mean.sum()
-    group = np.minimum((share * windows - 1e-9).astype(np.int64), windows - 1)
-    used = np.unique(group)
-    weights = (group == used[:, None]).astype(np.float64)
-    off = weights @ (histogram - law.mean)
-    matrix = law.covariance_of(weights[:, None], weights[None]) / size
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    starts = np.flatnonzero(np.diff(law.groups, prepend=-1))
+    off = np.add.reduceat(histogram - law.histogram, starts)
+    values, vectors = np.linalg.eigh(0.5 * (law.group_covariance + law.group_covariance.T))
     good = values > 1e-10 * values[-1]
-    statistic = float((((vectors.T @ off)[good]) ** 2 / values[good]).sum())
+    square = (((vectors.T @ off)[good]) ** 2 / values[good]).sum() / share
+    if law.simulated:  # the inverse of a sample covariance is too large (Hartlap et al., A&A 464, 399, 2007)
+        square *= (law.simulated - good.sum() - 2) / (law.simulated - 1)
     freedom = max(int(good.sum()) - parameters, 1)
-    p = float(chi2.sf(statistic, freedom))
-    return Check("histogram, chi²", statistic, float(freedom), math.sqrt(2.0 * freedom), p)
+    p = float(chi2.sf(square, freedom))
+    return Check("histogram, chi²", float(square), float(freedom), math.sqrt(2.0 * freedom), p)
 
 
-def _floors(law: Pmf, size: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Mean and 99 % quantile of total variation and KL of samples of `size` counts from the law itself."""
+def _floors(law: Prediction, measured: Pmf, size: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Mean and 99 % quantile of total variation and KL of samples of `size` counts from the law itself.
+
+    Of a simulated law, against another sample of its size: both drawn from what the two together say.
+    """
     random = np.random.default_rng(size)
-    p = np.append(law.p, max(1.0 - float(law.p.sum()), 0.0))
+    p = np.append(law.count.p, max(1.0 - float(law.count.p.sum()), 0.0))
+    if "count" not in law.exact:
+        low, high = min(law.count.first, measured.first), max(law.count.last, measured.last)
+        both = law.simulated * law.count.on(low, high) + size * measured.on(low, high)
+        p = both / both.sum()
     p /= p.sum()
     drawn = random.multinomial(size, p, size=_BOOTSTRAPS) / size
-    distance = 0.5 * np.abs(drawn - p).sum(-1)
-    divergence = kl_divergence(drawn, np.maximum(p, KL_FLOOR))
+    against = p if "count" in law.exact else random.multinomial(law.simulated, p, size=_BOOTSTRAPS) / law.simulated
+    distance = 0.5 * np.abs(drawn - against).sum(-1)
+    divergence = kl_divergence(drawn, np.maximum(against, KL_FLOOR))
     return (
         (float(distance.mean()), float(np.quantile(distance, 0.99))),
         (float(divergence.mean()), float(np.quantile(divergence, 0.99))),

@@ -11,12 +11,12 @@ namespace mars {
 
 // Of one pixel, folded over the exposure: `armed` periods in which it was armed at the start of the bin, `rearmed`
 // periods in which it became so inside of it, at a place taken as uniform. For dead times below one bin `armed` is
-// the armed time of the bin instead, in periods, and `rearmed` is 0.
+// the armed time of the bin instead, in periods, and `rearmed` is 0. `raw` is `armed` before it is kept within bounds.
 struct ArmedPasses {
-    std::vector<double> count, before, armed, rearmed;  // (bins), before (bins + 1)
+    std::vector<double> count, before, armed, rearmed, raw;  // (bins), before (bins + 1)
     double total = 0.0;
 
-    explicit ArmedPasses(int64_t bins) : count(bins), before(bins + 1), armed(bins), rearmed(bins) {}
+    explicit ArmedPasses(int64_t bins) : count(bins), before(bins + 1), armed(bins), rearmed(bins), raw(bins) {}
 
     // Armed time of bin j, in periods, where the registrations of the bin came in its middle (R5).
     double time(const HistogramRecord& r, int64_t j) const {
@@ -79,7 +79,8 @@ struct ArmedPasses {
                 blind = before[j] + whole[wraps] * total + weight * (total - before[q]);
             blind += f * weight2 * count[q2];
             rearmed[j] = early * weight * count[q] + late * weight2 * count[q2];
-            armed[j] = std::max({periods - blind, count[j] - rearmed[j], 0.0});
+            raw[j] = periods - blind;
+            armed[j] = std::max({raw[j], count[j] - rearmed[j], 0.0});
         }
     }
 
@@ -88,8 +89,8 @@ struct ArmedPasses {
         for (int64_t j = 0; j < r.bins; ++j) {
             const int64_t q = j == 0 ? r.bins - 1 : j - 1;
             const double weight = within(r, j == 0 ? 1 : 0);
-            const double time = static_cast<double>(r.cycles) - same * count[j] - next * weight * count[q];
-            armed[j] = std::max(time, 0.0);
+            raw[j] = static_cast<double>(r.cycles) - same * count[j] - next * weight * count[q];
+            armed[j] = std::max(raw[j], 0.0);
             rearmed[j] = 0.0;
         }
     }
@@ -105,20 +106,22 @@ struct ArmedPasses {
             lost += count[j] * ((1.0 - late) * within_sum(r, r.whole) + late * within_sum(r, r.whole + 1));
         }
         for (int64_t j = 0; j < n; ++j) {
-            armed[j] = std::max({static_cast<double>(r.cycles) - lost - before[j], count[j], 0.0});
+            raw[j] = static_cast<double>(r.cycles) - lost - before[j];
+            armed[j] = std::max({raw[j], count[j], 0.0});
             rearmed[j] = 0.0;
         }
     }
 };
 
-// Registrations that are expected in a bin of `photons` (R7), and what follows from them.
-struct Expected {
-    double mean, slope, silent;  // m, dm/dl, and the passes without a registration
+// What becomes of one pass of a bin of `photons`, armed at its start or re-armed inside of it (R7).
+struct Pass {
+    double quiet, fired;  // armed: P(no registration), P(one)
+    double q, dq, none;   // re-armed: P(registration), its derivative, P(none)
 
-    Expected(double photons, double armed, double rearmed) {
-        const double quiet = std::exp(-photons), fired = photons < 1e-5 ? photons * (1.0 - 0.5 * photons) : 1.0 - quiet;
-        double q, dq, none;  // of a pass that is re-armed: P(registration), its derivative, P(none)
-        if (rearmed == 0.0) {
+    Pass(double photons, bool rearmed) {
+        quiet = std::exp(-photons);
+        fired = photons < 1e-5 ? photons * (1.0 - 0.5 * photons) : 1.0 - quiet;
+        if (!rearmed) {
             q = dq = 0.0;
             none = 1.0;
         } else if (photons < 0.02) {
@@ -130,10 +133,21 @@ struct Expected {
             q = 1.0 - none;
             dq = (none - quiet) / photons;
         }
-        mean = armed * fired + rearmed * q;
-        slope = armed * quiet + rearmed * dq;
-        silent = armed * quiet + rearmed * none;
     }
+};
+
+// Registrations that are expected in a bin (R7), and what follows from them.
+struct Expected {
+    double mean, slope, silent;  // m, dm/dl, and the passes without a registration
+
+    Expected(const Pass& pass, double armed, double rearmed) {
+        mean = armed * pass.fired + rearmed * pass.q;
+        slope = armed * pass.quiet + rearmed * pass.dq;
+        silent = armed * pass.quiet + rearmed * pass.none;
+    }
+
+    Expected(double photons, double armed, double rearmed)
+        : Expected(Pass(photons, rearmed != 0.0), armed, rearmed) {}
 };
 
 // Photons per period of a bin with which it registers as often as it did (R8); infinite where it always did.

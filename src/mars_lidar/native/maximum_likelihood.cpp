@@ -45,6 +45,14 @@ bool solve(const double a[3][3], const double* b, const bool* free, double* x) {
     return true;
 }
 
+// What is known where the likelihood stands, without what the ends of the exposure hide, if that is positive definite.
+void known_information(const Likelihood& likelihood, const bool* free, double known[3][3]) {
+    double none[3] = {}, x[3];
+    for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b) known[a][b] = likelihood.information[a][b] - likelihood.hidden[a][b];
+    if (!solve(known, none, free, x)) std::copy(&likelihood.information[0][0], &likelihood.information[0][0] + 9, &known[0][0]);
+}
+
 struct Fit {
     double at[3] = {};
     Likelihood likelihood;
@@ -56,18 +64,17 @@ struct Fit {
 struct Terrain {
     double least;     // of B
     double farthest;  // a step of the delay may go
-    bool whole;       // likelihood bin by bin
     double best = -HUGE_VAL;
+    const ExposureEnds* ends = nullptr;
 };
 
 // Fisher scoring with Levenberg's damping: a step is taken if the likelihood does not fall. S >= 0 and B >= least. A
 // climb is given up where several times the gain that its next step promises would not make it the best.
 Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
     const double least = terrain.least, farthest = terrain.farthest;
-    const bool whole = terrain.whole;
     Fit fit;
     std::copy(start, start + 3, fit.at);
-    fit.likelihood = pixel(fit.at[0], fit.at[1], fit.at[2], whole);
+    fit.likelihood = pixel(fit.at[0], fit.at[1], fit.at[2], *terrain.ends);
     double damping = 1e-3;
     for (int step = 0; step < kMostSteps; ++step) {
         const Likelihood& now = fit.likelihood;
@@ -75,8 +82,9 @@ Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, c
                       (fit.at[0] < kMostPhotons || now.gradient[0] < 0.0);
         fit.free[1] = (fit.at[1] > least || now.gradient[1] > 0.0) && (fit.at[1] < kMostPhotons || now.gradient[1] < 0.0);
         fit.free[2] = with_signal && fit.at[0] > 0.0 && now.information[2][2] > 0.0;
-        double move[3];
-        if (solve(now.information, now.gradient, fit.free, move)) {
+        double move[3], known[3][3];
+        known_information(now, fit.free, known);
+        if (solve(known, now.gradient, fit.free, move)) {
             double gain = 0.0;
             for (int k = 0; k < 3; ++k) gain += 0.5 * move[k] * now.gradient[k];
             if (gain < kGain) {
@@ -89,13 +97,19 @@ Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, c
         for (int trial = 0; trial < 40 && !better; ++trial, damping *= 8.0) {
             double damped[3][3], next[3];
             for (int a = 0; a < 3; ++a)
-                for (int b = 0; b < 3; ++b) damped[a][b] = now.information[a][b] * (a == b ? 1.0 + damping : 1.0);
+                for (int b = 0; b < 3; ++b) damped[a][b] = known[a][b] * (a == b ? 1.0 + damping : 1.0);
             if (!solve(damped, now.gradient, fit.free, move)) continue;
             next[0] = std::clamp(fit.at[0] + move[0], 0.0, kMostPhotons);
             next[1] = std::clamp(fit.at[1] + move[1], std::max(least, 0.05 * fit.at[1]), kMostPhotons);
             next[2] = fit.at[2] + std::clamp(move[2], -farthest, farthest);
-            Likelihood there = pixel(next[0], next[1], next[2], whole);
+            Likelihood there = pixel(next[0], next[1], next[2], *terrain.ends);
             if (there.value >= now.value) {
+                double before = 0.0, after = 0.0;  // slopes along the step
+                for (int k = 0; k < 3; ++k) {
+                    before += now.gradient[k] * (next[k] - fit.at[k]);
+                    after += there.gradient[k] * (next[k] - fit.at[k]);
+                }
+                if (after < -0.5 * before) damping = std::max(damping, 8.0);  // far over the top: shorter from here
                 std::copy(next, next + 3, fit.at);
                 fit.likelihood = there;
                 better = true;
@@ -119,7 +133,7 @@ class Maximizer {
     // Signal, background, delay, their standard errors, twice the gain of the log likelihood by the signal, and its value.
     void operator()(const Count* histogram, double* out, uint8_t* flag) {
         passes_.set(r_, histogram);
-        const PixelLikelihood pixel(r_, passes_);
+        PixelLikelihood pixel(r_, passes_);
         for (int k = 0; k < kColumns; ++k) out[k] = NAN;
         *flag = 0;
         if (!(pixel.count() > 0.0) || !(pixel.time() > 0.0)) {
@@ -136,11 +150,14 @@ class Maximizer {
         Start starts[DelaySearch::kMost];
         const int found = search_(passes_, pixel, job_.starts, starts);
         Fit best;
-        Terrain terrain{least, farthest, flat / n > PixelLikelihood::kDim};
-        for (int k = 0; k < found; ++k) terrain.whole |= starts[k].background / n > PixelLikelihood::kDim;
+        Terrain terrain{least, farthest, -HUGE_VAL, &ends_};
+        double brightest = flat;
+        for (int k = 0; k < found; ++k) brightest = std::max(brightest, starts[k].background);
+        pixel.expect(brightest, series_);
         for (int k = 0; k < found; ++k) {
             const double at[3] = {std::min(starts[k].signal, kMostPhotons),
                                   std::clamp(starts[k].background, least, kMostPhotons), starts[k].delay};
+            ends_.set(r_, passes_, starts[k].delay);
             const Fit fit = climb(pixel, at, true, terrain);
             if (k > 0 && !(fit.likelihood.value > terrain.best)) continue;
             best = fit;
@@ -148,6 +165,7 @@ class Maximizer {
         }
         terrain.best = -HUGE_VAL;
         const double dark[3] = {0.0, flat, best.at[2]};
+        ends_.set(r_, passes_, best.at[2]);
         const Fit without = climb(pixel, dark, false, terrain);
         const double gain = std::max(2.0 * (best.likelihood.value - without.likelihood.value), 0.0);
         if (!best.converged) *flag |= kUnconverged;
@@ -163,10 +181,12 @@ class Maximizer {
  private:
     // Standard errors: roots of the diagonal of the inverse information; NaN for what lies on its bound.
     static void errors(const Fit& fit, double* out) {
+        double known[3][3];
+        known_information(fit.likelihood, fit.free, known);
         for (int k = 0; k < 3; ++k) {
             double unit[3] = {}, column[3];
             unit[k] = 1.0;
-            if (fit.free[k] && solve(fit.likelihood.information, unit, fit.free, column)) out[k] = std::sqrt(column[k]);
+            if (fit.free[k] && solve(known, unit, fit.free, column)) out[k] = std::sqrt(column[k]);
         }
     }
 
@@ -174,6 +194,8 @@ class Maximizer {
     const ReconstructionJob& job_;
     ArmedPasses passes_;
     DelaySearch search_;
+    ExposureEnds ends_;
+    BackgroundSeries series_;
 };
 
 template <class Count>
@@ -195,21 +217,25 @@ void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> hi
 }
 
 void log_likelihood(const HistogramRecord& recording, Vector<const double> histogram, Matrix<const double> at,
-                    Matrix<double> out) {
+                    Matrix<double> out, bool whole) {
     if (static_cast<int64_t>(histogram.shape(0)) != recording.bins || at.shape(1) != 3 || out.shape(1) != 13 ||
         out.shape(0) != at.shape(0))
         throw nb::value_error("histogram must be (bins), at (points, 3), out (points, 13)");
     ArmedPasses passes(recording.bins);
     passes.set(recording, histogram.data());
-    const PixelLikelihood pixel(recording, passes);
+    PixelLikelihood pixel(recording, passes);
+    ExposureEnds ends;
+    BackgroundSeries series;
     for (size_t k = 0; k < at.shape(0); ++k) {
         const double* x = at.data() + 3 * k;
-        const Likelihood found = pixel(x[0], x[1], x[2], true);
+        ends.set(recording, passes, x[2]);
+        pixel.expect(x[1], series);
+        const Likelihood found = pixel(x[0], x[1], x[2], ends, whole);
         double* to = out.data() + 13 * k;
         *to++ = found.value;
         for (int a = 0; a < 3; ++a) *to++ = found.gradient[a];
         for (int a = 0; a < 3; ++a)
-            for (int b = 0; b < 3; ++b) *to++ = found.information[a][b];
+            for (int b = 0; b < 3; ++b) *to++ = found.information[a][b] - found.hidden[a][b];
     }
 }
 
@@ -226,7 +252,8 @@ void bind_maximum_likelihood(nb::module_& module) {
     add(&maximum_likelihood<uint32_t>);
     add(&maximum_likelihood<double>);
     module.def("histogram_log_likelihood", &log_likelihood, nb::arg("recording"), nb::arg("histogram"), nb::arg("at"),
-               nb::arg("out").noconvert(), "Value, gradient and information at points (S, B, delay).");
+               nb::arg("out").noconvert(), nb::arg("whole") = true,
+               "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");
 }
 
 }  // namespace mars

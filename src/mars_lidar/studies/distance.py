@@ -98,6 +98,25 @@ def g_test(law: Pmf, sample: Pmf, size: int) -> float:
     return float(chi2.sf(2.0 * float((o * np.log(ratio)).sum()), e.size - 1))
 
 
+def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int) -> float:
+    """p-value of two samples of counts being of one law; counts expected fewer than 5 times in either are pooled."""
+    from scipy.stats import chi2_contingency
+
+    low, high = min(first.first, second.first), max(first.last, second.last)
+    table = np.stack([first.on(low, high) * first_size, second.on(low, high) * second_size])
+    expected = table.sum(0) * min(first_size, second_size) / (first_size + second_size)
+    common = expected >= _POOLED
+    table = np.column_stack([table[:, common], table[:, ~common].sum(1)])
+    if table.shape[1] > 2 and table[:, -1].sum() * min(first_size, second_size) < _POOLED * (first_size + second_size):
+        rarest = int(table[:, :-1].sum(0).argmin())
+        table[:, rarest] += table[:, -1]
+        table = table[:, :-1]
+    table = table[:, table.sum(0) > 0]
+    if table.shape[1] < 2:
+        return 1.0
+    return float(chi2_contingency(table, correction=False, lambda_="log-likelihood").pvalue)
+
+
 def mean_score(law_mean: float, law_variance: float, mean: float, size: int) -> float:
     """Standard scores by which a sample mean differs from the law's; 0 where both are certain and agree."""
     error = mean - law_mean

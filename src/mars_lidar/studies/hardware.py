@@ -16,7 +16,6 @@ from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate_timestamps
 from mars_lidar.studies import Tell
-from mars_lidar.studies.hardware_detectors import Faults, detect
 from mars_lidar.system import System
 from mars_lidar.timestamps import Timestamps
 
@@ -40,7 +39,7 @@ class Settings:
     fluxes: tuple[float, ...] = (0.05, 0.5, 5.0)
     signals: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
     delays: tuple[float, ...] = (0.2, 20.0, 60.0, 100.0, 133.0)
-    mismatched: int = 100  # the first so many of `MISMATCHES`
+    mismatched: int = 100  # the first so many of `hardware_mismatches.MISMATCHES`
     seed: int = 2026
 
 
@@ -91,11 +90,11 @@ class Spread:
     rapp: float
 
 
-def system_of(cycles: int, dead_ns: float = DEAD_NS, mode: Any = "nonparalyzable") -> System:
+def system_of(cycles: int, detector: Detector | None = None) -> System:
     """The paper's laser and detector, started ready as a recording is."""
     return System(
         period_ns=PERIOD_NS, cycles=cycles, bins=BINS, pulse=GaussianPulse(sigma_ns=SIGMA_NS),
-        detector=Detector(dead_time_ns=dead_ns, mode=mode),
+        detector=Detector(dead_time_ns=DEAD_NS) if detector is None else detector,
     )  # fmt: skip
 
 
@@ -104,8 +103,11 @@ def recorded(times: Timestamps) -> Timestamps:
     return replace(times, info={"source": "simulated"})
 
 
-def _stream(light: Flux, cycles: int, seed: int, **changes: Any) -> Timestamps:
-    return recorded(simulate_timestamps(light, system_of(cycles, **changes), seed=seed))
+def stream_of(
+    light: Flux, cycles: int, seed: int, detector: Detector | None = None, engine: str = "exact"
+) -> Timestamps:
+    """A recording of one pixel in that light."""
+    return recorded(simulate_timestamps(light, system_of(cycles, detector), seed=seed, engine=engine))
 
 
 def matched(settings: Settings, tell: Tell) -> list[Case]:
@@ -114,7 +116,7 @@ def matched(settings: Settings, tell: Tell) -> list[Case]:
     for number, (name, (signal, background)) in enumerate(PIXELS.items()):
         tell(f"hardware: {name} pixel, {settings.realizations:,} realizations of {settings.cycles:,} cycles")
         light = Flux(signal, background, DELAY_NS)
-        times = _stream(light, settings.cycles * settings.realizations, settings.seed + number)
+        times = stream_of(light, settings.cycles * settings.realizations, settings.seed + number)
         known = system_of(settings.cycles)
         found = validate(times, calibrate(times, known), cycles=settings.cycles)
         cases.append(Case(name, (signal, background, DELAY_NS), found))
@@ -143,80 +145,9 @@ def sweeps(settings: Settings, tell: Tell) -> list[Case]:
 def _swept(
     settings: Settings, name: str, truth: tuple[float, float, float], light: Flux, seed: int, returns: int = 1
 ) -> Case:
-    times = _stream(light, settings.swept_cycles * settings.swept_realizations, seed)
+    times = stream_of(light, settings.swept_cycles * settings.swept_realizations, seed)
     found = calibrate(times, dead_time_ns=DEAD_NS, returns=returns)
     return Case(name, truth, validate(times, found, cycles=settings.swept_cycles))
-
-
-@dataclass(frozen=True)
-class Mismatch:
-    """A detector that is not the model's, and how it is calibrated; `fits` is what the verdict should be."""
-
-    name: str
-    fits: bool = False
-    faults: Faults | None = None
-    mode: str = "nonparalyzable"
-    dead_ns: float = DEAD_NS
-    assumed_ns: float | None = DEAD_NS
-    hold_off_ns: float | None = None
-    known_pulse: bool = True
-    second_return: bool = False
-    drift: float = 0.0
-    background: float = 0.1
-
-
-MISMATCHES = (
-    Mismatch("none (control)", fits=True),
-    Mismatch("none, drawn photon by photon (control)", fits=True, faults=Faults()),
-    Mismatch("none, dead time and pulse not told", fits=True, assumed_ns=None, known_pulse=False),
-    Mismatch("dead time set 5 ns too short", assumed_ns=80.0),  # to here the quick study
-    Mismatch("dead time set 0.5 ns too short", assumed_ns=84.5),
-    Mismatch("dead time set 5 ns too long", assumed_ns=90.0),
-    Mismatch("paralyzable detector, B = 1", mode="paralyzable", background=1.0),
-    Mismatch("paralyzable detector, B = 0.1", mode="paralyzable"),
-    Mismatch("jitter 0.2 ns, pulse as without", faults=Faults(jitter_ns=0.2)),
-    Mismatch("jitter 0.2 ns, all fitted", faults=Faults(jitter_ns=0.2), assumed_ns=None, known_pulse=False),
-    Mismatch("afterpulses 2 %", faults=Faults(afterpulse=0.02)),
-    Mismatch("afterpulses 2 %, hold-off 400 ns", faults=Faults(afterpulse=0.02), hold_off_ns=400.0),
-    Mismatch(
-        "electronics dead 85 ns, detector 50 ns, B = 1", faults=Faults(electronics_ns=DEAD_NS), dead_ns=50.0,
-        background=1.0,
-    ),
-    Mismatch(
-        "the same, hold-off 135 ns", faults=Faults(electronics_ns=DEAD_NS), dead_ns=50.0,
-        hold_off_ns=DEAD_NS + 50.0, background=1.0,
-    ),
-    Mismatch("the same, B = 0.1, no hold-off", faults=Faults(electronics_ns=DEAD_NS), dead_ns=50.0),
-    Mismatch("a second return 4 ns behind, not fitted", second_return=True),
-    Mismatch("signal drifts by 10 %", drift=0.1),
-)
-
-
-def mismatches(settings: Settings, tell: Tell) -> list[tuple[Mismatch, Case]]:
-    """Detectors and scenes that the model does not have: the validation should fail, and say where."""
-    cases = []
-    signal = PIXELS["bright"][0]
-    cycles = settings.fault_cycles * settings.fault_realizations
-    for number, one in enumerate(MISMATCHES[: settings.mismatched]):
-        tell(f"hardware: {one.name}")
-        background = one.background
-        light = Flux(signal, background, DELAY_NS)
-        if one.second_return:
-            light = Flux.multi(light, Flux(0.1 * signal, 0.0, DELAY_NS + 4.0))
-        seed = settings.seed + 200 + number
-        if one.faults is not None:
-            raw = simulate_timestamps(light, system_of(cycles, 0.0), seed=seed)
-            times = recorded(detect(raw, one.dead_ns, one.faults, seed))
-        elif one.drift:
-            parts = [Flux(signal * (1.0 + d), background, DELAY_NS) for d in np.linspace(-1, 1, 20) * one.drift / 2]
-            times = joined([_stream(part, cycles // 20, seed + k) for k, part in enumerate(parts)])
-        else:
-            times = _stream(light, cycles, seed, dead_ns=one.dead_ns, mode=one.mode)
-        known = GaussianPulse(sigma_ns=SIGMA_NS) if one.known_pulse else None
-        fitted = calibrate(times, pulse=known, dead_time_ns=one.assumed_ns, hold_off_ns=one.hold_off_ns)
-        found = validate(times, fitted, cycles=settings.fault_cycles)
-        cases.append((one, Case(one.name, (signal, background, DELAY_NS), found)))
-    return cases
 
 
 def joined(parts: list[Timestamps]) -> Timestamps:

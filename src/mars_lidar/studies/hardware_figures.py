@@ -10,7 +10,8 @@ import numpy as np
 from mars_lidar.plot.stream import draw_counts, draw_histogram, draw_recovery, validation_figure
 from mars_lidar.plot.style import COLOURS, MUTED, style
 from mars_lidar.studies.draw import panels
-from mars_lidar.studies.hardware import Case, Example, Mismatch
+from mars_lidar.studies.hardware import Case, Example
+from mars_lidar.studies.hardware_mismatches import Mismatch
 from mars_lidar.studies.report import save_figure
 
 
@@ -81,6 +82,9 @@ def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
     figure, axes = panels(1.35 * rows, rows, columns)
     for ax, (_, case) in zip(axes.flat, faults, strict=False):
         draw_recovery(ax, case.found.recovery)
+        drawn = case.found.prediction.recovery
+        if drawn is not None:
+            ax.stairs(drawn.ratio, drawn.edges_ns, baseline=None, color=COLOURS[2], lw=0.8, zorder=4)
         mark = "fits" if case.found.consistent else "does not fit"
         ax.set_title(f"{_short(case.name)}\n({mark})", loc="left", fontsize=5.5)
         ax.set(xlabel="", ylabel="", ylim=(0.0, 1.5))
@@ -96,6 +100,5 @@ def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
 
 
 def _short(name: str) -> str:
-    for long, short in ((", drawn photon by photon", ""), ("electronics dead 85 ns,", "electronics 85,")):
-        name = name.replace(long, short)
-    return name
+    name = name.replace(", sequential engine", "")
+    return name.replace("electronics dead 85 ns, detector 50 ns", "t_e 85 ns, t_d 50 ns")

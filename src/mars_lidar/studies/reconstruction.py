@@ -60,6 +60,7 @@ class Picture:
 
 def run(request: Request) -> list[Path]:
     """Write reconstruction.md, reconstruction.csv and two figures."""
+    from mars_lidar.studies.reconstruction_bounds import lines
     from mars_lidar.studies.reconstruction_report import write
 
     settings = QUICK if request.quick else FULL
@@ -68,10 +69,12 @@ def run(request: Request) -> list[Path]:
         request.tell(f"reconstruction: S = {signal:.3g}")
         rows += sweep(PLAIN, signal, settings.pixels)
         rows += sweep(SYNCHRONOUS, signal, settings.pixels)
+    request.tell("reconstruction: near the bound")
+    near = lines(2 * settings.pixels)
     request.tell("reconstruction: picture")
     shown = picture(settings)
     request.tell("reconstruction: time")
-    return write(request.out, settings, rows, shown, timings(settings))
+    return write(request.out, settings, rows, near, shown, timings(settings))
 
 
 def sweep(system: System, signal: float, pixels: int) -> list[dict[str, Any]]:

@@ -1,0 +1,107 @@
+"""Detectors and scenes that the model of one dead time does not have: validated without and with being told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mars_lidar.avalanches import Afterpulsing
+from mars_lidar.detector import Detector
+from mars_lidar.effects import Jitter
+from mars_lidar.estimate import calibrate, validate
+from mars_lidar.flux import Flux
+from mars_lidar.pulse import GaussianPulse
+from mars_lidar.studies import Tell
+from mars_lidar.studies.hardware import (
+    DEAD_NS,
+    DELAY_NS,
+    PIXELS,
+    SIGMA_NS,
+    Case,
+    Settings,
+    joined,
+    stream_of,
+    system_of,
+)
+
+_PLAIN = Detector(dead_time_ns=DEAD_NS)
+_JITTER = replace(_PLAIN, jitter=Jitter(sigma_ns=0.2))
+_AFTERPULSES = replace(_PLAIN, afterpulsing=Afterpulsing(probability=0.02, delay_ns=100.0))
+_TWO = Detector(dead_time_ns=50.0, electronics_dead_time_ns=DEAD_NS)
+_PARALYZABLE = replace(_PLAIN, mode="paralyzable")
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """A detector, and how its stream is calibrated and validated; `fits` is what the verdict should be.
+
+    `told`: calibration and prediction are made with this detector, effects and all; else with a dead time of
+    `assumed_ns` (None: the smallest interval) and nothing more.
+    """
+
+    name: str
+    fits: bool = False
+    detector: Detector = _PLAIN
+    told: bool = False
+    engine: str = "exact"
+    assumed_ns: float | None = DEAD_NS
+    hold_off_ns: float | None = None
+    known_pulse: bool = True
+    second_return: bool = False
+    drift: float = 0.0
+    background: float = 0.1
+
+
+MISMATCHES = (
+    Mismatch("none (control)", fits=True),
+    Mismatch("none, sequential engine (control)", fits=True, engine="sequential"),
+    Mismatch("none, dead time and pulse not told", fits=True, assumed_ns=None, known_pulse=False),
+    Mismatch("dead time set 5 ns too short", assumed_ns=80.0),  # to here the quick study
+    Mismatch("dead time set 0.5 ns too short", assumed_ns=84.5),
+    Mismatch("dead time set 5 ns too long", assumed_ns=90.0),
+    Mismatch("paralyzable detector, B = 1", detector=_PARALYZABLE, background=1.0),
+    Mismatch("paralyzable detector, B = 0.1", detector=_PARALYZABLE),
+    Mismatch("paralyzable detector, B = 0.1, told", detector=_PARALYZABLE, told=True, fits=True),
+    Mismatch("jitter 0.2 ns, pulse as without", detector=_JITTER),
+    Mismatch("jitter 0.2 ns, all fitted", detector=_JITTER, assumed_ns=None, known_pulse=False),
+    Mismatch("jitter 0.2 ns, told", detector=_JITTER, told=True, fits=True),
+    Mismatch("afterpulses 2 %", detector=_AFTERPULSES),
+    Mismatch("afterpulses 2 %, hold-off 400 ns", detector=_AFTERPULSES, hold_off_ns=400.0),
+    Mismatch("afterpulses 2 %, told", detector=_AFTERPULSES, told=True, fits=True),
+    Mismatch("electronics dead 85 ns, detector 50 ns, B = 1", detector=_TWO, background=1.0),
+    Mismatch("the same, hold-off 135 ns", detector=_TWO, hold_off_ns=DEAD_NS + 50.0, background=1.0),
+    Mismatch("the same, told", detector=_TWO, told=True, fits=True, background=1.0),
+    Mismatch("electronics dead 85 ns, detector 50 ns, B = 0.1", detector=_TWO),
+    Mismatch("a second return 4 ns behind, not fitted", second_return=True),
+    Mismatch("signal drifts by 10 %", drift=0.1),
+)
+
+
+def mismatches(settings: Settings, tell: Tell) -> list[tuple[Mismatch, Case]]:
+    """Each of `MISMATCHES`: the validation should fail where the model is not told, and say where."""
+    cases = []
+    signal = PIXELS["bright"][0]
+    cycles = settings.fault_cycles * settings.fault_realizations
+    for number, one in enumerate(MISMATCHES[: settings.mismatched]):
+        tell(f"hardware: {one.name}")
+        background = one.background
+        light = Flux(signal, background, DELAY_NS)
+        if one.second_return:
+            light = Flux.multi(light, Flux(0.1 * signal, 0.0, DELAY_NS + 4.0))
+        seed = settings.seed + 200 + number
+        if one.drift:
+            parts = [Flux(signal * (1.0 + d), background, DELAY_NS) for d in np.linspace(-1, 1, 20) * one.drift / 2]
+            times = joined([stream_of(part, cycles // 20, seed + k) for k, part in enumerate(parts)])
+        else:
+            times = stream_of(light, cycles, seed, one.detector, one.engine)
+        if one.told:
+            fitted = calibrate(times, system_of(cycles, one.detector))
+        else:
+            known = GaussianPulse(sigma_ns=SIGMA_NS) if one.known_pulse else None
+            fitted = calibrate(times, pulse=known, dead_time_ns=one.assumed_ns, hold_off_ns=one.hold_off_ns)
+        found = validate(
+            times, fitted, cycles=settings.fault_cycles, detector=one.detector if one.told else None
+        )
+        cases.append((one, Case(one.name, (signal, background, DELAY_NS), found)))
+    return cases

@@ -13,12 +13,20 @@
 
 namespace mars {
 
-// Photons in the parts of a grid fine enough for the pulse and the gate.
-inline std::vector<double> photons_on_grid(const Job& job, const PulseShape& shape, int64_t pixel) {
+// Signal photons per period of a pixel.
+inline double bright(const Job& job, int64_t pixel) {
+    double photons = 0.0;
+    for (int64_t k = 0; k < job.returns; ++k) photons += std::max(0.0, job.signal[k * job.pixels + pixel]);
+    return photons;
+}
+
+// Photons in the parts of a grid fine enough for the pulse and the gate, each cut into `split`.
+inline std::vector<double> photons_on_grid(const Job& job, const PulseShape& shape, int64_t pixel, int64_t split = 1) {
     int64_t n = 1024;
     const bool gated = job.mode == DetectorMode::kGated;
     const double parts = gated ? 28.0 : 7.0, narrowest = gated ? job.gate.width / 64.0 : 1.0;
     while (n < 16384 && static_cast<double>(n) * std::min(shape.equivalent_width() / parts, narrowest) < 1.0) n *= 2;
+    n *= split;
     const double cells = static_cast<double>(n);
     std::vector<double> photons(n, job.background[pixel] / cells);
     for (int64_t k = 0; k < job.returns; ++k) {
@@ -105,14 +113,15 @@ public:
                    gaps_are_near(photons_.total(), photons_.least(dead, shape), dead)) {
             gaps_ = true;
         } else {
-            std::vector<double> photons = photons_on_grid(job, shape, pixel);
+            const bool locked = nearly_locked(dead, shape.equivalent_width(), bright(job, pixel));
+            std::vector<double> photons = photons_on_grid(job, shape, pixel, locked ? kExposureParts : 1);
             if (job.mode == DetectorMode::kGated)
                 apply_gate(job.gate, photons,
                            [&](double a, double b) { return photons_between(job, shape, pixel, a, b); });
             // drawn at the start of a period K + 2 periods before the exposure, which the kernel then runs through:
             // what the grid blurs, the physics mends
             start_ = -(static_cast<int64_t>(dead) + 2);
-            blind_.emplace_back(photons, dead);
+            blind_.push_back(locked ? locked_state(photons, dead) : StationaryState(photons, dead));
             blind_.front().check(job.pixel_index[pixel]);
         }
     }

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "exposure_kernel.h"
 #include "job.h"
 #include "stationary.h"
 
@@ -44,6 +45,37 @@ private:
     int64_t whole_;
     double seen_ = 0.0, mean_ = 1.0;
 };
+
+// Whether registrations lock to a bright pulse of `width` periods and drift through it slowly: each turn of the grid
+// of stationary.h blurs their phase by some 0.4 parts, which a pixel that remembers a hundred periods adds up to four.
+inline bool nearly_locked(double dead_time, double width, double signal) {
+    const double part = dead_time - std::floor(dead_time), drift = std::min(part, 1.0 - part);
+    return signal > 4.0 && drift > 0.0 && drift < 0.25 * width;
+}
+
+// Their state by the recursion of docs/theory_exposure.md, which does not blur; `photons` in quarters of its bins.
+inline StationaryState locked_state(const std::vector<double>& photons, double dead_time) {
+    const int32_t n = static_cast<int32_t>(photons.size() / kExposureParts);
+    const double place = (dead_time - std::floor(dead_time)) * n, none = 0.0, one = 1.0;
+    ExposureGrid grid;
+    grid.whole = static_cast<int64_t>(dead_time);
+    grid.bins = grid.out_bins = n;
+    grid.shift = static_cast<int32_t>(place);
+    grid.fraction = place - std::floor(place);
+    grid.stationary = true;
+    grid.tolerance = 1e-7;
+    const int32_t row = 0;
+    const ExposureFlux flux{1, &one, &none, &row, photons.data(), n};
+    std::vector<double> registrations(n);
+    int64_t settled = 0;
+    const std::atomic<bool> stop{false};
+    exposure_stationary_scalar({&grid, &flux, 0, 1, registrations.data(), &settled, &stop});
+    if (settled != kUnsettled) return StationaryState(dead_time, registrations);
+    std::vector<double> coarse(n);
+    for (int32_t j = 0; j < n; ++j)
+        for (int k = 0; k < kExposureParts; ++k) coarse[j] += photons[j * kExposureParts + k];
+    return StationaryState(coarse, dead_time);
+}
 
 // `photons` in equal parts of the period, what lies outside of the gate left out; `inside(from, to)` says how many
 // there are in an interval within one part.

@@ -7,6 +7,7 @@
 // that re-arm inside the bin, solved by Gauss-Seidel sweeps round the circle; the K whole periods of the dead
 // time follow by h = w / (1 + K sum w).
 #pragma once
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <stdexcept>
@@ -22,6 +23,13 @@ public:
     StationaryState(const std::vector<double>& photons, double dead_time)
         : dead_time_(dead_time), whole_(static_cast<int64_t>(dead_time)) {
         solve(photons);
+    }
+
+    // From registrations per period and bin that are known.
+    StationaryState(double dead_time, const std::vector<double>& registrations)
+        : dead_time_(dead_time), whole_(static_cast<int64_t>(dead_time)), below_(registrations.size() + 1, 0.0),
+          converged_(true) {
+        for (size_t j = 0; j < registrations.size(); ++j) below_[j + 1] = below_[j] + std::max(0.0, registrations[j]);
     }
 
     // Time to re-arming at t = 0 for a uniform number u: 0 if the pixel is armed.

@@ -1,0 +1,29 @@
+"""Stationary starts where registrations lock to a bright pulse and drift through it slowly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of
+from mars_lidar.engines import ENGINES
+from mars_lidar.statistics import count_law, exposure_moments
+
+GATE = {"mode": "gated", "gate_start_ns": 0.0, "gate_width_ns": PERIOD_NS}
+
+
+@pytest.mark.parametrize("detector", [{}, GATE], ids=["free running", "gated"])
+@pytest.mark.parametrize("dead", [0.9995, 2.0008])
+def test_a_locked_pixel_starts_as_the_statistics_say(dead: float, detector: dict[str, object]):
+    """A grid that blurs each turn by a part of a bin puts 0.001 registrations too many into each period."""
+    system = ml.System(
+        period_ns=PERIOD_NS, cycles=12, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), start="stationary",
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **detector),
+    )  # fmt: skip
+    law = count_law(20.0, 0.05, system, delay_ns=37.0)
+    pmf = np.zeros(law.support[-1] + 1)
+    pmf[law.support] = law.pmf
+    histogram = exposure_moments(20.0, 0.05, system, delay_ns=37.0).histogram
+    case = Case(f"locked, t_d {dead:g}", flux_of(20.0, 0.05, 0.37), system, 80_000)
+    check(ENGINES["exact"], case, Law(histogram, pmf), {COUNTS, SHAPE})

@@ -33,7 +33,7 @@ _LINES = {
     "mars_centre": (COLOURS[4], "-", 1.0),
     "mars_edge": (COLOURS[3], "--", 1.0),
     "renewal": (COLOURS[2], "-", 1.0),
-    "neural": (COLOURS[5], "-.", 1.0),
+    "neural": (COLOURS[5], "-", 1.4),
     "poisson": (COLOURS[0], "-", 1.0),
 }
 _LEGEND = {
@@ -61,7 +61,7 @@ def draw_all(
 
 
 def _colour(name: str) -> tuple[str, str, float]:
-    return _LINES.get(name, (COLOURS[5], "-.", 1.0))
+    return _LINES.get(name, (MUTED, "-.", 1.0))  # engines whose law is known by sampling
 
 
 def _nearest(cells: Sequence[Cell], target: tuple[float, float, float]) -> Cell:
@@ -74,6 +74,8 @@ def _nearest(cells: Sequence[Cell], target: tuple[float, float, float]) -> Cell:
 
 def _panels(path: Path, cells: Sequence[Cell]) -> Path:
     """Four count laws beside the simulated frequencies; the inset compares KL with its floor."""
+    from matplotlib.patches import Patch
+
     grid = [cell for cell in cells if cell.grid == "wide"]
     figure, axes = panels(5.0, 2, 2)
     for ax, target in zip(axes.flat, PANELS, strict=True):
@@ -83,6 +85,8 @@ def _panels(path: Path, cells: Sequence[Cell]) -> Path:
     for row in axes:
         row[0].set_ylabel("P(N)")
     handles = {label: handle for ax in axes.flat for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    if sampled := [name for name in grid[0].laws if name not in _LINES]:
+        handles[f"{', '.join(sampled)}: KL only"] = Patch(color=MUTED)
     figure.legend(handles.values(), handles.keys(), frameon=False, loc="outside lower center", ncols=4)
     return save_figure(path, figure)
 
@@ -91,7 +95,8 @@ def _panel(ax: Axes, cell: Cell) -> None:
     spread = max(float(cell.exact[1]) ** 0.5, 0.5)
     low, high = cell.mean - 5.0 * spread, cell.mean + 5.0 * spread
     beyond = []
-    for name, law in cell.laws.items():
+    drawn = {name: law for name, law in cell.laws.items() if name in _LINES}  # a sampled law is mostly noise
+    for name, law in drawn.items():
         at = law.first + np.arange(law.p.size)
         centre = float((law.p * at).sum())
         own = float((law.p * (at - centre) ** 2).sum()) ** 0.5
@@ -104,12 +109,12 @@ def _panel(ax: Axes, cell: Cell) -> None:
     ax.fill_between(
         counts, cell.truth.on(first, last), step="mid", color="#d0d0d0", lw=0.0, label="simulation", zorder=0
     )
-    for name, law in cell.laws.items():
+    for name, law in drawn.items():
         colour, dash, width = _colour(name)
         above = 1 if name == "mars_exact" else 2  # thin lines over the thick one
         here = law.on(first, last)
         ax.plot(counts, here, ls=dash, lw=width, color=colour, label=_LEGEND.get(name, name), zorder=above)
-    top = 1.15 * max(float(pmf.on(first, last).max()) for pmf in (cell.truth, *cell.laws.values()))
+    top = 1.15 * max(float(pmf.on(first, last).max()) for pmf in (cell.truth, *drawn.values()))
     # room at the right for the inset
     ax.set(xlim=(first, last + 0.55 * (last - first)), ylim=(0.0, top))
     ax.ticklabel_format(axis="x", useOffset=False)
@@ -144,14 +149,16 @@ def _shape(path: Path, settings: Settings, cells: Sequence[Cell], sweep: dict[st
         for name in SHAPES:
             colour, dash, _ = _colour(name)
             ax.plot(dead, np.quantile(sweep[name], quantile, axis=1), dash, color=colour, lw=1.0, label=SHAPES[name])
+        sampled = [name for name in grid[0].scores if name not in _LINES]
+        labels = {"mars_exact": "MaRS, ours, to simulation", "neural": "neural, to simulation"}
+        labels |= {name: f"{', '.join(sampled)}: samples" for name in sampled[:1]}
         for name in grid[0].scores:
             at = [[c.scores[name].shape for c in grid if c.dead_ns == d] for d in ticks]
             here = [float(np.quantile(values, quantile)) for values in at]
-            words_here = "MaRS, ours, to simulation" if name == "mars_exact" else None
             marker = "s" if name == "mars_exact" else "o"
             size = 4.5 if name == "mars_exact" else 2.8
             ax.plot(
-                np.array(ticks) / WIDE_PERIOD_NS, here, marker, ms=size, color=_colour(name)[0], label=words_here,
+                np.array(ticks) / WIDE_PERIOD_NS, here, marker, ms=size, color=_colour(name)[0], label=labels.get(name),
                 mfc="none" if name == "mars_exact" else None, mew=0.8,
             )
         noise = [[c.scores["mars_exact"].shape_floor for c in grid if c.dead_ns == d] for d in ticks]

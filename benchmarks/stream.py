@@ -49,7 +49,8 @@ def stream(config: Config, bandwidth: Bandwidth) -> Section:
         streams = {"stream, counts": iter(made(None)), "stream, float32": iter(made(torch.float32))}
         cases = {"bare engine": bare}
         for name, one in streams.items():
-            next(one)  # its memory is taken
+            for _ in range(4):  # its memory is taken, scenes are cast
+                next(one)
             cases[name] = lambda one=one: [None for _ in itertools.islice(one, 4)]
         timings = in_turn(cases, config)
         engine = min(timings["bare engine"].cpu) / (4 * BATCH)
@@ -94,41 +95,43 @@ def _measured(one: CubeStream, workers: int, config: Config) -> tuple[float | No
     A stretch begins and ends with all workers idle, as many batches made ahead: it holds the work of what was taken.
     """
     batches: Any = iter(DataLoader(one, batch_size=None, num_workers=workers))
-    known = [os.getpid(), *(worker.pid for worker in batches._workers)]
+    known = [worker.pid for worker in batches._workers]
     number, began, found = 4 * workers, time.perf_counter(), []
     for _ in range(number):  # memory is taken, scenes are cast
         next(batches)
     while len(found) < 2 or time.perf_counter() - began < config.seconds / 2:
-        _idle(known[1:])
-        before, start = [_seconds(process) for process in known], time.perf_counter()
+        _idle(known)
+        before, start, here = [_seconds(process) for process in known], time.perf_counter(), time.process_time()
         for _ in range(number):
             next(batches)
-        _idle(known[1:])
+        here = (time.process_time() - here) / (number * BATCH)  # waiting for the workers is not its work
+        _idle(known)
         wall = (time.perf_counter() - start) / (number * BATCH)
         cpu = [(_seconds(process) - spent) / (number * BATCH) for process, spent in zip(known, before, strict=True)]
-        found.append((sum(cpu), cpu[0], wall))
+        found.append((here + sum(cpu), here, wall))
     total, received, _ = min(found)
     wall = min(one[2] for one in found)
     return (None, None, wall) if math.isnan(total) else (received, total, wall)
 
 
 def _idle(processes: list[int]) -> None:
-    """Wait until they sleep, which they do not in the midst of simulating."""
+    """Wait until all their threads sleep, which they do not in the midst of simulating or sending."""
     quiet = 0
-    while quiet < 3:
+    while quiet < 5:
         time.sleep(0.005)
-        quiet = quiet + 1 if all(_fields(process)[:1] in (["S"], []) for process in processes) else 0
+        tasks = (task for process in processes for task in Path(f"/proc/{process}/task").glob("*/stat"))
+        quiet = quiet + 1 if all(_fields(task)[:1] in (["S"], []) for task in tasks) else 0
 
 
 def _seconds(process: int) -> float:
     """CPU seconds of a process, all its threads; NaN where the system does not tell."""
-    fields = _fields(process)
+    fields = _fields(Path(f"/proc/{process}/stat"))
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else math.nan
 
 
-def _fields(process: int) -> list[str]:
+def _fields(told: Path) -> list[str]:
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return told.read_text().rpartition(")")[2].split()
     except OSError:
         return []
 

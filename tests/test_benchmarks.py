@@ -145,3 +145,11 @@ def test_stream_is_measured_beside_the_engine():
     assert [row["workers"] for row in section.rows] == 2 * [0, 0, 0, 1, 2]
     assert all(row["cubes/s"] > 0 for row in section.rows)
     assert [row["of the engine's rate, CPU"] for row in section.rows if row["case"] == "bare engine"] == [1.0, 1.0]
+
+
+def test_estimators_are_timed():
+    reconstruction, calibration = command.run(TINY, ("reconstruction", "calibration")).sections
+    assert {row["method"] for row in reconstruction.rows} >= {"maximum_likelihood", "mchc", "coates", "matched_filter"}
+    assert all(row["us per pixel"] > 0 for row in reconstruction.rows)
+    assert [goal.unit for goal in reconstruction.goals] == ["s"]
+    assert all(row["CPU s per 10^6"] > 0 for row in calibration.rows)

@@ -11,6 +11,7 @@ from pathlib import Path
 from benchmarks import (
     effects,
     engines,
+    estimators,
     exposures,
     forward,
     laws,
@@ -43,6 +44,8 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
     "waveform": waveforms.waveform_engine,
     "exposure": laws.exposure_laws,
     "stationary": laws.stationary_distribution,
+    "reconstruction": estimators.reconstruction,
+    "calibration": estimators.calibration,
     "codecs": storage.codecs,
     "datasets": storage.datasets,
     "stream": stream.stream,

@@ -155,3 +155,11 @@ def test_forward_models_are_measured_with_their_gradients():
         value, both = row["value, CPU us a pixel"], row["value and gradient"]
         assert value > 0.0
         assert (both is None) == (row["case"] == "mean_histogram")
+
+
+def test_estimators_are_timed():
+    reconstruction, calibration = command.run(TINY, ("reconstruction", "calibration")).sections
+    assert {row["method"] for row in reconstruction.rows} >= {"maximum_likelihood", "mchc", "coates", "matched_filter"}
+    assert all(row["us per pixel"] > 0 for row in reconstruction.rows)
+    assert [goal.unit for goal in reconstruction.goals] == ["s"]
+    assert all(row["CPU s per 10^6"] > 0 for row in calibration.rows)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mars_lidar.cli.console import reported, table
+from mars_lidar.cli.console import check_picture, reported, save_picture, table
 
 if TYPE_CHECKING:
     from mars_lidar.detector import Detector
@@ -79,10 +78,7 @@ def view(
     Each histogram stands beside the incident rate, scaled to the same total: the difference is pile-up.
     """
     with reported():
-        if out.suffix not in (".png", ".pdf", ".svg"):
-            raise ValueError(f"--out must end in .png, .pdf or .svg, got {str(out)!r}")
-        if out.exists() and not overwrite:
-            raise FileExistsError(f"{out} exists already; choose another name or give --overwrite")
+        check_picture(out, overwrite)
         pixels = None if not pixel else [parsed_pixel(text) for text in pixel]
         from mars_lidar.io import load
 
@@ -90,12 +86,7 @@ def view(
             from mars_lidar.plot import overview
 
             figure = overview(cube, realization=realization, pixels=pixels)
-        unfinished = out.with_name(out.name + ".incomplete")
-        try:
-            figure.savefig(unfinished, format=out.suffix[1:])
-            os.replace(unfinished, out)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        save_picture(figure, out)
         print(f"wrote {out}")
 
 

@@ -10,41 +10,20 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
-from mars_lidar import _validate
-from mars_lidar.estimate.histograms import checked
-from mars_lidar.estimate.method import (
-    _PASSES,
-    FILTERS,
-    Estimates,
-    Filter,
-    FloatArray,
-    Histograms,
-    Method,
-    corrected_rates,
-    window_estimates,
-)
+from mars_lidar.estimate.method import FloatArray, RateMethod
 from mars_lidar.system import System
 
 
 @dataclass(frozen=True)
-class GeneralisedCoates(Method):
+class GeneralisedCoates(RateMethod):
     """Rates with which every bin registers as often as it did, given when the histogram says the pixel was armed (R8).
 
     `filter` on the rates: as `MatchedFilter`.
     """
 
-    filter: Filter = "log"
-
     name = "generalised_coates"
     modes = ("nonparalyzable", "gated")
     assumes = "nothing of the flux but its period"
-
-    def __post_init__(self) -> None:
-        _validate.choice("filter", self.filter, FILTERS)
-
-    def estimate(self, histograms: Histograms) -> Estimates:
-        """Delay by the filter, signal and background by its window, and their standard errors."""
-        return window_estimates(histograms, self.filter, _PASSES)
 
 
 def generalised_coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
@@ -53,6 +32,4 @@ def generalised_coates_rates(cube: ArrayLike, system: System, *, threads: int | 
     Whatever the waveform: no pulse is assumed. Bins that registered whenever they could are infinite. The variance of
     a bin's rate l is about l^2 / h, h its registrations, and bins are independent of each other.
     """
-    given, shape = checked(cube, system, threads)
-    GeneralisedCoates().check(system)
-    return corrected_rates(given, _PASSES).reshape(*shape, system.bins)
+    return GeneralisedCoates().rates(cube, system, threads)

@@ -11,12 +11,10 @@ from mars_lidar import _validate
 from mars_lidar.estimate.histograms import checked
 from mars_lidar.estimate.method import (
     _CHAIN,
-    FILTERS,
     Estimates,
-    Filter,
     FloatArray,
     Histograms,
-    Method,
+    RateMethod,
     corrected_rates,
     window_estimates,
 )
@@ -24,7 +22,7 @@ from mars_lidar.system import System
 
 
 @dataclass(frozen=True)
-class ChainCorrection(Method):
+class ChainCorrection(RateMethod):
     """Rates whose Markov chain of phases has the histogram f as its stationary distribution.
 
     ``l <- f; repeat s = (f P(l)) / l, l <- f / s``, scaled to the total flux (R14, R15). The paper takes the total from
@@ -40,16 +38,16 @@ class ChainCorrection(Method):
         Stops when the rates move by less than `tolerance` of their sum, or after so many iterations.
     """
 
-    filter: Filter = "log"
     iterations: int = 60
     tolerance: float = 1e-5
 
+    correction = _CHAIN
     name = "mchc"
     modes = ("nonparalyzable", "gated")
     assumes = "a long exposure, in which the phases are stationary"
 
     def __post_init__(self) -> None:
-        _validate.choice("filter", self.filter, FILTERS)
+        super().__post_init__()
         _validate.integer("iterations", self.iterations, low=1, high=100_000)
         _validate.real("tolerance", self.tolerance, low=0.0, high=0.1, strict_low=True)
 
@@ -65,7 +63,7 @@ class ChainCorrection(Method):
     def estimate(self, histograms: Histograms) -> Estimates:
         """Delay by the filter, signal and background by its window."""
         return window_estimates(
-            histograms, self.filter, _CHAIN, steps=self.iterations, tolerance=self.tolerance
+            histograms, self.filter, self.correction, steps=self.iterations, tolerance=self.tolerance
         )
 
 

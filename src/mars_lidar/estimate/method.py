@@ -9,8 +9,9 @@ from enum import IntFlag
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar import _validate
 from mars_lidar.detector import Mode
 from mars_lidar.estimate.recording import check_window, recording_of
 from mars_lidar.system import System
@@ -103,6 +104,33 @@ class Method(ABC):
     @abstractmethod
     def estimate(self, histograms: Histograms) -> Estimates:
         """Estimates of every pixel; the system is one that `check` let pass."""
+
+
+@dataclass(frozen=True)
+class RateMethod(Method):
+    """A method that corrects the rates, finds the delay by a filter on them, and signal and background by its window.
+
+    `filter` on the rates: as `MatchedFilter`.
+    """
+
+    filter: Filter = "log"
+
+    correction: ClassVar[int] = _PASSES
+
+    def __post_init__(self) -> None:
+        _validate.choice("filter", self.filter, FILTERS)
+
+    def estimate(self, histograms: Histograms) -> Estimates:
+        """Delay by the filter, signal and background by its window, and their standard errors."""
+        return window_estimates(histograms, self.filter, self.correction)
+
+    def rates(self, cube: ArrayLike, system: System, threads: int | None) -> FloatArray:
+        """Photons per period in each bin (..., bins) behind the histograms (..., bins)."""
+        from mars_lidar.estimate.histograms import checked
+
+        given, shape = checked(cube, system, threads)
+        self.check(system)
+        return corrected_rates(given, self.correction).reshape(*shape, system.bins)
 
 
 def window_estimates(

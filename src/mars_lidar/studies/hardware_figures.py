@@ -79,7 +79,7 @@ def _naive(case: Case) -> float:
 def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
     faults, columns = faults[1:], 4  # the second control stands for both
     rows = -(-len(faults) // columns)
-    figure, axes = panels(1.35 * rows, rows, columns)
+    figure, axes = panels(1.15 * rows, rows, columns)
     for ax, (_, case) in zip(axes.flat, faults, strict=False):
         draw_recovery(ax, case.found.recovery)
         drawn = case.found.prediction.recovery

@@ -1,0 +1,82 @@
+"""The estimators: reconstruction of a cube by each method and at several fluxes, calibration of a stream."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+import mars_lidar as ml
+from benchmarks.config import Config
+from benchmarks.floor import Bandwidth
+from benchmarks.report import Goal, Section
+from benchmarks.timing import in_turn
+from benchmarks.workload import SEED, system
+from mars_lidar.estimate import METHODS
+
+CUBE_PIXELS = 128 * 128  # what times are scaled to
+GOAL_CUBE_S = 10.0
+_SHARE = 16  # of the pixels of the image that are timed, the rest is alike
+_LEVELS = ((1.0, 1.0), (10.0, 10.0), (5.0, 60.0), (20.0, 250.0))  # S, B: to a quarter of a photon a bin, and more
+
+
+def reconstruction(config: Config, bandwidth: Bandwidth) -> Section:
+    """Methods at S = B = 1, and maximum likelihood of bright pixels."""
+    del bandwidth
+    pixels = max(64, config.pixels // _SHARE)
+    free = system(config)
+    clocked = free.replace(detector=ml.Detector(dead_time_ns=0.0, mode="synchronous"))
+    delay = np.random.default_rng(SEED).uniform(0.0, free.period_ns, (1, pixels))
+    cases: dict[str, Callable[[], object]] = {}
+    told: dict[str, tuple[str, str, float, float]] = {}
+    for instrument in (free, clocked):
+        mode = instrument.detector.mode
+        for signal, background in _LEVELS if instrument is free else _LEVELS[:1]:
+            cube = ml.simulate(ml.Flux(np.full_like(delay, signal), background, delay), instrument, seed=SEED)[0]
+            methods = [name for name, method in METHODS.items() if mode in method.modes]
+            for name in methods if signal == 1.0 else ["maximum_likelihood"]:
+                key = f"{mode} {name} {signal:g} {background:g}"
+                cases[key] = partial(ml.reconstruct, cube, instrument, name, threads=1)
+                told[key] = (mode, name, signal, background)
+    times = in_turn(cases, config)
+    section = Section("Reconstruction", notes=[_RECONSTRUCTION.format(pixels=pixels, threads=config.threads)])
+    slowest = 0.0
+    for key, (mode, name, signal, background) in told.items():
+        pixel = min(times[key].cpu) / pixels
+        section.rows.append({
+            "detector": mode, "method": name, "S": signal, "B": background, "us per pixel": 1e6 * pixel,
+            "CPU s per 128 x 128": CUBE_PIXELS * pixel,
+        })  # fmt: skip
+        if name == "maximum_likelihood":
+            slowest = max(slowest, CUBE_PIXELS * pixel)
+    section.goals = [Goal("maximum likelihood, CPU of 128 x 128, any flux", slowest, GOAL_CUBE_S, "s")]
+    return section
+
+
+def calibration(config: Config, bandwidth: Bandwidth) -> Section:
+    """Calibration of one stream, and its validation, per million timestamps."""
+    del bandwidth
+    instrument = system(config).replace(cycles=max(20_000, 1_000 * config.cycles))
+    times = ml.simulate_timestamps(ml.Flux(0.8, 0.5, 40.0), instrument, seed=SEED, threads=1)
+    light = ml.calibrate(times, instrument)
+    pieces = max(20, instrument.cycles // 2000)
+    cases: dict[str, Callable[[], object]] = {
+        "calibrate, pulse known": partial(ml.calibrate, times, instrument),
+        "calibrate, width fitted": partial(ml.calibrate, times, instrument, pulse="gaussian"),
+        "calibrate, any shape": partial(ml.calibrate, times, instrument, pulse="free"),
+        "validate": partial(ml.validate, times, light, cycles=instrument.cycles // pieces),
+    }
+    found = in_turn(cases, config)
+    section = Section("Calibration of a stream", notes=[f"{len(times):,} timestamps, S = 0.8, B = 0.5."])
+    section.rows = [
+        {"case": name, "CPU s": min(found[name].cpu), "CPU s per 10^6": 1e6 * min(found[name].cpu) / len(times)}
+        for name in cases
+    ]
+    return section
+
+
+_RECONSTRUCTION = (
+    "{pixels} pixels of the canonical system, delays all over the period, one thread; least of the turns, scaled to a "
+    "128 x 128 cube (the work divides among threads by pixels; here {threads} processors)."
+)

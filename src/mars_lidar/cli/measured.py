@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from mars_lidar.cli import options
-from mars_lidar.cli.console import FAILED, check_picture, reported, save_picture, say, table
-from mars_lidar.cli.inspect import parsed_pixel
+from mars_lidar.cli.console import FAILED, check_picture, reported, save_picture, table
+from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
-from mars_lidar.cli.options import _OUTPUT, _SYSTEM, _option
+from mars_lidar.cli.options import _OUTPUT, _option
+from mars_lidar.cli.stream_options import STREAM, DeadTimeNs, LightOptions, StreamOptions
 
-if TYPE_CHECKING:
-    from mars_lidar.detector import Detector
-    from mars_lidar.estimate import Calibration
-    from mars_lidar.pulse import Pulse
-    from mars_lidar.system import System as SystemObject
-    from mars_lidar.timestamps import Timestamps
-
-_STREAM = "Stream"
 _RECIPE = "docs/calibration.md has the whole recipe."
 INSPECT_EPILOG = "\n\n".join(
     (
@@ -52,56 +44,14 @@ Stream = Annotated[
     Path,
     typer.Argument(help="Photon stream: .ptu (T2, T3), Photon-HDF5, .mat or .npz.", show_default=False),
 ]
-Pixel = Annotated[
-    str | None,
-    _option("--pixel", panel=_STREAM, metavar="Y,X", help="Pixel (channel c is 0,c).", default="the brightest"),
-]
-PeriodNs = Annotated[
-    float | None, _option("--period-ns", panel=_STREAM, help="Laser period, ns, where the file does not tell it.")
-]
-Bins = Annotated[
-    int | None, _option("--bins", panel=_STREAM, help="Histogram bins of the period.", default="the file's clock")
-]
-UnitNs = Annotated[
-    float | None, _option("--unit-ns", panel=_STREAM, help="Unit of the times in a .mat or .npz, ns.")
-]
-Variable = Annotated[
-    str | None, _option("--variable", panel=_STREAM, help="Variable of a .mat or .npz that holds the times.")
-]
-DeadTimeNs = Annotated[
-    float | None,
-    _option(
-        "--dead-time-ns", panel=_SYSTEM, help="Dead time, ns.",
-        default="of --system or a simulated stream, else by the smallest interval",
-    ),
-]
-HoldOffNs = Annotated[
-    float | None,
-    _option(
-        "--hold-off-ns", panel=_SYSTEM, default="the dead time",
-        help="Leave out this long after each photon, ns: keeps out afterpulses and dead electronics.",
-    ),
-]
-System = Annotated[
-    Path | None, _option("--system", panel=_SYSTEM, help="YAML or JSON file with pulse and detector, effects too.")
-]
-PulseSigmaNs = Annotated[
-    float | None,
-    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse, sigma in ns.", default="fitted"),
-]
-Free = Annotated[
-    bool,
-    _option("--free", panel=_SYSTEM, help="Any shape of light, bin by bin: fluorescence, haze, many surfaces."),
-]
-Returns = Annotated[int, _option("--returns", panel=_SYSTEM, help="Returns (surfaces) in the pixel.", default="1")]
 Cycles = Annotated[
     int,
-    _option("--cycles", panel=_STREAM, help="Laser periods of a realization: the stream is cut into such pieces."),
+    _option("--cycles", panel=STREAM, help="Laser periods of a realization: the stream is cut into such pieces."),
 ]
 Simulated = Annotated[
     int,
     _option(
-        "--simulated", panel=_STREAM, help="Realizations to simulate for what no law predicts (effects of --system)."
+        "--simulated", panel=STREAM, help="Realizations to simulate for what no law predicts (effects of --system)."
     ),
 ]
 Picture = Annotated[Path | None, _option("-o", "--out", panel=_OUTPUT, help="A picture: .png, .pdf or .svg.")]
@@ -112,14 +62,11 @@ SystemOut = Annotated[
 Overwrite = Annotated[bool, _option("--overwrite", panel=_OUTPUT, help="Replace an existing file.")]
 
 
+@grouped
 def inspect(
     stream: Stream,
     *,
-    pixel: Pixel = None,
-    period_ns: PeriodNs = None,
-    bins: Bins = None,
-    unit_ns: UnitNs = None,
-    variable: Variable = None,
+    source: StreamOptions,
     dead_time_ns: DeadTimeNs = None,
     out: Picture = None,
     overwrite: Overwrite = False,
@@ -133,7 +80,7 @@ def inspect(
         check_picture(out, overwrite)
         from mars_lidar.estimate import inspect as look
 
-        times, rows = _loaded(stream, pixel, period_ns, bins, unit_ns, variable)
+        times, rows = source.load(stream)
         found = look(times, dead_time_ns=dead_time_ns)
         rows += clock_rows(found.calibration) + interval_rows(found.calibration, dead_time_ns is None)
         light = found.calibration
@@ -153,35 +100,20 @@ def inspect(
         table(rows)
 
 
+@grouped
 def calibrate(
     stream: Stream,
     *,
-    pixel: Pixel = None,
-    period_ns: PeriodNs = None,
-    bins: Bins = None,
-    unit_ns: UnitNs = None,
-    variable: Variable = None,
-    system: System = None,
-    dead_time_ns: DeadTimeNs = None,
-    hold_off_ns: HoldOffNs = None,
-    pulse_sigma_ns: PulseSigmaNs = None,
-    pulse_fwhm_ns: options.PulseFwhmNs = None,
-    pulse_file: options.PulseFile = None,
-    pulse_bin_ns: options.PulseBinNs = None,
-    pulse_origin: options.PulseOrigin = None,
-    free: Free = False,
-    returns: Returns = 1,
+    source: StreamOptions,
+    light: LightOptions,
     out: SystemOut = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Signal, background and delay of a photon stream, by maximum likelihood, with standard errors."""
     with reported():
-        _check_system_out(out, free, overwrite)
-        times, rows = _loaded(stream, pixel, period_ns, bins, unit_ns, variable)
-        found = _calibrated(
-            times, system, dead_time_ns, hold_off_ns, free, returns,
-            (pulse_sigma_ns, pulse_fwhm_ns, pulse_file, pulse_bin_ns, pulse_origin),
-        )  # fmt: skip
+        _check_system_out(out, light.free, overwrite)
+        times, rows = source.load(stream)
+        found = light.calibrate(times)
         rows += clock_rows(found) + light_rows(found)
         if out is not None:
             found.system(max(times.cycles, 1), times.bins if times.bins <= 2**20 else 1024, "armed").save(out)
@@ -189,25 +121,13 @@ def calibrate(
         table(rows)
 
 
+@grouped
 def validate(
     stream: Stream,
     *,
     cycles: Cycles,
-    pixel: Pixel = None,
-    period_ns: PeriodNs = None,
-    bins: Bins = None,
-    unit_ns: UnitNs = None,
-    variable: Variable = None,
-    system: System = None,
-    dead_time_ns: DeadTimeNs = None,
-    hold_off_ns: HoldOffNs = None,
-    pulse_sigma_ns: PulseSigmaNs = None,
-    pulse_fwhm_ns: options.PulseFwhmNs = None,
-    pulse_file: options.PulseFile = None,
-    pulse_bin_ns: options.PulseBinNs = None,
-    pulse_origin: options.PulseOrigin = None,
-    free: Free = False,
-    returns: Returns = 1,
+    source: StreamOptions,
+    light: LightOptions,
     simulated: Simulated = 4000,
     out: Picture = None,
     overwrite: Overwrite = False,
@@ -220,13 +140,10 @@ def validate(
         check_picture(out, overwrite)
         from mars_lidar.estimate import validate as compared
 
-        times, rows = _loaded(stream, pixel, period_ns, bins, unit_ns, variable)
-        light = _calibrated(
-            times, system, dead_time_ns, hold_off_ns, free, returns,
-            (pulse_sigma_ns, pulse_fwhm_ns, pulse_file, pulse_bin_ns, pulse_origin),
-        )  # fmt: skip
-        found = compared(times, light, cycles=cycles, detector=_with_effects(system), simulated=simulated)
-        rows += clock_rows(light) + light_rows(light)
+        times, rows = source.load(stream)
+        calibrated = light.calibrate(times)
+        found = compared(times, calibrated, cycles=cycles, detector=light.detector(), simulated=simulated)
+        rows += clock_rows(calibrated) + light_rows(calibrated)
         mean, high = found.total_variation_floor
         rows += [
             ("prediction", found.prediction.words),
@@ -234,7 +151,7 @@ def validate(
             ("count law", f"total variation {found.total_variation:.4g}, sampling floor {mean:.4g} (99 %: {high:.4g})"),
             ("", f"KL {found.kl:.4g} nats, sampling floor {found.kl_floor[0]:.4g} (99 %: {found.kl_floor[1]:.4g})"),
             ("histogram", f"total variation {found.shape_variation:.4g}, sampling floor {found.shape_floor:.4g}"
-             + (" (fitted bin by bin: tells nothing)" if light.waveform is not None else "")),
+             + (" (fitted bin by bin: tells nothing)" if calibrated.waveform is not None else "")),
         ]  # fmt: skip
         for check in found.checks:
             figures = "" if check.error != check.error else (
@@ -248,7 +165,7 @@ def validate(
             verdict = f"the model fits (a stream of the model's fails at {found.level:.0%})"
         else:
             failed = [check.name for check in found.failed]
-            failed += ["intervals shorter than the dead time"] * bool(light.too_short)
+            failed += ["intervals shorter than the dead time"] * bool(calibrated.too_short)
             verdict = f"the model does NOT fit: {', '.join(failed)}"
         rows.append(("verdict", verdict))
         if out is not None:
@@ -259,74 +176,6 @@ def validate(
         table(rows)
         if not found.consistent:
             raise typer.Exit(FAILED)
-
-
-def _loaded(
-    stream: Path,
-    pixel: str | None,
-    period_ns: float | None,
-    bins: int | None,
-    unit_ns: float | None,
-    variable: str | None,
-) -> tuple[Timestamps, list[tuple[str, str]]]:
-    """One pixel of the stream, and the rows that say what was read."""
-    import numpy as np
-
-    from mars_lidar.timestamps import Timestamps as Times
-
-    asked = None if pixel is None else parsed_pixel(pixel)
-    times = Times.load(stream, period_ns=period_ns, bins=bins, unit_ns=unit_ns, variable=variable)
-    height, width = times.shape
-    rows = [("file", f"{stream}: {len(times):,} photons of {height} × {width} pixels")]
-    if asked is None:
-        y, x = (int(k) for k in np.unravel_index(int(times.counts.argmax()), times.shape))
-    else:
-        y, x = asked
-        if not (0 <= y < height and 0 <= x < width):
-            raise ValueError(f"--pixel must lie in y 0 to {height - 1}, x 0 to {width - 1}, got ({y}, {x})")
-    one = times.pixel(y, x)
-    if height * width > 1:
-        how = ", the brightest" if asked is None else ""
-        rows.append(("pixel", f"({y}, {x}){how}: {len(one):,} photons"))
-    return one, rows
-
-
-def _calibrated(
-    times: Timestamps,
-    system: Path | None,
-    dead_time_ns: float | None,
-    hold_off_ns: float | None,
-    free: bool,
-    returns: int,
-    pulse: tuple[float | None, float | None, Path | None, float | None, str | None],
-) -> Calibration:
-    from mars_lidar.cli.system_options import _pulse
-    from mars_lidar.estimate import calibrate as fitted
-    from mars_lidar.system import System as SystemOf
-
-    shape: Pulse | Literal["free"] | None = _pulse(*pulse)
-    if free:
-        if shape is not None:
-            raise ValueError("the light has one shape: choose --free or a pulse")
-        shape = "free"
-    known: SystemObject | None = None if system is None else SystemOf.load(system)
-    found = fitted(
-        times, known, pulse=shape, dead_time_ns=dead_time_ns, hold_off_ns=hold_off_ns, returns=returns
-    )
-    if not found.converged:
-        say("warning: the likelihood was not maximised; what is printed is where it stopped")
-    return found
-
-
-def _with_effects(system: Path | None) -> Detector | None:
-    """The detector of the system file, where it is more than a dead time."""
-    if system is None:
-        return None
-    from mars_lidar.estimate.detector_model import is_plain
-    from mars_lidar.system import System as SystemOf
-
-    detector = SystemOf.load(system).detector
-    return None if is_plain(detector) else detector
 
 
 def _check_system_out(out: Path | None, free: bool, overwrite: bool) -> None:

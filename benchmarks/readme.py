@@ -58,7 +58,7 @@ def _rows(saved: Saved) -> dict[str, str]:
         "the paper's pipeline in NumPy, one core": saved.ms(
             _PIPELINE, "NumPy, lookup + alignment + multinomial"
         ),
-        "waveforms / timestamps (two passes), one core": (
+        "waveforms / timestamps (two passes, into fresh memory), one core": (
             f"{saved.ns(_PATHS, 'waveform of 1024 samples')} / {saved.ns(_PATHS, 'timestamps (two passes)')}"
         ),
         "exact mean, variance and mean histogram of one (S, B)": f"{number(laws[0]['ms per (S, B)'])} ms",

@@ -223,9 +223,10 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
         "shapes": np.ascontiguousarray(table.shapes(cycles)),
         "energy": frame.energy,
     }
-    here["guides"] = _core.shape_guides(
+    guides: Any = _core.shape_guides(
         here["shapes"], dead_time=dead_time, first=frame.first, size=frame.energy.shape[1]
     )
+    here["guides"] = guides
     for name, axis in axes.items():
         here |= {f"{name}.{part}": array for part, array in _core.table_axis(axis).items()}
     there = TableThere(cycles, axes, {name: machine.array(array) for name, array in here.items()})

@@ -215,7 +215,7 @@ def _characteristic(
     if cells.system.detector.mode == "paralyzable":
         for part in cells.chunks(bins, 1):
             some = cells.part(part)
-            mine = {name: x[part] if isinstance(x, np.ndarray) else x for name, x in points.items()}
+            mine: dict[str, Any] = {name: x[part] if isinstance(x, np.ndarray) else x for name, x in points.items()}
             rates = registration_rates(some, bins)
             _core.paralyzable_characteristic(grid=some.grid(bins, 1), photons=some.total, rates=rates, **mine)
     else:

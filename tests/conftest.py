@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
 from mars_lidar import Detector, Flux, GaussianPulse, System
@@ -29,6 +31,17 @@ def flux() -> Flux:
     return Flux(
         [[0.5, 3.0, 0.0], [10.0, 0.01, 0.0]], [[0.5, 0.1, 1.0], [2.0, 0.0, 0.0]], [[10, 60, 0], [133, 90, 5]]
     )
+
+
+@pytest.fixture
+def one_torch_thread() -> Iterator[None]:
+    """PyTorch on one thread: small tensors, and other tests beside it."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

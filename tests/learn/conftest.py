@@ -1,14 +1,10 @@
-"""Everything here on one thread: small tensors, and other tests beside it."""
+"""Everything here has PyTorch on one thread."""
 
 from __future__ import annotations
 
 import pytest
-import torch
 
 
 @pytest.fixture(autouse=True)
-def _one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+def _one_thread(one_torch_thread: None) -> None:
+    pass

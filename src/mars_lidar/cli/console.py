@@ -28,7 +28,6 @@ def say(message: str) -> None:
 @contextlib.contextmanager
 def reported() -> Iterator[None]:
     """Turn what goes wrong into one line and an exit code; anything unforeseen keeps its traceback."""
-    from mars_lidar.gpu.machine import NoCupyError, NoDeviceError
     from mars_lidar.io import Interrupted, WriteError
 
     try:
@@ -53,7 +52,7 @@ def reported() -> Iterator[None]:
     except OSError as error:
         say(f"failed: {_of_file(error)}")
         raise typer.Exit(FAILED) from None
-    except (ValueError, TypeError, OverflowError, MemoryError, NoCupyError, NoDeviceError) as error:
+    except (ValueError, TypeError, OverflowError, MemoryError) as error:
         say(" ".join(str(error).split()) or type(error).__name__)
         raise typer.Exit(BAD_INPUT) from None
 

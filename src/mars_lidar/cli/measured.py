@@ -11,7 +11,7 @@ from mars_lidar.cli.console import FAILED, check_picture, reported, save_picture
 from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
 from mars_lidar.cli.options import _OUTPUT, _option
-from mars_lidar.cli.stream_options import STREAM, DeadTimeNs, LightOptions, StreamOptions
+from mars_lidar.cli.stream_options import STREAM, DeadTimeNs, FitOptions, StreamOptions
 
 _RECIPE = "docs/calibration.md has the whole recipe."
 INSPECT_EPILOG = "\n\n".join(
@@ -105,7 +105,7 @@ def calibrate(
     stream: Stream,
     *,
     source: StreamOptions,
-    light: LightOptions,
+    light: FitOptions,
     out: SystemOut = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -127,7 +127,7 @@ def validate(
     *,
     cycles: Cycles,
     source: StreamOptions,
-    light: LightOptions,
+    light: FitOptions,
     simulated: Simulated = 4000,
     out: Picture = None,
     overwrite: Overwrite = False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from mars_lidar.detector import Detector
     from mars_lidar.estimate import Calibration
     from mars_lidar.pulse import Pulse
+    from mars_lidar.system import System as SystemObject
     from mars_lidar.timestamps import Timestamps
 
 STREAM = "Stream"
@@ -100,7 +102,7 @@ class StreamOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LightOptions:
+class FitOptions:
     """What is known of pulse and detector, and what light is fitted; None: found from the stream."""
 
     system: System = None
@@ -114,22 +116,27 @@ class LightOptions:
     free: Free = False
     returns: Returns = 1
 
-    def calibrate(self, times: Timestamps) -> Calibration:
-        """The light of the stream by maximum likelihood."""
-        from mars_lidar.cli.system_options import _pulse
-        from mars_lidar.estimate import calibrate as fitted
+    @cached_property
+    def known(self) -> SystemObject | None:
+        """The system of the file."""
         from mars_lidar.system import System as SystemOf
 
-        shape: Pulse | Literal["free"] | None = _pulse(
+        return None if self.system is None else SystemOf.load(self.system)
+
+    def calibrate(self, times: Timestamps) -> Calibration:
+        """The light of the stream by maximum likelihood."""
+        from mars_lidar.cli.system_options import pulse_of
+        from mars_lidar.estimate import calibrate as fitted
+
+        shape: Pulse | Literal["free"] | None = pulse_of(
             self.pulse_sigma_ns, self.pulse_fwhm_ns, self.pulse_file, self.pulse_bin_ns, self.pulse_origin
         )
         if self.free:
             if shape is not None:
                 raise ValueError("the light has one shape: choose --free or a pulse")
             shape = "free"
-        known = None if self.system is None else SystemOf.load(self.system)
         found = fitted(
-            times, known, pulse=shape, dead_time_ns=self.dead_time_ns, hold_off_ns=self.hold_off_ns,
+            times, self.known, pulse=shape, dead_time_ns=self.dead_time_ns, hold_off_ns=self.hold_off_ns,
             returns=self.returns,
         )  # fmt: skip
         if not found.converged:
@@ -138,10 +145,8 @@ class LightOptions:
 
     def detector(self) -> Detector | None:
         """That of the system file, where it is more than a dead time."""
-        if self.system is None:
+        if self.known is None:
             return None
         from mars_lidar.estimate.detector_model import is_plain
-        from mars_lidar.system import System as SystemOf
 
-        detector = SystemOf.load(self.system).detector
-        return None if is_plain(detector) else detector
+        return None if is_plain(self.known.detector) else self.known.detector

@@ -50,7 +50,7 @@ class SystemOptions:
         if self.detector is not None:
             base = base.replace(detector=Detector.preset(self.detector))
         changes: dict[str, Any] = {name: getattr(self, name) for name in ("period_ns", "cycles", "bins", "start")}
-        changes["pulse"] = _pulse(
+        changes["pulse"] = pulse_of(
             self.pulse_sigma_ns, self.pulse_fwhm_ns, self.pulse_file, self.pulse_bin_ns, self.pulse_origin
         )
         single = {name: getattr(self, name) for name in _DETECTOR}
@@ -69,9 +69,10 @@ def _detector(base: Detector, given: dict[str, Any]) -> Detector:
     return Detector.from_dict(known | given)
 
 
-def _pulse(
+def pulse_of(
     sigma_ns: float | None, fwhm_ns: float | None, file: Path | None, bin_ns: float | None, origin: str | None
 ) -> Pulse | None:
+    """The pulse that the options give, or None where they give none."""
     given = [
         name
         for name, value in (

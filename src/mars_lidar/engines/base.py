@@ -60,22 +60,26 @@ class Task:
         """The native pulse."""
         return _pulse_table(self.system.pulse, self.system.period_ns)
 
+    def pixel_arrays(self) -> dict[str, NDArray[Any]]:
+        """What kernels read of the pixels, by name: light of each return and delays in periods (returns, pixels)."""
+        return {
+            "signal": np.ascontiguousarray(self.flux.returns_signal.reshape(-1, self.pixel_index.size)),
+            "delay": self.flux.delay_periods(self.system.period_ns),
+            "background": np.ascontiguousarray(self.flux.background.reshape(-1)),
+            "pixel_index": self.pixel_index,
+        }
+
     @cached_property
     def job(self) -> _core.Job:
         """The native form of this task; times in laser periods."""
         from mars_lidar import _core
 
-        flux, pixels = self.flux, self.pixel_index.size
-        signal = np.ascontiguousarray(flux.returns_signal.reshape(-1, pixels))
-        wave = flux.waveform
+        wave = self.flux.waveform
         detector = self.system.detector
         start, step, width = detector.gate_periods(self.system.period_ns)
         return _core.Job(
-            signal=signal,
-            delay=flux.delay_periods(self.system.period_ns),
-            background=np.ascontiguousarray(flux.background.reshape(-1)),
-            waveform=None if wave is None else np.ascontiguousarray(wave.reshape(pixels, -1)),
-            pixel_index=self.pixel_index,
+            **self.pixel_arrays(),
+            waveform=None if wave is None else np.ascontiguousarray(wave.reshape(self.pixel_index.size, -1)),
             realizations=self.realizations,
             first_realization=self.first_realization,
             seed=self.seed,

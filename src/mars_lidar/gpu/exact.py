@@ -58,14 +58,10 @@ def exact_records(task: Task) -> Records:
 
 def host_arrays(task: Task) -> dict[str, NDArray[Any]]:
     """What the kernel reads, by name: flux, tables of the pulse, order of the pixels, starts of the exposures."""
-    flux, pixels = task.flux, task.pixel_index.size
     arrays: dict[str, NDArray[Any]] = {
-        "signal": np.ascontiguousarray(flux.returns_signal.reshape(-1, pixels)),
-        "delay": flux.delay_periods(task.system.period_ns),
-        "background": np.ascontiguousarray(flux.background.reshape(-1)),
-        "pixel_index": task.pixel_index,
+        **task.pixel_arrays(),
         # the threads of a warp wait for each other, and the longest exposures should begin first
-        "order": np.argsort(-flux.total.reshape(-1), kind="stable").astype(np.int32),
+        "order": np.argsort(-task.flux.total.reshape(-1), kind="stable").astype(np.int32),
         **_core.device_tables(task.pulse),
     }
     if task.system.start == "stationary" and task.system.dead_time_periods > 0.0:

@@ -63,16 +63,12 @@ def feedback_histogram(
 
 def _arrays(task: Task, machine: Machine) -> dict[str, Any]:
     """What the kernel reads of the pixels and the pulse."""
-    flux, pixels = task.flux, task.pixel_index.size
     here: dict[str, NDArray[Any]] = {
-        "signal": np.ascontiguousarray(flux.returns_signal.reshape(-1, pixels)),
-        "delay": flux.delay_periods(task.system.period_ns),
-        "background": np.ascontiguousarray(flux.background.reshape(-1)),
-        "pixel_index": task.pixel_index,
+        **task.pixel_arrays(),
         **_core.feedback_pulse(task.pulse),
     }
-    if flux.waveform is not None:
-        here["waveform"] = np.ascontiguousarray(flux.waveform.reshape(pixels, -1))
+    if task.flux.waveform is not None:
+        here["waveform"] = np.ascontiguousarray(task.flux.waveform.reshape(task.pixel_index.size, -1))
     return {name: machine.array(array) for name, array in here.items() if array.size}
 
 

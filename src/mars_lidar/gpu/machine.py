@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.gpu.kernels import HEADERS, OPTIONS, Kernel, source
+from mars_lidar.io.optional import MissingLibraryError
 
 _PLAIN_SHARED = 48 << 10  # bytes that a block gets without asking
 
 
-class NoCupyError(ImportError):
-    """CuPy is not installed."""
-
-
-class NoDeviceError(RuntimeError):
+class NoDeviceError(RuntimeError, ValueError):
     """There is no GPU that CuPy can use."""
 
 
@@ -26,7 +23,7 @@ def cupy_with_device() -> Any:
     try:
         import cupy
     except ImportError as error:
-        raise NoCupyError(
+        raise MissingLibraryError(
             "device='cuda' needs CuPy: pip install 'mars-lidar[cuda12]' or 'mars-lidar[cuda13]', as your driver has it"
         ) from error
     try:

@@ -7,7 +7,7 @@ from typing import Any
 
 
 class MissingLibraryError(ImportError, ValueError):
-    """A format needs a library that is not installed."""
+    """What was asked for needs a library that is not installed."""
 
 
 def needed(module: str, what: str) -> Any:

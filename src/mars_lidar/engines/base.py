@@ -60,8 +60,8 @@ class Task:
         """The native pulse."""
         return _pulse_table(self.system.pulse, self.system.period_ns)
 
-    def pixel_arrays(self) -> dict[str, NDArray[Any]]:
-        """What kernels read of the pixels, by name: light of each return and delays in periods (returns, pixels)."""
+    def pixel_arrays(self) -> dict[str, Any]:
+        """What kernels read of the pixels, by name: light and delays (in periods) of the returns, (returns, pixels)."""
         return {
             "signal": np.ascontiguousarray(self.flux.returns_signal.reshape(-1, self.pixel_index.size)),
             "delay": self.flux.delay_periods(self.system.period_ns),

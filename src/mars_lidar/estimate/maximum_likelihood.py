@@ -27,10 +27,14 @@ class MaximumLikelihood(Method):
         Pixels without signal that are not flagged as such, as a share of them, about: a signal counts as seen where
         twice its gain in log likelihood is more than what background reaches with this probability anywhere in the
         period.
+    less_bias
+        Take the bias of first order off the maximum (Cox and Snell, J. R. Stat. Soc. B 30, 248, 1968; R19): some
+        tenths of a standard error in bright pixels of short exposures, whose errors it makes smaller too.
     """
 
     starts: int = 3
     false_alarm: float = 0.01
+    less_bias: bool = True
 
     name = "maximum_likelihood"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -58,7 +62,7 @@ class MaximumLikelihood(Method):
         flags = np.empty(len(histograms.counts), np.uint8)
         _core.maximum_likelihood(
             histograms.recording, histograms.counts, starts=self.starts, least_gain=self.least_gain(histograms.system),
-            out=out, flags=flags, threads=histograms.threads, progress=histograms.progress,
+            less_bias=self.less_bias, out=out, flags=flags, threads=histograms.threads, progress=histograms.progress,
         )  # fmt: skip
         column = np.ascontiguousarray(out.T)
         return Estimates(

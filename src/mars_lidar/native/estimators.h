@@ -15,6 +15,7 @@ enum Flag : uint8_t { kEmpty = 1, kNoSignal = 2, kSaturated = 4, kUnconverged = 
 struct ReconstructionJob {
     int starts = 1;           // delays to begin at
     double least_gain = 0.0;  // twice the gain of the log likelihood below which a signal counts as not seen
+    bool less_bias = false;   // take off the first-order bias of the maximum
 };
 
 }  // namespace mars

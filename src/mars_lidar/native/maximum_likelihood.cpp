@@ -4,6 +4,7 @@
 
 #include "delay_search.h"
 #include "estimators.h"
+#include "likelihood_bias.h"
 #include "parallel.h"
 
 namespace mars {
@@ -171,14 +172,39 @@ class Maximizer {
         if (!best.converged) *flag |= kUnconverged;
         if (best.at[0] >= kMostPhotons || best.at[1] >= kMostPhotons) *flag |= kSaturated;
         if (best.at[0] == 0.0 || gain < job_.least_gain) *flag |= kNoSignal;
+        out[6] = gain;
+        out[7] = best.likelihood.value;
+        if (job_.less_bias && *flag == 0) correct(pixel, least, best);
         for (int k = 0; k < 3; ++k) out[k] = best.at[k];
         if (best.at[0] == 0.0) out[2] = NAN;
         errors(best, out + 3);
-        out[6] = gain;
-        out[7] = best.likelihood.value;
     }
 
  private:
+    // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.
+    void correct(const PixelLikelihood& pixel, double least, Fit& fit) {
+        double known[3][3], inverse[3][3], bias[3];
+        if (!fit.free[0] || !fit.free[1] || !fit.free[2]) return;
+        known_information(fit.likelihood, fit.free, known);
+        for (int k = 0; k < 3; ++k) {
+            double unit[3] = {};
+            unit[k] = 1.0;
+            if (!solve(known, unit, fit.free, inverse[k])) return;
+        }
+        bias_(r_, passes_, fit.at, inverse, bias);
+        double next[3];
+        for (int k = 0; k < 3; ++k) {
+            if (!std::isfinite(bias[k])) return;
+            const double most = std::sqrt(inverse[k][k]);
+            next[k] = fit.at[k] - std::clamp(bias[k], -most, most);
+        }
+        if (bias[0] > 0.0) next[0] = fit.at[0] / (1.0 + bias[0] / fit.at[0]);
+        next[1] = std::max(next[1], least);
+        const Likelihood there = pixel(next[0], next[1], next[2], ends_);
+        std::copy(next, next + 3, fit.at);
+        fit.likelihood = there;
+    }
+
     // Standard errors: roots of the diagonal of the inverse information; NaN for what lies on its bound.
     static void errors(const Fit& fit, double* out) {
         double known[3][3];
@@ -196,17 +222,18 @@ class Maximizer {
     DelaySearch search_;
     ExposureEnds ends_;
     BackgroundSeries series_;
+    LikelihoodBias bias_;
 };
 
 template <class Count>
 void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> histogram, int starts, double least_gain,
-                        Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
+                        bool less_bias, Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
     const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
     if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
         throw nb::value_error("histogram must be (pixels, bins)");
     if (out.shape(0) != histogram.shape(0) || out.shape(1) != kColumns || flags.shape(0) != histogram.shape(0))
         throw nb::value_error("out must be (pixels, 8), flags (pixels)");
-    const ReconstructionJob job{starts, least_gain};
+    const ReconstructionJob job{starts, least_gain, less_bias};
     run_chunks((pixels + kChunk - 1) / kChunk, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
         Maximizer<Count> maximizer(recording, job);
         for (int64_t p = chunk * kChunk; p < std::min(pixels, (chunk + 1) * kChunk); ++p) {
@@ -245,8 +272,8 @@ void bind_maximum_likelihood(nb::module_& module) {
     constexpr const char* kText = "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).";
     auto add = [&](auto* function) {
         module.def("maximum_likelihood", function, nb::arg("recording"), nb::arg("histogram").noconvert(), nb::kw_only(),
-                   nb::arg("starts"), nb::arg("least_gain"), nb::arg("out").noconvert(), nb::arg("flags").noconvert(),
-                   nb::arg("threads"), nb::arg("progress").none(), kText);
+                   nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"), nb::arg("out").noconvert(),
+                   nb::arg("flags").noconvert(), nb::arg("threads"), nb::arg("progress").none(), kText);
     };
     add(&maximum_likelihood<uint16_t>);
     add(&maximum_likelihood<uint32_t>);

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.estimate import Flags, cramer_rao, log_likelihood, reconstruct
+from mars_lidar.estimate import Flags, MaximumLikelihood, cramer_rao, log_likelihood, reconstruct
 from mars_lidar.flux import Flux
 from mars_lidar.simulate import simulate
 from mars_lidar.studies.reconstruction import PLAIN, SBR, SEED, SYNCHRONOUS
@@ -35,11 +35,14 @@ def line(system: System, signal: float, pixels: int) -> dict[str, Any]:
     for cycles in (system.cycles, _LONG):
         longer = system.replace(cycles=cycles)
         cube = simulate(flux, longer, seed=SEED)[0, 0]
-        found = reconstruct(cube, longer)
-        error = (found.signal - signal)[found.flags & Flags.SATURATED == 0] / least
-        error *= np.sqrt(cycles / system.cycles)
-        out[f"error / bound, {cycles} cycles"] = float(np.sqrt(np.mean(error**2)))
-        out[f"bias / bound, {cycles} cycles"] = float(error.mean())
+        for less, name in ((True, ""), (False, " of the maximum")):
+            if not less and cycles != system.cycles:
+                continue
+            found = reconstruct(cube, longer, MaximumLikelihood(less_bias=less))
+            error = (found.signal - signal)[found.flags & Flags.SATURATED == 0] / least
+            error *= np.sqrt(cycles / system.cycles)
+            out[f"error{name} / bound, {cycles} cycles"] = float(np.sqrt(np.mean(error**2)))
+            out[f"bias{name} / bound, {cycles} cycles"] = float(error.mean())
         if cycles == system.cycles:
             out |= _bounds(cube, longer, (signal, background, _DELAY_NS), bound.information, least)
     return out

@@ -55,7 +55,8 @@ def write(
         "*ends* of the exposure: the bound takes the armed time as known, a histogram hides how many passes its last "
         "dead time took; the covariance of the exact likelihood's score says what that costs any estimate. *Second "
         "order*: no unbiased estimate reaches the bound in so short an exposure; Bhattacharyya's bound, with second "
-        "derivatives, is nearer to what can be reached. And the *bias* of a maximum of likelihood. All in units of the "
+        "derivatives, is nearer to what can be reached. And the *bias* of a maximum of likelihood, which "
+        "`reconstruct` takes off to first order (columns *of the maximum*: as it was before that). All in units of the "
         f"Cramer-Rao bound of {PLAIN.cycles} cycles (of 20,000 cycles for the long exposures), pulse at 50 ns; by "
         "simulation, to 2 %.",
         table(near),

@@ -45,7 +45,9 @@ struct Terms {
     alignas(64) float beyond[kTeam], above[kTeam];   // P(H > k), P(H > k - 1)
     alignas(64) float count[kTeam];                  // k
 
-        MARS_INLINE void sum(const float* mean, const float* variance, const float* uniform) {
+    // A function of its own, of arrays that do not overlap, or not all compilers vectorise its loops.
+    MARS_NOINLINE void sum(const float* __restrict__ mean, const float* __restrict__ variance,
+                           const float* __restrict__ uniform) {
         alignas(64) float trials[kTeam], odds[kTeam], limit[kTeam], chance[kTeam], exponent[kTeam];
         int32_t large = 0;
         for (int i = 0; i < kTeam; ++i) {

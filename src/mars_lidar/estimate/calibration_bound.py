@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.estimate.calibration_fit import Light
 from mars_lidar.estimate.intervals import FloatArray
 from mars_lidar.pulse import GaussianPulse
@@ -29,6 +30,8 @@ class Bound:
 
     names: tuple[str, ...]
     information: FloatArray
+
+    __repr__ = brief
 
     @property
     def covariance(self) -> FloatArray:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._brief import brief
 from mars_lidar.timestamps import Timestamps
 
 FloatArray = NDArray[np.float64]
@@ -162,6 +163,8 @@ class ArmedTime:
     left_out: int
     hold_off_ns: float
 
+    __repr__ = brief
+
     @property
     def rate(self) -> FloatArray:
         """Photons per period in each bin (n,), the unrestricted maximum of the likelihood; 0 where never armed.
@@ -288,6 +291,8 @@ class Summary:
     smallest_ns: FloatArray
     quantiles_ns: FloatArray
     same_time: int
+
+    __repr__ = brief
 
     @property
     def rate_per_s(self) -> float:

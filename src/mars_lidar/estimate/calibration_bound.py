@@ -57,7 +57,8 @@ def calibration_bound(
     Parameters
     ----------
     signal, background, delay_ns
-        S > 0 and B > 0 in photons per period, delay in ns (None: half the period): scalars.
+        S > 0 and B > 0 in detected photons per period, as `calibrate` finds them (the detector's efficiency and dark
+        counts are in them already), delay in ns (None: half the period): scalars.
     system
         Laser, detector (non-paralyzable) and exposure.
     fit_width
@@ -68,6 +69,7 @@ def calibration_bound(
     tau = 0.5 * system.period_ns if delay_ns is None else _validate.real("delay_ns", delay_ns)
     if system.detector.mode != "nonparalyzable":
         raise ValueError(f"system must have a detector of mode 'nonparalyzable', got {system.detector.mode!r}")
+    system = system.detected()
     theta = [b, s, tau]
     if fit_width:
         if not isinstance(system.pulse, GaussianPulse):

@@ -87,7 +87,7 @@ def stream_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = False)
     """
     parts = [times] if isinstance(times, Timestamps) else list(times)
     if not parts or not all(isinstance(part, Timestamps) for part in parts):
-        raise TypeError(f"times must be Timestamps or a sequence of them, got {times!r}")
+        raise TypeError(f"times must be Timestamps or a sequence of them, got {type(times).__name__}")
     first = parts[0]
     if not (first.period_ns > 0 and math.isfinite(first.period_ns)):
         raise ValueError(f"times must tell the laser period, got period_ns {first.period_ns}")

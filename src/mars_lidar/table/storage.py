@@ -133,8 +133,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Attributes and arrays; the large ones are mapped, the others read."""
     import h5py
 
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
+    if path.is_dir():
+        raise ValueError(f"{path} is not a table of mars-lidar")
     try:
         with h5py.File(path, "r") as file:
             header = dict(file.attrs.items())

@@ -302,3 +302,27 @@ def test_no_work_is_done_for_bad_input():
     out = np.full((1, 2, 3, 8), 7, np.uint16)
     refused(lambda: ml.simulate(FLUX, SYSTEM, out=out, seed=-1), ValueError, "seed")
     assert (out == 7).all()
+
+
+def test_what_is_no_array_of_counts_is_named_by_its_type(tmp_path):
+    from mars_lidar import io
+
+    io.simulate_to(tmp_path / "a.zarr", FLUX, SYSTEM)
+    cube = io.load(tmp_path / "a.zarr")
+    refused(lambda: ml.reconstruct(cube, SYSTEM), TypeError, "its histogram", "got Cube")
+    refused(lambda: ml.reconstruct("a.zarr", SYSTEM), TypeError, "array of counts", "got str")
+    refused(lambda: ml.calibrate(np.zeros((3, 8))), TypeError, "Timestamps", "got ndarray")
+
+
+def test_a_file_of_another_kind_says_what_it_is(tmp_path):
+    from mars_lidar import io
+    from mars_lidar.io.maps import save_maps
+
+    cube = ml.simulate(FLUX, SYSTEM)
+    save_maps(tmp_path / "maps.npz", {"peak": ml.reconstruct(cube, SYSTEM, "peak")})
+    ml.simulate_timestamps(FLUX, SYSTEM).save(tmp_path / "times.npz")
+    ml.Table.build(SYSTEM, signal=(0.1, 1, 4), background=(0.1, 1, 4)).save(tmp_path / "table.h5")
+    for name, told in (("maps.npz", "load_maps"), ("times.npz", "Timestamps.load"), ("table.h5", "Table.load")):
+        refused(lambda name=name: io.load(tmp_path / name), ValueError, name, "not a cube", told)
+    io.simulate_to(tmp_path / "a.zarr", FLUX, SYSTEM)
+    refused(lambda: ml.Table.load(tmp_path / "a.zarr", SYSTEM), ValueError, "a.zarr is not a table")

@@ -132,6 +132,9 @@ def test_a_system_file_and_options_on_top_of_it(tmp_path):
 
 def test_init_does_not_overwrite(tmp_path):
     (tmp_path / "mine.yaml").write_text("mine")
+    assert run("init", "-o", tmp_path / "other.yaml").exit_code == 0  # as the other commands have it
+    assert (tmp_path / "other.yaml").exists()
+    assert run("init", tmp_path / "third.yaml", "-o", tmp_path / "other.yaml").exit_code == 2
     done = run("init", tmp_path / "mine.yaml")
     assert done.exit_code == 2
     assert "exists already" in done.stderr

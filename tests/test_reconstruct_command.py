@@ -37,6 +37,18 @@ def cube(tmp_path_factory):
     return path
 
 
+def test_reflectivity_is_right_behind_a_detection_efficiency(tmp_path):
+    """The truth's light falls on the pixel, the estimate's is detected: a level between them takes off the factor."""
+    out, share = tmp_path / "a.zarr", 0.25
+    words = (*SMALL[:-1], 8, "--detection-efficiency", share, "--cycles", 3000, "--no-picture", "-o", out)
+    assert run("simulate", "--scene", "room", *words).exit_code == 0
+    with io.load(out) as stored:
+        found = reconstruct_stored(stored, ["maximum_likelihood"])["maximum_likelihood"].found
+        ratio = found.reflectivity[0] / stored.reflectivity
+        np.testing.assert_allclose(found.signal[0] / stored.flux.signal, share, rtol=0.15)
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
+
+
 @pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
 def test_maps_read_back(cube, tmp_path, suffix):
     out = tmp_path / f"maps{suffix}"

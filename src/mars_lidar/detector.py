@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from mars_lidar import _validate, effects
+from mars_lidar._brief import brief
 from mars_lidar.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.effects import Jitter, SampledJitter
 
@@ -91,6 +92,8 @@ class Detector:
     max_events_per_exposure: int | None = None
     jitter: Jitter | SampledJitter | None = None
     code_density: tuple[float, ...] | None = None
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.detector import Detector as Detector
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.pulse import Pulse, pulse_from_dict
@@ -51,6 +52,8 @@ class System:
     pulse: Pulse
     detector: Detector
     start: Literal["armed", "stationary"] = "armed"
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         set_field = object.__setattr__

@@ -66,6 +66,14 @@ def test_unbiased_with_right_errors_at_the_bound(dead_ns, start):
     ledger.require({"scatter": 2 * min(stats.chi2.sf(square, number), stats.chi2.cdf(square, number))}, "calibrate")
 
 
+def test_efficiency_and_dark_counts_are_in_the_light_of_the_bound():
+    """As in that of a calibration: they change nothing of it."""
+    plain = system(1000, 75.0)
+    detector = ml.Detector(dead_time_ns=75.0, detection_efficiency=0.3, dark_count_hz=1e6)
+    found = calibration_bound(0.5, 2.0, plain.replace(detector=detector), delay_ns=DELAY)
+    assert np.array_equal(found.information, calibration_bound(0.5, 2.0, plain, delay_ns=DELAY).information)
+
+
 def test_the_bound_is_the_textbook_s_without_dead_time():
     """Poisson: the information is that of the counts of the bins."""
     made_by = system(1000, 0.0)

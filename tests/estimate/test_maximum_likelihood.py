@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -92,6 +93,33 @@ def test_bias_is_taken_off(system, signal, bias):
     assert errors[True].std() < 0.98 * errors[False].std()
     z = max(abs(errors[True].mean()) - 0.1, 0.0) / errors[True].std() * np.sqrt(pixels)
     require({"bias": 2 * stats.norm.sf(z)}, "bias of the maximum")
+
+
+def test_the_bound_knows_efficiency_and_dark_counts():
+    """It is that of the light that the pixel sees, in units of the light that falls on it."""
+    share, dark_hz = 0.4, 2e6
+    dim = PLAIN.replace(detector=ml.Detector(dead_time_ns=75.0, detection_efficiency=share, dark_count_hz=dark_hz))
+    seen = PLAIN.replace(detector=ml.Detector(dead_time_ns=75.0))
+    dark = 1e-9 * dark_hz * PERIOD
+    bound = ml.cramer_rao(2.0, 0.5, dim, delay_ns=37.0)
+    same = ml.cramer_rao(2.0 * share, 0.5 * share + dark, seen, delay_ns=37.0)
+    assert bound.signal * share == pytest.approx(float(same.signal), rel=1e-12)
+    assert bound.background * share == pytest.approx(float(same.background), rel=1e-12)
+    assert bound.depth_m == pytest.approx(float(same.depth_m), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"background": 0.0}, "background must be > 0, got 0.0"),
+        ({"signal": -1.0}, "signal must lie in .* got -1.0"),
+        ({"delay_ns": math.nan}, "delay_ns must be finite.* got nan"),
+    ],
+)
+def test_bad_arguments_of_the_bound_are_named(change, words):
+    given = {"signal": 1.0, "background": 1.0, "delay_ns": 37.0} | change
+    with pytest.raises(ValueError, match=words):
+        ml.cramer_rao(system=PLAIN, **given)
 
 
 # few passes are left at the pulse, so that it matters what the ends of the exposure leave of them

@@ -105,6 +105,18 @@ def test_mat_has_the_keys_shapes_and_types_of_the_field(tmp_path):
     assert found["photons"].item() == pytest.approx(60 * flux.signal.mean(), rel=1e-15)
 
 
+def test_a_mat_tells_the_light_that_the_pixel_detects(tmp_path):
+    """`photons` and `SBR` of the field's files are of detectable photons, dark counts in the background."""
+    detector = ml.Detector(dead_time_ns=SYSTEM.detector.dead_time_ns, detection_efficiency=0.25, dark_count_hz=1e6)
+    system = SYSTEM.replace(detector=detector)
+    flux = ml.Flux(np.full((2, 3), 2.0), 0.5, 20.0)
+    io.simulate_to(tmp_path / "a.mat", flux, system)
+    found = scipy.io.loadmat(tmp_path / "a.mat")
+    assert found["photons"].item() == pytest.approx(system.cycles * 0.5, rel=1e-12)
+    assert found["SBR"].item() == pytest.approx(0.5 / (0.125 + 1e-3 * system.period_ns), rel=1e-12)
+
+
+
 @pytest.mark.parametrize("make", [several_returns, waveform])
 def test_rates_are_the_signal_of_all_returns(tmp_path, make):
     flux = make()

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from store_cases import SUFFIXES, SYSTEM, one_return
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.io import recipe
+from mars_lidar.io.maps import save_maps
 
 
 def _interrupt_after(exposures: int):
@@ -138,3 +140,38 @@ def test_a_disk_that_is_full_from_the_start_is_told(tmp_path, suffix):
     assert done.stdout.startswith("WriteError: ")
     assert "nothing was left" in done.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on file sizes")
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.mat", "a.ptu", "s.npz", "s.h5", "s.ptu", "t.h5", "m.h5", "m.npz"])
+def test_a_file_that_finds_no_room_says_so_and_leaves_nothing(tmp_path, name, monkeypatch):
+    """Cubes (a), streams (s), tables (t), maps (m): one kind of error, in the words of the operating system."""
+    import resource
+    import shutil
+
+    for suffix, library in ((".ptu", "ptufile"), ("s.h5", "phconvert")):
+        if name.endswith(suffix):
+            pytest.importorskip(library)
+    system = SYSTEM.replace(cycles=3000)
+    flux = ml.Flux(np.full((16, 16), 1.0), 1.0, 20.0)
+    cube, times = ml.simulate(flux, system), ml.simulate_timestamps(flux, system)
+    table = ml.Table.build(SYSTEM, signal=(0.1, 1, 8), background=(0.1, 1, 8))
+    maps = {f"method {k}": ml.reconstruct(cube, system, "peak") for k in range(12)}
+    target = tmp_path / name
+    writes = {
+        "a": lambda: io.save(target, io.Cube(histogram=cube, recipe=io.Recipe(system=system, flux=flux))),
+        "s": lambda: times.save(target),
+        "t": lambda: table.save(target),
+        "m": lambda: save_maps(target, maps),
+    }
+    if name == "s.h5":  # its libraries do not say what is wrong; a limit on sizes leaves the disk itself empty
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, hard))
+    try:
+        full = "File too large|No space left on device"
+        with pytest.raises(io.WriteError, match=f"({full}); nothing was left at .*{name}"):
+            writes[name[0]]()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not list(tmp_path.iterdir())

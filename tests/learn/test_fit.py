@@ -76,7 +76,7 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been(tmp_path: Path):
 def test_it_stops_where_validation_does_not_improve(tmp_path: Path):
     train, test = examples(6, 1), examples(2, 2)
     hopeless = Examples(test.cubes, 1.0 - test.maps)  # the better the training goes, the worse the validation
-    found = fit(network(), train, hopeless, tmp_path, replace(PLAN, steps=400, every=10, patience=2))
+    found = fit(network(), train, hopeless, str(tmp_path), replace(PLAN, steps=400, every=10, patience=2))
     assert found.stopped
     assert found.steps == found.best_step + 20 < 400
     assert (tmp_path / BEST).exists()

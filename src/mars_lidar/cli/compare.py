@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from mars_lidar.cli import options
-from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.console import progress_bar, reported, save_picture, table
 from mars_lidar.cli.effect_options import Effects
 from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.inspect import parsed_pixel
@@ -157,20 +156,13 @@ def _names(engines: str | None) -> list[str]:
 def _draw(found: Comparison, out: Path) -> None:
     from mars_lidar.plot.compare import comparison
 
-    unfinished = out.with_name(out.name + ".incomplete")
-    try:
-        comparison(found).savefig(unfinished, format=out.suffix[1:])
-        os.replace(unfinished, out)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    save_picture(comparison(found), out)
 
 
 def _write(file: Path, text: str) -> None:
-    unfinished = file.with_name(file.name + ".incomplete")
-    try:
+    from mars_lidar.io.store import TemporarySibling
+
+    with TemporarySibling(file).writing() as unfinished:
         unfinished.write_text(text)
-        os.replace(unfinished, file)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 import time
 import warnings
@@ -115,12 +114,11 @@ def check_picture(out: Path | None, overwrite: bool) -> None:
 
 def save_picture(figure: Figure, out: Path) -> None:
     """Write a figure beside its name and rename it when it is whole."""
-    unfinished = out.with_name(out.name + ".incomplete")
-    try:
-        figure.savefig(unfinished, format=out.suffix[1:])
-        os.replace(unfinished, out)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    from mars_lidar.io.store import TemporarySibling
+
+    options: dict[str, Any] = {"pil_kwargs": {"compress_level": 4}} if out.suffix == ".png" else {}
+    with TemporarySibling(out).writing() as unfinished:
+        figure.savefig(unfinished, format=out.suffix[1:], **options)
 
 
 def table(rows: list[tuple[str, str]]) -> None:
@@ -144,7 +142,7 @@ def table(rows: list[tuple[str, str]]) -> None:
 def _of_file(error: OSError) -> str:
     if error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    return str(error)
+    return error.strerror or str(error)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:

@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from mars_lidar.cli.console import reported
+from mars_lidar.cli.console import reported, table
 
+_FILE = Path("system.yaml")
 # The values are those of `system_options.DEFAULT_SYSTEM`; a test reads the file back and compares.
 TEMPLATE = """\
 # A system for mars-lidar: laser, detector and histogram.
@@ -75,7 +76,10 @@ start: armed
 
 
 def init(
-    file: Annotated[Path, typer.Argument(help="Where to write it: .yaml or .yml.")] = Path("system.yaml"),
+    file: Annotated[Path, typer.Argument(help="Where to write it: .yaml or .yml.")] = _FILE,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="The same, as with the other commands.", show_default=False)
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a commented YAML file that describes a system: laser, detector, histogram.
@@ -83,9 +87,13 @@ def init(
     Edit it and pass it on:  mars-lidar simulate --scene room --system system.yaml -o room.zarr
     """
     with reported():
+        if out is not None:
+            if file != _FILE and file != out:
+                raise ValueError(f"give the file once, got {str(file)!r} and --out {str(out)!r}")
+            file = out
         if file.suffix not in (".yaml", ".yml"):
             raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
         if file.exists() and not overwrite:
             raise FileExistsError(f"{file} exists already; choose another name or give --overwrite")
         file.write_text(TEMPLATE.format(name=file))
-        print(f"wrote {file}")
+        table([("wrote", str(file))])

@@ -87,7 +87,7 @@ def view(
 
             figure = overview(cube, realization=realization, pixels=pixels)
         save_picture(figure, out)
-        print(f"wrote {out}")
+        table([("picture", str(out))])
 
 
 def parsed_pixel(text: str) -> tuple[int, int]:

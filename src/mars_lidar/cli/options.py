@@ -115,7 +115,8 @@ Engine = Annotated[
     str,
     _option(
         "--engine", panel=_RUN, default="exact",
-        help="exact; sequential (slow, independent gold standard); mars (count law x mean histogram); renewal, "
+        help="exact; feedback (long exposures, at a cost independent of them); auto (the faster of these, pixel by "
+        "pixel); mars (count law x mean histogram); sequential (slow, independent gold standard); renewal, neural, "
         "poisson (baselines).",
     ),
 ]

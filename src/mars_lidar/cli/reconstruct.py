@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import sys
 import time
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mars_lidar.cli.console import progress_bar, reported, say, table
+from mars_lidar.cli.console import progress_bar, reported, save_picture, say, table
 
 if TYPE_CHECKING:
     from mars_lidar.estimate import Reconstruction
@@ -179,9 +178,4 @@ def _grid(head: list[str], lines: list[list[str]]) -> None:
 def _draw(cube: Cube, results: dict[str, Reconstruction], png: Path) -> None:
     from mars_lidar.plot.reconstruction import reconstruction
 
-    unfinished = png.with_name(png.name + ".incomplete")
-    try:
-        reconstruction(cube, results).savefig(unfinished, format="png", pil_kwargs={"compress_level": 4})
-        os.replace(unfinished, png)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    save_picture(reconstruction(cube, results), png)

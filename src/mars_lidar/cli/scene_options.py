@@ -32,7 +32,8 @@ class SceneOptions:
         str | None,
         _option(
             "--scene", panel=_SCENE,
-            help="A built-in scene: room. Or a .yaml file of scene or transient, and light (docs/formats.md).",
+            help="A built-in scene: room, or random (another for each --scene-seed). "
+            "Or a .yaml file of scene or transient, and light (docs/formats.md).",
         ),
     ] = None
     size: Annotated[

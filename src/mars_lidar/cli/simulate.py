@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mars_lidar.cli import options
-from mars_lidar.cli.console import progress_bar, reported, say
+from mars_lidar.cli.console import progress_bar, reported, save_picture, say
 from mars_lidar.cli.console import table as print_table
 from mars_lidar.cli.effect_options import Effects
 from mars_lidar.cli.groups import grouped
@@ -33,8 +32,8 @@ EPILOG = "\n\n".join(
         "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
         "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
         "mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr",
-        "S and B are expected detectable photons per laser period, after detection efficiency. Dead time "
-        "bends histograms where S + B is not small.",
+        "S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the pixel. "
+        "Dead time bends histograms where S + B is not small.",
     )
 )
 
@@ -115,13 +114,10 @@ def _draw(cube: Path, png: Path) -> None:
     from mars_lidar.io import load
     from mars_lidar.plot import overview
 
-    unfinished = png.with_name(png.name + ".incomplete")
     try:
         with load(cube) as stored:
-            overview(stored).savefig(unfinished, format="png", pil_kwargs={"compress_level": 4})
-        os.replace(unfinished, png)
+            save_picture(overview(stored), png)
     except BaseException:
-        unfinished.unlink(missing_ok=True)
         say(f"{cube} is complete; its picture was not made (mars-lidar view {cube} -o {png} does it)")
         raise
 

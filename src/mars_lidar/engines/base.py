@@ -156,6 +156,10 @@ class Engine(ABC):
     devices: ClassVar[tuple[str, ...]] = ("cpu",)  # that it runs on
     options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
 
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
+        return f"{type(self).__name__}({told})"
+
     @property
     def settings(self) -> dict[str, Any]:
         """What a cube depends on beside system, flux and seed: plain data for the file of a cube."""

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.estimate.calibration_fit import Light, covariance, fit, initial
 from mars_lidar.estimate.calibration_rapp import RappEstimate, split, total_of
 from mars_lidar.estimate.detector_model import is_plain, pulse_of_the_light, recorded_pulse, stream_detector, watched
@@ -77,6 +78,8 @@ class Calibration:
     summary: Summary
     converged: bool
     simulated: float = 0.0
+
+    __repr__ = brief
 
     @property
     def signal(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.estimate.calibration_fit import Light
 from mars_lidar.estimate.intervals import FloatArray
 from mars_lidar.pulse import GaussianPulse
@@ -29,6 +30,8 @@ class Bound:
 
     names: tuple[str, ...]
     information: FloatArray
+
+    __repr__ = brief
 
     @property
     def covariance(self) -> FloatArray:
@@ -54,7 +57,8 @@ def calibration_bound(
     Parameters
     ----------
     signal, background, delay_ns
-        S > 0 and B > 0 in photons per period, delay in ns (None: half the period): scalars.
+        S > 0 and B > 0 in detected photons per period, as `calibrate` finds them (the detector's efficiency and dark
+        counts are in them already), delay in ns (None: half the period): scalars.
     system
         Laser, detector (non-paralyzable) and exposure.
     fit_width
@@ -65,6 +69,7 @@ def calibration_bound(
     tau = 0.5 * system.period_ns if delay_ns is None else _validate.real("delay_ns", delay_ns)
     if system.detector.mode != "nonparalyzable":
         raise ValueError(f"system must have a detector of mode 'nonparalyzable', got {system.detector.mode!r}")
+    system = system.detected()
     theta = [b, s, tau]
     if fit_width:
         if not isinstance(system.pulse, GaussianPulse):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.estimate.method import FloatArray
 from mars_lidar.estimate.recording import core_ns, open_bins, relative_width
 from mars_lidar.system import System
@@ -31,6 +32,8 @@ class HistogramBound:
     delay_ns: FloatArray
     depth_m: FloatArray
 
+    __repr__ = brief
+
 
 def cramer_rao(
     signal: ArrayLike, background: ArrayLike, system: System, *, delay_ns: ArrayLike, threads: int | None = None
@@ -45,7 +48,8 @@ def cramer_rao(
     Parameters
     ----------
     signal, background
-        S and B > 0, photons per period; they broadcast with `delay_ns` to (...).
+        S and B > 0, photons per period as a `Flux` has them (on the pixel, where the detector has an efficiency, and
+        without its dark counts); they broadcast with `delay_ns` to (...).
     system
         Detectors of mode nonparalyzable, synchronous, or gated with a gate that stays.
     delay_ns
@@ -59,14 +63,18 @@ def cramer_rao(
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     MaximumLikelihood().check(system)
+    mean = mean_histogram(signal, background, system, delay_ns=delay_ns, threads=threads)  # checks the arguments
     s, b, tau = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (signal, background, delay_ns)))
-    if not ((s >= 0) & (b > 0) & np.isfinite(s + b + tau)).all():
-        raise ValueError("signal must be >= 0, background > 0 and delay_ns finite")
-    mean = mean_histogram(s, b, system, delay_ns=tau, threads=threads)
+    if not (b > 0).all():
+        raise ValueError(f"background must be > 0, got {b[~(b > 0)].flat[0]}")
+    if not np.isfinite(tau).all():
+        raise ValueError(f"delay_ns must be finite, got {tau[~np.isfinite(tau)].flat[0]}")
     energy, slope, share = _pulse_bins(system, tau)
     flat = share / system.bins
-    rate = s[..., None] * energy + b[..., None] * flat
-    gradient = np.stack([energy, np.broadcast_to(flat, energy.shape), s[..., None] * slope], axis=-1)
+    seen = system.detector.detection_efficiency  # of the photons; dark counts come on top of them
+    dark = 1e-9 * system.detector.dark_count_hz * system.period_ns
+    rate = seen * s[..., None] * energy + (seen * b[..., None] + dark) * flat
+    gradient = seen * np.stack([energy, np.broadcast_to(flat, energy.shape), s[..., None] * slope], axis=-1)
     weight = np.where(rate > 0, mean / np.where(rate > 0, rate, 1.0) ** 2, 0.0)  # E[D] / l = E[h] / l^2
     if system.detector.mode == "synchronous" or system.detector.dead_time_ns >= system.bin_ns:
         x = np.clip(0.5 * rate, 1e-6, 300.0)

@@ -23,6 +23,8 @@ def checked(
     if progress is not None and not callable(progress):
         raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
     counts = np.asarray(cube)
+    if counts.dtype.kind in "OUS":
+        raise TypeError(f"cube must be an array of counts (of a loaded cube its histogram), got {type(cube).__name__}")
     if counts.ndim == 0 or counts.shape[-1] != system.bins or counts.size == 0:
         raise ValueError(
             f"cube must be (..., {system.bins}), the system's bins last and not empty, got shape {counts.shape}"

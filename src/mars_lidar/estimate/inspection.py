@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mars_lidar._brief import brief
 from mars_lidar.estimate.calibration import Calibration, calibrate
 from mars_lidar.estimate.intervals import FloatArray, stream_of
 from mars_lidar.estimate.recovery import Recovery, recovery_of
@@ -41,6 +42,8 @@ class Inspection:
     interval_edges_ns: FloatArray
     interval_histogram: FloatArray
     problems: tuple[str, ...]
+
+    __repr__ = brief
 
 
 def inspect(times: Timestamps, *, dead_time_ns: float | None = None) -> Inspection:

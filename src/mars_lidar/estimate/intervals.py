@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._brief import brief
 from mars_lidar.timestamps import Timestamps
 
 FloatArray = NDArray[np.float64]
@@ -86,7 +87,7 @@ def stream_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = False)
     """
     parts = [times] if isinstance(times, Timestamps) else list(times)
     if not parts or not all(isinstance(part, Timestamps) for part in parts):
-        raise TypeError(f"times must be Timestamps or a sequence of them, got {times!r}")
+        raise TypeError(f"times must be Timestamps or a sequence of them, got {type(times).__name__}")
     first = parts[0]
     if not (first.period_ns > 0 and math.isfinite(first.period_ns)):
         raise ValueError(f"times must tell the laser period, got period_ns {first.period_ns}")
@@ -161,6 +162,8 @@ class ArmedTime:
     used: int
     left_out: int
     hold_off_ns: float
+
+    __repr__ = brief
 
     @property
     def rate(self) -> FloatArray:
@@ -288,6 +291,8 @@ class Summary:
     smallest_ns: FloatArray
     quantiles_ns: FloatArray
     same_time: int
+
+    __repr__ = brief
 
     @property
     def rate_per_s(self) -> float:

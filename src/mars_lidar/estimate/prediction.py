@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._brief import brief
 from mars_lidar.detector import Detector
 from mars_lidar.estimate.calibration import Calibration
 from mars_lidar.estimate.detector_model import is_plain, pulse_of_the_light
@@ -58,6 +59,8 @@ class Prediction:
     simulated: int = 0
     exact: tuple[str, ...] = ("count", "histogram", "joint")
     recovery: Recovery | None = None
+
+    __repr__ = brief
 
     def noise(self, what: str) -> float:
         """1 / (realizations that a part was simulated with), 0 of an exact one: what sampling adds to variances."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.estimate.histograms import checked
 from mars_lidar.estimate.method import Estimates, Flags, FloatArray, Method, Progress
 from mars_lidar.system import System
@@ -29,7 +30,8 @@ class Reconstruction:
     delay_ns, depth_m
         Delay tau in [0, period), ns, and depth c tau / 2, m; NaN where there is no estimate.
     signal, background
-        S and B, detectable photons per laser period. B is that of the whole period, also behind a gate.
+        S and B, detectable photons per laser period: a detection efficiency and dark counts are in them. B is that of
+        the whole period, also behind a gate.
     reflectivity
         S over `level`, times depth^2 where the light falls off with it.
     level
@@ -56,6 +58,8 @@ class Reconstruction:
     background_error: FloatArray | None
     significance: FloatArray | None
     flags: NDArray[np.uint8]
+
+    __repr__ = brief
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -90,7 +94,8 @@ def reconstruct(
         ``"maximum_likelihood"`` (default), ``"generalised_coates"``, ``"mchc"``, ``"coates"``, ``"matched_filter"``,
         ``"peak"``, or a `Method` of your own settings. Each refuses detectors that it does not hold for.
     level
-        Signal photons per period of a surface of reflectivity 1 (at 1 m, with ``attenuation="inverse_square"``).
+        Detectable signal photons per period of a surface of reflectivity 1 (at 1 m, with
+        ``attenuation="inverse_square"``).
         None: so that the mean reflectivity of the pixels with a return is 1, which makes it relative.
     attenuation
         As in `Scene.flux`: ``"inverse_square"`` makes reflectivity proportional to S times depth squared.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
 from mars_lidar.timestamps import Timestamps
 
@@ -43,6 +44,8 @@ class Recovery:
     expected: FloatArray
     dead_time_ns: float
     hold_off_ns: float
+
+    __repr__ = brief
 
     @property
     def ratio(self) -> FloatArray:

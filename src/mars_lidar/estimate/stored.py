@@ -90,9 +90,10 @@ def reconstruct_stored(
 
 
 def true_level(cube: Cube, attenuation: str) -> float | None:
-    """Signal of a surface of reflectivity 1 in the scene behind a cube; None where there is no scene."""
+    """Detectable signal of a surface of reflectivity 1 in the scene behind a cube; None where there is no scene."""
     if cube.reflectivity is None:
         return None
     light = cube.reflectivity * (cube.depth_m**-2.0 if attenuation == "inverse_square" else 1.0)
-    lit = (cube.flux.signal > 0) & np.isfinite(light) & (light > 0)
-    return float(cube.flux.signal[lit].sum() / light[lit].sum()) if lit.any() else None
+    signal = cube.flux.signal * cube.system.detector.detection_efficiency
+    lit = (signal > 0) & np.isfinite(light) & (light > 0)
+    return float(signal[lit].sum() / light[lit].sum()) if lit.any() else None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.detector import Detector
 from mars_lidar.estimate.calibration import Calibration, _free_bins, calibrate
 from mars_lidar.estimate.detector_model import stream_detector
@@ -101,6 +102,8 @@ class Validation:
     checks: tuple[Check, ...]
     recovery: Recovery
     level: float
+
+    __repr__ = brief
 
     @property
     def predicted(self) -> Pmf:

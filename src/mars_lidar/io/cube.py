@@ -11,14 +11,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._brief import brief
 from mars_lidar._memory import check_memory
 from mars_lidar.flux import Flux
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import INCOMPLETE_SUFFIX, CountArray, IncompleteFileError, Writer, check_target
+from mars_lidar.io.store import (
+    INCOMPLETE_SUFFIX,
+    CountArray,
+    IncompleteFileError,
+    WriteError,
+    Writer,
+    check_target,
+    reason,
+)
 from mars_lidar.system import System
 
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz", ".mat", ".ptu")
+
+
+def _nothing() -> None:
+    pass
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,7 +62,9 @@ class Cube:
     version: str = ""
     path: Path | None = None
     progress: str = ""
-    _close: Callable[[], None] = field(default=lambda: None, repr=False)
+    _close: Callable[[], None] = field(default=_nothing, repr=False)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if tuple(self.histogram.shape) != self.recipe.shape:
@@ -103,6 +118,12 @@ class Cube:
         """(realizations, H, W, bins)."""
         return self.recipe.shape
 
+    def __reduce__(self) -> Any:
+        """Pickled as its path, for another process to open; without one, with its counts."""
+        if self.path is None:
+            return super().__reduce__()
+        return _opened_again, (self.path.absolute(), not self.complete)
+
     def close(self) -> None:
         """Close the file; the histogram cannot be read from it afterwards."""
         self._close()
@@ -112,6 +133,10 @@ class Cube:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _opened_again(path: Path, incomplete: bool) -> Cube:
+    return load(path, allow_incomplete=incomplete)
 
 
 def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
@@ -124,7 +149,11 @@ def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
     OSError
         `path` exists and `overwrite` is false, or cannot be written.
     """
-    writer = create(path, cube.recipe, overwrite=overwrite)
+    check_output(path, cube.recipe, overwrite=overwrite)
+    try:
+        writer = create(path, cube.recipe, overwrite=overwrite)
+    except OSError as error:
+        raise WriteError(error.errno, f"{reason(error)}; nothing was left at {path}") from error
     try:
         registrations = 0
         for realizations, rows in cube.recipe.blocks(writer.chunks):
@@ -134,6 +163,8 @@ def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
             writer.write(realizations, rows, block)
             registrations += int(block.sum(dtype=np.uint64))
         writer.finish(registrations)
+    except OSError as error:
+        raise WriteError(error.errno, f"{reason(error)}; {writer.abandon()}") from error
     except BaseException:
         writer.abandon()
         raise

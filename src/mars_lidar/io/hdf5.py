@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.store import INCOMPLETE_SUFFIX, IncompleteFileError, OpenedStore, TemporarySibling, Writer
+
+if TYPE_CHECKING:
+    import h5py
 
 # 1 MiB is HDF5's default chunk cache. gzip at level 1 with byte shuffle, on the room of zarr_store.py (write,
 # read, size): 0.32 s, 0.15 s, 5.2 MB; level 4 0.72 s, 0.21 s, 4.5 MB; lzf 0.26 s, 0.16 s, 8.7 MB, and MATLAB
@@ -85,6 +89,20 @@ class Hdf5Writer(Writer):
             self._file.close()
         self._disk.close()
         return self._sibling.discard()
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[h5py.File]:
+    """A new file, closed and checked at the end: HDF5's own, when a disk is full, ends the process as it is closed."""
+    import h5py
+
+    disk = _ForgivingFile(path)
+    try:
+        with h5py.File(disk, "w", libver=("earliest", "v110")) as file:
+            yield file
+    finally:
+        disk.close()
+    disk.check()
 
 
 def open_writer(path: Path, recipe: Recipe) -> Writer:

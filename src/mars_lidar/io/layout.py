@@ -41,6 +41,13 @@ from mars_lidar.stored_flux import BAND_BYTES, StoredFlux, Waveforms
 from mars_lidar.system import System
 
 FORMAT = "mars-lidar cube"
+_OTHERS = {  # attribute `format` of what is no cube, `kind` of a table: what it is, what reads it
+    "mars-lidar maps": "reconstructed maps, not a cube: mars_lidar.io.maps.load_maps reads them",
+    "mars-lidar dataset": "a dataset, not a cube: mars_lidar.dataset.open_dataset reads it",
+    "mars-lidar timestamps": "a photon stream, not a cube: mars_lidar.Timestamps.load reads it, mars-lidar inspect "
+    "shows it",
+    "mars-lidar table": "a lookup table, not a cube: mars_lidar.Table.load reads it, mars-lidar table info shows it",
+}
 FORMAT_VERSION = 1
 DIMS = ("realization", "y", "x", "time")
 HISTOGRAM_LABELS = {"long_name": "registrations per bin", "units": "count"}
@@ -182,6 +189,9 @@ def _stored_flux(
 
 def check_format(path: object, attrs: Mapping[str, Any]) -> None:
     """Raise ValueError unless these are the attributes of a cube that this version can read."""
+    kind = attrs.get("kind", attrs.get("format"))
+    if isinstance(kind, str) and kind in _OTHERS:
+        raise ValueError(f"{path} holds {_OTHERS[kind]}")
     if attrs.get("format") != FORMAT:
         raise ValueError(f"{path} is not a cube written by mars-lidar (no attribute format = {FORMAT!r})")
     version = int(attrs.get("format_version", 0))

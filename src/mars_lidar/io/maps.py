@@ -8,7 +8,6 @@ maps", ``format_version``, ``system`` (JSON), ``level``, ``source`` (the cube), 
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -56,25 +55,17 @@ def save_maps(
     target = Path(path)
     check_maps_output(target, overwrite=overwrite)
     variables, attrs = _contents(results, source)
-    sibling = TemporarySibling(target)
-    try:
+    with TemporarySibling(target).writing() as unfinished:
         if target.suffix == ".zarr":
-            shutil.rmtree(sibling.path, ignore_errors=True)
-            _write_zarr(sibling.path, variables, attrs)
+            shutil.rmtree(unfinished, ignore_errors=True)
+            _write_zarr(unfinished, variables, attrs)
             if target.exists():
                 (target / "zarr.json").unlink(missing_ok=True)
                 shutil.rmtree(target)
         elif target.suffix == ".npz":
-            _write_npz(sibling.path, variables, attrs)
+            _write_npz(unfinished, variables, attrs)
         else:
-            _write_hdf5(sibling.path, variables, attrs)
-        os.replace(sibling.path, target)
-    except BaseException:
-        if sibling.path.is_dir():
-            shutil.rmtree(sibling.path, ignore_errors=True)
-        else:
-            sibling.path.unlink(missing_ok=True)
-        raise
+            _write_hdf5(unfinished, variables, attrs)
     return target
 
 
@@ -158,9 +149,9 @@ def _write_npz(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any
 
 
 def _write_hdf5(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
-    import h5py
+    from mars_lidar.io.hdf5 import new_file
 
-    with h5py.File(path, "w") as file:
+    with new_file(path) as file:
         file.attrs.update(attrs)
         for name, (dims, data, more) in variables.items():
             if data.dtype.kind == "U":

@@ -90,7 +90,7 @@ class MatWriter(Writer):
             fine = fine.repeat(UPSAMPLING, axis=0).repeat(UPSAMPLING, axis=1)
         else:
             fine = self._bin_hr
-        flux = recipe.flux
+        flux = recipe.flux.detected(recipe.system)
         background = float(flux.background.mean())
         sbr = float(flux.signal.mean()) / background if background > 0 else np.inf
         attrs: dict[str, Any] = {**layout.attributes(recipe), "complete": True, "registrations": registrations}

@@ -9,8 +9,11 @@ time to half a unit. Photons are in order of time. phconvert writes and validate
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
+import re
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,7 @@ from mars_lidar.timestamps import Timestamps
 
 _GROUP, _ATTRIBUTES = "mars_lidar", "attributes"  # below /user, which the format leaves to its writers
 _PHOTONS = "photon_data"
+_FULL = 2**20  # bytes free on a disk that is taken for full
 
 
 def check() -> None:
@@ -88,6 +92,11 @@ def write(path: Path, times: Timestamps) -> None:
             save_photon_hdf5(
                 content, str(path), overwrite=True, warnings=False, compression={"complevel": 1, "complib": "zlib"}
             )
+    except Exception as error:  # on a full disk PyTables tells a back trace, or phconvert that the file is wrong
+        told = re.search(r"errno = (\d+)", str(error))
+        if told is None and shutil.disk_usage(path.parent).free > _FULL:
+            raise
+        raise OSError(int(told[1]) if told else errno.ENOSPC, "Photon-HDF5 could not be written") from None
     finally:
         file = content.get("_data_file")
         if file is not None and file.isopen:

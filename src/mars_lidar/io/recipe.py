@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.flux import Flux
 from mars_lidar.stored_flux import StoredFlux
 from mars_lidar.system import System
@@ -54,6 +55,8 @@ class Recipe:
     source: str = ""
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, System):

@@ -6,9 +6,11 @@ written never looks complete, whatever stops the process.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,6 +23,10 @@ INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is writt
 
 class IncompleteFileError(ValueError):
     """The file was left by a simulation that did not finish."""
+
+
+class WriteError(OSError):
+    """The file could not be written (a full disk, say); its text says what is left on disk."""
 
 
 class CountArray(Protocol):
@@ -109,12 +115,32 @@ class TemporarySibling:
         """Put the finished file in its place."""
         os.replace(self.path, self.target)
 
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[Path]:
+        """The path to write to: published at the end, or removed, and an OSError then tells what is left."""
+        try:
+            yield self.path
+            self.publish()
+        except OSError as error:
+            raise WriteError(error.errno, f"{reason(error)}; {self.discard()}") from error
+        except BaseException:
+            self.discard()
+            raise
+
     def discard(self) -> str:
-        """Remove the unfinished file; says so."""
-        self.path.unlink(missing_ok=True)
+        """Remove the unfinished file, or folder; says so."""
+        if self.path.is_dir():
+            shutil.rmtree(self.path, ignore_errors=True)
+        else:
+            self.path.unlink(missing_ok=True)
         if self.target.exists():
             return f"{self.target} is what it was before"
         return f"nothing was left at {self.target}"
+
+
+def reason(error: OSError) -> str:
+    """Why, in the words of the operating system, which HDF5 buries under its own."""
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def check_target(path: Path, *, folder: bool, overwrite: bool) -> None:
@@ -127,7 +153,7 @@ def check_target(path: Path, *, folder: bool, overwrite: bool) -> None:
     if not (path.exists() or path.is_symlink()):
         return
     if not overwrite:
-        raise FileExistsError(f"{path} exists already; choose another name or allow overwriting")
+        raise FileExistsError(f"{path} exists already; choose another name or give --overwrite (overwrite=True)")
     # never delete what a slip of the keyboard named: only a store is replaced by a store, a file by a file
     if folder and not ((path / "zarr.json").is_file() or (path.is_dir() and not any(path.iterdir()))):
         raise FileExistsError(f"{path} exists and is not a Zarr store; it will not be overwritten")

@@ -16,6 +16,8 @@ from mars_lidar.engines import find_engine
 from mars_lidar.flux import Flux
 from mars_lidar.io.cube import Cube, check_output, create
 from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.store import WriteError as WriteError
+from mars_lidar.io.store import reason
 from mars_lidar.system import System
 
 if TYPE_CHECKING:
@@ -55,10 +57,6 @@ class Written:
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C during `simulate_to`; its text says what is left on disk."""
-
-
-class WriteError(OSError):
-    """The file could not be written (a full disk, say); its text says what is left on disk."""
 
 
 def simulate_to(
@@ -140,7 +138,7 @@ def simulate_to(
     try:
         writer = create(target, recipe, overwrite=overwrite)
     except OSError as error:
-        raise WriteError(error.errno, f"{error.strerror or error}; nothing was left at {target}") from error
+        raise WriteError(error.errno, f"{reason(error)}; nothing was left at {target}") from error
     registrations = 0
     simulate_s = write_s = 0.0
     report: dict[str, float] = {}
@@ -161,7 +159,7 @@ def simulate_to(
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; {writer.abandon()}") from None
     except OSError as error:
-        raise WriteError(error.errno, f"{error.strerror or error}; {writer.abandon()}") from error
+        raise WriteError(error.errno, f"{reason(error)}; {writer.abandon()}") from error
     except BaseException:
         writer.abandon()
         raise

@@ -37,13 +37,8 @@ def save(path: str | Path, times: Timestamps, *, overwrite: bool = False) -> Non
             f"got period_ns {times.period_ns} and cycles {times.cycles}"
         )
     check_output(target, overwrite=overwrite)
-    sibling = TemporarySibling(target)
-    try:
-        write(sibling.path, times)
-        sibling.publish()
-    except BaseException:
-        sibling.discard()
-        raise
+    with TemporarySibling(target).writing() as unfinished:
+        write(unfinished, times)
 
 
 def check_output(path: str | Path, *, overwrite: bool = False) -> None:

@@ -109,7 +109,7 @@ def fit(
     network: nn.Module,
     training: Examples,
     validation: Examples,
-    folder: Path,
+    folder: str | Path,
     plan: FitPlan,
     *,
     about: Mapping[str, Any] | None = None,
@@ -123,6 +123,7 @@ def fit(
     steps as if it had not been; one of another plan in the same folder is an error. A complete one returns at once.
     """
     place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     record = {"plan": asdict(plan), "about": dict(about or {})}
     _check_record(folder / RECORD, record)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.system import System
 
@@ -122,6 +123,8 @@ class SystemRange:
     period_ns: float | Range | None = None
     dead_time_ns: float | Range | None = None
     sigma_ns: float | Range | None = None
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if not isinstance(self.base, System):

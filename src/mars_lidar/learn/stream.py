@@ -157,6 +157,11 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         self._state.share_memory_()  # type: ignore[no-untyped-call]
         self._given = 0
 
+    def __repr__(self) -> str:
+        told = {"size": self._recipe.size, "epoch_size": self._size, "batch_size": self._batch}
+        given = ", ".join(f"{name}={value}" for name, value in told.items() if value is not None)
+        return f"CubeStream({given}, seed={self._recipe.seed}, epoch {self.epoch})"
+
     def set_epoch(self, epoch: int, start: int = 0) -> None:
         """Choose the epoch of the next pass, and its first sample: the one before which an earlier run stopped.
 

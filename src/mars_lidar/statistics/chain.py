@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.statistics._feedback import ConvergenceError, Feedback, Solution, cyclic_recursion
 from mars_lidar.statistics._gate import require_mode
 from mars_lidar.statistics.grid import cell_name, photons_per_bin
@@ -55,6 +56,8 @@ class Stationary:
     error: float
     sweeps: int
     method: str
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +106,8 @@ class PhaseChain:
     rekeep: FloatArray = field(init=False, repr=False)
     fire: FloatArray = field(init=False, repr=False)
     refire: FloatArray = field(init=False, repr=False)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         photons = np.array(self.photons, dtype=np.float64)

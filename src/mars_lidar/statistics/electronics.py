@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.detector import Mode
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray
@@ -47,6 +48,8 @@ class ElectronicsMoments:
     variance: FloatArray
     histogram: FloatArray
     bins: NDArray[np.int64]
+
+    __repr__ = brief
 
 
 def electronics_moments(

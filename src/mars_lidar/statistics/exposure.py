@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.detector import Mode
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
@@ -65,6 +66,8 @@ class Exposure:
     settled: IndexArray
     bins: IndexArray
     movement: FloatArray
+
+    __repr__ = brief
 
     @property
     def mean(self) -> FloatArray:

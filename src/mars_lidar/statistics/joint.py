@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar._memory import check_memory
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray
@@ -135,6 +136,8 @@ class JointLaw:
     grid_bins: int
     settled: int
     _pixel: Pixel | TimedPixel | None = field(repr=False)
+
+    __repr__ = brief
 
     @property
     def sweeps(self) -> int:

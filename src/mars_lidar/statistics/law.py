@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -118,6 +118,11 @@ class CountLaw:
     @cached_property
     def _width(self) -> int:
         return max(window.pmf.size for window in self._windows)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The law with its probabilities: what evaluates them when first asked for does not go to other processes."""
+        windows = self._windows
+        return {name: value for name, value in self.__dict__.items() if name != "_evaluate"} | {"_windows": windows}
 
     def __repr__(self) -> str:
         if self._shape:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.statistics._cells import Cells, FloatArray
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._gate import photons_before
@@ -41,6 +42,8 @@ class ParalyzableMoments:
     variance: FloatArray
     histogram: FloatArray
     bins: FloatArray
+
+    __repr__ = brief
 
 
 def paralyzable_moments(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.statistics._feedback import cyclic_recursion
 from mars_lidar.statistics._gate import require_mode
 from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
@@ -39,6 +40,8 @@ class MomentMatrices:
     q_mu: FloatArray
     q_mu2: FloatArray
     q_s2: FloatArray
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +80,8 @@ class HoldingTimes:
     covariance_sum: float
     relative_value: FloatArray
     defect: float
+
+    __repr__ = brief
 
 
 def moment_matrices(chain: PhaseChain) -> MomentMatrices:

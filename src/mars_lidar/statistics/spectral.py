@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.statistics._gate import require_mode
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covariances, weighted_waits
@@ -59,6 +60,8 @@ class HoldingTimeCovariance:
     _chain: PhaseChain
     _times: HoldingTimes
     _unit: float  # ns^2 per period^2
+
+    __repr__ = brief
 
     @property
     def stationary_pdf(self) -> FloatArray:

@@ -27,22 +27,16 @@ _READABLE = (1, FORMAT)  # the first kept no laws of entries
 
 def save(table: Table, path: Path, *, overwrite: bool) -> None:
     """Write all of a table; the file gets its name when it is complete."""
-    import h5py
+    from mars_lidar.io.hdf5 import new_file
 
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
     check_target(path, folder=False, overwrite=overwrite)
-    sibling = TemporarySibling(path)
-    try:
-        with h5py.File(sibling.path, "w", libver=("earliest", "v110")) as file:
-            for name, value in _header(table).items():
-                file.attrs[name] = value
-            for name, array in _arrays(table).items():
-                file.create_dataset(name, data=array)
-        sibling.publish()
-    except BaseException:
-        sibling.discard()
-        raise
+    with TemporarySibling(path).writing() as unfinished, new_file(unfinished) as file:
+        for name, value in _header(table).items():
+            file.attrs[name] = value
+        for name, array in _arrays(table).items():
+            file.create_dataset(name, data=array)
 
 
 def load(path: Path, system: System) -> Table:
@@ -139,8 +133,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Attributes and arrays; the large ones are mapped, the others read."""
     import h5py
 
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
+    if path.is_dir():
+        raise ValueError(f"{path} is not a table of mars-lidar")
     try:
         with h5py.File(path, "r") as file:
             header = dict(file.attrs.items())

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
+from mars_lidar._brief import brief
 from mars_lidar.statistics._cells import FloatArray, _broadcast, _reals
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.exposure import thread_count
@@ -64,6 +65,8 @@ class Table:
     entries: Entries = field(repr=False)
     start_phases: StartPhases = field(repr=False)
     laws: NodeLaws = field(repr=False)
+
+    __repr__ = brief
 
     @classmethod
     def build(

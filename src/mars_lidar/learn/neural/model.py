@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
+import zipfile
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from hashlib import blake2b
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mars_lidar.io.store import TemporarySibling
 from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, one_thread, rolled
 from mars_lidar.learn.neural.pairs import FluxRange
 from mars_lidar.statistics.chain import PhaseChain
@@ -130,13 +131,8 @@ class NeuralMap:
             "record": self.record,
         }
         weights = {name: value.cpu().numpy() for name, value in self.network.state_dict().items()}
-        unfinished = target.with_name(target.name + ".incomplete")
-        try:
-            with unfinished.open("wb") as file:
-                np.savez_compressed(file, header=np.array(json.dumps(header)), **weights)
-            os.replace(unfinished, target)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with TemporarySibling(target).writing() as unfinished, unfinished.open("wb") as file:
+            np.savez_compressed(file, header=np.array(json.dumps(header)), **weights)
 
     @classmethod
     def load(cls, path: str | Path) -> NeuralMap:
@@ -144,6 +140,8 @@ class NeuralMap:
         source = Path(path)
         if not source.is_file():
             raise FileNotFoundError(f"{source}: there is no such file of a neural map")
+        if not zipfile.is_zipfile(source):
+            raise ValueError(f"{source} must be a neural map (mars-lidar neural train writes one)")
         try:
             with source.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 header = json.loads(str(stored["header"]))

@@ -1,0 +1,39 @@
+"""One short line for every public object: what a notebook or a debugger shows must not fill the screen."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+_MOST_VALUES = 4  # of an array or a sequence that is written out; larger ones by type and shape
+_MOST_TEXT = 240  # characters of anything else, such as a system inside of a result
+
+
+def brief(self: Any) -> str:
+    """The ``__repr__`` of a dataclass: fields that differ from their defaults, large arrays by type and shape only."""
+    told = []
+    for field in dataclasses.fields(self):
+        value = getattr(self, field.name)
+        if field.repr and not _is_default(field, value):
+            told.append(f"{field.name}={_shown(value)}")
+    return f"{type(self).__name__}({', '.join(told)})"
+
+
+def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
+    default = field.default
+    if field.default_factory is not dataclasses.MISSING:
+        default = field.default_factory()
+    return default is value or (type(default) is type(value) and not isinstance(value, np.ndarray) and default == value)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, np.ndarray) and value.size > _MOST_VALUES:
+        return f"<{value.dtype} {value.shape}>"
+    if isinstance(value, np.ndarray):
+        return np.array2string(value, precision=6, separator=", ", max_line_width=10**6).replace("\n", "")
+    if isinstance(value, list | tuple) and len(value) > _MOST_VALUES:
+        return f"<{type(value).__name__} of {len(value)}>"
+    text = repr(value)
+    return text if len(text) <= _MOST_TEXT else f"{type(value).__name__}(...)"

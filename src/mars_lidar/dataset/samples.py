@@ -6,7 +6,8 @@ import math
 import warnings
 from collections.abc import Sequence
 
-from mars_lidar.dataset.recipe import DatasetRecipe, Light
+from mars_lidar.dataset.light import Light
+from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.flux import Flux
 from mars_lidar.scene import Scene
 from mars_lidar.system import System

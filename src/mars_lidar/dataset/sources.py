@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar.dataset.recipe import DatasetRecipe, listed_numbers
+from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.samples import flux_of
+from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
 from mars_lidar.flux import Flux
 from mars_lidar.io.scan import Problem, SceneFile, scan

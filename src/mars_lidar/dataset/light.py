@@ -57,3 +57,12 @@ def read_light(data: Any) -> Light:
         ambient=ambient,
         dark_counts_per_s=values.real((*key, "dark_counts_per_s"), known.get("dark_counts_per_s", 0.0), low=0.0),
     )
+
+
+def refuse_for_transients(light: Light) -> None:
+    """Raise where a dataset with rendered light says of all of it what only surfaces have."""
+    if light.attenuation != "none":
+        told = f"attenuation is for surfaces; transients have it in them, got {light.attenuation!r}"
+        raise RecipeError(("light", "attenuation"), told)
+    if light.ambient not in (None, "uniform"):
+        raise RecipeError(("light", "ambient"), f"ambient must be uniform with transients, got {light.ambient!r}")

@@ -10,7 +10,7 @@ from typing import Any
 
 from mars_lidar.dataset import values
 from mars_lidar.dataset.entries import read_scenes
-from mars_lidar.dataset.light import Light, read_light
+from mars_lidar.dataset.light import Light, read_light, refuse_for_transients
 from mars_lidar.dataset.lines import Key, RecipeError, line_of, read_yaml
 from mars_lidar.system import System
 
@@ -25,7 +25,8 @@ class DatasetRecipe:
     Attributes
     ----------
     scenes
-        Sources as plain data: ``{"example": "room", "size": 64, "seeds": [0, 1]}`` or ``{"path": "nyu/", ...}``.
+        Sources as plain data: ``{"example": "room", "size": 64, "seeds": [0, 1]}``, ``{"path": "nyu/", ...}`` or
+        ``{"transient": "renders/", ...}``.
     systems
         Lasers, detectors and histograms; they share the number of bins.
     light
@@ -93,10 +94,13 @@ class DatasetRecipe:
             raise RecipeError(("store", "shard_mib"), f"shard_mib must be at least chunk_mib, {chunk:g}, got {shard:g}")
         systems = _systems(root["systems"], folder or Path())
         engine = values.checked(("engine",), _engine, root.get("engine", "exact"), systems)
+        scenes, light = read_scenes(root["scenes"]), read_light(root.get("light") or {})
+        if any("transient" in one for one in scenes):
+            refuse_for_transients(light)
         return cls(
-            scenes=read_scenes(root["scenes"]),
+            scenes=scenes,
             systems=systems,
-            light=read_light(root.get("light") or {}),
+            light=light,
             size=values.size(("size",), root.get("size")),
             crop=crop,
             crops=crops,

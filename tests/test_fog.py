@@ -6,7 +6,7 @@ import csv
 
 import numpy as np
 import pytest
-from scipy import integrate
+from scipy import integrate, special
 
 import mars_lidar as ml
 from mars_lidar.studies.__main__ import main
@@ -51,6 +51,24 @@ def test_limits():
     assert thick.info["extinction_per_m"] == 3.0
     near = ml.Flux(1.0, 0.0, 3.0).in_fog(SYSTEM, extinction_per_m=0.1, backscatter=5.0)  # before the fog begins
     assert near.signal[0, 0] == pytest.approx(np.exp(-0.2 * 1.5 * C), rel=1e-6)
+
+
+def test_light_that_comes_many_periods_late():
+    """Thin fog without a target: light from 50 km on 15 m of range, in a memory that does not grow with it."""
+    quick = SYSTEM.replace(pulse=ml.GaussianPulse(sigma_ns=0.001))
+    flux = ml.Flux([[0.0, 1.0]], 0.0, [[np.nan, 3e5]]).in_fog(
+        quick, extinction_per_m=1e-5, backscatter=1.0, nearest_m=0.5, parts=16
+    )
+
+    def share(z):
+        z = np.maximum(z, 0.5)
+        return 1.0 - special.expn(2, 2e-5 * z) / z * 0.5 / special.expn(2, 1e-5)
+
+    edges = np.arange(16 * 20_000 + 1) * (0.5 * C * 100.0 / 16)
+    for pixel, end in ((0, np.inf), (1, 0.5 * C * 3e5)):
+        expected = np.diff(share(np.minimum(edges, end))).reshape(-1, 16).sum(0)
+        expected += np.exp(-2e-5 * end) * quick.pulse.bin_energy(3e5, 100.0, 16) if pixel else 0.0
+        assert flux.waveform[0, pixel] == pytest.approx(expected, abs=1e-6)
 
 
 def test_bad_input():

@@ -1,9 +1,10 @@
-"""From a scene to photons: signal level, attenuation, ambient light, dark counts. Formulas: `Scene.flux`."""
+"""From surfaces to photons: signal level, attenuation, ambient light, dark counts. Formulas: `Scene.flux`."""
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ _AMBIENTS = ("uniform", "reflectivity", "map")
 
 
 def scene_flux(
-    scene: Scene,
+    layers: Sequence[Scene],
     system: System,
     signal: float,
     sbr: float,
@@ -32,27 +33,34 @@ def scene_flux(
     ambient: str | None,
     dark_counts_per_s: float,
 ) -> Flux:
-    """The body of `Scene.flux`, which documents arguments, formulas and warnings."""
+    """The body of `Scene.flux` and `LayeredScene.flux`, which document arguments, formulas and warnings.
+
+    `layers` are surfaces on the rays of the same pixels; the ambient map is that of the first.
+    """
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {system!r}")
     level = _validate.real("signal", signal, low=0.0, strict_low=True)
     ratio = _ratio(sbr)
     _validate.choice("attenuation", attenuation, _ATTENUATIONS)
+    scene = layers[0]
     light_name = ("uniform" if scene.background is None else "map") if ambient is None else ambient
     _validate.choice("ambient", light_name, _AMBIENTS)
     rate = _validate.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
-    light = _ambient_light(scene, light_name)
-    valid = scene.valid
+    light = _ambient_light(layers, light_name)
+    depth = np.stack([one.depth_m for one in layers])
+    there = ~np.isnan(depth)
+    valid = np.asarray(there.any(axis=0))
     if not valid.any():
         raise ValueError("depth_m is NaN at every pixel: there is no return to set a signal level with")
     reach = system.unambiguous_range_m
 
-    s = _scaled(_returned(scene, valid, attenuation), level, valid, "reflectivity", f"signal={level:g}")
+    returned = _returned(layers, depth, there, attenuation)
+    s = _scaled(returned, level, valid, "reflectivity", f"signal={level:g}")
     b = np.zeros(scene.shape)
     if ratio < math.inf:
-        b = _scaled(light, level / ratio, valid, "ambient light", f"sbr={ratio:g}")
+        b = _scaled(light[None], level / ratio, valid, "ambient light", f"sbr={ratio:g}")[0]
     dark = rate * system.period_ns * 1e-9 / system.detector.detection_efficiency  # photons for as many counts
-    wrapped = int(np.count_nonzero(scene.depth_m[valid] >= reach))
+    wrapped = int(np.count_nonzero((np.where(there, depth, 0.0) >= reach).any(axis=0)))
     info = {
         "source": "Scene.flux",
         "signal": level,
@@ -66,41 +74,46 @@ def scene_flux(
         "n_valid": int(np.count_nonzero(valid)),
         "n_wrapped": wrapped,
         "unambiguous_range_m": reach,
-        **_means(s[valid], b[valid], dark),
+        **_means(s.sum(axis=0)[valid], b[valid], dark),
     }
-    flux = Flux(signal=s, background=b + dark, delay_ns=system.delay_ns(scene.depth_m), info=info)
+    delay = system.delay_ns(depth)
+    flux = Flux(signal=s[0], background=b + dark, delay_ns=delay[0], info=info)
+    if len(layers) > 1:
+        others = [Flux(signal=one, delay_ns=tau) for one, tau in zip(s[1:], delay[1:], strict=True)]
+        flux = Flux.multi(flux, *others, info=info)
     _warn(int(np.count_nonzero(~valid)), wrapped, valid.size, reach)
     return flux
 
 
-def _ambient_light(scene: Scene, name: str) -> FloatArray:
+def _ambient_light(layers: Sequence[Scene], name: str) -> FloatArray:
     """Relative ambient light (H, W)."""
+    scene = layers[0]
     if name == "uniform":
         return np.ones(scene.shape)
-    if name == "reflectivity":
-        return scene.reflectivity
+    if name == "reflectivity":  # each surface scatters it
+        more = [np.where(one.valid, one.reflectivity, 0.0) for one in layers[1:]]
+        return sum(more, start=scene.reflectivity)
     if scene.background is None:
         raise ValueError("ambient='map' needs a scene with a background map, got one without")
     return scene.background
 
 
-def _returned(scene: Scene, valid: NDArray[np.bool_], attenuation: str) -> FloatArray:
-    """Relative returned laser light (H, W), 0 where nothing returns."""
-    share = np.where(valid, scene.reflectivity, 0.0)
+def _returned(layers: Sequence[Scene], depth: FloatArray, there: NDArray[np.bool_], attenuation: str) -> FloatArray:
+    """Relative returned laser light (layers, H, W), 0 where nothing returns."""
+    share = np.where(there, np.stack([one.reflectivity for one in layers]), 0.0)
     if attenuation == "inverse_square":
         # Relative to the nearest depth: the same after normalisation, and nothing overflows.
-        nearest = scene.depth_m[valid].min()
-        share *= (nearest / np.where(valid, scene.depth_m, np.inf)) ** 2
+        share *= (depth[there].min() / np.where(there, depth, np.inf)) ** 2
     return share
 
 
 def _scaled(light: FloatArray, mean: float, valid: NDArray[np.bool_], what: str, asked: str) -> FloatArray:
-    """A relative map scaled to a mean over the valid pixels."""
-    top = float(light[valid].max())
+    """Relative maps (K, H, W) scaled together, so that their sum has a mean over the valid pixels."""
+    top = float(light.sum(axis=0)[valid].max())
     if top == 0.0:
         raise ValueError(f"{what} is zero at every pixel with a return: {asked} cannot be reached")
     relative = light / top  # to order one first: a map of 1e-300 scales as well as one of 1e300
-    scaled: FloatArray = relative * (mean / float(relative[valid].mean()))
+    scaled: FloatArray = relative * (mean / float(relative.sum(axis=0)[valid].mean()))
     return scaled
 
 

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar import _validate
 from mars_lidar.flux import Flux
 from mars_lidar.radiometry import scene_flux
+from mars_lidar.resample import area_mean, image_size, nearest, new_size, window
 from mars_lidar.system import System
 
 FloatArray = NDArray[np.float64]
 
 _EXAMPLES = ("room", "random")
 _MAX_DEPTH_M = 1e9  # beyond the Moon; keeps delays far inside what a double resolves to a picosecond
-_MAX_SIDE = 1 << 13
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -98,11 +98,7 @@ class Scene:
 
     def __getitem__(self, key: Any) -> Scene:
         """A crop: ``scene[rows, columns]`` with slices."""
-        keys = key if isinstance(key, tuple) else (key,)
-        if len(keys) > 2 or not all(isinstance(k, slice) for k in keys):
-            raise IndexError(f"scene takes one or two slices (rows, columns), got {key!r}")
-        if self.depth_m[keys].size == 0:
-            raise IndexError(f"scene[{key!r}] selects no pixel of {self.shape}")
+        keys = window("scene", key, self.shape)
         return self._with(lambda depth: depth[keys], lambda image: image[keys])
 
     def resize(self, size: int | tuple[int, int]) -> Scene:
@@ -116,15 +112,11 @@ class Scene:
         size
             (H, W), or the longer side: the other one then keeps the aspect ratio.
         """
-        if isinstance(size, tuple | list):
-            height, width = _image_size(size)
-        else:
-            longer = _validate.integer("size", size, low=1, high=_MAX_SIDE)
-            height, width = (max(1, round(longer * n / max(self.shape))) for n in self.shape)
-        rows, columns = _nearest(self.shape[0], height), _nearest(self.shape[1], width)
+        height, width = new_size(size, self.shape)
+        rows, columns = nearest(self.shape[0], height), nearest(self.shape[1], width)
         return self._with(
             lambda depth: depth[np.ix_(rows, columns)],
-            lambda image: _area_mean(_area_mean(image, height, axis=0), width, axis=1),
+            lambda image: area_mean(area_mean(image, height, axis=0), width, axis=1),
         )
 
     def _with(self, depth: Any, image: Any) -> Scene:
@@ -191,7 +183,7 @@ class Scene:
             An argument of the wrong kind or out of range; no valid pixel; a level or ratio that cannot be
             reached because reflectivity or ambient light is zero at every valid pixel.
         """
-        return scene_flux(self, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+        return scene_flux((self,), system, signal, sbr, attenuation, ambient, dark_counts_per_s)
 
     @staticmethod
     def example_names() -> tuple[str, ...]:
@@ -218,7 +210,7 @@ class Scene:
         """
         _validate.choice("name", name, _EXAMPLES)
         seed = _validate.integer("seed", seed, low=0, high=2**64 - 1)
-        shape = _image_size(size if isinstance(size, tuple | list) else (size, size))
+        shape = image_size(size if isinstance(size, tuple | list) else (size, size))
         if name == "random":
             from mars_lidar.random_scene import random_scene
 
@@ -294,28 +286,3 @@ def _refuse(name: str, array: FloatArray, wrong: NDArray[np.bool_], allowed: str
     if wrong.any():
         where = tuple(int(k) for k in np.argwhere(wrong)[0])
         raise ValueError(f"{name} must be {allowed}, got {array[where]} at pixel {where}")
-
-
-def _image_size(size: Any) -> tuple[int, int]:
-    if len(size) != 2:
-        raise ValueError(f"size must be one integer or (height, width), got {size!r}")
-    height, width = (_validate.integer("size", n, low=1, high=_MAX_SIDE) for n in size)
-    return height, width
-
-
-def _nearest(old: int, new: int) -> NDArray[np.intp]:
-    """Old pixel under the centre of each new one; integer arithmetic, so halves never depend on rounding."""
-    return (2 * np.arange(new) + 1) * old // (2 * new)
-
-
-def _area_mean(image: FloatArray, new: int, axis: int) -> FloatArray:
-    """Mean of a piecewise constant image over each of `new` equal parts of an axis."""
-    old = image.shape[axis]
-    if new == old:
-        return image
-    x = np.moveaxis(image, axis, 0)
-    before = np.concatenate((np.zeros((1, *x.shape[1:])), np.cumsum(x, axis=0)))  # integral up to each edge
-    whole, part = np.divmod(np.arange(new + 1) * old, new)
-    inner = x[np.minimum(whole, old - 1)] * (part / new).reshape(-1, *(1,) * (x.ndim - 1))
-    mean = np.diff(before[whole] + inner, axis=0) * (new / old)
-    return np.moveaxis(np.clip(mean, image.min(), image.max()), 0, axis)  # the sums' rounding stays inside

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar import _validate
 from mars_lidar._memory import check_memory
 from mars_lidar.flux import Flux
+from mars_lidar.pulse import Pulse
+from mars_lidar.rate_parts import CroppedRates, ResizedRates
+from mars_lidar.resample import new_size, window
 from mars_lidar.stored_flux import StoredFlux
 from mars_lidar.system import System
 
@@ -52,10 +55,18 @@ class Transient:
         Travel time at the start of bin 0, ns.
     source
         Where it comes from, for the record.
+    totals
+        (H, W), sums over all bins, where they are known already: else the values are read once for them.
     """
 
     def __init__(
-        self, values: RateArray | ArrayLike, bin_ns: float, *, start_ns: float = 0.0, source: str = ""
+        self,
+        values: RateArray | ArrayLike,
+        bin_ns: float,
+        *,
+        start_ns: float = 0.0,
+        source: str = "",
+        totals: ArrayLike | None = None,
     ) -> None:
         self.bin_ns = _validate.real("bin_ns", bin_ns, low=0.0, strict_low=True)
         self.start_ns = _validate.real("start_ns", start_ns)
@@ -64,6 +75,10 @@ class Transient:
             raise ValueError(f"values must be (H, W, T) with at least one bin, got shape {tuple(rates.shape)}")
         self.values: RateArray = rates
         self.source = source
+        if totals is not None:
+            self.totals = np.asarray(totals, dtype=np.float64)
+            if self.totals.shape != self.shape:
+                raise ValueError(f"totals must have shape {self.shape}, got {self.totals.shape}")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -75,10 +90,22 @@ class Transient:
         h, w, bins = self.values.shape
         return f"Transient({h} x {w} pixels, {bins} bins of {self.bin_ns:.6g} ns from {self.start_ns:.6g} ns)"
 
+    def __getitem__(self, key: Any) -> Transient:
+        """A crop: ``transient[rows, columns]`` with slices; nothing is read."""
+        rows, columns = window("transient", key, self.shape)
+        return self._with(CroppedRates(self.values, rows, columns))
+
+    def resize(self, size: int | tuple[int, int]) -> Transient:
+        """At another size, (H, W) or the longer side: mean light over the area of the new pixels; nothing is read."""
+        return self._with(ResizedRates(self.values, new_size(size, self.shape)))
+
+    def _with(self, values: RateArray) -> Transient:
+        return Transient(values, self.bin_ns, start_ns=self.start_ns, source=self.source)
+
     @cached_property
     def totals(self) -> FloatArray:
         """Light of each pixel (H, W): the sum over all bins. Reads the whole transient once, band by band."""
-        return np.concatenate([self._rows(rows).sum(-1) for rows in self.bands()])
+        return np.concatenate([self.rows(some).sum(-1) for some in self.bands()])
 
     def bands(self, band_bytes: int = _BAND_BYTES) -> Iterator[slice]:
         """Rows that take at most about `band_bytes` as float64 each, at least one; together the image."""
@@ -152,8 +179,7 @@ class Transient:
         first, last, stride = rows.indices(self.shape[0])
         if stride != 1 or first >= last:
             raise ValueError(f"rows must select a run of at least one of {self.shape[0]}, got {rows!r}")
-        number = max(system.bins, math.ceil(system.period_ns / self.bin_ns * (1 - 1e-12)))
-        number = _validate.integer("parts", number if parts is None else parts, low=1, high=_MAX_PARTS)
+        number = _validate.integer("parts", parts_of(self, system) if parts is None else parts, low=1, high=_MAX_PARTS)
         lit = self.totals[self.totals > 0]
         if lit.size == 0:
             raise ValueError("values must have light in some pixel, got none")
@@ -164,16 +190,12 @@ class Transient:
         size = 8 * (last - first) * self.shape[1] * number
         check_memory(4 * size, "the waveforms of these rows", "take fewer rows at a time")  # Flux keeps a copy
         waveform = np.empty((last - first, self.shape[1], number))
-        spread = _spread_spectrum(system, number) if pulse else None
         step = max(1, _WORK_BYTES // (8 * self.shape[1] * max(number, self.values.shape[2])))
         for begin in range(first, last, step):
             here = slice(begin, min(begin + step, last))
-            light = self._on_period(self._rows(here), system.period_ns, number)
-            if spread is not None:
-                total = light.sum(-1, keepdims=True)
-                light = np.fft.irfft(np.fft.rfft(light) * spread, n=number)
-                light = np.maximum(light, 0.0)  # the transform's rounding
-                light *= np.divide(total, light.sum(-1, keepdims=True), out=np.zeros_like(total), where=total > 0)
+            light = self._on_period(self.rows(here), system.period_ns, number)
+            if pulse:
+                light = through_pulse(light, system)
             waveform[here.start - first : here.stop - first] = scale * light
         info = {
             "transient": self.source,
@@ -217,7 +239,8 @@ class Transient:
         background = np.full(self.shape, first.info["mean_background"])
         return StoredFlux(scale * self.totals, background, first.waveform.shape[-1], make, first.info)
 
-    def _rows(self, rows: slice) -> FloatArray:
+    def rows(self, rows: slice) -> FloatArray:
+        """Light of some rows (rows, W, T), checked."""
         values = np.asarray(self.values[rows])
         if values.dtype.kind not in "fiu":
             raise TypeError(f"values must be real numbers, got dtype {values.dtype}")
@@ -246,10 +269,26 @@ class Transient:
         return np.maximum(out, 0.0)
 
 
-def _spread_spectrum(system: System, number: int) -> NDArray[np.complex128]:
+def parts_of(transient: Transient, system: System) -> int:
+    """Parts of a waveform as fine as the transient and the histogram."""
+    return max(system.bins, math.ceil(system.period_ns / transient.bin_ns * (1 - 1e-12)))
+
+
+def through_pulse(light: FloatArray, system: System) -> FloatArray:
+    """Light in equal parts of the period (..., T), even inside each, after the system's pulse; its energy is kept."""
+    number = light.shape[-1]
+    total = light.sum(-1, keepdims=True)
+    spread = np.fft.irfft(np.fft.rfft(light) * _spectrum(system.pulse, system.period_ns, number), n=number)
+    spread = np.maximum(spread, 0.0)  # the transform's rounding
+    spread *= np.divide(total, spread.sum(-1, keepdims=True), out=np.zeros_like(total), where=total > 0)
+    return spread
+
+
+@lru_cache(maxsize=4)
+def _spectrum(pulse: Pulse, period_ns: float, number: int) -> NDArray[np.complex128]:
     """Transform of the pulse's energy in each part, for light that is spread evenly over part 0."""
-    part_ns = system.period_ns / number
+    part_ns = period_ns / number
     energy = np.zeros(number)
     for k in range(_DELAYS):
-        energy += system.pulse.bin_energy((k + 0.5) / _DELAYS * part_ns, system.period_ns, number)
+        energy += pulse.bin_energy((k + 0.5) / _DELAYS * part_ns, period_ns, number)
     return np.fft.rfft(energy / _DELAYS)

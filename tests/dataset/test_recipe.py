@@ -67,7 +67,7 @@ def test_options_replace_values(write):
         ("example: room", "example: rome", 3, "must be one of 'room', 'random', got 'rome'"),
         ("size: 16", "size: [1, 2, 3]", 4, r"scenes\[0\].size must be an integer or \[height, width\]"),
         ("count: 3}", "count: x}", 5, r"scenes\[0\].seeds.count must be an integer"),
-        ("path: nyu", "paths: nyu", 6, "must give one of example and path"),
+        ("path: nyu", "paths: nyu", 6, "must give one of example, path and transient"),
         ('pattern: "*_depth.png"', "pattern: 4", 7, "pattern must be a text"),
         ("size: 8,", "size: 0,", 8, r"crop.size must be an integer in \[1, 8192\], got 0"),
         ("system.yaml", "other.yaml", 10, "No such file"),

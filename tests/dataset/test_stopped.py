@@ -38,7 +38,8 @@ except (io.Interrupted, io.WriteError) as error:
 """
 
 
-def _run(recipe: dict, out: Path, how: str, number: int) -> subprocess.CompletedProcess[str]:
+def stopped(recipe: dict, out: Path, how: str, number: int) -> subprocess.CompletedProcess[str]:
+    """A run that ends at a part, at a full disk, or before its scenes are in."""
     text = DatasetRecipe.from_dict(recipe).to_json()
     return subprocess.run(
         [sys.executable, "-c", _SCRIPT, text, str(out), how, str(number)], capture_output=True, text=True
@@ -56,7 +57,7 @@ def whole(tmp_path, recipe) -> dict[str, bytes]:
 @pytest.mark.parametrize(("how", "number"), [("kill", 1), ("kill", 11), ("int", 5), ("scenes", 0)])
 def test_a_run_that_was_stopped_goes_on(tmp_path, recipe, whole, how, number):
     out = tmp_path / "set.zarr"
-    ran = _run(recipe, out, how, number)
+    ran = stopped(recipe, out, how, number)
     if how == "int":
         assert ran.stdout.startswith("Interrupted interrupted; "), ran.stderr
         assert "parts of" in ran.stdout
@@ -78,7 +79,7 @@ def test_a_run_that_was_stopped_goes_on(tmp_path, recipe, whole, how, number):
 
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 def test_without_its_scenes_a_store_needs_its_recipe(tmp_path, recipe):
-    _run(recipe, tmp_path / "set.zarr", "scenes", 0)
+    stopped(recipe, tmp_path / "set.zarr", "scenes", 0)
     with pytest.raises(ValueError, match="give the recipe again"):
         ml.generate(None, tmp_path / "set.zarr", resume=True)
 
@@ -97,7 +98,7 @@ def test_a_shard_that_was_cut_short_is_made_again(tmp_path, recipe, whole):
 def test_a_full_disk_is_told_and_the_run_goes_on_afterwards(tmp_path, recipe, whole):
     out = tmp_path / "set.zarr"
     limit = max(len(one) for name, one in whole.items() if name.startswith("histogram/c")) - 20
-    ran = _run(recipe, out, "disk", limit)
+    ran = stopped(recipe, out, "disk", limit)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.startswith("WriteError File too large; "), ran.stdout
     assert "marked incomplete" in ran.stdout

@@ -33,6 +33,7 @@ GENERATE_EPILOG = "\n\n".join(
 
 
 _RECIPES = (".yaml", ".yml")
+_TRANSIENTS = (".h5", ".hdf5")  # a depth is never in one; the other files of transients need a recipe
 
 
 def _many(text: str, panel: str = "Light") -> Any:
@@ -44,7 +45,9 @@ def generate(
     source: Annotated[
         Path | None,
         typer.Argument(
-            help="A recipe (.yaml, .yml), a built-in scene (room), or RGB-D: a file or a folder.", show_default=False
+            help="A recipe (.yaml, .yml), a built-in scene (room), RGB-D (a file or a folder), or a rendered transient "
+            "(.h5, .hdf5).",
+            show_default=False,
         ),
     ] = None,
     size: Annotated[
@@ -219,6 +222,10 @@ def _recipe(
         if scene_seeds is not None:
             raise ValueError(f"--scene-seeds belongs to a built-in scene, and {source} is none")
         scene = {"path": str(source), **rgbd}
+        if source.suffix.lower() in _TRANSIENTS:
+            if rgbd:
+                raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
+            scene = {"transient": str(source)}
     return DatasetRecipe.from_dict({"systems": _default_systems(), **replaced, "scenes": scene})
 
 

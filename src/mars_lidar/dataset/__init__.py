@@ -8,8 +8,9 @@ from mars_lidar.dataset.run import Generated, generate
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.estimate import Estimate, estimate
+    from mars_lidar.dataset.light import Light
     from mars_lidar.dataset.read import read_sparse
-    from mars_lidar.dataset.recipe import DatasetRecipe, Light
+    from mars_lidar.dataset.recipe import DatasetRecipe
     from mars_lidar.dataset.store import Dataset, open_dataset
     from mars_lidar.dataset.verify import Verified, verify
 
@@ -17,7 +18,7 @@ _MODULES = {
     "Dataset": "store",
     "DatasetRecipe": "recipe",
     "Estimate": "estimate",
-    "Light": "recipe",
+    "Light": "light",
     "Verified": "verify",
     "estimate": "estimate",
     "open_dataset": "store",

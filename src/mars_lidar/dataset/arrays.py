@@ -13,7 +13,8 @@ from mars_lidar.dataset import samples
 from mars_lidar.dataset.recipe import DatasetRecipe
 
 FORMAT = "mars-lidar dataset"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # of datasets whose scenes are one surface each, in clear air
+MORE_VERSION = 2  # of others, which an older mars-lidar must not take for such
 DIMS = ("sample", "realization", "y", "x", "time")
 PHOTONS = "photons per laser period"
 MAPS = {

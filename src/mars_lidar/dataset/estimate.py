@@ -14,10 +14,10 @@ import numpy as np
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import MAPS, histogram_array, histogram_blocks
 from mars_lidar.dataset.recipe import DatasetRecipe
-from mars_lidar.dataset.run import BUFFER_BYTES, read_recipe
+from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
+from mars_lidar.dataset.shown import Rendered, Shown
 from mars_lidar.dataset.sources import Candidate, Named, candidates, scenes
 from mars_lidar.io.scan import Problem
-from mars_lidar.scene import Scene
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -88,12 +88,13 @@ def estimate(
     total = samples.count_samples(plan, number)
     image = looked[0].shape
     shape, dtype, chunk, shard = histogram_blocks(plan, total, image)
-    seconds, ratio = _probe(plan, looked, chunk, dtype)
+    seconds, ratio = _probe(plan, looked, chunk, shard[1], dtype)
     dense = math.prod(shape) * dtype.itemsize
     pixels = math.prod(image)
-    maps = 4 * len(MAPS) * pixels * total + 16 * pixels * number
+    maps = 4 * len(MAPS) * pixels * total + sum(map(_scene_bytes, looked)) // len(looked) * number
     team = threads or _default_threads()
-    block = math.prod(chunk) * dtype.itemsize
+    parts = max(one.waveform_parts(system) for one in looked for system in plan.systems)
+    block = making_bytes(chunk, dtype.itemsize, parts)
     shards = math.prod(math.ceil(a / b) for a, b in zip(shape, shard, strict=True))
     teams = max(1, min(team, shards, BUFFER_BYTES // block))
     return Estimate(
@@ -113,11 +114,11 @@ def estimate(
 
 def _looked_at(
     found: list[Candidate], plan: DatasetRecipe, problems: list[Problem]
-) -> tuple[list[Scene], float]:
+) -> tuple[list[Shown], float]:
     """Some scenes of one size, and the seconds that reading one took."""
     began = time.perf_counter()
     chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, _SCENES)})
-    good: list[Scene] = []
+    good: list[Shown] = []
     for k in chosen:
         for one in scenes(found[k], plan, good[0].shape if good else None):
             if isinstance(one, Named):
@@ -127,21 +128,33 @@ def _looked_at(
     return good, (time.perf_counter() - began) / max(1, len(chosen))
 
 
+def _scene_bytes(shown: Shown) -> int:
+    """Of one scene in the store, not packed."""
+    maps = 3 + shown.transient.values.shape[2] if isinstance(shown, Rendered) else 2 * len(shown.layers)
+    return 8 * maps * math.prod(shown.shape)
+
+
 def _probe(
-    plan: DatasetRecipe, looked: list[Scene], chunk: tuple[int, ...], dtype: np.dtype[Any]
+    plan: DatasetRecipe, looked: list[Shown], chunk: tuple[int, ...], shard: int, dtype: np.dtype[Any]
 ) -> tuple[float, float]:
-    """Seconds of one thread per exposure of a pixel, and bytes on disk over dense bytes."""
+    """Seconds of one thread per exposure of a pixel, and bytes on disk over dense bytes.
+
+    `shard` exposures of a sample are made one after the other.
+    """
     from mars_lidar.simulate import simulate
 
     random = np.random.default_rng(0)
     every = samples.count_samples(plan, len(looked))
     rows, columns = chunk[2], chunk[3]
     seconds, packed, dense, exposures = 0.0, 0, 0, 0
+    together = min(shard, plan.realizations)  # exposures that share a flux
     for k, sample in enumerate(random.choice(every, min(every, _PROBES), replace=False)):
         scene, system, signal, sbr = samples.sample_parts(plan, int(sample))
-        flux = samples.flux_of(looked[scene], plan.systems[system], plan.light, signal, sbr)
+        flux = looked[scene].flux(plan.systems[system], plan.light, signal, sbr)
         y, x = (int(random.integers(n - m + 1)) for n, m in zip(looked[0].shape, (rows, columns), strict=True))
+        began = time.perf_counter()
         part = flux[y : y + rows, x : x + columns]
+        seconds += (time.perf_counter() - began) / together
 
         def once(part: Any = part, system: int = system, seed: int = k) -> tuple[float, NDArray[Any], int]:
             began = time.perf_counter()

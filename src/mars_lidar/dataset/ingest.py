@@ -14,6 +14,7 @@ from mars_lidar.dataset.arrays import (
     FORMAT,
     FORMAT_VERSION,
     MAPS,
+    MORE_VERSION,
     PHOTONS,
     create_histogram,
     create_list,
@@ -21,9 +22,9 @@ from mars_lidar.dataset.arrays import (
     mark,
 )
 from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.scenes import SceneWriter
 from mars_lidar.dataset.sources import candidates, scenes, seed_of
 from mars_lidar.io.scan import Problem
-from mars_lidar.scene import Scene
 
 
 def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
@@ -49,10 +50,8 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
         told = "\n".join(f"  {problem}" for problem in problems[:5])
         more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""
         raise ValueError(f"none of the scenes can be used:\n{told}{more}")
-    shape = writer.shape
-    assert shape is not None
     writer.finish()
-    lay_out(group, recipe, writer.names, shape, problems)
+    lay_out(group, recipe, writer, problems)
 
 
 def begin(path: Path, recipe: DatasetRecipe) -> Any:
@@ -75,64 +74,10 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
     return zarr.create_group(path, zarr_format=3, attributes=attrs)
 
 
-class SceneWriter:
-    """Takes scenes one by one into the group ``scenes`` of a new store; memory for one shard."""
-
-    def __init__(self, group: Any, most: int) -> None:
-        self._group = group.create_group("scenes")
-        self._most = most
-        self._arrays: dict[str, Any] = {}
-        self._held: list[Scene] = []
-        self.names: list[str] = []
-        self._written = 0
-
-    @property
-    def shape(self) -> tuple[int, int] | None:
-        """(H, W) of all scenes, None before the first."""
-        return tuple(self._arrays["depth"].shape[1:]) if self._arrays else None
-
-    def add(self, name: str, scene: Scene) -> None:
-        """One more scene."""
-        if not self._arrays:
-            shape = (self._most, *scene.shape)
-            for array, unit in (("depth", "m"), ("reflectivity", "1"), ("background", "relative")):
-                self._arrays[array] = create_maps(
-                    self._group, array, shape, np.dtype(np.float64), ("scene", "y", "x"), array, unit
-                )
-        self.names.append(name)
-        self._held.append(scene)
-        if len(self._held) == self._arrays["depth"].shards[0]:
-            self._flush()
-
-    def finish(self) -> int:
-        """Write the rest and cut the arrays to their length; returns it."""
-        self._flush()
-        for array in self._arrays.values():
-            array.resize((self._written, *array.shape[1:]))
-        rows = [name.encode() for name in self.names]
-        table = np.zeros((len(rows), max(map(len, rows))), np.uint8)
-        for row, text in zip(table, rows, strict=True):
-            row[: len(text)] = np.frombuffer(text, np.uint8)
-        create_list(self._group, "name", table, ("scene", "letter"), "name of the scene, UTF-8", "1")
-        return self._written
-
-    def _flush(self) -> None:
-        part = slice(self._written, self._written + len(self._held))
-        if self._held:
-            self._arrays["depth"][part] = np.stack([one.depth_m for one in self._held])
-            self._arrays["reflectivity"][part] = np.stack([one.reflectivity for one in self._held])
-            if any(one.background is not None for one in self._held):
-                nothing = np.full(self._held[0].shape, np.nan)
-                light = [nothing if one.background is None else one.background for one in self._held]
-                self._arrays["background"][part] = np.stack(light)
-        self._written = part.stop
-        self._held.clear()
-
-
-def lay_out(
-    group: Any, recipe: DatasetRecipe, names: list[str], shape: tuple[int, int], problems: list[Problem]
-) -> None:
+def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: list[Problem]) -> None:
     """Create all arrays of the samples, write the small ones, and mark the store as planned."""
+    names, shape = writer.names, writer.shape
+    assert shape is not None
     number = samples.count_samples(recipe, len(names))
     parts = [samples.sample_parts(recipe, k) for k in range(number)]
     texts = [one.to_json() for one in recipe.systems]
@@ -161,4 +106,7 @@ def lay_out(
     create_histogram(group, recipe, number, shape)
     plain = [[str(one.path), one.reason] for one in problems]
     systems = [one.to_dict() for one in recipe.systems]
-    mark(group, {"stage": "counts", "systems": json.dumps(systems), "problems": plain})
+    attrs: dict[str, Any] = {"stage": "counts", "systems": json.dumps(systems), "problems": plain}
+    if not writer.plain:
+        attrs["format_version"] = MORE_VERSION
+    mark(group, attrs)

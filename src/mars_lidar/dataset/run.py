@@ -201,7 +201,8 @@ def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None
 
     team = threads or _default_threads()
     array = dataset.histogram
-    chunk = math.prod(array.chunks) * array.dtype.itemsize
+    parts = dataset.scenes.waveform_parts(dataset.recipe.systems)
+    chunk = making_bytes(array.chunks, array.dtype.itemsize, parts)
     teams = max(1, min(team, len(todo), BUFFER_BYTES // chunk))
     stop = threading.Event()
     makers = [Maker(dataset, max(1, team // teams), stop) for _ in range(teams)]
@@ -230,6 +231,11 @@ def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None
                 with contextlib.suppress(Stopped, Exception):
                     future.result()
             raise
+
+
+def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> int:
+    """Memory for making a chunk: its dense counts, and waveforms of its pixels, which are copied twice."""
+    return math.prod(chunk) * itemsize + 3 * 8 * math.prod(chunk[2:4]) * waveform_parts
 
 
 def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) -> None:

@@ -1,15 +1,11 @@
-"""The samples of a dataset: their numbering, their flux, and how arrays are cut into chunks and shards."""
+"""The samples of a dataset: their numbering, and how arrays are cut into chunks and shards."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 
-from mars_lidar.dataset.recipe import DatasetRecipe, Light
-from mars_lidar.flux import Flux
-from mars_lidar.scene import Scene
-from mars_lidar.system import System
+from mars_lidar.dataset.recipe import DatasetRecipe
 
 
 def count_samples(recipe: DatasetRecipe, scenes: int) -> int:
@@ -22,22 +18,6 @@ def sample_parts(recipe: DatasetRecipe, sample: int) -> tuple[int, int, float, f
     rest, level = divmod(sample, len(recipe.light.levels))
     scene, system = divmod(rest, len(recipe.systems))
     return scene, system, *recipe.light.levels[level]
-
-
-def flux_of(
-    scene: Scene, system: System, light: Light, signal: float, sbr: float, dark: float | None = None
-) -> Flux:
-    """The flux of a sample. Pixels without return or beyond the range are told once, not for every sample."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return scene.flux(
-            system,
-            signal=signal,
-            sbr=sbr,
-            attenuation=light.attenuation,  # type: ignore[arg-type]  # checked by the recipe
-            ambient=light.ambient,  # type: ignore[arg-type]
-            dark_counts_per_s=light.dark_counts_per_s if dark is None else dark,
-        )
 
 
 def fitting(shape: Sequence[int], unit: Sequence[int], itemsize: int, most_bytes: float) -> tuple[int, ...]:

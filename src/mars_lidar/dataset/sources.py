@@ -5,18 +5,24 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mars_lidar.dataset.recipe import DatasetRecipe, listed_numbers
-from mars_lidar.dataset.samples import flux_of
+from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.renders import transient_files
+from mars_lidar.dataset.shown import Shown, Surfaces
+from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
 from mars_lidar.flux import Flux
+from mars_lidar.fog import Fog
+from mars_lidar.io.rgbd.stack import is_stack
 from mars_lidar.io.scan import Problem, SceneFile, scan
+from mars_lidar.layers import LayeredScene, read_layers
 from mars_lidar.scene import Scene
 from mars_lidar.simulate import _check_registrations
 
@@ -25,20 +31,12 @@ _TRIES = 20  # places tried for a crop with a return in it
 
 @dataclass(frozen=True)
 class Candidate:
-    """A scene that has not been read yet; its name goes into the seeds of its samples."""
+    """A scene that has not been read yet; its name goes into the seeds of its samples, `place` into its crops."""
 
     name: str
     path: Path
-    file: SceneFile | None = None
-    example: tuple[str, Any, int] | None = None  # name, size, seed
-
-    def load(self) -> Scene:
-        """Read or ray-cast it."""
-        if self.file is not None:
-            return self.file.load()
-        assert self.example is not None
-        name, size, seed = self.example
-        return Scene.example(name, tuple(size) if isinstance(size, list) else size, seed)
+    load: Callable[[], Shown]
+    place: str
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Named:
     """A scene as the dataset has it."""
 
     name: str
-    scene: Scene
+    scene: Shown
 
 
 def candidates(recipe: DatasetRecipe, folder: Path) -> tuple[list[Candidate], list[Problem]]:
@@ -62,13 +60,16 @@ def candidates(recipe: DatasetRecipe, folder: Path) -> tuple[list[Candidate], li
     for entry in recipe.scenes:
         before = len(found)
         if "example" in entry:
-            name, size = entry["example"], entry["size"]
-            for seed in listed_numbers(entry["seeds"]):
-                called = f"{name}, size {size}, seed {seed}"
-                found.append(Candidate(called, Path(called), example=(name, size, seed)))
+            found += [one for clear in _examples(entry) for one in _behind_all(clear, entry)]
+            continue
+        if "transient" in entry:
+            for path, load in transient_files(entry, folder):
+                name = _named(entry["transient"], folder, path)
+                found.append(Candidate(name, path, load, name))
             continue
         for file in _files(entry, folder, problems):
-            found.append(Candidate(_name(entry["path"], folder, file), file.depth, file=file))
+            name = _named(entry["path"], folder, file.depth) + ("" if file.index is None else f", frame {file.index}")
+            found += _behind_all(Candidate(name, file.depth, partial(_surfaces, file), name), entry)
         if len(found) == before and not problems:
             raise ValueError(f"{folder / entry['path']}: no scene found; docs/formats.md tells what is one")
     names = [one.name for one in found]
@@ -95,14 +96,16 @@ def scenes(
     for number in range(recipe.crops if recipe.crop else 1):
         name = candidate.name if recipe.crop is None else f"{candidate.name}, crop {number}"
         try:
-            scene = whole if recipe.crop is None else _cropped(whole, recipe.crop, name, recipe.seed)
+            scene = whole
+            if recipe.crop is not None:
+                scene = _cropped(whole, recipe.crop, f"{candidate.place}, crop {number}", recipe.seed)
             if shape is not None and scene.shape != shape:
                 raise ValueError(
                     f"is {scene.shape[0]} × {scene.shape[1]} pixels, the scenes before it {shape[0]} × {shape[1]}: "
                     "give size or crop"
                 )
             _check_levels(scene, recipe)
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OSError, MemoryError) as error:
             yield Problem(candidate.path, f"{name}: {error}")
         else:
             shape = scene.shape
@@ -164,16 +167,54 @@ def _chosen(files: list[SceneFile], entry: dict[str, Any]) -> list[SceneFile]:
     return [one for one in files if one.index in wanted]
 
 
-def _name(given: str, folder: Path, file: SceneFile) -> str:
-    path = file.depth
+def _named(given: str, folder: Path, path: Path) -> str:
+    """A file as the recipe gives it, or as it lies in the folder that the recipe gives."""
     root = folder / given
     inside = ""
     if path != root:
         inside = "/" + (path.relative_to(root) if path.is_relative_to(root) else path).as_posix()
-    return given.rstrip("/") + inside + ("" if file.index is None else f", frame {file.index}")
+    return given.rstrip("/") + inside
 
 
-def _cropped(scene: Scene, size: tuple[int, int], name: str, seed: int) -> Scene:
+def _examples(entry: dict[str, Any]) -> Iterator[Candidate]:
+    name, size = entry["example"], entry["size"]
+    for seed in listed_numbers(entry["seeds"]):
+        called = f"{name}, size {size}, seed {seed}"
+        yield Candidate(called, Path(called), partial(_example, name, size, seed), called)
+
+
+def _example(name: str, size: Any, seed: int) -> Shown:
+    return Surfaces(Scene.example(name, tuple(size) if isinstance(size, list) else size, seed))
+
+
+def _surfaces(file: SceneFile) -> Shown:
+    """A scene, or the layers of an ``.npz``."""
+    if is_stack(file.depth):
+        return Surfaces(read_layers(file.depth, depth_unit_m=file.depth_unit_m, focal_px=file.focal_px))
+    return Surfaces(file.load())
+
+
+def _behind_all(clear: Candidate, entry: dict[str, Any]) -> Iterator[Candidate]:
+    """The scene behind the pane and in each of the fogs of an entry; itself where there are none.
+
+    Crops of a scene are at the same places whatever stands before it.
+    """
+    pane, fogs = entry.get("pane"), entry.get("fog") or [None]
+    for fog in fogs:
+        told = [] if pane is None else [f"pane {pane['depth_m']!r} {pane['reflectivity']!r} {pane['transmission']!r}"]
+        told += [] if fog is None else [f"fog {fog['extinction_per_m']!r} {fog['backscatter']!r} {fog['nearest_m']!r}"]
+        name = ", ".join([clear.name, *told])
+        yield Candidate(name, clear.path, partial(_behind, clear.load, pane, fog), clear.place)
+
+
+def _behind(load: Callable[[], Shown], pane: dict[str, float] | None, fog: dict[str, float] | None) -> Shown:
+    shown = load()
+    assert isinstance(shown, Surfaces)
+    scene = shown.scene if pane is None else LayeredScene.behind_pane(shown.scene, **pane)
+    return Surfaces(scene, None if fog is None else Fog(**fog))
+
+
+def _cropped(scene: Shown, size: tuple[int, int], name: str, seed: int) -> Shown:
     height, width = scene.shape
     if size[0] > height or size[1] > width:
         raise ValueError(f"is {height} × {width} pixels, smaller than a crop of {size[0]} × {size[1]}")
@@ -182,24 +223,36 @@ def _cropped(scene: Scene, size: tuple[int, int], name: str, seed: int) -> Scene
     for _ in range(_TRIES):
         y, x = int(random.integers(height - size[0] + 1)), int(random.integers(width - size[1] + 1))
         crop = scene[y : y + size[0], x : x + size[1]]
-        if (crop.reflectivity[crop.valid] > 0.0).any():
+        if crop.lit:
             return crop
     raise ValueError(f"no pixel with a return in {_TRIES} crops of {size[0]} × {size[1]}")
 
 
-def _check_levels(scene: Scene, recipe: DatasetRecipe) -> None:
+def _check_levels(scene: Shown, recipe: DatasetRecipe) -> None:
     """Raise ValueError where a level cannot be had of a scene: before anything is simulated."""
     light, engine = recipe.light, find_engine(recipe.engine)
     unit_sbr = 1.0 if any(math.isfinite(sbr) for _, sbr in light.levels) else math.inf
     units: dict[float, Flux] = {}
     for system in recipe.systems:
         if system.period_ns not in units:
-            units[system.period_ns] = flux_of(scene, system, light, 1.0, unit_sbr, dark=0.0)
+            units[system.period_ns] = scene.flux(system, light, 1.0, unit_sbr, dark=0.0)
         unit = units[system.period_ns]
         dark = light.dark_counts_per_s * system.period_ns * 1e-9 / system.detector.detection_efficiency
+        pixels: dict[tuple[int, int], Flux] = {}
         for signal, sbr in light.levels:
             total = unit.signal + unit.background / sbr
             y, x = (int(k) for k in np.unravel_index(int(total.argmax()), total.shape))
-            brightest = Flux(signal * unit.signal[y, x], signal / sbr * unit.background[y, x] + dark, 0.0)
+            if (y, x) not in pixels:
+                pixels[y, x] = unit[y, x]
+            brightest = _at_level(pixels[y, x], signal, signal / sbr, dark)
             _check_registrations(brightest, system)
             engine.check(brightest, system)
+
+
+def _at_level(unit: Flux, signal: float, ambient: float, dark: float) -> Flux:
+    """Light at the level 1, at another one."""
+    background = ambient * unit.background + dark
+    if unit.waveform is not None:
+        return Flux(waveform=signal * unit.waveform, background=background)
+    returns = zip(unit.returns_signal, unit.returns_delay_ns, strict=True)
+    return Flux.multi(*(Flux(signal * one, background if k == 0 else 0.0, tau) for k, (one, tau) in enumerate(returns)))

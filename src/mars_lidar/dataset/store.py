@@ -5,7 +5,7 @@
     histogram   (sample, realization, y, x, time)  counts
     depth, reflectivity, signal, background, delay  (sample, y, x) float32: m, 1, photons per period, ns
     scene, system, signal_level, sbr, seed, ...     (sample)
-    scenes/     what the samples are made of, as it was read: depth, reflectivity, background (scene, y, x) float64
+    scenes/     what the samples are made of, as it was read: see `mars_lidar.dataset.scenes`
 
 The store alone is enough to make any part of it, so that workers and `verify` need no source files. Every part is a
 file of its own that appears by a rename: what is there is whole, and what is missing is known from the names.
@@ -24,13 +24,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, mark, with_zeros
+from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
 from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.scenes import SceneReader
+from mars_lidar.dataset.shown import Rendered
 from mars_lidar.io.scan import Problem
 from mars_lidar.io.store import IncompleteFileError
+from mars_lidar.layers import LayeredScene
 from mars_lidar.scene import Scene
-
-_SCENE_BYTES = 4 << 20  # of one map: scenes are read this many at once, each read costs a millisecond
+from mars_lidar.transient import Transient
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,10 @@ class Dataset:
         self.attrs: dict[str, Any] = dict(self.group.attrs)
         if self.attrs.get("format") != FORMAT:
             raise ValueError(f"{path} is not a dataset written by mars-lidar (no attribute format = {FORMAT!r})")
-        if self.attrs.get("format_version") != FORMAT_VERSION:
+        if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
             told = self.attrs.get("format_version")
-            raise ValueError(f"{path} has layout version {told}; version {FORMAT_VERSION} can be read")
+            raise ValueError(f"{path} has layout version {told}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
-        self._scene_block: tuple[int, tuple[NDArray[np.float64], ...] | None] = (0, None)
 
     @property
     def planned(self) -> bool:
@@ -94,28 +95,19 @@ class Dataset:
         """What was left out, and why."""
         return [Problem(Path(path), reason) for path, reason in self.attrs.get("problems", [])]
 
-    def scene(self, number: int) -> Scene:
-        """A scene as it was read."""
-        first, maps = self._scene_block
-        if maps is None or not first <= number < first + len(maps[0]):
-            size = 8 * math.prod(self._scene_maps[0].shape[1:])
-            count = max(1, _SCENE_BYTES // size)
-            first = number // count * count
-            maps = tuple(np.asarray(array[first : first + count]) for array in self._scene_maps)
-            self._scene_block = first, maps  # together: several threads read
-        depth, reflectivity, background = (values[number - first] for values in maps)
-        return Scene(depth, reflectivity, None if np.isnan(background).all() else background)
+    def scene(self, number: int) -> Scene | LayeredScene | Transient:
+        """A scene as it was read: of rendered light the transient, which stays on disk."""
+        shown = self.scenes.read(number)
+        return shown.transient if isinstance(shown, Rendered) else shown.scene
 
     @cached_property
-    def _scene_maps(self) -> tuple[Any, ...]:
-        """The arrays of `scene`, opened once."""
-        group: Any = self.group["scenes"]
-        return tuple(group[name] for name in ("depth", "reflectivity", "background"))
+    def scenes(self) -> SceneReader:
+        """All that samples show."""
+        return SceneReader(self.group["scenes"])
 
     def scene_names(self) -> list[str]:
         """Names of all scenes."""
-        rows: Any = self.group["scenes/name"]
-        return [bytes(row).rstrip(b"\0").decode() for row in np.asarray(rows[...])]
+        return self.scenes.names()
 
     def items(self) -> Iterator[Item]:
         """All parts, in the order in which they are made."""

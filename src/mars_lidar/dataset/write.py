@@ -13,11 +13,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.dataset.samples import flux_of, sample_parts
+from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.shard import chunks_of, packer, write_shard
+from mars_lidar.dataset.shown import Shown
 from mars_lidar.dataset.store import Dataset, Item
 from mars_lidar.flux import Flux
-from mars_lidar.scene import Scene
 
 _T = TypeVar("_T")
 _KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
@@ -45,8 +45,9 @@ class Maker:
         self._stop = stop
         self._buffer: NDArray[Any] | None = None
         self._simulate_s = 0.0
-        self._scenes: OrderedDict[int, Scene] = OrderedDict()
+        self._scenes: OrderedDict[int, Shown] = OrderedDict()
         self._fluxes: OrderedDict[int, Flux] = OrderedDict()
+        self._last: tuple[tuple[int, ...], Flux] | None = None
 
     def make(self, item: Item) -> Made:
         """Make a part and write it."""
@@ -87,7 +88,8 @@ class Maker:
             stacks["reflectivity"].append(scene.reflectivity)
             stacks["signal"].append(flux.signal)
             stacks["background"].append(flux.background)
-            stacks["delay"].append(flux.delay_ns)
+            system = self.dataset.recipe.systems[sample_parts(self.dataset.recipe, sample)[1]]
+            stacks["delay"].append(system.delay_ns(scene.depth_m))  # of waveforms the flux has none
         return {name: np.stack(values).astype(np.float32) for name, values in stacks.items()}
 
     def counts(self, region: tuple[slice, ...]) -> NDArray[Any]:
@@ -104,7 +106,7 @@ class Maker:
             system = recipe.systems[sample_parts(recipe, sample)[1]]
             direct = system.histogram_dtype == dtype
             drawn = simulate(
-                self.flux(sample)[rows, columns],
+                self._part(sample, rows, columns),
                 system,
                 engine=recipe.engine,
                 realizations=realizations.stop - realizations.start,
@@ -126,13 +128,21 @@ class Maker:
         return _remembered(
             self._fluxes,
             sample,
-            lambda: flux_of(self.scene(sample), recipe.systems[system], recipe.light, signal, sbr),
+            lambda: self.scene(sample).flux(recipe.systems[system], recipe.light, signal, sbr),
         )
 
-    def scene(self, sample: int) -> Scene:
-        """Scene of a sample."""
+    def _part(self, sample: int, rows: slice, columns: slice) -> Flux:
+        """Part of the flux; the last one is kept: of waveforms it takes longer to make than to simulate."""
+        key = (sample, rows.start, rows.stop, columns.start, columns.stop)
+        if self._last is None or self._last[0] != key:
+            self._last = None  # its memory first
+            self._last = key, self.flux(sample)[rows, columns]
+        return self._last[1]
+
+    def scene(self, sample: int) -> Shown:
+        """What a sample shows."""
         number = sample_parts(self.dataset.recipe, sample)[0]
-        return _remembered(self._scenes, number, lambda: self.dataset.scene(number))
+        return _remembered(self._scenes, number, lambda: self.dataset.scenes.read(number))
 
     def _room(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
         """An array of this shape in the buffer, whose pages need not be asked for again."""

@@ -13,6 +13,7 @@ from mars_lidar._memory import check_memory
 from mars_lidar.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.transient import Transient
 
+SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _NAME = "transient"
 _T_SX_SY = 1  # tal.enums.HFormat (github.com/diegoroyo/tal)
 _TAL_FORMATS = {0: "UNKNOWN", 1: "T_Sx_Sy", 2: "T_Lx_Ly_Sx_Sy", 3: "T_Si", 4: "T_Li_Si"}
@@ -73,7 +74,7 @@ def read_transient(
     elif suffix == ".mat":
         values, told = _from_mat(source, name or _NAME)
     else:
-        raise ValueError(f"{source}: a transient must be a .npy, .npz, .h5, .hdf5 or .mat file")
+        raise ValueError(f"{source}: a transient must be one of {', '.join(SUFFIXES)}")
     width = told.get("bin_ns") if bin_ns is None else bin_ns
     if width is None:
         raise ValueError(f"{source}: does not tell the width of a time bin: give bin_ns")

@@ -176,7 +176,13 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
         if (Path(scenes) / "zarr.json").is_file():
             from mars_lidar.dataset.store import open_dataset
 
-            maps = open_dataset(scenes).maps
+            stored = open_dataset(scenes)
+            if any("transient" in one for one in stored.recipe.scenes):
+                raise ValueError(
+                    f"{scenes}: holds rendered transients, which have no surfaces to light anew; "
+                    "StoredDataset gives their cubes"
+                )
+            maps = stored.maps
             return Arrays({name: maps[name] for name in ("depth", "reflectivity")})
         files, problems = scan(scenes, check=False)
         if not files:

@@ -27,7 +27,8 @@ from mars_lidar.learn.places import rank_of, worker_of
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.sample import Recipe, Sample, maps_of, numbers_of
 from mars_lidar.learn.scenes import as_source
-from mars_lidar.scene import Scene, _image_size
+from mars_lidar.resample import image_size
+from mars_lidar.scene import Scene
 from mars_lidar.system import System
 
 _LAST = 2**62
@@ -132,7 +133,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         world_size: int | None = None,
     ) -> None:
         super().__init__()
-        shape = None if size is None else _image_size(size if isinstance(size, tuple | list) else (size, size))
+        shape = None if size is None else image_size(size if isinstance(size, tuple | list) else (size, size))
         if shape is None and isinstance(scenes, str) and scenes in Scene.example_names():
             shape = (64, 64)
         drawn = as_systems(systems)

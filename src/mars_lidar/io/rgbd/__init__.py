@@ -118,13 +118,7 @@ def _stored(path: Path, suffix: str) -> NDArray[Any]:
 
 
 def _npz(path: Path, unit: float | None) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
-    try:
-        with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except Exception as error:
-        raise ValueError(f"{path}: cannot be read ({pixels.reason(error)})") from error
-    if "depth" not in arrays:
-        raise ValueError(f"{path}: must hold an array 'depth', got {', '.join(sorted(arrays)) or 'none'}")
+    arrays = _npz_arrays(path)
     if "reflectivity" in arrays and "image" in arrays:
         raise ValueError(f"{path}: must hold one of 'reflectivity' and 'image', got both")
     depth = _depth(path, arrays["depth"], unit)
@@ -142,6 +136,18 @@ def _npz(path: Path, unit: float | None) -> tuple[FloatArray, FloatArray | None,
             told = f"{pixels.size(depth)}, got {pixels.size(array)}"
             raise ValueError(f"{path}: {name} must have the size of depth, {told}")
     return depth, reflectivity, background
+
+
+def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Everything in the file, a ``depth`` among it."""
+    try:
+        with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except Exception as error:
+        raise ValueError(f"{path}: cannot be read ({pixels.reason(error)})") from error
+    if "depth" not in arrays:
+        raise ValueError(f"{path}: must hold an array 'depth', got {', '.join(sorted(arrays)) or 'none'}")
+    return arrays
 
 
 def _depth(path: Path, stored: NDArray[Any], unit: float | None) -> FloatArray:

@@ -1,0 +1,45 @@
+"""Rendered transients of a recipe: which files, and what is read of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mars_lidar.dataset.shown import Rendered, unknown
+from mars_lidar.io.transient import SUFFIXES, read_transient
+from mars_lidar.io.transient_truth import read_truth
+
+_OPTIONS = ("bin_ns", "start_ns", "name", "channel")
+
+
+def transient_files(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, partial[Rendered]]]:
+    """The files of an entry in the order of their paths, and what opens each.
+
+    Raises
+    ------
+    ValueError
+        No file at all.
+    """
+    root = folder / entry["transient"]
+    options = {name: entry[name] for name in _OPTIONS if name in entry}
+    files = [root]
+    if root.is_dir():
+        every = sorted(root.glob(entry.get("pattern", "**/*")))
+        files = [one for one in every if one.is_file() and ("pattern" in entry or one.suffix.lower() in SUFFIXES)]
+        if not files:
+            raise ValueError(f"{root}: no transient found, a file {', '.join(SUFFIXES)}")
+    elif "pattern" in entry:
+        raise ValueError(f"pattern belongs to a folder, and {root} is none")
+    elif not root.is_file():
+        raise ValueError(f"{root}: no such file or folder")
+    for file in files:
+        yield file, partial(_open, file, options, entry.get("pulse", True))
+
+
+def _open(file: Path, options: dict[str, Any], pulse: bool) -> Rendered:
+    transient = read_transient(file, **options)
+    truth = read_truth(file, transient.shape)
+    nothing = unknown(transient.shape)
+    return Rendered(transient, truth.get("depth", nothing), truth.get("reflectivity", nothing), pulse)

@@ -1,0 +1,241 @@
+"""The scenes of a dataset in its store, group ``scenes``: written one by one, read again when a sample needs one.
+
+::
+
+    depth, reflectivity, background  (scene, y, x)         as they were read; of the first layer
+    name                             (scene, letter)       UTF-8
+    kind                             (scene, letter)       JSON: what is more than one surface in clear air
+    layer_depth, layer_reflectivity  (scene, layer, y, x)  the other layers
+    transient                        (scene, y, x, bin)    rendered light
+    total                            (scene, y, x)         its sum over all bins
+
+All float64; the last five are there where a scene needs them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.dataset import samples
+from mars_lidar.dataset.arrays import blosc, create_list, create_maps
+from mars_lidar.dataset.shown import Rendered, Shown, Surfaces
+from mars_lidar.fog import Fog
+from mars_lidar.layers import MOST, LayeredScene
+from mars_lidar.scene import Scene
+from mars_lidar.system import System
+from mars_lidar.transient import Transient
+
+_DOUBLE = np.dtype(np.float64)
+_READ_BYTES = 4 << 20  # of one map: scenes are read this many at once, each read costs a millisecond
+_RATE_BYTES = 8 << 20  # of a chunk of rendered light
+_LAYERS = ("layer_depth", "layer_reflectivity")
+
+
+class SceneWriter:
+    """Takes scenes one by one into the group ``scenes`` of a new store; memory for one shard of maps."""
+
+    def __init__(self, group: Any, most: int) -> None:
+        self._group = group.create_group("scenes")
+        self._most = most
+        self._arrays: dict[str, Any] = {}
+        self._held: list[Shown] = []
+        self._kinds: list[str] = []
+        self.names: list[str] = []
+        self._written = 0
+
+    @property
+    def shape(self) -> tuple[int, int] | None:
+        """(H, W) of all scenes, None before the first."""
+        return tuple(self._arrays["depth"].shape[1:]) if self._arrays else None
+
+    @property
+    def plain(self) -> bool:
+        """Whether each scene so far is one surface in clear air."""
+        return not any(self._kinds)
+
+    def add(self, name: str, scene: Shown) -> None:
+        """One more scene."""
+        if not self._arrays:
+            for array, unit in (("depth", "m"), ("reflectivity", "1"), ("background", "relative")):
+                self._arrays[array] = self._maps(array, (self._most, *scene.shape), ("scene", "y", "x"), unit)
+        number = len(self.names)
+        if isinstance(scene, Rendered):
+            self._write_light(number, scene)
+        elif len(scene.layers) > 1:
+            self._write_layers(number, scene)
+        self.names.append(name)
+        self._kinds.append(_kind(scene))
+        self._held.append(scene)
+        if len(self._held) == self._arrays["depth"].shards[0]:
+            self._flush()
+
+    def finish(self) -> int:
+        """Write the rest and cut the arrays to their length; returns it."""
+        self._flush()
+        for array in self._arrays.values():
+            array.resize((self._written, *array.shape[1:]))
+        dims = ("scene", "letter")
+        create_list(self._group, "name", _rows(self.names), dims, "name of the scene, UTF-8", "1")
+        if not self.plain:
+            create_list(self._group, "kind", _rows(self._kinds), dims, "what it is, JSON", "1")
+        return self._written
+
+    def _flush(self) -> None:
+        part = slice(self._written, self._written + len(self._held))
+        if self._held:
+            self._arrays["depth"][part] = np.stack([one.depth_m for one in self._held])
+            self._arrays["reflectivity"][part] = np.stack([one.reflectivity for one in self._held])
+            light = [_background(one) for one in self._held]
+            if any(one is not None for one in light):
+                nothing = np.full(self._held[0].shape, np.nan)
+                self._arrays["background"][part] = np.stack([nothing if one is None else one for one in light])
+        self._written = part.stop
+        self._held.clear()
+
+    def _write_layers(self, number: int, scene: Surfaces) -> None:
+        if _LAYERS[0] not in self._arrays:
+            shape = (self._most, MOST - 1, *scene.shape)
+            for name, unit in zip(_LAYERS, ("m", "1"), strict=True):
+                self._arrays[name] = self._maps(name, shape, ("scene", "layer", "y", "x"), unit)
+        behind = scene.layers[1:]
+        self._arrays[_LAYERS[0]][number, : len(behind)] = np.stack([one.depth_m for one in behind])
+        self._arrays[_LAYERS[1]][number, : len(behind)] = np.stack([one.reflectivity for one in behind])
+
+    def _write_light(self, number: int, scene: Rendered) -> None:
+        height, width, bins = scene.transient.values.shape
+        if "transient" not in self._arrays:
+            shape = (self._most, height, width, bins)
+            self._arrays["transient"] = self._group.create_array(
+                "transient",
+                shape=shape,
+                dtype=_DOUBLE,
+                chunks=samples.fitting((1, *shape[1:]), (1, 1, 1, bins), _DOUBLE.itemsize, _RATE_BYTES),
+                compressors=(blosc(_DOUBLE, "zstd", 1, "shuffle"),),
+                fill_value=0.0,
+                dimension_names=("scene", "y", "x", "bin"),
+                attributes={"long_name": "rendered light per bin", "units": "relative"},
+            )
+            dims = ("scene", "y", "x")
+            self._arrays["total"] = self._maps("total", (self._most, height, width), dims, "relative")
+        array = self._arrays["transient"]
+        if bins > array.shape[3]:
+            array.resize((*array.shape[:3], bins))
+        step = array.chunks[1]
+        for first in range(0, height, step):
+            rows = slice(first, min(first + step, height))
+            array[number, rows, :, :bins] = scene.transient.rows(rows)
+        self._arrays["total"][number] = scene.transient.totals
+
+    def _maps(self, name: str, shape: tuple[int, ...], dims: tuple[str, ...], unit: str) -> Any:
+        return create_maps(self._group, name, shape, _DOUBLE, dims, name.replace("_", " of the "), unit)
+
+
+class SceneReader:
+    """Scenes by their number; several threads may read."""
+
+    def __init__(self, group: Any) -> None:
+        self._group = group
+        self._block: tuple[int, tuple[NDArray[np.float64], ...] | None] = (0, None)
+
+    def read(self, number: int) -> Shown:
+        """A scene as it was read from its source; rendered light stays on disk."""
+        depth, reflectivity, background = self._first_layer(number)
+        told = self.kind(number)
+        if "transient" in told:
+            light = told["transient"]
+            rates = _Rates(self._group["transient"], number, light["bins"])
+            totals = np.asarray(self._group["total"][number])
+            transient = Transient(rates, light["bin_ns"], start_ns=light["start_ns"], totals=totals)
+            return Rendered(transient, depth, reflectivity, light["pulse"])
+        first = Scene(depth, reflectivity, None if np.isnan(background).all() else background)
+        scene: Scene | LayeredScene = first
+        if "layers" in told:
+            more = told["layers"] - 1
+            others = map(Scene, *(np.asarray(self._group[name][number, :more]) for name in _LAYERS))
+            scene = LayeredScene([first, *others])
+        return Surfaces(scene, Fog(**told["fog"]) if "fog" in told else None)
+
+    def kind(self, number: int) -> dict[str, Any]:
+        """What is more than one surface in clear air."""
+        told: dict[str, Any] = json.loads(self._kinds[number]) if self._kinds and self._kinds[number] else {}
+        return told
+
+    def waveform_parts(self, systems: Sequence[System]) -> int:
+        """Most parts of the period in waveforms of samples; 0 where returns are enough."""
+        one_of_each = {text: number for number, text in enumerate(self._kinds) if text}
+        shown = [self.read(number) for number in one_of_each.values()]
+        return max((one.waveform_parts(system) for one in shown for system in systems), default=0)
+
+    def names(self) -> list[str]:
+        """Names of all scenes."""
+        return _texts(self._group["name"])
+
+    @cached_property
+    def _kinds(self) -> list[str]:
+        return _texts(self._group["kind"]) if "kind" in self._group else []
+
+    @cached_property
+    def _maps(self) -> tuple[Any, ...]:
+        """The arrays of one surface, opened once."""
+        return tuple(self._group[name] for name in ("depth", "reflectivity", "background"))
+
+    def _first_layer(self, number: int) -> tuple[NDArray[np.float64], ...]:
+        first, maps = self._block
+        if maps is None or not first <= number < first + len(maps[0]):
+            size = 8 * math.prod(self._maps[0].shape[1:])
+            count = max(1, _READ_BYTES // size)
+            first = number // count * count
+            maps = tuple(np.asarray(array[first : first + count]) for array in self._maps)
+            self._block = first, maps  # together: several threads read
+        return tuple(values[number - first] for values in maps)
+
+
+class _Rates:
+    """Rendered light of one scene (H, W, T) on disk."""
+
+    def __init__(self, array: Any, number: int, bins: int) -> None:
+        self._array, self._number = array, number
+        self.shape = (*array.shape[1:3], bins)
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        return np.asarray(self._array[self._number, rows, :, : self.shape[2]])
+
+
+def _kind(scene: Shown) -> str:
+    told: dict[str, Any] = {}
+    if isinstance(scene, Rendered):
+        light = scene.transient
+        told["transient"] = {
+            "bins": light.values.shape[2], "bin_ns": light.bin_ns, "start_ns": light.start_ns, "pulse": scene.pulse
+        }  # fmt: skip
+    else:
+        if len(scene.layers) > 1:
+            told["layers"] = len(scene.layers)
+        if scene.fog is not None:
+            told["fog"] = asdict(scene.fog)
+    return json.dumps(told) if told else ""
+
+
+def _background(scene: Shown) -> NDArray[np.float64] | None:
+    return None if isinstance(scene, Rendered) else scene.scene.background
+
+
+def _rows(texts: Sequence[str]) -> NDArray[np.uint8]:
+    """Texts as rows of bytes."""
+    rows = [text.encode() for text in texts]
+    table = np.zeros((len(rows), max(map(len, rows))), np.uint8)
+    for row, text in zip(table, rows, strict=True):
+        row[: len(text)] = np.frombuffer(text, np.uint8)
+    return table
+
+
+def _texts(rows: Any) -> list[str]:
+    return [bytes(row).rstrip(b"\0").decode() for row in np.asarray(rows[...])]

@@ -1,0 +1,76 @@
+"""What a file of a transient tells beside the light: depth and reflectivity of each pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+NAMES = ("depth", "reflectivity")
+
+
+def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray]:
+    """Depth and reflectivity beside a transient.
+
+    Arrays ``depth`` (m; 0, NaN and inf mean "no return", which becomes NaN) and ``reflectivity`` ([0, 1]), (H, W), of
+    ``.npz``, ``.h5``, ``.hdf5`` and ``.mat`` (there turned by MATLAB, as the transient is).
+
+    Parameters
+    ----------
+    path
+        The file, which `mars_lidar.io.read_transient` has opened before.
+    shape
+        (H, W) of the transient.
+
+    Returns
+    -------
+    dict
+        Those that are there, float64.
+
+    Raises
+    ------
+    ValueError
+        Another shape, or values that cannot be: the message starts with the file.
+    """
+    source = Path(path)
+    found = _read(source)
+    told: dict[str, FloatArray] = {}
+    for name, stored in found.items():
+        if stored.shape != shape or stored.dtype.kind not in "fiu":
+            raise ValueError(f"{source}: {name} must be real numbers {shape}, got {stored.dtype} {stored.shape}")
+        told[name] = stored.astype(np.float64)
+    if "depth" in told:
+        depth = told["depth"]
+        if (depth < 0.0).any():
+            raise ValueError(f"{source}: depth must not be negative, got {np.nanmin(depth):g} m")
+        told["depth"] = np.where((depth > 0.0) & (depth < np.inf), depth, np.nan)
+    if "reflectivity" in told and not ((told["reflectivity"] >= 0.0) & (told["reflectivity"] <= 1.0)).all():
+        raise ValueError(f"{source}: reflectivity must lie in [0, 1]")
+    return told
+
+
+def _read(path: Path) -> dict[str, NDArray[Any]]:
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in NAMES if name in archive.files}
+    import h5py
+
+    if suffix in (".h5", ".hdf5", ".mat") and h5py.is_hdf5(path):
+        with h5py.File(path, "r") as file:
+            turned = suffix == ".mat"
+            return {name: _turned(file[name][()], turned) for name in NAMES if isinstance(file.get(name), h5py.Dataset)}
+    if suffix == ".mat":
+        from scipy.io import loadmat
+
+        found: Mapping[str, Any] = loadmat(path, variable_names=list(NAMES))
+        return {name: np.asarray(found[name]) for name in NAMES if name in found}
+    return {}
+
+
+def _turned(stored: Any, turned: bool) -> NDArray[Any]:
+    return np.asarray(stored).T if turned else np.asarray(stored)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from mars_lidar import _validate
 from mars_lidar.detector import Detector
 from mars_lidar.estimate.ages import age_table
-from mars_lidar.estimate.calibration import Calibration, _free_bins, calibrate
+from mars_lidar.estimate.calibration import Calibration, _free_bins, _system_of, calibrate
 from mars_lidar.estimate.checks import Check, Compared
-from mars_lidar.estimate.detector_model import stream_detector
+from mars_lidar.estimate.detector_model import is_plain, moves_records, stream_detector
 from mars_lidar.estimate.fitted import Fitted
 from mars_lidar.estimate.intervals import FloatArray, stream_of
 from mars_lidar.estimate.prediction import Prediction, cut, predict, system_of
@@ -101,10 +101,14 @@ class Validation:
         return tuple(check for check in self.checks if check.p < self.level / len(self.checks))
 
     @property
+    def too_short(self) -> bool:
+        """Whether there are intervals shorter than the dead time that the detector cannot make."""
+        return bool(self.calibration.too_short) and not moves_records(self.system.detector)
+
+    @property
     def consistent(self) -> bool:
         """Whether the stream could be one of the model's."""
-        short = self.calibration.too_short and self.prediction.recovery is None  # a jitter makes some, as simulated
-        return not self.failed and not short
+        return not self.failed and not self.too_short
 
 
 def validate(
@@ -129,8 +133,9 @@ def validate(
         Laser periods of a realization; at least 20 must fit in the stream. What is left at its end is not used.
     detector
         What the prediction is made for: free-running, paralyzable too, with effects. Efficiency and dark counts are
-        taken as part of the calibrated light, a Gaussian jitter as part of its pulse. Default: a pixel with the
-        calibrated dead time and nothing more.
+        taken as part of the calibrated light, a Gaussian jitter as part of its pulse. Default: that of the system that
+        the stream tells (a simulated one), where the calibration is by default too; else a pixel with the calibrated
+        dead time and nothing more.
     simulated
         Realizations to simulate, at least 200, for what no law predicts: the exact engine draws the model's stream,
         which is cut as the measured one. Their own sampling error is part of every floor and test.
@@ -155,6 +160,9 @@ def validate(
         detector = stream_detector(detector)
     if calibration is None:
         calibration = calibrate(times, pooled=pooled)
+        told = None if detector is not None else _system_of(times)
+        if told is not None and not is_plain(told.detector):
+            detector = stream_detector(told.detector)
     elif not isinstance(calibration, Calibration):
         raise TypeError(f"calibration must be a Calibration, got {type(calibration).__name__}")
     stream = stream_of(times, pooled=pooled)

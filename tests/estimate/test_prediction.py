@@ -117,3 +117,38 @@ def test_bad_input_and_the_command(tmp_path):
     assert done.exit_code == 0, done.output
     assert "prediction     exact laws; recovery simulated" in done.output
     assert "by simulation  bias by the detector's effects taken off" in done.output
+
+
+def test_options_of_the_detector(tmp_path):
+    """Single options say what a system file says, and replace its values; a simulated stream tells its own."""
+
+    def rows(command: str, *arguments: object) -> dict[str, str]:
+        done = CliRunner().invoke(app, [command, str(tmp_path / "lab.npz"), *(str(one) for one in arguments)])
+        assert done.exit_code == 0, done.output
+        return {line[:15].strip(): line[15:] for line in done.output.splitlines()}
+
+    detector = DETECTORS["electronics"]
+    system = PLAIN.replace(detector=detector)
+    recorded(detector, seed=36).save(tmp_path / "lab.npz")
+    system.save(tmp_path / "lab.yaml")
+    PLAIN.save(tmp_path / "plain.yaml")
+    shape = ("--pulse-sigma-ns", 1.0)
+    single = ("--dead-time-ns", 40, "--electronics-dead-time-ns", 65)
+    by_file = rows("calibrate", "--system", tmp_path / "lab.yaml")
+    assert "105 ns" in by_file["hold-off"]
+    assert rows("calibrate", *single, *shape) == by_file
+    assert rows("calibrate", "--system", tmp_path / "plain.yaml", *single, "-o", tmp_path / "out.yaml")
+    assert ml.System.load(tmp_path / "out.yaml").detector == detector
+    told = rows("validate", "--cycles", 500, "--simulated", 500, *single, *shape)
+    assert "by 512 simulated realizations" in told["prediction"]
+    whole = ml.simulate_timestamps(LIGHT, system, seed=36)
+    assert ml.validate(whole, cycles=500).system.detector == detector
+    for arguments, message in (
+        (("--jitter-fwhm-ns", 0.5), "needs its dead time: give --dead-time-ns or --system"),
+        (("--mode", "gated", "--dead-time-ns", 65), "--mode must be nonparalyzable or paralyzable"),
+        (("--afterpulse-probability", 0.1, "--dead-time-ns", 65), "--afterpulse-delay-ns belong together"),
+        (("--crosstalk", 0.1), "No such option"),
+    ):
+        done = CliRunner().invoke(app, ["calibrate", str(tmp_path / "lab.npz"), *(str(one) for one in arguments)])
+        assert done.exit_code == 2
+        assert message in done.output + done.stderr

@@ -1,4 +1,4 @@
-"""The options that switch on effects of the detector, for every command that takes a system."""
+"""The options that switch on effects of the detector, for every command that takes a system or a stream."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _EFFECTS = "Effects of the detector (off by default)"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Effects:
-    """Effects of the detector; None: as in the file."""
+class LightEffects:
+    """What changes the light that a pixel counts; None: as in the file."""
 
     detection_efficiency: Annotated[
         float | None,
@@ -30,6 +30,12 @@ class Effects:
             help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
         ),
     ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamEffects:
+    """Effects of the detector that the stream of one pixel shows; None: as in the file."""
+
     afterpulse_probability: Annotated[
         float | None,
         _option(
@@ -49,17 +55,6 @@ class Effects:
             help="Arrivals this long before the end of the dead time fire at its end, ns.",
         ),
     ] = None
-    crosstalk: Annotated[
-        float | None,
-        _option(
-            "--crosstalk", panel=_EFFECTS, default="0",
-            help="Mean number of neighbours that an avalanche triggers; with --engine sequential.",
-        ),
-    ] = None
-    crosstalk_kernel: Annotated[
-        str | None,
-        _option("--crosstalk-kernel", panel=_EFFECTS, help="Which neighbours: 4 or 8.", default="8"),
-    ] = None
     electronics_dead_time_ns: Annotated[
         float | None,
         _option(
@@ -70,12 +65,6 @@ class Effects:
     max_events_per_period: Annotated[
         int | None,
         _option("--max-events-per-period", panel=_EFFECTS, help="Events recorded of a period.", default="no limit"),
-    ] = None
-    max_events_per_exposure: Annotated[
-        int | None,
-        _option(
-            "--max-events-per-exposure", panel=_EFFECTS, help="Events recorded of an exposure.", default="no limit"
-        ),
     ] = None
     jitter_fwhm_ns: Annotated[
         float | None,
@@ -113,11 +102,6 @@ class Effects:
             {"probability": self.afterpulse_probability, "delay_ns": self.afterpulse_delay_ns},
             "--afterpulse-probability and --afterpulse-delay-ns",
         )
-        if self.crosstalk_kernel is not None and self.crosstalk is None:
-            raise ValueError("--crosstalk-kernel belongs to --crosstalk, which is not given")
-        told["crosstalk"] = None
-        if self.crosstalk is not None:
-            told["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
         if self.code_density_file is not None:
             told["code_density"] = read_array("--code-density-file", self.code_density_file)
         return {name: value for name, value in told.items() if value is not None}
@@ -139,6 +123,40 @@ class Effects:
         if gaussian and self.jitter_fwhm_ns is None:
             raise ValueError("--jitter-tail-ns and --jitter-tail-fraction need --jitter-fwhm-ns")
         return {"kind": "gaussian", **gaussian} if gaussian else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effects(StreamEffects, LightEffects):
+    """Effects of the detector; None: as in the file."""
+
+    crosstalk: Annotated[
+        float | None,
+        _option(
+            "--crosstalk", panel=_EFFECTS, default="0",
+            help="Mean number of neighbours that an avalanche triggers; with --engine sequential.",
+        ),
+    ] = None
+    crosstalk_kernel: Annotated[
+        str | None,
+        _option("--crosstalk-kernel", panel=_EFFECTS, help="Which neighbours: 4 or 8.", default="8"),
+    ] = None
+    max_events_per_exposure: Annotated[
+        int | None,
+        _option(
+            "--max-events-per-exposure", panel=_EFFECTS, help="Events recorded of an exposure.", default="no limit"
+        ),
+    ] = None
+
+    def given(self) -> dict[str, Any]:
+        """Fields of `Detector`, as plain data."""
+        told = super().given()
+        if self.crosstalk is None:
+            told.pop("crosstalk", None)
+            if self.crosstalk_kernel is not None:
+                raise ValueError("--crosstalk-kernel belongs to --crosstalk, which is not given")
+        else:
+            told["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
+        return told
 
 
 def _together(values: dict[str, Any], names: str) -> dict[str, Any] | None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mars_lidar.cli.console import FAILED, check_picture, reported, save_picture, table
+from mars_lidar.cli.effect_options import StreamEffects
 from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
 from mars_lidar.cli.options import _OUTPUT, _option
@@ -28,6 +29,7 @@ CALIBRATE_EPILOG = "\n\n".join(
         "mars-lidar calibrate lab.ptu --dead-time-ns 85 -o lab.yaml",
         "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008",
         "mars-lidar calibrate lab.ptu --returns 2 --hold-off-ns 120",
+        "mars-lidar calibrate lab.ptu --dead-time-ns 85 --pulse-sigma-ns 0.5 --jitter-fwhm-ns 0.1",
         _RECIPE,
     )
 )
@@ -36,6 +38,8 @@ VALIDATE_EPILOG = "\n\n".join(
         "[bold]Examples[/bold]",
         "mars-lidar validate lab.ptu --cycles 9975 --dead-time-ns 85 -o validation.png",
         "mars-lidar validate decay.ptu --cycles 1000 --free",
+        "mars-lidar validate lab.ptu --cycles 9975 --system lab.yaml --afterpulse-probability 0.01 "
+        "--afterpulse-delay-ns 50",
         "Exit code 1 where the model does not fit the stream. " + _RECIPE,
     )
 )
@@ -51,7 +55,7 @@ Cycles = Annotated[
 Simulated = Annotated[
     int,
     _option(
-        "--simulated", panel=STREAM, help="Realizations to simulate for what no law predicts (effects of --system)."
+        "--simulated", panel=STREAM, help="Realizations to simulate for what no law predicts of a detector."
     ),
 ]
 Picture = Annotated[Path | None, _option("-o", "--out", panel=_OUTPUT, help="A picture: .png, .pdf or .svg.")]
@@ -106,6 +110,7 @@ def calibrate(
     *,
     source: StreamOptions,
     light: FitOptions,
+    effects: StreamEffects,
     out: SystemOut = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -113,10 +118,13 @@ def calibrate(
     with reported():
         _check_system_out(out, light.free, overwrite)
         times, rows = source.load(stream)
-        found = light.calibrate(times)
-        rows += clock_rows(found) + light_rows(found)
+        found, detector = light.calibrate(times, effects)
+        rows += clock_rows(found) + light_rows(found, detector)
         if out is not None:
-            found.system(max(times.cycles, 1), times.bins if times.bins <= 2**20 else 1024, "armed").save(out)
+            from mars_lidar.estimate.prediction import system_of
+
+            bins = times.bins if times.bins <= 2**20 else 1024
+            system_of(found, detector, max(times.cycles, 1), bins).replace(start="armed").save(out)
             rows.append(("wrote", str(out)))
         table(rows)
 
@@ -128,6 +136,7 @@ def validate(
     cycles: Cycles,
     source: StreamOptions,
     light: FitOptions,
+    effects: StreamEffects,
     simulated: Simulated = 4000,
     out: Picture = None,
     overwrite: Overwrite = False,
@@ -141,9 +150,9 @@ def validate(
         from mars_lidar.estimate import validate as compared
 
         times, rows = source.load(stream)
-        calibrated = light.calibrate(times)
-        found = compared(times, calibrated, cycles=cycles, detector=light.detector(), simulated=simulated)
-        rows += clock_rows(calibrated) + light_rows(calibrated)
+        calibrated, detector = light.calibrate(times, effects)
+        found = compared(times, calibrated, cycles=cycles, detector=detector, simulated=simulated)
+        rows += clock_rows(calibrated) + light_rows(calibrated, detector)
         mean, high = found.total_variation_floor
         rows += [
             ("prediction", found.prediction.words),
@@ -165,7 +174,7 @@ def validate(
             verdict = f"the model fits (a stream of the model's fails at {found.level:.0%})"
         else:
             failed = [check.name for check in found.failed]
-            failed += ["intervals shorter than the dead time"] * bool(calibrated.too_short)
+            failed += ["intervals shorter than the dead time"] * found.too_short
             verdict = f"the model does NOT fit: {', '.join(failed)}"
         rows.append(("verdict", verdict))
         if out is not None:

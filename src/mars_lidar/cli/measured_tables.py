@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from mars_lidar.detector import Detector
     from mars_lidar.estimate import Calibration
 
 
@@ -33,18 +34,19 @@ def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
     ]
 
 
-def light_rows(found: Calibration) -> list[tuple[str, str]]:
-    """What was calibrated."""
+def light_rows(found: Calibration, detector: Detector | None = None) -> list[tuple[str, str]]:
+    """What was calibrated; `detector` is told, with its effects."""
+    from mars_lidar.estimate.detector_model import moves_records
     from mars_lidar.system import SPEED_OF_LIGHT_M_PER_NS
 
     rows = interval_rows(found, found.dead_time_error_ns > 0)
     if found.hold_off_ns > found.dead_time_ns + found.dead_time_error_ns:
         rows.append(("hold-off", f"{found.hold_off_ns:.5g} ns: {found.armed.left_out:,} photons not used"))
     if found.too_short:
-        rows.append(
-            ("does not fit", f"{found.too_short:,} intervals shorter than the dead time, the smallest "
-             f"{found.summary.smallest_ns[0]:.5g} ns")
-        )  # fmt: skip
+        expected = detector is not None and moves_records(detector)
+        smallest = f"the smallest {found.summary.smallest_ns[0]:.5g} ns"
+        told = f"{found.too_short:,} intervals shorter than the dead time, {smallest}"
+        rows.append(("by jitter" if expected else "does not fit", told))
     errors = found.errors
     if found.waveform is not None:
         rows.append(("light", f"{found.total:.6g} ± {found.total_error:.2g} photons per period, any shape"))

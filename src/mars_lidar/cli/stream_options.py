@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from mars_lidar.cli import options
 from mars_lidar.cli.console import say
+from mars_lidar.cli.effect_options import StreamEffects
 from mars_lidar.cli.inspect import parsed_pixel
 from mars_lidar.cli.options import _SYSTEM, _option
 
@@ -41,19 +41,30 @@ Variable = Annotated[
 DeadTimeNs = Annotated[
     float | None,
     _option(
-        "--dead-time-ns", panel=_SYSTEM, help="Dead time, ns.",
+        "--dead-time-ns", panel=_SYSTEM, help="Dead time of the pixel, ns.",
         default="of --system or a simulated stream, else by the smallest interval",
     ),
 ]
 HoldOffNs = Annotated[
     float | None,
     _option(
-        "--hold-off-ns", panel=_SYSTEM, default="the dead time",
+        "--hold-off-ns", panel=_SYSTEM, default="the dead time; with dead electronics the sum of both",
         help="Leave out this long after each photon, ns: keeps out afterpulses and dead electronics.",
     ),
 ]
 System = Annotated[
-    Path | None, _option("--system", panel=_SYSTEM, help="YAML or JSON file with pulse and detector, effects too.")
+    Path | None,
+    _option(
+        "--system", panel=_SYSTEM, help="YAML or JSON file with pulse and detector; single options replace its values.",
+        default="that of a simulated stream",
+    ),
+]
+Mode = Annotated[
+    str | None,
+    _option(
+        "--mode", panel=_SYSTEM, default="nonparalyzable",
+        help="nonparalyzable, or paralyzable: every arrival restarts the dead time.",
+    ),
 ]
 PulseSigmaNs = Annotated[
     float | None,
@@ -103,10 +114,12 @@ class StreamOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """What is known of pulse and detector, and what light is fitted; None: found from the stream."""
+    """What is known of pulse and detector, and what light is fitted; None: of the file, or found from the stream."""
 
     system: System = None
+    detector: options.DetectorPreset = None
     dead_time_ns: DeadTimeNs = None
+    mode: Mode = None
     hold_off_ns: HoldOffNs = None
     pulse_sigma_ns: PulseSigmaNs = None
     pulse_fwhm_ns: options.PulseFwhmNs = None
@@ -116,37 +129,62 @@ class FitOptions:
     free: Free = False
     returns: Returns = 1
 
-    @cached_property
-    def known(self) -> SystemObject | None:
-        """The system of the file."""
+    def told(self, times: Timestamps, effects: StreamEffects) -> SystemObject | None:
+        """The system that file, stream and options tell, of the light's own pulse; None where they tell no detector."""
+        from mars_lidar.cli.system_options import with_given
+        from mars_lidar.detector import Detector
+        from mars_lidar.estimate.detector_model import stream_detector
+        from mars_lidar.pulse import GaussianPulse
         from mars_lidar.system import System as SystemOf
 
-        return None if self.system is None else SystemOf.load(self.system)
+        if self.mode not in (None, "nonparalyzable", "paralyzable"):
+            raise ValueError(f"--mode must be nonparalyzable or paralyzable for a running stream, got {self.mode!r}")
+        known = times.system if self.system is None else SystemOf.load(self.system)
+        given = effects.given() | ({} if self.mode is None else {"mode": self.mode})
+        dead = self.dead_time_ns
+        if known is None and self.detector is None and not given:
+            return None
+        if self.detector is not None:
+            base = Detector.preset(self.detector)
+        elif known is not None:
+            base = known.detector
+        elif dead is None:
+            raise ValueError("a detector with effects needs its dead time: give --dead-time-ns or --system")
+        else:
+            base = Detector(dead_time_ns=dead)
+        detector = stream_detector(with_given(base, given | ({} if dead is None else {"dead_time_ns": dead})))
+        pulse = self._pulse() or (GaussianPulse(sigma_ns=0.01 * times.period_ns) if known is None else known.pulse)
+        if known is not None:
+            return known.replace(detector=detector, pulse=pulse)
+        return SystemOf(
+            period_ns=times.period_ns, cycles=max(times.cycles, 1), bins=times.bins, pulse=pulse, detector=detector,
+            start="armed",
+        )  # fmt: skip
 
-    def calibrate(self, times: Timestamps) -> Calibration:
-        """The light of the stream by maximum likelihood."""
+    def _pulse(self) -> Pulse | None:
         from mars_lidar.cli.system_options import pulse_of
-        from mars_lidar.estimate import calibrate as fitted
 
-        shape: Pulse | Literal["free"] | None = pulse_of(
+        return pulse_of(
             self.pulse_sigma_ns, self.pulse_fwhm_ns, self.pulse_file, self.pulse_bin_ns, self.pulse_origin
         )
-        if self.free:
-            if shape is not None:
-                raise ValueError("the light has one shape: choose --free or a pulse")
-            shape = "free"
-        found = fitted(
-            times, self.known, pulse=shape, dead_time_ns=self.dead_time_ns, hold_off_ns=self.hold_off_ns,
-            returns=self.returns,
-        )  # fmt: skip
-        if not found.converged:
-            say("warning: the likelihood was not maximised; what is printed is where it stopped")
-        return found
 
-    def detector(self) -> Detector | None:
-        """That of the system file, where it is more than a dead time."""
-        if self.known is None:
-            return None
+    def calibrate(self, times: Timestamps, effects: StreamEffects) -> tuple[Calibration, Detector | None]:
+        """The light of the stream by maximum likelihood, and the detector where it is more than a dead time."""
+        from mars_lidar.estimate import calibrate as fitted
         from mars_lidar.estimate.detector_model import is_plain
 
-        return None if is_plain(self.known.detector) else self.known.detector
+        told, pulse = self.told(times, effects), self._pulse()
+        shape: Pulse | Literal["free", "gaussian"] | None = pulse if told is None else None
+        if told is not None and pulse is None and self.system is None and times.system is None:
+            shape = "gaussian"
+        if self.free:
+            if pulse is not None:
+                raise ValueError("the light has one shape: choose --free or a pulse")
+            shape = "free"
+        dead = self.dead_time_ns if told is None else None
+        found = fitted(
+            times, told, pulse=shape, dead_time_ns=dead, hold_off_ns=self.hold_off_ns, returns=self.returns
+        )
+        if not found.converged:
+            say("warning: the likelihood was not maximised; what is printed is where it stopped")
+        return found, None if told is None or is_plain(told.detector) else told.detector

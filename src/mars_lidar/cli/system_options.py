@@ -57,11 +57,11 @@ class SystemOptions:
         given = {name: value for name, value in single.items() if value is not None}
         given |= {} if effects is None else effects.given()
         if given:
-            changes["detector"] = _detector(base.detector, given)
+            changes["detector"] = with_given(base.detector, given)
         return base.replace(**{name: value for name, value in changes.items() if value is not None})
 
 
-def _detector(base: Detector, given: dict[str, Any]) -> Detector:
+def with_given(base: Detector, given: dict[str, Any]) -> Detector:
     """`base` with what is given in place of its values; a gate of the file goes with its mode."""
     known = base.to_dict()
     if given.get("mode", base.mode) != base.mode:

@@ -3,6 +3,7 @@
 from mars_lidar.estimate.calibration import Calibration, calibrate
 from mars_lidar.estimate.calibration_bound import Bound, calibration_bound
 from mars_lidar.estimate.calibration_rapp import RappEstimate, rapp_total
+from mars_lidar.estimate.checks import Check
 from mars_lidar.estimate.coates import Coates, coates_rates
 from mars_lidar.estimate.generalised_coates import GeneralisedCoates, generalised_coates_rates
 from mars_lidar.estimate.histogram_bound import HistogramBound, cramer_rao, window_error, window_weights
@@ -15,7 +16,7 @@ from mars_lidar.estimate.method import Flags, Method
 from mars_lidar.estimate.peak import Peak
 from mars_lidar.estimate.reconstruct import Reconstruction, reconstruct
 from mars_lidar.estimate.recovery import Recovery, recovery
-from mars_lidar.estimate.validation import Check, Validation, validate
+from mars_lidar.estimate.validation import Validation, validate
 
 METHODS: dict[str, Method] = {
     method.name: method

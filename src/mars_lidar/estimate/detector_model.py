@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from mars_lidar.detector import Detector
-from mars_lidar.effects import Jitter
+from mars_lidar.effects import TIMING_EFFECTS, Jitter
 from mars_lidar.pulse import GaussianPulse, Pulse
 from mars_lidar.system import System
 
@@ -37,6 +37,11 @@ def stream_detector(detector: Detector) -> Detector:
 def is_plain(detector: Detector) -> bool:
     """Whether the likelihood of a stream is exact: one dead time and nothing more."""
     return detector.mode == "nonparalyzable" and not set(detector.effects) - set(_IN_THE_LIGHT)
+
+
+def moves_records(detector: Detector) -> bool:
+    """Whether intervals may be shorter than the dead time, as records are not at the times of their avalanches."""
+    return bool(set(detector.effects) & set(TIMING_EFFECTS))
 
 
 def watched(detector: Detector) -> tuple[float, float]:

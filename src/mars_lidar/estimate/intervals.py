@@ -241,8 +241,8 @@ def _watch(
     """Add the stretches [opens, closes) to `events` and `passes`; returns how many there were."""
     kept = closes > opens
     opens, closes = opens[kept], closes[kept]
-    cycle_a, bin_a, part_a = _place(opens, period_ns, passes.size)
-    cycle_b, bin_b, part_b = _place(closes, period_ns, passes.size)
+    cycle_a, bin_a, part_a = places(opens, period_ns, passes.size)
+    cycle_b, bin_b, part_b = places(closes, period_ns, passes.size)
     passes += float((cycle_b - cycle_a).sum()) + _begun(bin_b, part_b, passes.size)
     passes -= _begun(bin_a, part_a, passes.size)
     if closed_by_photon:
@@ -250,7 +250,7 @@ def _watch(
     return int(closes.size)
 
 
-def _place(t: FloatArray, period_ns: float, bins: int) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
+def places(t: FloatArray, period_ns: float, bins: int) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
     """Laser period, bin, and the part of that bin that is over."""
     x = t / period_ns
     cycle = np.floor(x)

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from mars_lidar._brief import brief
 from mars_lidar.detector import Detector
+from mars_lidar.estimate.ages import AgeTable, age_table
 from mars_lidar.estimate.calibration import Calibration
 from mars_lidar.estimate.detector_model import is_plain, pulse_of_the_light
+from mars_lidar.estimate.fitted import Fitted
 from mars_lidar.estimate.intervals import FloatArray, Piece, Stream, stream_of
 from mars_lidar.estimate.recovery import Recovery, recovery_of
 from mars_lidar.statistics import ConvergenceError, JointLaw, count_law, joint_law, mean_histogram
@@ -43,7 +45,7 @@ class Prediction:
         Realizations that were simulated for what no law gives; 0 where all is exact.
     exact
         What of it is exact: names of ``("count", "histogram", "joint")``.
-    recovery
+    recovery, ages
         Of the simulated stream; None where none was.
     """
 
@@ -59,6 +61,7 @@ class Prediction:
     simulated: int = 0
     exact: tuple[str, ...] = ("count", "histogram", "joint")
     recovery: Recovery | None = None
+    ages: AgeTable | None = None
 
     __repr__ = brief
 
@@ -88,22 +91,27 @@ def system_of(calibration: Calibration, detector: Detector | None, cycles: int, 
     return plain.replace(detector=detector, pulse=pulse_of_the_light(plain.pulse, detector))
 
 
-def predict(calibration: Calibration, system: System, realizations: int) -> Prediction:
-    """What realizations of `system` in the calibrated light are like; `realizations` to simulate where no law is."""
-    light = calibration.light_arguments()
+def predict(calibration: Calibration, system: System, realizations: int, light: Fitted) -> Prediction:
+    """What realizations of `system` in the calibrated light are like; `realizations` to simulate where no law is.
+
+    `light` is the same light, for the ages of the simulated stream.
+    """
+    arguments = calibration.light_arguments()
     try:
-        exact = count_law(**light, system=system)
-        law = joint_law(**light, system=system)
+        exact = count_law(**arguments, system=system)
+        law = joint_law(**arguments, system=system)
     except (ValueError, ConvergenceError):
         if is_plain(system.detector):
             raise  # not for want of a law
-        return _simulated(calibration, system, realizations)
+        return _simulated(calibration, system, realizations, light)
     window, groups = window_of(calibration, system, law.mean), _groups_of(law.mean)
-    recovery = None if is_plain(system.detector) else _recovery(calibration, next(_streams(calibration, system, 1000)))
+    recovery, ages = None, None
+    if not is_plain(system.detector):
+        recovery, ages = _intervals(calibration, next(_streams(calibration, system, 1000)), light)
     return Prediction(
         Pmf(int(exact.support[0]), exact.pmf), float(exact.mean), float(exact.variance), law.mean, law.variance,
         float(law.window(window)[1]), window, groups, _law_covariance(law, groups),
-        recovery=recovery,
+        recovery=recovery, ages=ages,
     )  # fmt: skip
 
 
@@ -146,17 +154,17 @@ def cut(stream: Stream, system: System, labels: NDArray[np.integer]) -> tuple[ND
     return every, total / max(len(every), 1)
 
 
-def _simulated(calibration: Calibration, system: System, realizations: int) -> Prediction:
+def _simulated(calibration: Calibration, system: System, realizations: int, light: Fitted) -> Prediction:
     """From streams of the exact engine, warmed up for a realization and cut as the measured one is."""
     parts: list[tuple[NDArray[np.int64], ...]] = []  # of each part: groups, window
     total, squares = np.zeros(system.bins), np.zeros(system.bins)
     window, groups = np.zeros(system.bins, bool), np.zeros(system.bins, np.int64)
-    recovery = None
+    recovery, ages = None, None
     for stream in _streams(calibration, system, -(-realizations // _PIXELS)):
         table, histogram = cut(stream, system, np.arange(system.bins))
         if recovery is None:
             window, groups = window_of(calibration, system, histogram), _groups_of(histogram)
-            recovery = _recovery(calibration, stream)
+            recovery, ages = _intervals(calibration, stream, light)
         total += table.sum(0)
         squares += (table**2).sum(0)
         starts = np.flatnonzero(np.diff(groups, prepend=-1))
@@ -165,25 +173,25 @@ def _simulated(calibration: Calibration, system: System, realizations: int) -> P
     number = grouped.sum(1)
     mean = total / number.size
     spread = np.maximum(squares / number.size - mean**2, 0.0)
-    light = calibration.light_arguments()
+    arguments = calibration.light_arguments()
     exact: list[str] = []
     count, moments = Pmf.of_counts(number), (float(number.mean()), float(number.var(ddof=1)))
     try:
-        law = count_law(**light, system=system)
+        law = count_law(**arguments, system=system)
     except (ValueError, ConvergenceError):
         pass
     else:
         count, moments = Pmf(int(law.support[0]), law.pmf), (float(law.mean), float(law.variance))
         exact.append("count")
     try:
-        mean = np.asarray(mean_histogram(**light, system=system), dtype=np.float64)
+        mean = np.asarray(mean_histogram(**arguments, system=system), dtype=np.float64)
     except (ValueError, ConvergenceError):
         pass
     else:
         exact.append("histogram")
     return Prediction(
         count, *moments, mean, spread, float(inside.var(ddof=1)), window, groups, np.atleast_2d(np.cov(grouped.T)),
-        number.size, tuple(exact), recovery,
+        number.size, tuple(exact), recovery, ages,
     )  # fmt: skip
 
 
@@ -206,8 +214,9 @@ def _streams(calibration: Calibration, system: System, per_pixel: int) -> Iterat
         yield replace(stream, pieces=pieces, cycles=_PIXELS * wanted * system.cycles)
 
 
-def _recovery(calibration: Calibration, stream: Stream) -> Recovery:
-    return recovery_of(stream, calibration.rate, calibration.dead_time_ns, calibration.hold_off_ns)
+def _intervals(calibration: Calibration, stream: Stream, light: Fitted) -> tuple[Recovery, AgeTable]:
+    dead, hold = calibration.dead_time_ns, calibration.hold_off_ns
+    return recovery_of(stream, calibration.rate, dead, hold), age_table(stream, light, dead, hold)
 
 
 def _groups_of(mean: FloatArray) -> NDArray[np.int64]:

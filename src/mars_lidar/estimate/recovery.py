@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar._brief import brief
+from mars_lidar.estimate.ages import intervals_of
 from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
 from mars_lidar.timestamps import Timestamps
 
@@ -80,18 +81,6 @@ class Recovery:
         number = int(judged.sum())
         return float(chi2.sf(float((self.score[judged] ** 2).sum()), number)) if number else 1.0
 
-    def p_against(self, other: Recovery) -> float:
-        """Of all ages against those of another stream in the same light, by chi-square."""
-        from scipy.stats import chi2
-
-        seen, expected = self.observed + other.observed, self.expected + other.expected
-        ratio = np.where(expected > 0, seen / np.where(expected > 0, expected, 1.0), 0.0)
-        judged = np.minimum(self.expected, other.expected) * ratio >= _LEAST
-        mine, theirs = np.maximum(self.expected, 1e-300), np.maximum(other.expected, 1e-300)
-        off = self.observed / mine - other.observed / theirs
-        square = off[judged] ** 2 / (ratio * (1.0 / mine + 1.0 / theirs))[judged]
-        return float(chi2.sf(float(square.sum()), int(judged.sum()))) if judged.any() else 1.0
-
     @property
     def recovered_ns(self) -> float:
         """Age from which on the rate is that of the light: the end of the last age, in one run from the dead time
@@ -143,7 +132,7 @@ def recovery_of(
     before = np.arange(dead_time_ns, begin - 1e-9 * step, -step)[1:][::-1]
     edges = np.concatenate([before[before >= 0.0], ages])
     cumulative = np.concatenate([[0.0], np.cumsum(rate)])
-    start, dt = _intervals(stream)
+    start, dt = intervals_of(stream, _MOST)
     observed = np.histogram(dt, edges)[0].astype(np.float64)
     expected = np.zeros(edges.size - 1)
     alive = dt > edges[0]
@@ -155,21 +144,6 @@ def recovery_of(
         alive = dt > edge
         start, dt, light = start[alive], dt[alive], later[alive]
     return Recovery(edges, observed, expected, dead_time_ns, hold_off_ns)
-
-
-def _intervals(stream: Stream) -> tuple[FloatArray, FloatArray]:
-    """Time of a registration and time to the next, ns, of the first intervals of the stream."""
-    start: list[FloatArray] = [np.empty(0)]
-    dt: list[FloatArray] = [np.empty(0)]
-    left = _MOST
-    for piece in stream.pieces:
-        t = piece.times_ns[: left + 1]
-        start.append(t[:-1])
-        dt.append(np.diff(t))
-        left -= max(t.size - 1, 0)
-        if left <= 0:
-            break
-    return np.concatenate(start), np.concatenate(dt)
 
 
 def _light(start: FloatArray, age: FloatArray | float, cumulative: FloatArray, period_ns: float) -> FloatArray:

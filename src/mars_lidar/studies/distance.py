@@ -73,34 +73,46 @@ def sampling_floor(law: Pmf, size: int, draws: int, random: np.random.Generator)
     return found
 
 
-def g_test(law: Pmf, sample: Pmf, size: int) -> float:
+def g_test(law: Pmf, sample: Pmf, size: int, *, any_mean: bool = False) -> float:
     """p-value of a sample of `size` counts under the law; counts expected fewer than 5 times are pooled.
 
-    1 where the law leaves nothing to test: a single class.
+    1 where the law leaves nothing to test: a single class. `any_mean`: the law's mean has an error of its own, or was
+    fitted to the sample; a shift of the mean, to first order, is left out.
     """
     from scipy.stats import binomtest, chi2
 
     low, high = min(law.first, sample.first), max(law.last, sample.last)
     expected, observed = law.on(low, high) * size, sample.on(low, high) * size
+    counts = low + np.arange(expected.size)
+    moved = expected * (counts - float(expected @ counts) / max(float(expected.sum()), 1e-300))  # by a shift of the law
     common = expected >= _POOLED
     e = np.append(expected[common], max(size - float(expected[common].sum()), 0.0))
     o = np.append(observed[common], max(size - float(observed[common].sum()), 0.0))
+    d = np.append(moved[common], -float(moved[common].sum()))
     if e[-1] < _POOLED and e.size > 2:  # too rare on its own: with the rarest of the others
         rarest = int(e[:-1].argmin())
-        e[rarest] += e[-1]
-        o[rarest] += o[-1]
-        e, o = e[:-1], o[:-1]
+        for of in (e, o, d):
+            of[rarest] += of[-1]
+        e, o, d = e[:-1], o[:-1], d[:-1]
     if e.size < 2:
         return 1.0
     if e.size == 2:  # a count that hardly ever changes
         return float(binomtest(round(float(o[1])), size, min(float(e[1]) / size, 1.0)).pvalue)
     ratio = np.where(o > 0, o / e, 1.0)
-    return float(chi2.sf(2.0 * float((o * np.log(ratio)).sum()), e.size - 1))
+    square = 2.0 * float((o * np.log(ratio)).sum())
+    if any_mean:
+        square -= float(((o - e) * d / e).sum()) ** 2 / max(float((d**2 / e).sum()), 1e-300)
+    return float(chi2.sf(max(square, 0.0), e.size - 1 - any_mean))
 
 
-def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int) -> float:
-    """p-value of two samples of counts being of one law; counts expected fewer than 5 times in either are pooled."""
-    from scipy.stats import chi2_contingency
+def two_sample_g_test(
+    first: Pmf, first_size: int, second: Pmf, second_size: int, *, any_mean: bool = False
+) -> float:
+    """p-value of two samples of counts being of one law; counts expected fewer than 5 times in either are pooled.
+
+    `any_mean`: as for `g_test`, of the difference of the two means.
+    """
+    from scipy.stats import chi2, chi2_contingency
 
     low, high = min(first.first, second.first), max(first.last, second.last)
     table = np.stack([first.on(low, high) * first_size, second.on(low, high) * second_size])
@@ -114,7 +126,15 @@ def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int
     table = table[:, table.sum(0) > 0]
     if table.shape[1] < 2:
         return 1.0
-    return float(chi2_contingency(table, correction=False, lambda_="log-likelihood").pvalue)
+    found = chi2_contingency(table, correction=False, lambda_="log-likelihood")
+    square, freedom = float(found.statistic), int(found.dof)
+    if any_mean and freedom > 1:
+        both = (first_size * first.on(low, high) + second_size * second.on(low, high)) / (first_size + second_size)
+        counts = low + np.arange(both.size)
+        variance = float(both @ (counts - both @ counts) ** 2) * (1.0 / first_size + 1.0 / second_size)
+        square -= float((first.on(low, high) - second.on(low, high)) @ counts) ** 2 / max(variance, 1e-300)
+        freedom -= 1
+    return float(chi2.sf(max(square, 0.0), freedom))
 
 
 def mean_score(law_mean: float, law_variance: float, mean: float, size: int) -> float:

@@ -252,7 +252,7 @@ def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatA
 
 def _map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:
     if isinstance(value, np.ma.MaskedArray):  # a masked delay is no return; masked light is refused, not taken as it is
-        value = value.astype(np.float64).filled(np.nan)
+        value = np.where(np.ma.getmaskarray(value), np.nan, value.data)
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")

@@ -304,6 +304,15 @@ def test_no_work_is_done_for_bad_input():
     assert (out == 7).all()
 
 
+def test_a_masked_pixel_is_not_taken_for_what_lies_under_the_mask():
+    mask = [[False, True, False], [False, False, False]]
+    light = np.ma.MaskedArray(np.ones((2, 3)), mask=mask)
+    refused(lambda: ml.Flux(light, 0.5, 20.0), ValueError, "signal", "nan at index (0, 1)")
+    refused(lambda: ml.Flux(1.0, light, 20.0), ValueError, "background", "nan at index (0, 1)")
+    refused(lambda: ml.Flux(1.0, 0.5, light), ValueError, "delay_ns", "(0, 1)")
+    assert np.isnan(ml.Flux(np.where(mask, 0.0, 1.0), 0.5, light).delay_ns[0, 1])  # no light: no return
+
+
 def test_what_is_no_array_of_counts_is_named_by_its_type(tmp_path):
     from mars_lidar import io
 

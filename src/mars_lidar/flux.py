@@ -251,6 +251,8 @@ def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatA
 
 
 def _map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:
+    if isinstance(value, np.ma.MaskedArray):  # a masked delay is no return; masked light is refused, not taken as it is
+        value = np.where(np.ma.getmaskarray(value), np.nan, value.data)
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
@@ -270,9 +272,8 @@ def _check_photons(name: str, array: FloatArray) -> None:
     bad = ~((array >= 0) & (array <= MAX_PHOTONS))
     if bad.any():
         where = tuple(int(k) for k in np.argwhere(bad)[0])
-        raise ValueError(
-            f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]} at index {where}"
-        )
+        at = f" at index {where}" if where else ""
+        raise ValueError(f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]}{at}")
 
 
 def _common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:

@@ -32,6 +32,7 @@ def test_a_file_says_what_the_table_said(tmp_path, method):
     assert isinstance(read.shapes().base, np.memmap)
     assert (read.system, read.method, read.provenance) == (table.system, method, table.provenance)
     assert read.nbytes == table.nbytes
+    assert ml.Table.load(tmp_path / "t.h5").system == table.system
     for name in ("row", "first", "offsets", "pmf"):
         assert np.array_equal(getattr(read.laws, name), getattr(table.laws, name))
     assert (table.laws.row.size > 0) == (method == "exposure")

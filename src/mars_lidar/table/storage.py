@@ -39,15 +39,15 @@ def save(table: Table, path: Path, *, overwrite: bool) -> None:
             file.create_dataset(name, data=array)
 
 
-def load(path: Path, system: System) -> Table:
+def load(path: Path, system: System | None) -> Table:
     """See `Table.load`."""
     from mars_lidar.table.table import Table
 
-    if not isinstance(system, System):
+    if system is not None and not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     header, arrays = _read(path)
-    system = system.detected()
     made_for = System.from_json(header["system"])
+    system = made_for if system is None else system.detected()
     _compare(path, made_for, system)
     entries = Entries(
         cycles=made_for.cycles,

@@ -254,8 +254,8 @@ class Table:
         save(self, Path(path), overwrite=overwrite)
 
     @classmethod
-    def load(cls, path: str | Path, system: System) -> Table:
-        """The table of a file, for `system`; shapes stay in the file, mapped into memory.
+    def load(cls, path: str | Path, system: System | None = None) -> Table:
+        """The table of a file, for `system` (None: for the one it was made for); shapes stay in the file, mapped.
 
         Raises
         ------

@@ -267,8 +267,8 @@ def _map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:
 
 
 def _check_photons(name: str, array: FloatArray) -> None:
-    bad = ~((array >= 0) & (array <= MAX_PHOTONS))
-    if bad.any():
+    if not (array.min() >= 0 and array.max() <= MAX_PHOTONS):  # NaN is neither
+        bad = ~((array >= 0) & (array <= MAX_PHOTONS))
         where = tuple(int(k) for k in np.argwhere(bad)[0])
         raise ValueError(
             f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]} at index {where}"
@@ -285,7 +285,7 @@ def _common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tu
 
 def _broadcast(names: Sequence[str], maps: Sequence[FloatArray]) -> list[FloatArray]:
     shape = _common_shape(names, [m.shape for m in maps])
-    return [np.broadcast_to(m, shape) for m in maps]
+    return [m if m.shape == shape else np.broadcast_to(m, shape) for m in maps]
 
 
 def _waveform_maps(waveform: ArrayLike, background: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -319,8 +319,8 @@ def _fill(
     waveform: FloatArray | None,
     info: dict[str, Any] | None,
 ) -> None:
-    lost = np.isnan(delay) & (signal > 0)
-    if lost.any():
+    lost = np.isnan(delay)
+    if lost.any() and (lost := lost & (signal > 0)).any():
         where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
         raise ValueError(f"delay_ns must be finite where signal > 0, got NaN at pixel {where}")
     if waveform is not None:

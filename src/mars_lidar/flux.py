@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from mars_lidar.photon_maps import MAX_PHOTONS as MAX_PHOTONS
+from mars_lidar.photon_maps import FloatArray as FloatArray
+from mars_lidar.photon_maps import broadcast, check_photons, common_shape, frozen, light_map, waveform_maps
 
 if TYPE_CHECKING:
     from mars_lidar.system import System
 
-MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -72,14 +73,14 @@ class Flux:
         if waveform is not None:
             if signal is not None or delay_ns is not None:
                 raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
-            wave, back = _waveform_maps(waveform, background)
+            wave, back = waveform_maps(waveform, background)
             _fill(self, np.empty((0, *back.shape)), np.empty((0, *back.shape)), back, wave, info)
             return
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-        maps = [_map("signal", signal), _map("background", background)]
-        maps.append(_map("delay_ns", 0.0 if delay_ns is None else delay_ns, photons=False))
-        s, b, tau = _broadcast(("signal", "background", "delay_ns"), maps)
+        maps = [light_map("signal", signal), light_map("background", background)]
+        maps.append(light_map("delay_ns", 0.0 if delay_ns is None else delay_ns, photons=False))
+        s, b, tau = broadcast(("signal", "background", "delay_ns"), maps)
         if delay_ns is None and (s > 0).any():
             raise ValueError("delay_ns must be given where signal > 0")
         _fill(self, s[None], tau[None], b, None, info)
@@ -96,7 +97,7 @@ class Flux:
         waves = [f.waveform for f in fluxes if f.waveform is not None]
         if waves and len(waves) != len(fluxes):
             raise ValueError("multi cannot mix waveforms with returns; write the returns into the waveform")
-        shape = _common_shape(tuple(f"fluxes[{k}]" for k in range(len(fluxes))), [f.shape for f in fluxes])
+        shape = common_shape(tuple(f"fluxes[{k}]" for k in range(len(fluxes))), [f.shape for f in fluxes])
         back = np.sum([np.broadcast_to(f.background, shape) for f in fluxes], axis=0)
         self = cls.__new__(cls)
         if waves:
@@ -148,10 +149,10 @@ class Flux:
         They are background that the detection efficiency of the system does not reduce (hence divided by it here, for
         `detected` multiplies), uniform in time; a gated pixel has them in its gate only.
         """
-        rate = _map("rate_hz", rate_hz, photons=False)
+        rate = light_map("rate_hz", rate_hz, photons=False)
         if not (rate >= 0.0).all():
             raise ValueError(f"rate_hz must be counts/s >= 0, got {rate.min():g}")
-        _common_shape(("flux", "rate_hz"), [self.shape, rate.shape])
+        common_shape(("flux", "rate_hz"), [self.shape, rate.shape])
         if np.broadcast_shapes(self.shape, rate.shape) != self.shape:
             raise ValueError(f"rate_hz must be a scalar or {self.shape}, got {rate.shape}")
         return self._scaled(1.0, _dark_photons(rate, system) / system.detector.detection_efficiency)
@@ -159,7 +160,7 @@ class Flux:
     def _scaled(self, share: float, more: float | FloatArray) -> Flux:
         """Signal and background times `share`, and more background."""
         background = self.background * share + more
-        _check_photons("background with dark counts", background)
+        check_photons("background with dark counts", background)
         flux, wave = Flux.__new__(Flux), None if self.waveform is None else self.waveform * share
         _fill(flux, self.returns_signal * share, self.returns_delay_ns, background, wave, self.info)
         return flux
@@ -250,68 +251,6 @@ def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatA
     return rate_hz * (system.period_ns * 1e-9)
 
 
-def _map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:
-    if isinstance(value, np.ma.MaskedArray):  # a masked delay is no return; masked light is refused, not taken as it is
-        value = np.where(np.ma.getmaskarray(value), np.nan, value.data)
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiub":
-        raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
-    array = array.astype(np.float64)
-    if array.ndim > 2:
-        raise ValueError(f"{name} must be a scalar or (H, W), got shape {array.shape}")
-    if array.size == 0:
-        raise ValueError(f"{name} must have at least one pixel, got shape {array.shape}")
-    if photons:
-        _check_photons(name, array)
-    elif np.isinf(array).any():
-        raise ValueError(f"{name} must be finite (or NaN where there is no return), got inf")
-    return np.atleast_2d(array)
-
-
-def _check_photons(name: str, array: FloatArray) -> None:
-    bad = ~((array >= 0) & (array <= MAX_PHOTONS))
-    if bad.any():
-        where = tuple(int(k) for k in np.argwhere(bad)[0])
-        at = f" at index {where}" if where else ""
-        raise ValueError(f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]}{at}")
-
-
-def _common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    try:
-        return np.broadcast_shapes(*shapes)
-    except ValueError:
-        told = ", ".join(f"{n} {s}" for n, s in zip(names, shapes, strict=True))
-        raise ValueError(f"shapes must broadcast to one (H, W), got {told}") from None
-
-
-def _broadcast(names: Sequence[str], maps: Sequence[FloatArray]) -> list[FloatArray]:
-    shape = _common_shape(names, [m.shape for m in maps])
-    return [np.broadcast_to(m, shape) for m in maps]
-
-
-def _waveform_maps(waveform: ArrayLike, background: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    wave = np.asarray(waveform)
-    if wave.dtype.kind not in "fiub":
-        raise TypeError(f"waveform must be real numbers, got dtype {wave.dtype}")
-    if wave.ndim not in (1, 2, 3) or wave.size == 0:
-        raise ValueError(f"waveform must be (T,), (W, T) or (H, W, T), got shape {wave.shape}")
-    wave = wave.astype(np.float64)
-    _check_photons("waveform", wave)
-    wave = wave.reshape((1,) * (3 - wave.ndim) + wave.shape)
-    _check_photons("waveform summed over a period", wave.sum(-1))
-    back = _map("background", background)
-    shape = _common_shape(("waveform", "background"), [wave.shape[:2], back.shape])
-    return np.broadcast_to(wave, (*shape, wave.shape[-1])), np.broadcast_to(back, shape)
-
-
-def _frozen(array: FloatArray) -> FloatArray:
-    copy = np.ascontiguousarray(array, dtype=np.float64)
-    if copy is array or copy.base is not None:
-        copy = copy.copy()
-    copy.flags.writeable = False
-    return copy
-
-
 def _fill(
     flux: Flux,
     signal: FloatArray,
@@ -320,8 +259,8 @@ def _fill(
     waveform: FloatArray | None,
     info: dict[str, Any] | None,
 ) -> None:
-    lost = np.isnan(delay) & (signal > 0)
-    if lost.any():
+    lost = np.isnan(delay)
+    if lost.any() and (lost := lost & (signal > 0)).any():
         where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
         raise ValueError(f"delay_ns must be finite where signal > 0, got NaN at pixel {where}")
     if waveform is not None:
@@ -338,6 +277,6 @@ def _fill(
         "returns_signal": signal,
         "returns_delay_ns": delay,
     }.items():
-        object.__setattr__(flux, name, _frozen(array))
-    object.__setattr__(flux, "waveform", None if waveform is None else _frozen(waveform))
+        object.__setattr__(flux, name, frozen(array))
+    object.__setattr__(flux, "waveform", None if waveform is None else frozen(waveform))
     object.__setattr__(flux, "info", dict(info or {}))

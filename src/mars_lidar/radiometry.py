@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -47,20 +47,22 @@ def scene_flux(
     _validate.choice("ambient", light_name, _AMBIENTS)
     rate = _validate.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
     light = _ambient_light(layers, light_name)
-    depth = np.stack([one.depth_m for one in layers])
-    there = ~np.isnan(depth)
-    valid = np.asarray(there.any(axis=0))
-    if not valid.any():
+    valid = _any([one.valid for one in layers])
+    number = int(np.count_nonzero(valid))
+    if number == 0:
         raise ValueError("depth_m is NaN at every pixel: there is no return to set a signal level with")
     reach = system.unambiguous_range_m
 
-    returned = _returned(layers, depth, there, attenuation)
-    s = _scaled(returned, level, valid, "reflectivity", f"signal={level:g}")
+    def seen(image: FloatArray) -> FloatArray:
+        """The pixels with a return."""
+        return image.reshape(-1) if number == valid.size else image[valid]
+
+    s = _scaled(_returned(layers, attenuation), level, seen, "reflectivity", f"signal={level:g}")
     b = np.zeros(scene.shape)
     if ratio < math.inf:
-        b = _scaled(light[None], level / ratio, valid, "ambient light", f"sbr={ratio:g}")[0]
+        (b,) = _scaled([light], level / ratio, seen, "ambient light", f"sbr={ratio:g}")
     dark = rate * system.period_ns * 1e-9 / system.detector.detection_efficiency  # photons for as many counts
-    wrapped = int(np.count_nonzero((np.where(there, depth, 0.0) >= reach).any(axis=0)))
+    wrapped = int(np.count_nonzero(_any([one.depth_m >= reach for one in layers])))
     info = {
         "source": "Scene.flux",
         "signal": level,
@@ -71,17 +73,17 @@ def scene_flux(
         "ambient": light_name,
         "dark_counts_per_s": rate,
         "n_pixels": int(valid.size),
-        "n_valid": int(np.count_nonzero(valid)),
+        "n_valid": number,
         "n_wrapped": wrapped,
         "unambiguous_range_m": reach,
-        **_means(s.sum(axis=0)[valid], b[valid], dark),
+        **_means(seen(_sum(s)), seen(b), dark),
     }
-    delay = system.delay_ns(depth)
-    flux = Flux(signal=s[0], background=b + dark, delay_ns=delay[0], info=info)
+    flux = Flux(signal=s[0], background=b + dark, delay_ns=system.delay_ns(scene.depth_m), info=info)
     if len(layers) > 1:
-        others = [Flux(signal=one, delay_ns=tau) for one, tau in zip(s[1:], delay[1:], strict=True)]
+        delays = [system.delay_ns(one.depth_m) for one in layers[1:]]
+        others = [Flux(signal=one, delay_ns=tau) for one, tau in zip(s[1:], delays, strict=True)]
         flux = Flux.multi(flux, *others, info=info)
-    _warn(int(np.count_nonzero(~valid)), wrapped, valid.size, reach)
+    _warn(valid.size - number, wrapped, valid.size, reach)
     return flux
 
 
@@ -98,23 +100,36 @@ def _ambient_light(layers: Sequence[Scene], name: str) -> FloatArray:
     return scene.background
 
 
-def _returned(layers: Sequence[Scene], depth: FloatArray, there: NDArray[np.bool_], attenuation: str) -> FloatArray:
-    """Relative returned laser light (layers, H, W), 0 where nothing returns."""
-    share = np.where(there, np.stack([one.reflectivity for one in layers]), 0.0)
+def _returned(layers: Sequence[Scene], attenuation: str) -> list[FloatArray]:
+    """Relative returned laser light of each layer (H, W), 0 where nothing returns."""
+    share = [np.where(one.valid, one.reflectivity, 0.0) for one in layers]
     if attenuation == "inverse_square":
         # Relative to the nearest depth: the same after normalisation, and nothing overflows.
-        share *= (depth[there].min() / np.where(there, depth, np.inf)) ** 2
+        nearest = min(np.nanmin(one.depth_m) for one in layers if one.valid.any())
+        for one, light in zip(layers, share, strict=True):
+            light *= (nearest / np.where(one.valid, one.depth_m, np.inf)) ** 2
     return share
 
 
-def _scaled(light: FloatArray, mean: float, valid: NDArray[np.bool_], what: str, asked: str) -> FloatArray:
-    """Relative maps (K, H, W) scaled together, so that their sum has a mean over the valid pixels."""
-    top = float(light.sum(axis=0)[valid].max())
+def _scaled(
+    light: list[FloatArray], mean: float, seen: Callable[[FloatArray], FloatArray], what: str, asked: str
+) -> list[FloatArray]:
+    """Relative maps scaled together, so that their sum has a mean over the pixels that are `seen`."""
+    total = _sum(light)
+    top = float(seen(total).max())
     if top == 0.0:
         raise ValueError(f"{what} is zero at every pixel with a return: {asked} cannot be reached")
-    relative = light / top  # to order one first: a map of 1e-300 scales as well as one of 1e300
-    scaled: FloatArray = relative * (mean / float(relative.sum(axis=0)[valid].mean()))
-    return scaled
+    # to order one first: a map of 1e-300 scales as well as one of 1e300
+    scale = mean / float((seen(total) / top).mean())
+    return [one / top * scale for one in light]
+
+
+def _sum(images: list[FloatArray]) -> FloatArray:
+    return images[0] if len(images) == 1 else np.sum(images, axis=0)
+
+
+def _any(images: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    return images[0] if len(images) == 1 else np.logical_or.reduce(images)
 
 
 def _means(s: FloatArray, ambient: FloatArray, dark: float) -> dict[str, float | None]:

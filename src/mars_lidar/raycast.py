@@ -24,6 +24,7 @@ _RAYS = 1 << 14  # cast together: their arrays stay in the second-level cache
 # Four rays round the one through the pixel's centre, on a square turned by atan(1/2): no two share a row or a
 # column, which smooths near-horizontal and near-vertical edges best.
 _EXTRA = ((-0.375, -0.125), (-0.125, 0.375), (0.375, 0.125), (0.125, -0.375))
+_TWO, _FOUR = np.int8(2), np.int8(4)  # numbers of faces and objects take a byte: they are compared again and again
 _CONTRAST = 0.04  # neighbours that differ by more get the extra rays
 
 
@@ -101,13 +102,14 @@ class Box:
         x, y, z = o[:, None] + t * local
         # The face that holds the point is the one it is farthest out on, in half lengths.
         a, b, c = np.abs(x / self.half[0]), np.abs(y / self.half[1]), np.abs(z / self.half[2])
-        face = np.where((a >= b) & (a >= c), x > 0.0, np.where(b >= c, 2 + (y > 0.0), 4 + (z > 0.0)))
+        up, out = (y > 0.0).view(np.int8) + _TWO, (z > 0.0).view(np.int8) + _FOUR
+        face = np.where((a >= b) & (a >= c), (x > 0.0).view(np.int8), np.where(b >= c, up, out))
         light = np.empty(t.size)
         for k in range(6):
-            on = np.flatnonzero(face == k)
+            (on,) = (face == k).nonzero()
             if on.size:
                 u, v = ((z, y), (x, z), (x, y))[k // 2]
-                light[on] = np.abs(local[k // 2, on]) * self.faces[k](u[on], v[on])
+                light[on] = np.abs(local[k // 2].take(on)) * self.faces[k](u.take(on), v.take(on))
         return light
 
 
@@ -122,7 +124,7 @@ class Sphere:
     def hit(self, origin: FloatArray, d: FloatArray) -> FloatArray:
         """Range (n,) at which rays (3, n) meet the sphere, inf for a miss."""
         o = origin - self.centre
-        b = o @ d
+        b = o[0] * d[0] + o[1] * d[1] + o[2] * d[2]  # not o @ d: BLAS libraries differ in the last bit
         discriminant = b * b - (o @ o - self.radius**2)
         t = -b - np.sqrt(np.maximum(discriminant, 0.0))
         return np.where((discriminant > 0.0) & (t > 0.0), t, np.inf)
@@ -158,13 +160,10 @@ def cast(
 def _uneven(image: FloatArray) -> NDArray[np.bool_]:
     """Pixels that differ from one of their four neighbours."""
     uneven = np.zeros(image.shape, dtype=np.bool_)
-    for axis in (0, 1):
-        step = np.abs(np.diff(image, axis=axis)) > _CONTRAST
-        pad = [(0, 0), (0, 0)]
-        pad[axis] = (1, 0)
-        uneven |= np.pad(step, pad)
-        pad[axis] = (0, 1)
-        uneven |= np.pad(step, pad)
+    for turned, told in ((image, uneven), (image.T, uneven.T)):
+        step = np.abs(turned[1:] - turned[:-1]) > _CONTRAST
+        told[1:] |= step
+        told[:-1] |= step
     return uneven
 
 
@@ -173,22 +172,22 @@ def _trace(
 ) -> tuple[FloatArray, FloatArray]:
     """Range to the nearest surface along each ray (3, n), and albedo times cosine of incidence there."""
     nearest = np.full(d.shape[1], np.inf)
-    owner = np.full(d.shape[1], -1, dtype=np.intp)
+    owner = np.full(d.shape[1], -1, dtype=np.int8 if len(objects) < 128 else np.intp)
     for k, thing in enumerate(objects):
         rays = _towards(thing, origin, d)
         if rays is not None and rays.size == 0:
             continue
-        t = thing.hit(origin, d if rays is None else d[:, rays])
-        seen = np.flatnonzero(t < (nearest if rays is None else nearest[rays]))
-        where = seen if rays is None else rays[seen]
-        nearest[where] = t[seen]
+        t = thing.hit(origin, d if rays is None else d.take(rays, axis=1))
+        (seen,) = (t < (nearest if rays is None else nearest.take(rays))).nonzero()
+        where = seen if rays is None else rays.take(seen)
+        nearest[where] = t.take(seen)
         owner[where] = k
     light = np.zeros(d.shape[1])
     for k, thing in enumerate(objects):
-        where = np.flatnonzero(owner == k)
+        (where,) = (owner == k).nonzero()
         if where.size:
-            light[where] = thing.light(origin, d[:, where], nearest[where])
-    return nearest, np.clip(light, 0.0, 1.0)
+            light[where] = thing.light(origin, d.take(where, axis=1), nearest.take(where))
+    return nearest, np.minimum(np.maximum(light, 0.0, out=light), 1.0, out=light)
 
 
 def _towards(thing: Box | Sphere, origin: FloatArray, d: FloatArray) -> NDArray[np.intp] | None:
@@ -198,4 +197,4 @@ def _towards(thing: Box | Sphere, origin: FloatArray, d: FloatArray) -> NDArray[
     if distance <= thing.radius:
         return None
     cosine = math.sqrt(1.0 - (thing.radius / distance) ** 2)
-    return np.flatnonzero((to / distance) @ d >= cosine - 1e-12)
+    return ((to / distance) @ d >= cosine - 1e-12).nonzero()[0]

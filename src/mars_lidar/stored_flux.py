@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._memory import check_memory
-from mars_lidar.flux import FloatArray, Flux, _check_photons
+from mars_lidar.flux import FloatArray, Flux
+from mars_lidar.photon_maps import check_photons
 
 BAND_BYTES = 64 * 2**20  # of waveforms that are made together
 
@@ -79,7 +80,7 @@ class StoredFlux(Flux):
 
     def _scaled(self, share: float, more: float | FloatArray) -> Flux:
         background = self.background * share + more
-        _check_photons("background with dark counts", background)
+        check_photons("background with dark counts", background)
         every = np.broadcast_to(more, self.shape)
 
         def rows(wanted: slice) -> Flux:

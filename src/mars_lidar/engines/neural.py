@@ -92,8 +92,8 @@ class NeuralEngine(Engine):
 
     def of_cells(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
         """PDFs (cells, bins), means and variances (cells,): uniform, 0 and 0 where there is no light."""
+        from mars_lidar.statistics._methods import pixel_of
         from mars_lidar.statistics.grid import photons_per_bin
-        from mars_lidar.statistics.law import pixel_of
 
         system, model = cells.system, self.model
         model.check(system)

@@ -84,8 +84,8 @@ def _laws(system: System, signal: FloatArray, background: FloatArray) -> CountLa
 
 def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:
     """Shapes (cells, bins) and registrations per period (cells,)."""
+    from mars_lidar.statistics._methods import pixel_of
     from mars_lidar.statistics.chain import PhaseChain
-    from mars_lidar.statistics.law import pixel_of
 
     cells, system = group.cells, run.task.system
     shapes, rates = np.zeros((cells.size, system.bins)), np.zeros(cells.size)

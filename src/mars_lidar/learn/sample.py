@@ -50,9 +50,8 @@ class Recipe:
 
     def sample(self, epoch: int, index: int) -> Sample:
         """Sample `index` of an epoch. What is drawn for one purpose does not depend on the settings of another."""
-        system = self.systems.draw(generator(4, self.seed, epoch, index))
-        light = generator(5, self.seed, epoch, index)
-        level, sbr, stretch = (given.draw(light) for given in (self.signal, self.sbr, self.depth_scale))
+        system = self._system(epoch, index)
+        level, sbr, stretch = self._light(epoch, index)
         scene = self._placed(self.source.scene(self.seed, epoch, index), epoch, index)
         if stretch != 1.0:
             scene = Scene(scene.depth_m * stretch, scene.reflectivity, scene.background)
@@ -65,6 +64,19 @@ class Recipe:
         seed = int(generator(6, self.seed, epoch, index).integers(2**63))
         return Sample(index, scene, system, flux, level, sbr, seed)
 
+    def _system(self, epoch: int, index: int) -> System:
+        if isinstance(self.systems, SystemList) and len(self.systems.corners()) == 1:
+            return self.systems.corners()[0]
+        return self.systems.draw(generator(4, self.seed, epoch, index))
+
+    def _light(self, epoch: int, index: int) -> tuple[float, ...]:
+        """Signal, sbr and the factor on the depth."""
+        given = (self.signal, self.sbr, self.depth_scale)
+        if all(len(set(one.ends)) == 1 for one in given):  # nothing to draw, and a generator takes 10 us
+            return tuple(one.ends[0] for one in given)
+        light = generator(5, self.seed, epoch, index)
+        return tuple(one.draw(light) for one in given)
+
     def _placed(self, scene: Scene, epoch: int, index: int) -> Scene:
         """A crop of the scene, mirrored or not: the scene is, before anything is simulated."""
         random = generator(7, self.seed, epoch, index)
@@ -75,9 +87,9 @@ class Recipe:
         for _ in range(_TRIES):
             y = int(random.integers(scene.shape[0] - height + 1))
             x = int(random.integers(scene.shape[1] - width + 1))
-            crop = scene[y : y + height, x : x + width]
-            if (crop.reflectivity[crop.valid] > 0.0).any():
-                return crop[::down, ::right]
+            crop = scene[_run(y, height, down), _run(x, width, right)]
+            if (crop.valid & (crop.reflectivity > 0.0)).any():
+                return crop
         seen = np.argwhere(scene.valid & (scene.reflectivity > 0.0))  # few and far between: about one of them
         if not len(seen):
             raise ValueError(f"a scene must have a pixel with a return, got {scene!r}")
@@ -86,7 +98,14 @@ class Recipe:
             int(random.integers(max(0, place - wanted + 1), min(place, whole - wanted) + 1))
             for place, wanted, whole in zip(at.tolist(), (height, width), scene.shape, strict=True)
         )
-        return scene[y : y + height, x : x + width][::down, ::right]
+        return scene[_run(y, height, down), _run(x, width, right)]
+
+
+def _run(first: int, number: int, step: int) -> slice:
+    """So many pixels from `first` on, in this order or, with the step -1, in the other."""
+    if step > 0:
+        return slice(first, first + number)
+    return slice(first + number - 1, first - 1 if first else None, -1)
 
 
 def numbers_of(system: System) -> dict[str, float]:

@@ -6,6 +6,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +74,7 @@ class RayCast(SceneSource):
         if self._reuse == 1:
             return int(generator(1, seed, epoch, sample).integers(2**64, dtype=np.uint64))
         which = int(generator(2, seed, epoch, sample).integers(POOL))
-        return int(
-            generator(1, seed, epoch, sample // (POOL * self._reuse), which).integers(2**64, dtype=np.uint64)
-        )
+        return _pooled(seed, epoch, sample // (POOL * self._reuse), which)
 
     def load(self, number: int) -> Scene:
         """Cast it, or take it from another worker."""
@@ -86,6 +85,12 @@ class RayCast(SceneSource):
             if shared is not None:
                 shared.put(number, found)
         return found
+
+
+@lru_cache(maxsize=4 * POOL)
+def _pooled(seed: int, epoch: int, turn: int, which: int) -> int:
+    """A seed of 64 bits for one of the scenes of a round."""
+    return int(generator(1, seed, epoch, turn, which).integers(2**64, dtype=np.uint64))
 
 
 class Given(SceneSource):

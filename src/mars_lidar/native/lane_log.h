@@ -31,8 +31,8 @@ public:
     void clear(int64_t item) {
         switch (output_.sink) {
             case Sink::kCounts: static_cast<int64_t*>(output_.out)[item] = 0; return;
-            case Sink::kHistogram16: memset(row<uint16_t>(item), 0, bins_ * sizeof(uint16_t)); return;
-            case Sink::kHistogram32: memset(row<uint32_t>(item), 0, bins_ * sizeof(uint32_t)); return;
+            case Sink::kHistogram16: return clear_row<uint16_t>(item);
+            case Sink::kHistogram32: return clear_row<uint32_t>(item);
             case Sink::kTimestamps: return;
         }
     }
@@ -77,6 +77,18 @@ private:
     template <class Count>
     Count* row(int64_t item) const {
         return static_cast<Count*>(output_.out) + static_cast<size_t>(item) * bins_;
+    }
+
+    // The next row is asked for meanwhile: a cube is larger than the caches, and to wait for its lines took a seventh of
+    // the time of dim light.
+    template <class Count>
+    void clear_row(int64_t item) const {
+        constexpr size_t most = 4096, line = 64;
+        Count* const cleared = row<Count>(item);
+        const size_t bytes = bins_ * sizeof(Count);
+        const char* const next = reinterpret_cast<const char*>(cleared) + bytes;
+        for (size_t k = 0; k < (bytes < most ? bytes : most); k += line) __builtin_prefetch(next + k, 1, 2);
+        memset(cleared, 0, bytes);
     }
 
     // Rows [from, to) of n lanes from `lane`.

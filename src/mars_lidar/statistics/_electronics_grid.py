@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mars_lidar.statistics._cells import Cells, FloatArray
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._gate import photons_before
-from mars_lidar.statistics.exposure import stationary_histogram
+from mars_lidar.statistics.stationary import stationary_histogram
 
 _MAX_NUMBERS = 1 << 27  # of the kernel: 1 GiB
 _ONE_THREAD = 250_000  # multiplications

@@ -28,9 +28,9 @@ Progress = Callable[[int, int], object]
 
 _MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
 _ORDERS = 4
-_MAX_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
+MOST_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
 _NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settled")  # what the native core fills
-_UNSETTLED = -2  # the native core's code: gave up
+UNSETTLED = -2  # the native core's code: gave up
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def refined_moments(
             break
         pending, coarse = pending[~good], _take(fine, ~good)
         bins *= 2
-        if bins > max(_MAX_BINS, 4 * out_bins):
+        if bins > max(MOST_BINS, 4 * out_bins):
             worst = int(np.argmax(moved[~good]))
             raise ConvergenceError(
                 f"exposure statistics of {cells.name(int(pending[worst]))}: with {bins // 2} bins per period "
@@ -179,32 +179,6 @@ def refined_moments(
         )
     np.maximum(result.cumulants[:, 1], 0.0, out=result.cumulants[:, 1])  # rounding of a locked pixel
     return _shaped(result, cells.shape)
-
-
-def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
-    """Registrations per period and bin (cells, out_bins) of a pixel that has been running for long (18)."""
-    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
-    team = thread_count(threads)
-    result = np.empty((cells.size, out_bins))
-    pending = np.arange(cells.size)
-    bins = cells.first_bins(out_bins)
-    shared = math.gcd(bins // 2, out_bins)
-    coarse = _stationary(cells, bins // 2, shared, team)
-    while pending.size:
-        fine = _stationary(cells.part(pending), bins, out_bins, team)
-        joined = fine.reshape(*coarse.shape, -1).sum(-1)
-        total = np.maximum(fine.sum(-1), np.finfo(float).tiny)
-        moved = np.abs(joined - coarse).sum(-1) / total
-        good = (moved <= tolerance) & (fine.min(-1) >= -1e-12 * total)
-        result[pending[good]] = np.maximum(fine[good], 0.0)
-        pending, coarse = pending[~good], fine[~good]
-        bins *= 2
-        if pending.size and bins > max(_MAX_BINS, 4 * out_bins):
-            raise ConvergenceError(
-                f"stationary histogram of {cells.name(int(pending[0]))}: with {bins // 2} bins per period it "
-                f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g})"
-            )
-    return result
 
 
 def thread_count(threads: int | None) -> int:
@@ -253,39 +227,13 @@ def _run(cells: Cells, bins: int, out_bins: int, threads: int, progress: Progres
             grid=grid, signal=signal, background=background, shape=row, shapes=energy, **into,
             threads=threads, level="", progress=progress,
         )  # fmt: skip
-    lost = result.settled == _UNSETTLED
+    lost = result.settled == UNSETTLED
     if lost.any():
         raise ConvergenceError(
             f"exposure statistics of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not "
             "repeat from period to period for so long that the exposure cannot be run to its end"
         )
     result.bins[:] = bins
-    return result
-
-
-def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:
-    from mars_lidar import _core
-
-    result = np.empty((cells.size, out_bins))
-    settled = np.empty(cells.size, np.int64)
-    for part in cells.chunks(bins, out_bins):
-        some = cells.part(part)
-        energy, row = some.energies(bins)
-        _core.exposure_stationary(
-            grid=some.grid(bins, out_bins),
-            signal=some.native_flux[0],
-            background=some.native_flux[1],
-            shape=row,
-            shapes=energy,
-            histogram=result[part],
-            settled=settled[part],
-            threads=threads,
-            level="",
-            progress=None,
-        )
-    if (settled == _UNSETTLED).any():
-        k = int(np.argmax(settled == _UNSETTLED))
-        raise ConvergenceError(f"stationary state of {cells.name(k)}: not reached")
     return result
 
 

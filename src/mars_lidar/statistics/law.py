@@ -1,9 +1,8 @@
-"""The count law of a pixel and the shape of its histogram, by any of the methods, under two verbs."""
+"""The count law of a pixel, by any of the methods."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,10 +15,11 @@ from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._electronics_law import record_windows
 from mars_lidar.statistics._gate import PLAIN
+from mars_lidar.statistics._methods import check_model, neural_moments, pixel_of, rearm_of
 from mars_lidar.statistics._pmf import Window, exact_windows, gaussian_window, poisson_window
-from mars_lidar.statistics._timing import recorded
-from mars_lidar.statistics.exposure import Exposure, refined_moments, stationary_histogram, thread_count
-from mars_lidar.statistics.histogram import histogram_effects, mean_histograms
+from mars_lidar.statistics.exposure import Exposure, refined_moments, thread_count
+from mars_lidar.statistics.histogram import histogram_effects
+from mars_lidar.statistics.shape import registration_pdf as registration_pdf
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 from mars_lidar.system import System
 
@@ -37,9 +37,6 @@ _LAW_MODES: dict[str, tuple[Mode, ...]] = {
     "neural": PLAIN,
     "poisson": MODES,
 }
-_SHAPES = ("exposure", "stationary", "chain", "neural")
-_OF_CHAIN = ("chain", "neural")
-_REARMS = ("centre", "edge")
 
 
 class CountLaw:
@@ -182,8 +179,8 @@ def count_law(
         For cells of shape (...).
     """
     _validate.choice("method", method, _METHODS)
-    edge = _rearm(rearm, method == "mars", f"method {method!r}")
-    _model(model, method)
+    edge = rearm_of(rearm, method == "mars", f"method {method!r}")
+    check_model(model, method)
     cells = Cells.of(
         signal, background, system, delay_ns=delay_ns, waveform=waveform,
         what=f"count_law of method {method!r}", modes=_LAW_MODES[method], effects=_law_effects(method, system),
@@ -205,7 +202,7 @@ def count_law(
         means = system.cycles * cells.total
         cumulants = np.repeat(means[:, None], 4, axis=1).reshape(*cells.shape, 4)
         return CountLaw(method, cumulants, lambda: [poisson_window(float(m)) for m in means])
-    mean, variance = _neural(cells, model)[1:] if method == "neural" else _gaussian_moments(method, cells, edge)
+    mean, variance = neural_moments(cells, model)[1:] if method == "neural" else _gaussian_moments(method, cells, edge)
     cumulants = np.zeros((*cells.shape, 4))
     cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
     return CountLaw(
@@ -215,86 +212,8 @@ def count_law(
     )
 
 
-def registration_pdf(
-    signal: ArrayLike | None,
-    background: ArrayLike,
-    system: System,
-    method: Literal["exposure", "stationary", "chain", "neural"] = "exposure",
-    *,
-    delay_ns: ArrayLike | None = None,
-    waveform: ArrayLike | None = None,
-    rearm: Literal["centre", "edge"] | None = None,
-    tolerance: float = 1e-4,
-    threads: int | None = None,
-    model: NeuralMap | str | Path | None = None,
-) -> FloatArray:
-    """Shape of the mean histogram: the distribution of registrations over the bins of the period.
-
-    Parameters
-    ----------
-    signal, background, delay_ns, waveform, tolerance, threads
-        As `count_law`; arrays broadcast to (...).
-    method
-        - ``"exposure"``: mean histogram of the finite exposure, which is what a measurement averages to,
-        - ``"stationary"``: that of a pixel which has been running for long,
-        - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500), for detectors
-          of mode ``"nonparalyzable"``; the first two are for every mode (docs/detectors.md),
-        - ``"neural"``: a trained network's answer to the flux, in place of the chain's
-          (`mars_lidar.engines.NeuralEngine`).
-    rearm
-        ``"centre"`` (default) or ``"edge"`` of the bin, for ``"chain"`` only.
-    model
-        For ``"neural"``: as `simulate`.
-
-    Returns
-    -------
-    NDArray
-        (..., bins), non-negative; sums to 1 over the last axis. A cell without any flux has the uniform
-        shape, the limit of little background.
-    """
-    _validate.choice("method", method, _SHAPES)
-    edge = _rearm(rearm, method == "chain", f"method {method!r}")
-    _model(model, method)
-    cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what=f"registration_pdf of method {method!r}", modes=PLAIN if method in _OF_CHAIN else MODES,
-        effects=_shape_effects(method, system),
-    )  # fmt: skip
-    if method == "neural":
-        shape = _neural(cells, model)[0]
-    elif method == "chain":
-        shape = _chain_shapes(cells, edge)
-    elif method == "exposure" or system.detector.mode == "synchronous":  # there the same at any time
-        shape = mean_histograms(cells, tolerance, threads)
-    elif system.detector.mode == "paralyzable":
-        warm = replace(cells, system=system.replace(start="stationary"))
-        shape = mean_histograms(warm, tolerance, threads)
-    else:
-        shape = recorded(
-            cells, lambda some, parts: stationary_histogram(some, parts, tolerance=tolerance, threads=threads)
-        )
-    total = shape.sum(-1, keepdims=True)
-    dark = total == 0.0
-    shape = np.where(dark, 1.0 / system.bins, shape / np.where(dark, 1.0, total))
-    return np.asarray(shape.reshape(*cells.shape, system.bins), dtype=np.float64)
-
-
 def _law_effects(method: str, system: System) -> tuple[str, ...]:
     return histogram_effects(system) if method == "exact" else LIGHT_EFFECTS + TIMING_EFFECTS
-
-
-def _shape_effects(method: str, system: System) -> tuple[str, ...]:
-    if method in _OF_CHAIN:
-        return LIGHT_EFFECTS
-    return histogram_effects(system) if method == "exposure" else LIGHT_EFFECTS + TIMING_EFFECTS
-
-
-def _rearm(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"]:
-    if rearm is None:
-        return "centre"
-    if not used:
-        raise ValueError(f"rearm must be None for {by}, which has no such choice, got {rearm!r}")
-    return "edge" if _validate.choice("rearm", rearm, _REARMS) == "edge" else "centre"
 
 
 def _gaussian_moments(
@@ -314,41 +233,3 @@ def _gaussian_moments(
             signal, cells.background[k], cells.system, rearm=edge, delay_ns=delay, waveform=waveform
         )
     return mean, variance
-
-
-def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
-    """Registrations per period (cells, bins), by the chain on its grid, summed into histogram bins."""
-    from mars_lidar.statistics.chain import PhaseChain
-
-    bins = cells.system.bins
-    out = np.zeros((cells.size, bins))
-    for k in range(cells.size):
-        if cells.signal[k] + cells.background[k] == 0.0:
-            continue
-        signal, waveform, delay = pixel_of(cells, k)
-        chain = PhaseChain.from_flux(
-            signal, float(cells.background[k]), cells.system, rearm=edge, delay_ns=delay, waveform=waveform
-        )
-        out[k] = chain.stationary().pdf.reshape(bins, -1).sum(-1)
-    return out
-
-
-def _model(model: object, method: str) -> None:
-    if model is not None and method != "neural":
-        raise ValueError(f"model must be None for method {method!r}, which has no network, got {model!r}")
-
-
-def _neural(cells: Cells, model: NeuralMap | str | Path | None) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """PDFs (cells, bins), means and variances (cells,) by the network."""
-    from mars_lidar.engines import ENGINES, NeuralEngine
-
-    default = ENGINES["neural"]
-    engine = default if model is None and isinstance(default, NeuralEngine) else NeuralEngine(model)
-    return engine.of_cells(cells)
-
-
-def pixel_of(cells: Cells, k: int) -> tuple[float | None, FloatArray | None, float | None]:
-    """Signal, waveform and delay of one cell as the chain takes them."""
-    if cells.waveform is not None:
-        return None, cells.signal[k] * cells.waveform[cells.row[k]], None
-    return float(cells.signal[k]), None, float(cells.delay[k]) * cells.system.period_ns

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar.statistics._cells import FloatArray, IndexArray
+from mars_lidar.statistics._cells import FloatArray, IndexArray, _broadcast, _reals
 from mars_lidar.table.start_phase import StartPhases
 
 
@@ -45,6 +45,45 @@ class Lookup:
         if inside.any():
             good[inside] = trusted(self.cumulants[inside], threads=1)
         return good
+
+
+def read_pixels(
+    period_ns: float,
+    axes: tuple[FloatArray, FloatArray],
+    signal: ArrayLike,
+    background: ArrayLike,
+    delay_ns: ArrayLike | None,
+    outside: str,
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """The arguments of `Table.lookup`, checked, (P,): signal, background, phase, and what lies beyond the axes.
+
+    The phase, in [0, 1) periods, is by how much the return comes before the canonical delay, half a period; 0 where
+    there is no return.
+    """
+    canonical = 0.5 * period_ns
+    given = _reals("delay_ns", canonical if delay_ns is None else delay_ns)
+    parts = _broadcast(
+        ("signal", "background", "delay_ns"), _reals("signal", signal), _reals("background", background), given
+    )
+    s, b, delay = (np.ascontiguousarray(part.reshape(-1), dtype=np.float64) for part in parts)
+    bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (s == 0))
+    if bad.any():
+        raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad][0]}")
+    beyond = np.zeros(s.size, dtype=bool)
+    for name, values, axis in (("signal", s, axes[0]), ("background", b, axes[1])):
+        if not (values >= 0).all():
+            raise ValueError(f"{name} must be photons per period >= 0, got {values[~(values >= 0)][0]}")
+        out = (values < axis[0]) | (values > axis[-1])
+        if out.any() and outside == "error":
+            raise ValueError(
+                f"{name} must lie in the table's [{axis[0]:g}, {axis[-1]:g}] photons per period, got "
+                f"{values.min():g} to {values.max():g} ({int(out.sum())} of {values.size} pixels outside); build "
+                "the table over that range, or leave them to the exact engine with outside='exact'"
+            )
+        beyond |= out
+    phase = (canonical - np.where(np.isnan(delay), canonical, delay)) / period_ns
+    phase -= np.floor(phase)
+    return s, b, phase, beyond
 
 
 def evaluate(

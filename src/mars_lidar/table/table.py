@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar._brief import brief
-from mars_lidar.statistics._cells import FloatArray, _broadcast, _reals
+from mars_lidar.statistics._cells import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.exposure import thread_count
 from mars_lidar.system import System
@@ -24,7 +24,7 @@ from mars_lidar.table.axes import PAPER_GRID, Grid
 from mars_lidar.table.entries import Entries, Progress
 from mars_lidar.table.error import QuantisationError, quantisation_error
 from mars_lidar.table.law import LawError, law_error
-from mars_lidar.table.lookup import Lookup, evaluate
+from mars_lidar.table.lookup import Lookup, evaluate, read_pixels
 from mars_lidar.table.node_laws import NodeLaws
 from mars_lidar.table.start_phase import StartPhases
 
@@ -162,29 +162,9 @@ class Table:
         _validate.choice("outside", outside, _OUTSIDE)
         periods = self._cycles(cycles)
         team = thread_count(threads)
-        canonical = 0.5 * self.system.period_ns
-        given = _reals("delay_ns", canonical if delay_ns is None else delay_ns)
-        parts = _broadcast(
-            ("signal", "background", "delay_ns"), _reals("signal", signal), _reals("background", background), given
+        s, b, phase, beyond = read_pixels(
+            self.system.period_ns, (self.signal, self.background), signal, background, delay_ns, outside
         )
-        s, b, delay = (np.ascontiguousarray(part.reshape(-1), dtype=np.float64) for part in parts)
-        bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (s == 0))
-        if bad.any():
-            raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad][0]}")
-        beyond = np.zeros(s.size, dtype=bool)
-        for name, values, axis in (("signal", s, self.signal), ("background", b, self.background)):
-            if not (values >= 0).all():
-                raise ValueError(f"{name} must be photons per period >= 0, got {values[~(values >= 0)][0]}")
-            out = (values < axis[0]) | (values > axis[-1])
-            if out.any() and outside == "error":
-                raise ValueError(
-                    f"{name} must lie in the table's [{axis[0]:g}, {axis[-1]:g}] photons per period, got "
-                    f"{values.min():g} to {values.max():g} ({int(out.sum())} of {values.size} pixels outside); build "
-                    "the table over that range, or leave them to the exact engine with outside='exact'"
-                )
-            beyond |= out
-        phase = (canonical - np.where(np.isnan(delay), canonical, delay)) / self.system.period_ns
-        phase -= np.floor(phase)
         inside = np.flatnonzero(~beyond)
         rows, weights = np.zeros((s.size, 4), np.int64), np.zeros((s.size, 4))
         weights[:, 0] = 1.0

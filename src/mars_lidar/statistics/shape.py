@@ -1,0 +1,115 @@
+"""The shape of the mean histogram of a pixel, by any of the methods."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar import _validate
+from mars_lidar.detector import MODES
+from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.statistics._cells import Cells, FloatArray
+from mars_lidar.statistics._gate import PLAIN
+from mars_lidar.statistics._methods import check_model, neural_moments, pixel_of, rearm_of
+from mars_lidar.statistics._timing import recorded
+from mars_lidar.statistics.histogram import histogram_effects, mean_histograms
+from mars_lidar.statistics.stationary import stationary_histogram
+from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mars_lidar.learn.neural import NeuralMap
+
+_SHAPES = ("exposure", "stationary", "chain", "neural")
+_OF_CHAIN = ("chain", "neural")
+
+
+def registration_pdf(
+    signal: ArrayLike | None,
+    background: ArrayLike,
+    system: System,
+    method: Literal["exposure", "stationary", "chain", "neural"] = "exposure",
+    *,
+    delay_ns: ArrayLike | None = None,
+    waveform: ArrayLike | None = None,
+    rearm: Literal["centre", "edge"] | None = None,
+    tolerance: float = 1e-4,
+    threads: int | None = None,
+    model: NeuralMap | str | Path | None = None,
+) -> FloatArray:
+    """Shape of the mean histogram: the distribution of registrations over the bins of the period.
+
+    Parameters
+    ----------
+    signal, background, delay_ns, waveform, tolerance, threads
+        As `count_law`; arrays broadcast to (...).
+    method
+        - ``"exposure"``: mean histogram of the finite exposure, which is what a measurement averages to,
+        - ``"stationary"``: that of a pixel which has been running for long,
+        - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500), for detectors
+          of mode ``"nonparalyzable"``; the first two are for every mode (docs/detectors.md),
+        - ``"neural"``: a trained network's answer to the flux, in place of the chain's
+          (`mars_lidar.engines.NeuralEngine`).
+    rearm
+        ``"centre"`` (default) or ``"edge"`` of the bin, for ``"chain"`` only.
+    model
+        For ``"neural"``: as `simulate`.
+
+    Returns
+    -------
+    NDArray
+        (..., bins), non-negative; sums to 1 over the last axis. A cell without any flux has the uniform
+        shape, the limit of little background.
+    """
+    _validate.choice("method", method, _SHAPES)
+    edge = rearm_of(rearm, method == "chain", f"method {method!r}")
+    check_model(model, method)
+    cells = Cells.of(
+        signal, background, system, delay_ns=delay_ns, waveform=waveform,
+        what=f"registration_pdf of method {method!r}", modes=PLAIN if method in _OF_CHAIN else MODES,
+        effects=_shape_effects(method, system),
+    )  # fmt: skip
+    if method == "neural":
+        shape = neural_moments(cells, model)[0]
+    elif method == "chain":
+        shape = _chain_shapes(cells, edge)
+    elif method == "exposure" or system.detector.mode == "synchronous":  # there the same at any time
+        shape = mean_histograms(cells, tolerance, threads)
+    elif system.detector.mode == "paralyzable":
+        warm = replace(cells, system=system.replace(start="stationary"))
+        shape = mean_histograms(warm, tolerance, threads)
+    else:
+        shape = recorded(
+            cells, lambda some, parts: stationary_histogram(some, parts, tolerance=tolerance, threads=threads)
+        )
+    total = shape.sum(-1, keepdims=True)
+    dark = total == 0.0
+    shape = np.where(dark, 1.0 / system.bins, shape / np.where(dark, 1.0, total))
+    return np.asarray(shape.reshape(*cells.shape, system.bins), dtype=np.float64)
+
+
+def _shape_effects(method: str, system: System) -> tuple[str, ...]:
+    if method in _OF_CHAIN:
+        return LIGHT_EFFECTS
+    return histogram_effects(system) if method == "exposure" else LIGHT_EFFECTS + TIMING_EFFECTS
+
+
+def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
+    """Registrations per period (cells, bins), by the chain on its grid, summed into histogram bins."""
+    from mars_lidar.statistics.chain import PhaseChain
+
+    bins = cells.system.bins
+    out = np.zeros((cells.size, bins))
+    for k in range(cells.size):
+        if cells.signal[k] + cells.background[k] == 0.0:
+            continue
+        signal, waveform, delay = pixel_of(cells, k)
+        chain = PhaseChain.from_flux(
+            signal, float(cells.background[k]), cells.system, rearm=edge, delay_ns=delay, waveform=waveform
+        )
+        out[k] = chain.stationary().pdf.reshape(bins, -1).sum(-1)
+    return out

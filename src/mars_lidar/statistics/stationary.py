@@ -1,0 +1,64 @@
+"""The mean histogram of a pixel that has been running for long, by the recursion of `exposure.py`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mars_lidar import _validate
+from mars_lidar.statistics._cells import Cells, FloatArray
+from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED, thread_count
+
+
+def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
+    """Registrations per period and bin (cells, out_bins) of a pixel that has been running for long (18)."""
+    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    team = thread_count(threads)
+    result = np.empty((cells.size, out_bins))
+    pending = np.arange(cells.size)
+    bins = cells.first_bins(out_bins)
+    shared = math.gcd(bins // 2, out_bins)
+    coarse = _stationary(cells, bins // 2, shared, team)
+    while pending.size:
+        fine = _stationary(cells.part(pending), bins, out_bins, team)
+        joined = fine.reshape(*coarse.shape, -1).sum(-1)
+        total = np.maximum(fine.sum(-1), np.finfo(float).tiny)
+        moved = np.abs(joined - coarse).sum(-1) / total
+        good = (moved <= tolerance) & (fine.min(-1) >= -1e-12 * total)
+        result[pending[good]] = np.maximum(fine[good], 0.0)
+        pending, coarse = pending[~good], fine[~good]
+        bins *= 2
+        if pending.size and bins > max(MOST_BINS, 4 * out_bins):
+            raise ConvergenceError(
+                f"stationary histogram of {cells.name(int(pending[0]))}: with {bins // 2} bins per period it "
+                f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g})"
+            )
+    return result
+
+
+def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:
+    from mars_lidar import _core
+
+    result = np.empty((cells.size, out_bins))
+    settled = np.empty(cells.size, np.int64)
+    for part in cells.chunks(bins, out_bins):
+        some = cells.part(part)
+        energy, row = some.energies(bins)
+        _core.exposure_stationary(
+            grid=some.grid(bins, out_bins),
+            signal=some.native_flux[0],
+            background=some.native_flux[1],
+            shape=row,
+            shapes=energy,
+            histogram=result[part],
+            settled=settled[part],
+            threads=threads,
+            level="",
+            progress=None,
+        )
+    if (settled == UNSETTLED).any():
+        k = int(np.argmax(settled == UNSETTLED))
+        raise ConvergenceError(f"stationary state of {cells.name(k)}: not reached")
+    return result

@@ -28,6 +28,7 @@ from mars_lidar.studies.hardware import (
     spreads,
     sweeps,
 )
+from mars_lidar.studies.hardware_alarms import ALARM_BINS, Alarms, alarm_row, alarms
 from mars_lidar.studies.hardware_example_report import example_parts
 from mars_lidar.studies.hardware_figures import draw_all
 from mars_lidar.studies.hardware_mismatch_report import mismatch_parts
@@ -46,6 +47,7 @@ def run(request: Request) -> list[Path]:
     swept = sweeps(settings, request.tell)
     faults = mismatches(settings, request.tell)
     weak = sensitivities(settings, request.tell)
+    false = alarms(settings, request.tell)
     many = spreads(settings, request.tell)
     measured = None if request.stream is None else example(request.stream, settings, request.tell)
     figures = draw_all(request.out, pixels, swept, faults, measured)
@@ -83,6 +85,12 @@ def run(request: Request) -> list[Path]:
         _image(figures[1]),
         "## Detectors that are not the model's",
         *mismatch_parts(faults, weak, settings, figures[2]),
+        "## False alarms",
+        f"Streams of the model itself (the bright pixel, {ALARM_BINS} bins), {settings.replicate_cycles:,} cycles cut "
+        f"into realizations of {settings.alarm_cycles}, at the verdict's 1 %. The fit leaves less or more to the tests: "
+        "it is made of the same photons, of some of them, or of those of another stream.",
+        table([alarm_row(one) for one in false]),
+        _alarm_finding(false),
         *example_parts(measured, settings, figures),
     ]
     rows = [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))]
@@ -181,6 +189,11 @@ def _sweep_finding(cases: Sequence[Case]) -> str:
         f"{len(scores)} "
         f"scores {float(np.mean(np.square(scores))):.2f} (1 is right), largest {max(map(abs, scores)):.1f}."
     )
+
+
+def _alarm_finding(false: Sequence[Alarms]) -> str:
+    streams, refused = sum(one.streams for one in false), sum(one.refused for one in false)
+    return f"{refused} of {streams:,} are refused, {refused / streams:.1%}."
 
 
 def _csv_row(case: Case) -> Row:

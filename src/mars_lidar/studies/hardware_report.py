@@ -87,8 +87,8 @@ def run(request: Request) -> list[Path]:
         *mismatch_parts(faults, weak, settings, figures[2]),
         "## False alarms",
         f"Streams of the model itself (the bright pixel, {ALARM_BINS} bins), {settings.replicate_cycles:,} cycles cut "
-        f"into realizations of {settings.alarm_cycles}, at the verdict's 1 %. The fit leaves less or more to the tests: "
-        "it is made of the same photons, of some of them, or of those of another stream.",
+        f"into realizations of {settings.alarm_cycles}, at the verdict's 1 %. The fit leaves less or more to the "
+        "tests: it is made of the same photons, of some of them, or of those of another stream.",
         table([alarm_row(one) for one in false]),
         _alarm_finding(false),
         *example_parts(measured, settings, figures),

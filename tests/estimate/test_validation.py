@@ -133,6 +133,8 @@ def test_bad_input(times):
         ml.validate(times, 0.9, cycles=100)
     with pytest.raises(ValueError, match="level must be"):
         ml.validate(times, cycles=100, level=0.0)
+    with pytest.raises(ValueError, match="at least 10 photons, got 1: all others came within its hold-off of 1e\\+07"):
+        ml.validate(times, ml.calibrate(times, hold_off_ns=1e7), cycles=100)
     light = ml.calibrate(times)
     with pytest.raises(ValueError, match="must have the period that was calibrated, 100 ns, got 50"):
         ml.validate(dataclasses.replace(times, period_ns=50.0), light, cycles=100)
@@ -168,3 +170,24 @@ def test_commands(tmp_path, times):
     ):
         assert run(*arguments).exit_code == 2, arguments
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.png", "lab.npz", "lab.yaml", "look.png"]
+
+
+@pytest.mark.parametrize(
+    ("light", "dead", "cycles"),
+    [
+        (ml.Flux(0.01, 0.001, 37.0), 65.0, 20),  # most realizations have no photon
+        (ml.Flux(0.0, 0.4, 37.0), 65.0, 200),
+        (ml.Flux(0.9, 0.0, 37.0), 65.0, 200),
+        (ml.Flux(50.0, 5.0, 37.0), 65.0, 200),
+        (ml.Flux(0.9, 0.4, 37.0), 0.0, 200),
+        (ml.Flux(0.9, 0.4, 37.0), 1000.0, 200),  # counts of 18 or 19
+        (ml.Flux(0.9, 0.4, 37.0), 1000.0, 5),  # shorter than the dead time
+    ],
+)
+def test_extreme_streams_of_the_model_pass(light: ml.Flux, dead: float, cycles: int):
+    system = SYSTEM.replace(cycles=20_000, detector=ml.Detector(dead_time_ns=dead))
+    times = ml.simulate_timestamps(light, system, seed=41)
+    found = ml.validate(times, cycles=cycles)
+    assert found.consistent, found.failed
+    assert found.total_variation <= 1.5 * found.total_variation_floor[1]
+    assert all(0.0 <= check.p <= 1.0 for check in found.checks)

@@ -175,7 +175,7 @@ def validate(
         else:
             failed = [check.name for check in found.failed]
             failed += ["intervals shorter than the dead time"] * found.too_short
-            verdict = f"the model does NOT fit: {', '.join(failed)}"
+            verdict = f"the model does NOT fit: {'; '.join(failed)}"
         rows.append(("verdict", verdict))
         if out is not None:
             from mars_lidar.plot.stream import validation_figure

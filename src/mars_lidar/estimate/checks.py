@@ -98,8 +98,8 @@ class Compared:
         found = [
             Check("counts, G-test", math.nan, math.nan, math.nan, self._count_test()),
             _check("mean count", float(self.counts.mean()), law.mean, error),
-            _variance("count variance", self.counts, law.variance, count * size),
-            _variance("window variance", self.inside, law.window_variance, joint * size),
+            _variance("count variance", self.counts, law.variance, count * size, law.count),
+            _variance("window variance", self.inside, law.window_variance, joint * size, Pmf.of_counts(self.inside)),
         ]
         return [*found, self._shape_check()] if shape else found
 
@@ -174,20 +174,20 @@ def _check(name: str, measured: float, predicted: float, error: float) -> Check:
     return Check(name, measured, predicted, error, float(2.0 * norm.sf(abs(measured - predicted) / error)))
 
 
-def _variance(name: str, counts: NDArray[np.int64], predicted: float, more: float) -> Check:
-    """Sample variance against the predicted one, by the kurtosis of the sample.
+def _variance(name: str, counts: NDArray[np.int64], predicted: float, more: float, of: Pmf) -> Check:
+    """Sample variance against the predicted one, by the kurtosis of the law, or of the sample, `of`.
 
     `more`: how much larger the error's square is than that of the sample, by the prediction's own. The sample variance
     is taken to be a scaled chi-square of the same mean and variance.
     """
     from scipy.stats import chi2
 
-    x = counts - counts.mean()
-    measured = float((x**2).sum() / (counts.size - 1))
-    if not predicted > 0 or not measured > 0:
+    measured = float(counts.var(ddof=1))
+    away = of.first + np.arange(of.p.size) - float(of.p @ np.arange(of.first, of.last + 1)) / float(of.p.sum())
+    second, fourth = (float(of.p @ away**k) for k in (2, 4))
+    if not (predicted > 0 and second > 0):
         return Check(name, measured, predicted, 0.0, 1.0 if measured == predicted else 0.0)
-    kurtosis = float((x**4).mean()) / measured**2
-    square = more * max(kurtosis - 1.0, 2.0 / counts.size) / counts.size  # of the relative error
+    square = more * max(fourth / second**2 - 1.0, 2.0 / counts.size) / counts.size  # of the relative error
     freedom = 2.0 / square
     at = freedom * measured / predicted
     p = 2.0 * min(float(chi2.cdf(at, freedom)), float(chi2.sf(at, freedom)))

@@ -26,6 +26,7 @@ from mars_lidar.timestamps import Timestamps
 
 _LEAST_REALIZATIONS = 20
 _LEAST_SIMULATED = 200
+_LEAST_PHOTONS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +169,11 @@ def validate(
             detector = stream_detector(told.detector)
     elif not isinstance(calibration, Calibration):
         raise TypeError(f"calibration must be a Calibration, got {type(calibration).__name__}")
+    if calibration.armed.used < _LEAST_PHOTONS:
+        raise ValueError(
+            f"calibration must be made of at least {_LEAST_PHOTONS} photons, got {calibration.armed.used}: all others "
+            f"came within its hold-off of {calibration.hold_off_ns:.5g} ns"
+        )
     stream = stream_of(times, pooled=pooled)
     if abs(stream.period_ns / calibration.summary.period_ns - 1.0) > 1e-9:
         raise ValueError(

@@ -47,7 +47,7 @@ def validation_figure(found: Validation, title: str = "") -> Figure:
         draw_counts(left, found)
         draw_histogram(middle, found)
         draw_recovery(right, found.recovery)
-        failed = ", ".join(check.name for check in found.failed)
+        failed = "; ".join(check.name for check in found.failed)
         words = "the model fits" if found.consistent else f"the model does not fit ({failed or 'short intervals'})"
         size = f"{found.realizations:,} realizations of {found.system.cycles:,} cycles"
         _tidy(figure, " · ".join(part for part in (title, size, words) if part))

@@ -20,6 +20,7 @@ from mars_lidar.system import System
 from mars_lidar.timestamps import Timestamps
 
 PERIOD_NS, DEAD_NS, SIGMA_NS, DELAY_NS, BINS = 1e3 / 7.5, 85.0, 0.5, 40.0, 1024
+AT_FLOOR = 1.15  # times the floor that matched pixels may have
 EXAMPLE_UNIT_NS = 0.064  # of the times in the measured stream
 
 
@@ -39,6 +40,9 @@ class Settings:
     fluxes: tuple[float, ...] = (0.05, 0.5, 5.0)
     signals: tuple[float, ...] = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
     delays: tuple[float, ...] = (0.2, 20.0, 60.0, 100.0, 133.0)
+    alarms: int = 125  # streams of `replicate_cycles` for each way of calibrating
+    alarm_cycles: int = 100
+    sensed: int = 8  # streams of each weak mismatch
     mismatched: int = 100  # the first so many of `hardware_mismatches.MISMATCHES`
     seed: int = 2026
 
@@ -46,7 +50,8 @@ class Settings:
 FULL = Settings()
 QUICK = Settings(
     cycles=500, realizations=300, swept_cycles=200, swept_realizations=200, fault_cycles=500, fault_realizations=200,
-    replicates=8, replicate_cycles=4000, fluxes=(0.5,), signals=(0.1, 3.0), delays=(0.2,), mismatched=4,
+    replicates=8, replicate_cycles=4000, fluxes=(0.5,), signals=(0.1, 3.0), delays=(0.2,), alarms=5, sensed=1,
+    mismatched=4,
 )  # fmt: skip
 
 PIXELS = {"bright": (0.8, 0.1), "dark": (0.25, 0.1)}  # the paper's S and B are not known
@@ -59,6 +64,21 @@ class Case:
     name: str
     truth: tuple[float, float, float]
     found: Validation
+
+    @property
+    def ratio(self) -> float:
+        """Total variation of the count law over its floor."""
+        return self.found.total_variation / self.found.total_variation_floor[0]
+
+    @property
+    def verdict(self) -> str:
+        """In words."""
+        return "fits" if self.found.consistent else "does not fit"
+
+    @property
+    def findings(self) -> list[str]:
+        """What the recovery says; nothing where it was predicted by simulation of the detector, effects and all."""
+        return self.found.recovery.findings() if self.found.prediction.recovery is None else []
 
     @property
     def scores(self) -> tuple[float, float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,9 +26,14 @@ from mars_lidar.studies.hardware import (
     system_of,
 )
 
+
+def _afterpulses(probability: float) -> Detector:
+    return replace(_PLAIN, afterpulsing=Afterpulsing(probability=probability, delay_ns=100.0))
+
+
 _PLAIN = Detector(dead_time_ns=DEAD_NS)
 _JITTER = replace(_PLAIN, jitter=Jitter(sigma_ns=0.2))
-_AFTERPULSES = replace(_PLAIN, afterpulsing=Afterpulsing(probability=0.02, delay_ns=100.0))
+_AFTERPULSES = _afterpulses(0.02)
 _TWO = Detector(dead_time_ns=50.0, electronics_dead_time_ns=DEAD_NS)
 _PARALYZABLE = replace(_PLAIN, mode="paralyzable")
 
@@ -105,3 +111,44 @@ def mismatches(settings: Settings, tell: Tell) -> list[tuple[Mismatch, Case]]:
         )
         cases.append((one, Case(one.name, (signal, background, DELAY_NS), found)))
     return cases
+
+
+WEAK = (
+    Mismatch("none (control)", fits=True),
+    *(Mismatch(f"afterpulses {100 * p:g} %", detector=_afterpulses(p)) for p in (0.003, 0.006, 0.01)),
+    Mismatch("electronics dead 85 ns, detector 50 ns", detector=_TWO, background=0.03),
+    Mismatch("electronics dead 85 ns, detector 50 ns", detector=_TWO),
+    Mismatch("paralyzable detector", detector=_PARALYZABLE, background=0.03),
+)
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """How many `streams` of a mismatch are `refused`, by which tests how often, and the mean score of B."""
+
+    name: str
+    background: float
+    streams: int
+    refused: int
+    by: dict[str, int]
+    score: float
+
+
+def sensitivities(settings: Settings, tell: Tell) -> list[Sensitivity]:
+    """Each of `WEAK`, and the control, in several streams."""
+    found = []
+    cycles = settings.fault_cycles * settings.fault_realizations
+    for number, one in enumerate(WEAK):
+        tell(f"hardware: how weak a mismatch is seen, {one.name}")
+        light = Flux(PIXELS["bright"][0], one.background, DELAY_NS)
+        by: Counter[str] = Counter()
+        scores, refused = [], 0
+        for k in range(settings.sensed * (2 if one.fits else 1)):
+            times = stream_of(light, cycles, settings.seed + 400 + 100 * number + k, one.detector)
+            fitted = calibrate(times, pulse=GaussianPulse(sigma_ns=SIGMA_NS), dead_time_ns=DEAD_NS)
+            result = validate(times, fitted, cycles=settings.fault_cycles)
+            refused += not result.consistent
+            by.update(check.name for check in result.failed)
+            scores.append((fitted.background - one.background) / fitted.errors["background"])
+        found.append(Sensitivity(one.name, one.background, len(scores), refused, dict(by), float(np.mean(scores))))
+    return found

@@ -11,6 +11,7 @@ import numpy as np
 
 from mars_lidar.studies import Request
 from mars_lidar.studies.hardware import (
+    AT_FLOOR,
     BINS,
     DEAD_NS,
     DELAY_NS,
@@ -20,7 +21,6 @@ from mars_lidar.studies.hardware import (
     QUICK,
     SIGMA_NS,
     Case,
-    Example,
     Settings,
     Spread,
     example,
@@ -28,13 +28,15 @@ from mars_lidar.studies.hardware import (
     spreads,
     sweeps,
 )
+from mars_lidar.studies.hardware_alarms import ALARM_BINS, Alarms, alarm_row, alarms
+from mars_lidar.studies.hardware_example_report import example_parts
 from mars_lidar.studies.hardware_figures import draw_all
-from mars_lidar.studies.hardware_mismatches import Mismatch, mismatches
+from mars_lidar.studies.hardware_mismatch_report import mismatch_parts
+from mars_lidar.studies.hardware_mismatches import mismatches, sensitivities
 from mars_lidar.studies.machine import machine
 from mars_lidar.studies.report import Row, configuration, save_csv, save_text, table
 
 PAPER = {"bright": 0.0651, "dark": 0.0601}  # T6 of arXiv 2512.04924: total variation of the count law
-AT_FLOOR = 1.15  # times the floor that the matched pixels may have
 
 
 def run(request: Request) -> list[Path]:
@@ -44,6 +46,8 @@ def run(request: Request) -> list[Path]:
     pixels = matched(settings, request.tell)
     swept = sweeps(settings, request.tell)
     faults = mismatches(settings, request.tell)
+    weak = sensitivities(settings, request.tell)
+    false = alarms(settings, request.tell)
     many = spreads(settings, request.tell)
     measured = None if request.stream is None else example(request.stream, settings, request.tell)
     figures = draw_all(request.out, pixels, swept, faults, measured)
@@ -80,19 +84,14 @@ def run(request: Request) -> list[Path]:
         _sweep_finding(swept),
         _image(figures[1]),
         "## Detectors that are not the model's",
-        f"S = {PIXELS['bright'][0]:g}, {settings.fault_realizations:,} realizations of {settings.fault_cycles:,} "
-        f"cycles. "
-        "The verdict is that of `mars-lidar validate` at 1 % false alarms; *failed* lists the tests that failed. Where "
-        "the detector is *told*, effects and all, calibration and prediction are made with it: by the laws that there "
-        "are, else by simulation with the exact engine, and the stream should fit.",
-        table([_fault_row(one, case) for one, case in faults]),
-        _fault_finding(faults),
-        "What the recovery says, where it says something:",
-        "\n".join(f"- {case.name}: {text}." for _, case in faults for text in case.found.recovery.findings()),
-        "Recovery: registrations by time since the last one, over the light that fell on the pixel at that age; "
-        "the vertical line is the dead time that was assumed, the stepped one the recovery of the simulated stream.",
-        _image(figures[2]),
-        *_measured(measured, settings, figures),
+        *mismatch_parts(faults, weak, settings, figures[2]),
+        "## False alarms",
+        f"Streams of the model itself (the bright pixel, {ALARM_BINS} bins), {settings.replicate_cycles:,} cycles cut "
+        f"into realizations of {settings.alarm_cycles}, at the verdict's 1 %. The fit leaves less or more to the "
+        "tests: it is made of the same photons, of some of them, or of those of another stream.",
+        table([alarm_row(one) for one in false]),
+        _alarm_finding(false),
+        *example_parts(measured, settings, figures),
     ]
     rows = [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))]
     text = save_text(request.out / "hardware.md", parts)
@@ -111,10 +110,6 @@ def _settings(settings: Settings) -> dict[str, Any]:
     }
 
 
-def _ratio(case: Case) -> float:
-    return case.found.total_variation / case.found.total_variation_floor[0]
-
-
 def _pixel_row(case: Case) -> Row:
     found = case.found
     light = found.calibration
@@ -131,7 +126,7 @@ def _pixel_row(case: Case) -> Row:
         "TV of the histogram": found.shape_variation,
         "its floor": found.shape_floor,
         "window variance z": _check(case, "window variance"),
-        "verdict": _verdict(case),
+        "verdict": case.verdict,
     }
 
 
@@ -139,12 +134,8 @@ def _check(case: Case, name: str) -> float:
     return next(check.score for check in case.found.checks if check.name == name)
 
 
-def _verdict(case: Case) -> str:
-    return "fits" if case.found.consistent else "does not fit"
-
-
 def _pixel_finding(case: Case) -> str:
-    ratio = _ratio(case)
+    ratio = case.ratio
     judged = "at the floor" if ratio <= AT_FLOOR else "**above the floor**"
     z = ", ".join(f"{value:+.1f}" for value in case.scores)
     return (
@@ -184,15 +175,15 @@ def _sweep_row(case: Case) -> Row:
     )
     return {
         "stream": case.name, "calibrated S": returns, "z S": z[0], "z B": z[1], "z delay": z[2],
-        "TV / floor": _ratio(case), "99 %": found.total_variation_floor[1] / found.total_variation_floor[0],
-        "histogram TV / floor": found.shape_variation / found.shape_floor, "verdict": _verdict(case),
+        "TV / floor": case.ratio, "99 %": found.total_variation_floor[1] / found.total_variation_floor[0],
+        "histogram TV / floor": found.shape_variation / found.shape_floor, "verdict": case.verdict,
     }  # fmt: skip
 
 
 def _sweep_finding(cases: Sequence[Case]) -> str:
     scores = [value for case in cases for value in case.scores if not np.isnan(value)]
     fits = sum(case.found.consistent for case in cases)
-    mean = float(np.mean([_ratio(case) for case in cases]))
+    mean = float(np.mean([case.ratio for case in cases]))
     return (
         f"{fits} of {len(cases)} fit; total variation {mean:.3f} times the floor in the mean. Mean square of the "
         f"{len(scores)} "
@@ -200,99 +191,9 @@ def _sweep_finding(cases: Sequence[Case]) -> str:
     )
 
 
-def _fault_row(one: Mismatch, case: Case) -> Row:
-    found = case.found
-    light = found.calibration
-    told = [check.name for check in found.failed]
-    told += ["short intervals"] * bool(light.too_short and found.prediction.recovery is None)
-    return {
-        "detector": one.name, "dead time (ns)": light.dead_time_ns, "S": light.signal, "B": light.background,
-        "true B": case.truth[1], "z S": f"{case.scores[0]:+.1f}", "z B": f"{case.scores[1]:+.1f}",
-        "TV / floor": _ratio(case), "verdict": _verdict(case),
-        "predicted by": found.prediction.words, "failed": ", ".join(told) or "-",
-    }  # fmt: skip
-
-
-def _fault_finding(faults: Sequence[tuple[Mismatch, Case]]) -> str:
-    lines = []
-    wrong = [case.name for one, case in faults if not one.fits and case.found.consistent]
-    alarms = [case.name for one, case in faults if one.fits and not case.found.consistent]
-    number = sum(not one.fits for one, _ in faults)
-    lines.append(f"- {number - len(wrong)} of {number} mismatches are told apart from the model.")
-    for name in wrong:
-        case = next(case for _, case in faults if case.name == name)
-        lines.append(
-            f"- **Not told apart**: {name}. The model with S = {case.found.calibration.signal:.4f} and B = "
-            f"{case.found.calibration.background:.4f} makes the same stream at this length; the light is off by "
-            f"{case.scores[0]:+.1f} and {case.scores[1]:+.1f} standard errors, so a fit is no proof of the detector."
-        )
-    lines += [f"- **False alarm**: {name}." for name in alarms]
-    below = [case.name for one, case in faults if not case.found.consistent and _ratio(case) < AT_FLOOR]
-    lines.append(
-        f"- Total variation of the count law alone is within {AT_FLOOR} floors in {len(below)} of the streams "
-        f"that do not fit "
-        f"({'; '.join(below)}): by itself it is a weak test, because S and B are fitted to the same stream."
-    )
-    return "\n".join(lines)
-
-
-def _measured(found: Example | None, settings: Settings, figures: Sequence[Path]) -> list[str]:
-    if found is None:
-        return ["## A measured stream", "Not given: `--stream FILE` adds it."]
-    told = ", ".join(f"{name} {value:.4g} ns" for name, value in found.told.items())
-    rows = [
-        {
-            "calibration": name, "dead time (ns)": case.calibration.dead_time_ns,
-            "Lambda": f"{case.calibration.total:.3f} ± {case.calibration.total_error:.3f}",
-            "by Rapp": f"{case.calibration.rapp.total:.3f} ± {case.calibration.rapp.total_error:.3f}",
-            "photons used": case.calibration.armed.used, "TV": case.total_variation,
-            "floor": case.total_variation_floor[0],
-            "failed": ", ".join(check.name for check in case.failed) or "-",
-            "verdict": "fits" if case.consistent else "does not fit",
-        }
-        for name, case in found.cases
-    ]  # fmt: skip
-    first = found.cases[0][1].calibration
-    return [
-        "## A measured stream",
-        f"{found.registrations:,} photons of a TCSPC instrument in {found.cycles:,} periods of "
-        f"{found.period_ns:.5g} ns (the file says: {told}), cut into realizations of {settings.example_cycles} cycles.",
-        "What does not fit, or cannot be known from this file:",
-        "\n".join(_example_limits(found, settings)),
-        f"The dead time estimated from the photons alone is {first.dead_time_ns:.2f} ± "
-        f"{first.dead_time_error_ns:.2f} ns.",
-        table(rows),
-        _image(figures[3]),
-    ]
-
-
-def _example_limits(found: Example, settings: Settings) -> list[str]:
-    """What the measured stream does not fit, from its own calibrations."""
-    free = [case for name, case in found.cases if name.startswith("free shape, t_e")]
-    gaussian = [case for name, case in found.cases if name.startswith("Gaussian")]
-    lines = [
-        "- The light is a decay (fluorescence), not a pulse on a background. S and B are not separate, and the "
-        "free shape's mean histogram agrees by construction."
-    ]
-    if gaussian:
-        refused = "refused" if not gaussian[0].consistent else "not refused, for lack of photons"
-        lines.append(f"- A Gaussian pulse is {refused}.")
-    if free:
-        trace = "is seen in the recovery" if any(case.recovery.findings() for case in free) else (
-            "leaves no trace in the recovery of so few photons"
-        )
-        agrees = "agrees" if all(case.consistent for case in free) else "does not agree"
-        lines.append(
-            "- The dead time is that of the electronics, longer than the detector's. Detections that the "
-            "electronics miss "
-            f"blind the detector after them, which the model does not have: this {trace}, and the law with t_e "
-            f"alone {agrees}."
-        )
-    lines.append(
-        f"- {found.cycles:,} periods do not make realizations of the paper's {FULL.cycles:,} cycles: "
-        f"{settings.example_cycles} are taken."
-    )
-    return lines
+def _alarm_finding(false: Sequence[Alarms]) -> str:
+    streams, refused = sum(one.streams for one in false), sum(one.refused for one in false)
+    return f"{refused} of {streams:,} are refused, {refused / streams:.1%}."
 
 
 def _csv_row(case: Case) -> Row:

@@ -18,6 +18,7 @@
 #include "trap_law.h"
 #include "waveform_kernel.h"
 #include "waveform_start.h"
+#include "waveform_table.h"
 
 namespace mars {
 namespace {
@@ -83,11 +84,12 @@ void run_waveform(const BoundJob& job, WaveformBlock proto, int threads, const s
             block.start_cycle = cycle.data();
             block.start_phase = phase.data();
         }
-        const std::unique_ptr<double[]> energy(new double[layout.room]);
-        const std::unique_ptr<int32_t[]> edges(new int32_t[proto.team * layout.edges]);
+        struct alignas(64) Line {
+            int32_t edges[16];
+        };
+        const std::unique_ptr<Line[]> edges(new Line[proto.team * layout.edges / 16]);
         const std::unique_ptr<uint16_t[]> guides(new uint16_t[proto.team * layout.cells]);
-        block.energy = energy.get();
-        block.edges = edges.get();
+        block.edges = edges[0].edges;
         block.guides = guides.get();
         if (!stop.load(std::memory_order_relaxed)) kernel(block);
     });

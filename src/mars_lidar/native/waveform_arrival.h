@@ -145,6 +145,7 @@ MARS_INLINE void find_part(const WaveTables& tables, Int energy, Int& part, Int&
     const int32_t* const edge = tables.edge;
     const uint16_t* const guide = tables.guide;
     const int group = tables.group;
+#pragma GCC unroll 4
     for (int lane = 0; lane < kLanes; ++lane) {
         const int32_t first = begin[lane] + (guide[cell[lane]] << group);
         place[lane] = first + count_not_above(edge + first + 1, e[lane]);

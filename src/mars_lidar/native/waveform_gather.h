@@ -12,8 +12,8 @@ constexpr int kScan = 16;  // numbers that are looked at together
 // How many of kScan ascending numbers are not above `x`.
 MARS_INLINE int32_t count_not_above(const int32_t* numbers, int32_t x) {
 #if defined(MARS_LEVEL_avx512)
-    const uint32_t above = _mm512_cmpgt_epi32_mask(_mm512_loadu_si512(numbers), _mm512_set1_epi32(x));
-    return __builtin_ctz(above | 1u << kScan);
+    const uint32_t below = _mm512_cmple_epi32_mask(_mm512_loadu_si512(numbers), _mm512_set1_epi32(x));
+    return __builtin_popcount(below);
 #elif defined(MARS_LEVEL_avx2)
     const __m256i bound = _mm256_set1_epi32(x);
     const auto above = [&](const int32_t* from) {

@@ -18,7 +18,6 @@ struct WaveformBlock {
     const double* start_phase;   // in periods, [0, 1)
     Output output;
     int64_t team;            // tables that there is memory for: waveform_table.h
-    double* energy;          // to work in
     int32_t* edges;
     uint16_t* guides;
     const std::atomic<bool>* stop;

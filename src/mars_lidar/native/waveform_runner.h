@@ -19,6 +19,7 @@ inline namespace MARS_LEVEL {
 namespace {
 
 constexpr int kWaitsAhead = 8;             // registrations drawn ahead
+constexpr int64_t kFetchAhead = 16384;      // numbers
 constexpr int kRoundsToPoll = 512;         // between looks at `stop`
 constexpr int32_t kIdleCycle = 100000001;  // every exposure has ended; + kWaitsAhead (kForever + t_d) fits 32 bits
 
@@ -195,16 +196,19 @@ private:
         latest_ = 0;
         while (users_[latest_] > 0) ++latest_;
         photons_ = fill_table(layout_, job_.waveform + pixel * job_.samples, job_.background[pixel],
-                              block_.energy, block_.edges + latest_ * layout_.edges,
-                              block_.guides + latest_ * layout_.cells);
+                              block_.edges + edges_of(latest_), block_.guides + latest_ * layout_.cells);
         fetch_from(pixel_ + 1);
     }
 
-    // Asks for the waveform of the next pixel, a little at a time: the memory then works while the lanes do.
+    int32_t edges_of(int32_t slot) const { return slot * static_cast<int32_t>(layout_.edges) + kFirstEdge; }
+
+    // Asks for the waveforms of the next pixels, a little at a time: the memory then works while the lanes do. Several lanes
+    // may end together, so it runs ahead of the next pixel by kFetchAhead.
     void fetch_from(int64_t pixel) {
-        const bool more = pixel < block_.pixels;
-        fetch_ = more ? job_.waveform + (block_.first_pixel + pixel) * job_.samples : nullptr;
-        fetch_end_ = more ? fetch_ + job_.samples : nullptr;
+        const double* const next = job_.waveform + (block_.first_pixel + pixel) * job_.samples;
+        const int64_t left = (block_.pixels - pixel) * job_.samples;
+        if (fetch_ < next) fetch_ = next;
+        fetch_end_ = next + (left < kFetchAhead ? left : kFetchAhead);
     }
     MARS_INLINE void fetch() {
 #if defined(__GNUC__)
@@ -218,7 +222,7 @@ private:
     void load_items() {
         alignas(64) int32_t edges[kLanes], guides[kLanes];
         for (int lane = 0; lane < kLanes; ++lane) {
-            edges[lane] = slot_[lane] * static_cast<int32_t>(layout_.edges);
+            edges[lane] = edges_of(slot_[lane]);
             guides[lane] = slot_[lane] * static_cast<int32_t>(layout_.cells);
         }
         tables_.edges = load<Int>(edges);

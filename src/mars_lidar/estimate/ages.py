@@ -22,8 +22,12 @@ _PHASES, _AGES = 16, 24
 _BRIGHT = 2.0  # times the level between the pulses
 _COARSE = 64  # parts of the period by which that level is found
 _LEAST = 10.0  # registrations expected in a cell that is judged by itself
-_ENOUGH = 50.0  # photons of a kind of light, expected and in the fit, that make the laws normal
+_ENOUGH = 50.0  # photons of a kind of light that make the laws normal, expected and in the fit ...
+_OTHERS = 200.0  # ... where the light was fitted to others than those that are judged
+_NORMAL = 100.0  # photons in effect that make a weighted sum of them normal
 _ORDERS = 5
+_SHARES = (0.25, 0.5, 0.75, 1.0)  # of the dead time, that a hidden one may last
+_PARTS = 16  # of a group of phases
 
 IntArray = NDArray[np.int64]
 
@@ -60,18 +64,18 @@ class AgeTable:
     @property
     def recovery(self) -> AgeTable:
         """The same by age alone, (1, m, 1)."""
-        observed, expected, slopes = (
-            one.sum((0, 2), keepdims=True) for one in (self.observed, self.expected, self.slopes)
-        )
+        kept = [one[:, :, self.judged] for one in (self.observed, self.expected, self.slopes)]
+        observed, expected, slopes = (one.sum((0, 2), keepdims=True) for one in kept)
         judged = np.array([self.judged.any()])
         return AgeTable(self.phases[[0, -1]], self.edges_ns, observed, expected, slopes, self.watched, judged)
 
     def p_values(self, light: Fitted, other: AgeTable | None = None) -> dict[str, float]:
-        """Against those of `other`, or of the model, by age and of the cells, by chi-square, and of trends with age."""
+        """Against those of `other`, or of the model, by age and of the cells, by chi-square, and in some directions."""
         return {
             "recovery, chi²": _p_of_cells(self.recovery, light, None if other is None else other.recovery),
             "recovery by phase, chi²": _p_of_cells(self, light, other),
             "recovery, trend": _p_of_trends(self, light, other),
+            "recovery, unseen photons": _p_of_unseen(self, light, other),
         }
 
 
@@ -95,9 +99,9 @@ def age_table(
             fell[:, age] += passes @ both
     split = fell.reshape(*shape, 2, weights.shape[1])
     seen = np.array([light.registrations[~bright].sum(), light.registrations[bright].sum()])
-    return AgeTable(
-        phases, edges, observed, split[..., 0], split[..., 1:], edges[:-1] >= hold_off_ns - 1e-9, seen >= _ENOUGH
-    )
+    watched = edges[:-1] >= hold_off_ns - 1e-9
+    enough = seen >= (_ENOUGH if light.own and watched.all() else _OTHERS)
+    return AgeTable(phases, edges, observed, split[..., 0], split[..., 1:], watched, enough)
 
 
 def intervals_of(stream: Stream, most: int) -> tuple[FloatArray, FloatArray]:
@@ -214,33 +218,68 @@ def _p_of_cells(table: AgeTable, light: Fitted, other: AgeTable | None) -> float
 
 
 def _p_of_trends(table: AgeTable, light: Fitted, other: AgeTable | None) -> float:
-    """Rao's score test of slow changes with age, polynomials in the light that fell, for faint and bright light apart.
+    """Slow changes with age, polynomials in the light that fell, for faint and bright light apart.
 
-    Neyman's smooth test (Skand. Aktuarietidskr. 20, 149, 1937) of a model with fitted parameters. Afterpulses add to
-    the faint light; what a detector misses, it misses of both.
+    Afterpulses add to the faint light; what a detector misses, it misses of both.
+    """
+    off, variance, _ = _compared(table, other)
+    seen = np.where((variance > 0) & table.judged, table.expected, 0.0).sum(0)
+    trends = [np.zeros((0, *table.expected.shape))]
+    for kind in range(2):
+        total = seen[:, kind].sum()
+        if total >= _ENOUGH:
+            passed = (np.cumsum(seen[:, kind]) - 0.5 * seen[:, kind]) / total
+            weights = np.zeros((_ORDERS, *off.shape))
+            weights[..., kind] = np.polynomial.legendre.legvander(2.0 * passed - 1.0, _ORDERS - 1).T[:, None]
+            trends.append(weights)
+    return _p_of_scores(table, light, other, np.concatenate(trends))
+
+
+def _p_of_unseen(table: AgeTable, light: Fitted, other: AgeTable | None) -> float:
+    """Photons that the records do not show, and that blind the detector again: a second dead time, to first order.
+
+    Behind electronics that are dead for t_e a photon at age u in (t_d, t_e) blinds the detector until u + t_d; a
+    paralyzable one is blinded by each for its whole dead time.
+    """
+    dead = float(table.edges_ns[0])
+    age = 0.5 * (table.edges_ns[:-1] + table.edges_ns[1:])
+    parts = (np.arange(_PARTS) + 0.5) / _PARTS
+    start = (table.phases[:-1, None] + np.diff(table.phases)[:, None] * parts) * light.period_ns  # (p, parts)
+    cumulative = np.concatenate([[0.0], np.cumsum(light.rate)])
+    ends = light_before(start + dead, cumulative, light.period_ns)[..., None]
+    weights = []
+    for first, blind in ((0.0, dead), *((share * dead, share * dead) for share in _SHARES)):
+        begin = np.minimum(np.maximum(first, age - blind), dead)
+        fell = ends - light_before(start[..., None] + begin, cumulative, light.period_ns)
+        weights.append(np.broadcast_to(fell.mean(1)[..., None], table.expected.shape))
+    return _p_of_scores(table, light, other, np.stack(weights))
+
+
+def light_before(time_ns: FloatArray, cumulative: FloatArray, period_ns: float) -> FloatArray:
+    """Photons from time 0 on, of the cumulative light (n + 1,) of a period."""
+    x = time_ns / period_ns
+    cycle = np.floor(x)
+    phase = np.interp(x - cycle, np.linspace(0.0, 1.0, cumulative.size), cumulative)
+    return np.asarray(phase + cumulative[-1] * cycle, dtype=np.float64)
+
+
+def _p_of_scores(table: AgeTable, light: Fitted, other: AgeTable | None, weight: FloatArray) -> float:
+    """Rao's score test of changes `weight` (q, p, m, 2) of the rate, relative to the light.
+
+    Neyman's smooth test (Skand. Aktuarietidskr. 20, 149, 1937) of a model with fitted parameters.
     """
     from scipy.stats import chi2
 
     off, variance, ratio = _compared(table, other)
     judged = variance > 0 if other is None else np.minimum(table.expected, other.expected) >= _LEAST
-    judged &= table.judged
-    off, variance = np.where(judged, off, 0.0), np.where(judged, variance, 0.0)
-    slopes = np.where(judged[..., None], ratio[..., None] * table.slopes, 0.0)
-    trends, seen = [], np.where(judged, table.expected, 0.0).sum(0)
-    for kind in range(2):
-        total = seen[:, kind].sum()
-        if total >= _ENOUGH:
-            passed = (np.cumsum(seen[:, kind]) - 0.5 * seen[:, kind]) / total
-            weights = np.zeros((_ORDERS, *seen.shape))
-            weights[:, :, kind] = np.polynomial.legendre.legvander(2.0 * passed - 1.0, _ORDERS - 1).T
-            trends.append(weights)
-    if not trends:
+    weight = weight * (judged & table.judged)
+    square, fourth = (np.einsum("qpmk,pmk->q", weight**k, variance) for k in (2, 4))
+    weight = weight[square**2 > _NORMAL * fourth]
+    if not len(weight):
         return 1.0
-    weight = np.concatenate(trends)
-    spread = np.einsum("qmk,rmk,pmk->qr", weight, weight, variance)
-    slope = np.einsum("qmk,pmkt->qt", weight, slopes)
-    watched = np.einsum("qmk,pmkt->qt", weight, slopes * table.watched[:, None, None])
-    square, freedom = tested(
-        np.einsum("qmk,pmk->q", weight, off), spread, light.correction(slope, watched)
-    )
-    return float(chi2.sf(square, freedom)) if freedom else 1.0
+    spread = np.einsum("qpmk,rpmk,pmk->qr", weight, weight, variance)
+    slopes = ratio[..., None] * table.slopes
+    slope = np.einsum("qpmk,pmkt->qt", weight, slopes)
+    watched = np.einsum("qpmk,pmkt->qt", weight, slopes * table.watched[:, None, None])
+    found, freedom = tested(np.einsum("qpmk,pmk->q", weight, off), spread, light.correction(slope, watched))
+    return float(chi2.sf(found, freedom)) if freedom else 1.0

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar._brief import brief
-from mars_lidar.estimate.ages import intervals_of
+from mars_lidar.estimate.ages import intervals_of, light_before
 from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
 from mars_lidar.timestamps import Timestamps
 
@@ -137,21 +137,13 @@ def recovery_of(
     expected = np.zeros(edges.size - 1)
     alive = dt > edges[0]
     start, dt = start[alive], dt[alive]
-    light = _light(start, edges[0], cumulative, stream.period_ns)
+    light = light_before(start + edges[0], cumulative, stream.period_ns)
     for k, edge in enumerate(edges[1:]):
-        later = _light(start, np.minimum(dt, edge), cumulative, stream.period_ns)
+        later = light_before(start + np.minimum(dt, edge), cumulative, stream.period_ns)
         expected[k] = float((later - light).sum())
         alive = dt > edge
         start, dt, light = start[alive], dt[alive], later[alive]
     return Recovery(edges, observed, expected, dead_time_ns, hold_off_ns)
-
-
-def _light(start: FloatArray, age: FloatArray | float, cumulative: FloatArray, period_ns: float) -> FloatArray:
-    """Photons from time 0 to `start` + `age`."""
-    x = (start + age) / period_ns
-    cycle = np.floor(x)
-    phase = np.interp(x - cycle, np.linspace(0.0, 1.0, cumulative.size), cumulative)
-    return np.asarray(phase + cumulative[-1] * cycle, dtype=np.float64)
 
 
 def recovery(

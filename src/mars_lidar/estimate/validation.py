@@ -1,4 +1,4 @@
-"""The verb `validate`: does the calibrated model predict the stream? Count law, shape, joint statistics, recovery."""
+"""The verb `validate`: does the calibrated model predict the stream? Count law, shape, joint statistics, intervals."""
 
 from __future__ import annotations
 
@@ -154,8 +154,9 @@ def validate(
     -----
     A stretch of a running stream begins with a warmed-up pixel: the law is that of ``start="stationary"``.
     Neighbouring stretches share a dead time, which correlates their counts at the order of one count; the floors
-    take them for independent. Parameters that were fitted to the same stream make the fit slightly better than
-    the floor; a free shape makes the mean histogram agree by construction, and then it is not tested.
+    take them for independent. The error of the calibrated light is part of every test and floor: less is left to a
+    statistic of the photons that were fitted, more than sampling where others were (a hold-off, another stream). A free
+    shape makes the mean histogram agree by construction, and then it is not tested.
     """
     number = _validate.integer("cycles", cycles, low=1, high=10**8)
     alpha = _validate.real("level", level, low=0.0, high=0.5, strict_low=True)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from mars_lidar.cli import options
 from mars_lidar.cli.console import say
 from mars_lidar.cli.inspect import parsed_pixel
 from mars_lidar.cli.options import _SYSTEM, _option
+from mars_lidar.cli.pulse_options import FittedPulseOptions
 
 if TYPE_CHECKING:
     from mars_lidar.detector import Detector
@@ -54,10 +54,6 @@ HoldOffNs = Annotated[
 ]
 System = Annotated[
     Path | None, _option("--system", panel=_SYSTEM, help="YAML or JSON file with pulse and detector, effects too.")
-]
-PulseSigmaNs = Annotated[
-    float | None,
-    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse, sigma in ns.", default="fitted"),
 ]
 Free = Annotated[
     bool,
@@ -108,11 +104,7 @@ class FitOptions:
     system: System = None
     dead_time_ns: DeadTimeNs = None
     hold_off_ns: HoldOffNs = None
-    pulse_sigma_ns: PulseSigmaNs = None
-    pulse_fwhm_ns: options.PulseFwhmNs = None
-    pulse_file: options.PulseFile = None
-    pulse_bin_ns: options.PulseBinNs = None
-    pulse_origin: options.PulseOrigin = None
+    pulse: FittedPulseOptions = field(default_factory=FittedPulseOptions)
     free: Free = False
     returns: Returns = 1
 
@@ -125,12 +117,9 @@ class FitOptions:
 
     def calibrate(self, times: Timestamps) -> Calibration:
         """The light of the stream by maximum likelihood."""
-        from mars_lidar.cli.system_options import pulse_of
         from mars_lidar.estimate import calibrate as fitted
 
-        shape: Pulse | Literal["free"] | None = pulse_of(
-            self.pulse_sigma_ns, self.pulse_fwhm_ns, self.pulse_file, self.pulse_bin_ns, self.pulse_origin
-        )
+        shape: Pulse | Literal["free"] | None = self.pulse.build()
         if self.free:
             if shape is not None:
                 raise ValueError("the light has one shape: choose --free or a pulse")

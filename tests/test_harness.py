@@ -23,6 +23,7 @@ from harness import (
     SHAPE,
     Case,
     JointLaw,
+    Law,
     Reference,
     armed_count_pmf,
     bonferroni,
@@ -37,8 +38,9 @@ from harness import (
     stationary_count_pmf,
     two_mean_vectors,
 )
-from harness.pvalues import merge
-from mars_lidar import Detector, Flux, GaussianPulse, System
+from harness.pvalues import merge, variance_score
+from harness.sample import draw
+from mars_lidar import Detector, Flux, GaussianPulse, System, count_law
 from mars_lidar.engines import ENGINES, Engine
 from mars_lidar.engines.base import Records, Task
 
@@ -258,11 +260,56 @@ def test_nothing_varies():
     assert two_mean_vectors(still, still) == 1.0
     assert two_mean_vectors(still, still + 1) == 0.0
     assert mean_vector(still, still[0]) == 1.0
-    assert mean_vector(still, still[0] + 1) == 0.0
+    assert mean_vector(still, still[0] + 1) < LEVEL
     total = np.random.default_rng(0).multinomial(50, [0.2, 0.3, 0.5], 200)  # the sum never changes
     other = np.random.default_rng(1).multinomial(51, [0.2, 0.3, 0.5], 200)
     assert two_mean_vectors(total[:100], total[100:]) > LEVEL
     assert two_mean_vectors(total, other) == 0.0
+
+
+@pytest.mark.parametrize("variance", [None, 2e-6, 0.0])
+def test_a_count_that_hardly_ever_changes(variance: float | None):
+    """A locked pixel: all counts are equal, and equal to the prediction as far as they can tell."""
+    still = np.full(6000, 1500)
+    for mean in (1500.0, 1500.0 + 1e-8, 1500.0 + 2e-6, 1500.0 - 2e-6):  # rounding; one exposure of 500,000 differs
+        assert mean_vector(still, mean, variance=variance) > 0.9
+    for mean in (1500.02, 1499.98, 1501.0):  # 120 and more exposures should have differed
+        assert mean_vector(still, mean, variance=variance) < LEVEL
+    assert mean_vector(np.column_stack([still, still]), [1500.0, 1500.02]) < LEVEL
+    beside = np.column_stack([still, np.random.default_rng(2).poisson(40.0, 6000)])
+    assert mean_vector(beside, [1500.0 + 2e-6, 40.0]) > LEVEL
+    assert mean_vector(beside, [1500.02, 40.0]) < LEVEL
+    assert mean_vector(beside, [1500.0, 41.0]) < LEVEL
+
+
+def test_a_variance_that_cannot_be_seen():
+    still = np.full(6000, 1500)
+    assert np.abs(variance_score(still, 2e-6)) < 0.1
+    assert 2 * stats.norm.sf(np.abs(variance_score(still, 0.02))) < LEVEL
+    beside = np.column_stack([still, np.random.default_rng(3).poisson(40.0, 6000)])
+    assert np.all(np.abs(variance_score(beside, [2e-6, 40.0])) < 5)
+    assert np.all(np.abs(variance_score(beside, [0.02, 44.0])) > 5)
+
+
+@pytest.mark.parametrize(("dead", "differ"), [(0.9, 0), (0.893, 20)])
+def test_a_locked_pixel_is_right_and_a_wrong_one_is_found(dead: float, differ: int):
+    """So bright that counts repeat: the engine agrees with the exact law, and one period less does not."""
+    locked = Case(
+        "locked", flux_of(0.0, 300.0),
+        System(
+            period_ns=PERIOD_NS, cycles=60, bins=16, pulse=GaussianPulse(sigma_ns=1.5),
+            detector=Detector(dead_time_ns=dead * PERIOD_NS),
+        ),
+        2000,
+    )  # fmt: skip
+    exact = count_law(0.0, 300.0, locked.system)
+    pmf = np.zeros(exact.support[-1] + 1)
+    pmf[exact.support] = exact.pmf
+    law = Law(count_pmf=pmf)
+    counts = draw(EXACT, locked, 1).counts
+    assert abs((counts != 67).sum() - differ) < 15
+    require(compare(EXACT, locked, law, {COUNTS}), "locked pixel")
+    assert "count mean" in rejected(compare(OneCycleShort(), locked, law, {COUNTS}))
 
 
 def test_cells_are_merged_in_order():

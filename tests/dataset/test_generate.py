@@ -176,6 +176,37 @@ def test_the_command(tmp_path):
     assert not (tmp_path / "b.zarr").exists()
 
 
+def test_the_command_takes_every_option_of_a_system(tmp_path):
+    name = str(tmp_path / "set.zarr")
+    ran = CliRunner().invoke(app, [
+        "generate", "room", "--size", "8", "--cycles", "20", "--bins", "16", "--mode", "gated", "--gate-start-ns", "20",
+        "--gate-width-ns", "50", "--pulse-fwhm-ns", "2", "--jitter-fwhm-ns", "0.5", "--attenuation", "inverse_square",
+        "--ambient", "reflectivity", "-o", name,
+    ])  # fmt: skip
+    assert ran.exit_code == 0, ran.output
+    stored = open_dataset(name)
+    (system,) = stored.recipe.systems
+    assert (system.detector.mode, system.detector.gate_width_ns) == ("gated", 50.0)
+    assert system.pulse == ml.GaussianPulse.from_fwhm(fwhm_ns=2.0)
+    assert (stored.recipe.light.attenuation, stored.recipe.light.ambient) == ("inverse_square", "reflectivity")
+    assert verify(name, chunks=None).good
+
+
+def test_crosstalk_needs_whole_images(tmp_path, recipe):
+    crosstalk = ml.Crosstalk(probability=0.05)
+    system = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, crosstalk=crosstalk))
+    recipe |= {"systems": [system], "light": {"sbr": 1.0}}
+    with pytest.raises(ValueError, match="does not do crosstalk"):
+        ml.generate(recipe, tmp_path / "set.zarr")
+    recipe["engine"] = "sequential"
+    with pytest.raises(ValueError, match=r"store.chunk_mib must be at least 0.007324, got 0.004"):
+        ml.generate(recipe, tmp_path / "set.zarr")
+    assert not (tmp_path / "set.zarr").exists()
+    recipe["store"] = {}
+    ml.generate(recipe, tmp_path / "set.zarr")
+    assert verify(tmp_path / "set.zarr", chunks=None).good
+
+
 def test_estimates_come_near(tmp_path, recipe):
     recipe["scenes"][0]["size"] = 48
     recipe["store"] = {"chunk_mib": 0.1, "shard_mib": 1}

@@ -46,27 +46,40 @@ def mean_vector(
     """Mean vector of a sample (realizations, components) against a known one.
 
     `share` is 1 / (realizations behind `mean`), 0 if it is exact; `variance` that of the components.
+
+    Components that are the same number in every realization say nothing of their variance, and the known mean need not
+    be that number: a count that is 1500 but once in a million exposures has the mean 1500 + 1e-6. See `_never_moved`.
     """
     x = _matrix(a)
     difference = x.mean(0) - np.atleast_1d(np.asarray(mean, float))
     total = 1.0 / len(x) + share
+    moving = np.ptp(x, axis=0) > 0
     covariance = np.atleast_2d(np.cov(x, rowvar=False))
     size = np.diag(covariance) if variance is None else np.atleast_1d(np.asarray(variance, float))
-    single = bonferroni(2 * stats.norm.sf(_scores(difference, size * total)))
-    return bonferroni([_hotelling(difference, covariance * total, len(x) - 1), single])
+    single = 2 * stats.norm.sf(_scores(difference, size * total))
+    single[~moving] = np.maximum(single[~moving], _never_moved(np.abs(difference[~moving]), total))
+    if not moving.any():
+        return bonferroni(single)
+    together = _hotelling(difference[moving], covariance[np.ix_(moving, moving)] * total, len(x) - 1)
+    return bonferroni([together, bonferroni(single)])
 
 
 def variance_score(a: ArrayLike, variance: ArrayLike, *, share: float = 0.0) -> Floats:
     """z of sample variances (components) against known ones.
 
-    Compared by logarithm, which takes most of the skewness out; standard error from the fourth moment.
+    Compared by logarithm, which takes most of the skewness out; standard error from the fourth moment. Of components
+    that are the same number in every realization: see `_never_moved`.
     """
     x = _matrix(a)
-    square = (x - x.mean(0)) ** 2
+    known = np.broadcast_to(np.asarray(variance, float), x.shape[1:])
+    moving = np.ptp(x, axis=0) > 0
+    total = 1.0 / len(x) + share
+    z = -stats.norm.isf(0.5 * _never_moved(known, total))
+    square = (x[:, moving] - x[:, moving].mean(0)) ** 2
     second = square.mean(0)
     kurtosis = (square**2).mean(0) / second**2 - 1.0
-    ratio = np.log(second * len(x) / (len(x) - 1) / np.atleast_1d(np.asarray(variance, float)))
-    return np.asarray(ratio / np.sqrt(kurtosis * (1.0 / len(x) + share)))
+    z[moving] = np.log(second * len(x) / (len(x) - 1) / known[moving]) / np.sqrt(kurtosis * total)
+    return np.asarray(z)
 
 
 def goodness(
@@ -118,6 +131,16 @@ def merge(weight: ArrayLike, least: float) -> NDArray[np.intp]:
     if held < least and number > 0:
         cell[cell == number] = number - 1
     return cell
+
+
+def _never_moved(size: Floats, total: float) -> Floats:
+    """P(nothing happens in 1 / `total` realizations) where each registration more or less has the mean `size`.
+
+    For numbers of registrations: those that differ from the usual one differ by one at least. So a mean that is `size`
+    away from the usual number, or a variance of `size`, takes `size` such realizations in each, or fewer that differ by
+    more; they fail to come with this probability, by Poisson's law.
+    """
+    return np.asarray(np.exp(-size / total))
 
 
 def _matrix(a: ArrayLike) -> Floats:

@@ -1,5 +1,9 @@
 """The study of table errors: it writes what it measures."""
 
+import csv
+
+import pytest
+
 from mars_lidar.studies import STUDIES, Request
 
 
@@ -15,3 +19,15 @@ def test_the_study_writes_its_report(tmp_path):
     bilinear, nearest = (float(row[at]) for row in rows[1:3])
     assert bilinear < 0.1 * nearest
     assert len(told) == 1
+
+
+def test_the_start_up_study_writes_its_report(tmp_path):
+    paths = STUDIES["start-up"][1](Request(tmp_path, quick=True))
+    assert [path.name for path in paths] == ["start_up.md", "start_up.csv"]
+    rows = list(csv.DictReader(paths[1].read_text().splitlines()))
+    short, long = (max(float(r["displaced"]) for r in rows if r["cycles"] == n) for n in ("100", "1000"))
+    assert short == pytest.approx(long, rel=0.05)  # start-up does not grow with the exposure
+    assert 0.5 < short < 2.0
+    dim = max(float(r["tv"]) for r in rows if float(r["signal"]) <= 0.1 and float(r["background"]) <= 0.1)
+    assert 0.0 < dim < 0.1 * max(float(r["tv"]) for r in rows)
+    assert "registrations of an exposure are displaced" in paths[0].read_text()

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mars_lidar.cli import options
-from mars_lidar.cli.console import BAD_INPUT, FAILED, progress_bar, reported, say, table
-from mars_lidar.cli.system_options import SystemOptions
+from mars_lidar.cli.console import FAILED, progress_bar, reported, say, table
+from mars_lidar.cli.dataset_tables import tell, tell_estimate
+from mars_lidar.cli.effect_options import Effects
+from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.options import _option
+from mars_lidar.cli.scene_options import Ambient, Attenuation
+from mars_lidar.cli.system_options import SystemChanges
 
 if TYPE_CHECKING:
     from mars_lidar.dataset import DatasetRecipe
-    from mars_lidar.dataset.estimate import Estimate
-    from mars_lidar.dataset.run import Generated
-    from mars_lidar.io import Problem
 
 GENERATE_EPILOG = "\n\n".join(
     (
@@ -36,10 +36,10 @@ _RECIPES = (".yaml", ".yml")
 _TRANSIENTS = (".h5", ".hdf5")  # a depth is never in one; the other files of transients need a recipe
 
 
-def _many(text: str, panel: str = "Light") -> Any:
-    return typer.Option(rich_help_panel=panel, help=text, show_default=False)
+_SCENES, _LIGHT, _RUN, _OUTPUT = "Scenes", "Light", "Simulation", "Output"
 
 
+@grouped
 def generate(
     *,
     source: Annotated[
@@ -51,95 +51,128 @@ def generate(
         ),
     ] = None,
     size: Annotated[
-        str | None, _many("Resample every scene: the longer side, or HEIGHT,WIDTH. Room: 128 by default.", "Scenes")
+        str | None,
+        _option(
+            "--size", panel=_SCENES, metavar="SIDE", default="as it is; room: 128",
+            help="Resample every scene: the longer side, or HEIGHT,WIDTH.",
+        ),
     ] = None,
-    crop: Annotated[str | None, _many("Cut out parts at random places: side, or HEIGHT,WIDTH.", "Scenes")] = None,
-    crops: Annotated[int | None, _many("Parts per scene. Default: 1.", "Scenes")] = None,
-    scene_seeds: Annotated[int | None, _many("Room: that many, of seeds 0, 1, ... Default: 1.", "Scenes")] = None,
-    depth_unit_m: Annotated[float | None, _many("RGB-D: metres per stored unit of depth.", "Scenes")] = None,
-    focal_px: Annotated[float | None, _many("RGB-D: focal length in pixels of the file.", "Scenes")] = None,
+    crop: Annotated[
+        str | None,
+        _option("--crop", panel=_SCENES, metavar="SIDE", help="Cut out parts at random places: side, or HEIGHT,WIDTH."),
+    ] = None,
+    crops: Annotated[int | None, _option("--crops", panel=_SCENES, help="Parts per scene.", default="1")] = None,
+    scene_seeds: Annotated[
+        int | None,
+        _option("--scene-seeds", panel=_SCENES, help="Built-in scene: that many, of seeds 0, 1, ...", default="1"),
+    ] = None,
+    depth_unit_m: Annotated[
+        float | None,
+        _option(
+            "--depth-unit-m", panel=_SCENES, help="RGB-D: metres per stored unit of depth.",
+            default="0.001 for images, 1 for arrays",
+        ),
+    ] = None,
+    focal_px: Annotated[
+        float | None,
+        _option(
+            "--focal-px", panel=_SCENES, default="depth as it is",
+            help="RGB-D: focal length, pixels of the file: turns depth along the axis into range along the ray.",
+        ),
+    ] = None,
     system: Annotated[
-        list[Path] | None, _many("System file (see mars-lidar init); may be repeated.", "System")
+        list[Path] | None,
+        _option(
+            "--system", panel="System",
+            help="YAML or JSON file (see mars-lidar init), repeated for several; single options replace its values.",
+        ),
     ] = None,
-    period_ns: options.PeriodNs = None,
-    dead_time_ns: options.DeadTimeNs = None,
-    cycles: options.Cycles = None,
-    bins: options.Bins = None,
-    pulse_sigma_ns: options.PulseSigmaNs = None,
+    changes: SystemChanges,
+    effects: Effects,
     signal: Annotated[
-        list[float] | None, _many("Mean signal photons per period; may be repeated. Default: 1.")
+        list[float] | None,
+        _option(
+            "--signal", panel=_LIGHT, default="1",
+            help="Mean signal photons per laser period, repeated for several levels.",
+        ),
     ] = None,
     sbr: Annotated[
-        list[float] | None, _many("Mean signal / mean ambient photons; may be repeated. Default: 1.")
+        list[float] | None,
+        _option(
+            "--sbr", panel=_LIGHT, default="1",
+            help="Mean signal / mean ambient photons, repeated for several: each with each signal.",
+        ),
     ] = None,
-    engine: Annotated[str | None, _many("As for mars-lidar simulate. Default: exact.", "Simulation")] = None,
-    realizations: Annotated[int | None, _many("Exposures of each sample. Default: 1.", "Simulation")] = None,
-    seed: Annotated[int | None, _many("Seed of the dataset. Default: 0.", "Simulation")] = None,
+    attenuation: Attenuation = None,
+    ambient: Ambient = None,
+    engine: Annotated[
+        str | None, _option("--engine", panel=_RUN, help="As for mars-lidar simulate.", default="exact")
+    ] = None,
+    realizations: Annotated[
+        int | None, _option("--realizations", panel=_RUN, help="Exposures of each sample.", default="1")
+    ] = None,
+    seed: Annotated[int | None, _option("--seed", panel=_RUN, help="Seed of the dataset.", default="0")] = None,
     threads: options.Threads = None,
     workers: Annotated[
-        int | None, _many("Worker processes on this machine (extra cluster).", "Simulation")
+        int | None, _option("--workers", panel=_RUN, help="Worker processes on this machine (extra cluster).")
     ] = None,
     scheduler: Annotated[
-        str | None, _many("Address of a dask scheduler whose workers see --out (extra cluster).", "Simulation")
+        str | None,
+        _option(
+            "--scheduler", panel=_RUN, help="Address of a dask scheduler whose workers see --out (extra cluster)."
+        ),
     ] = None,
-    out: Annotated[
-        Path, typer.Option("-o", "--out", rich_help_panel="Output", help="The dataset, NAME.zarr.", show_default=False)
-    ],
+    out: Annotated[Path, _option("-o", "--out", panel=_OUTPUT, help="The dataset, NAME.zarr.")],
     layout: Annotated[
         str | None,
-        _many("sparse (packed bins that are not zero) or dense (for other Zarr libraries). Default: sparse.", "Output"),
+        _option(
+            "--layout", panel=_OUTPUT, default="sparse",
+            help="sparse (packed bins that are not zero) or dense (for other Zarr libraries).",
+        ),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", rich_help_panel="Output", help="Continue what was stopped.")
-    ] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", rich_help_panel="Output", help="Replace an existing dataset.")
-    ] = False,
+    resume: Annotated[bool, _option("--resume", panel=_OUTPUT, help="Continue what was stopped.")] = False,
+    overwrite: Annotated[bool, _option("--overwrite", panel=_OUTPUT, help="Replace an existing dataset.")] = False,
     dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", rich_help_panel="Output", help="Tell size, time and memory; write nothing."),
+        bool, _option("--dry-run", panel=_OUTPUT, help="Tell size, time and memory; write nothing.")
     ] = False,
 ) -> None:
     """Simulate a dataset: scenes x systems x levels of light x realizations, into one Zarr store.
 
     With a recipe, options replace its values. The store does not depend on threads, workers or interruptions: the
     same recipe gives the same files, byte for byte. Files that cannot be used are left out and told at the end.
+    Fog, panes, folders of transients and all else that has no option stand in a recipe.
     """
     with reported():
         from mars_lidar import dataset
 
-        single = {
-            "period_ns": period_ns, "dead_time_ns": dead_time_ns, "cycles": cycles, "bins": bins,
-            "pulse_sigma_ns": pulse_sigma_ns,
-        }  # fmt: skip
         replaced = {
             "size": _size("--size", size),
             "crop": None if crop is None else {"size": _size("--crop", crop), "count": crops or 1},
-            "systems": _systems(system, single),
-            "light": _light(signal, sbr),
+            "systems": _systems(system, changes, effects),
+            "light": _given(signal=signal or None, sbr=sbr or None, attenuation=attenuation, ambient=ambient) or None,
             "engine": engine,
             "realizations": realizations,
             "seed": seed,
             "store": None if layout is None else {"layout": layout},
         }
-        replaced = {name: value for name, value in replaced.items() if value is not None}
+        replaced = _given(**replaced)
         if source is not None and source.suffix in _RECIPES and not system and "systems" in replaced:
             raise ValueError("with a recipe, single options of the system need the --system whose values they replace")
         if crops is not None and crop is None:
             raise ValueError("--crops belongs to --crop, which is not given")
-        rgbd = {"depth_unit_m": depth_unit_m, "focal_px": focal_px}
-        recipe = _recipe(source, replaced, scene_seeds, {k: v for k, v in rgbd.items() if v is not None}, resume)
+        rgbd = _given(depth_unit_m=depth_unit_m, focal_px=focal_px)
+        recipe = _recipe(source, replaced, scene_seeds, rgbd, resume)
         if dry_run:
             if recipe is None:
                 raise ValueError("--dry-run needs a source")
-            _tell_estimate(dataset.estimate(recipe, out, threads=threads))
+            tell_estimate(dataset.estimate(recipe, out, threads=threads))
             return
         with progress_bar("generating") as progress:
             done = dataset.generate(
                 recipe, out, resume=resume, overwrite=overwrite, threads=threads, workers=workers,
                 scheduler=scheduler, progress=progress,
             )  # fmt: skip
-        _tell(done)
+        tell(done)
 
 
 def verify(
@@ -164,37 +197,6 @@ def verify(
         for line in told.different:
             say(line)
         raise typer.Exit(FAILED)
-
-
-def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
-    """What `mars-lidar info` tells of a dataset; None for anything else."""
-    from mars_lidar.dataset.store import is_dataset, open_dataset
-
-    if not is_dataset(path):
-        return None
-    stored = open_dataset(path, allow_incomplete=True)
-    rows = [("file", f"{path} (mars-lidar {stored.attrs['version']})")]
-    if not stored.planned:
-        return [*rows, ("complete", "NO: stopped before its scenes were in; generate it again with --resume")]
-    left = [] if stored.complete else stored.missing()
-    total = sum(1 for _ in stored.items())
-    array, recipe = stored.histogram, stored.recipe
-    levels = ", ".join(f"{s:g}/{b:g}" for s, b in recipe.light.levels[:8])
-    problems = len(stored.problems)
-    return [
-        *rows,
-        ("complete", f"NO: {total - len(left)} of {total} parts are there; continue with --resume" if left else "yes"),
-        ("counts", f"{_shape(array.shape)} {array.dtype}, {recipe.layout}"),
-        ("size", f"{_bytes(math.prod(array.shape) * array.dtype.itemsize)} dense, {_bytes(_on_disk(path))} on disk"),
-        ("chunk", f"{_shape(array.chunks)} of a shard of {_shape(array.shards)}"),
-        ("engine", f"{recipe.engine}, seed {recipe.seed}"),
-        *((f"system {k}", one.to_json()) for k, one in enumerate(recipe.systems)),
-        ("light", f"signal/sbr {levels}{', ...' if len(recipe.light.levels) > 8 else ''}"),
-        ("scenes", ", ".join(json.dumps(one) for one in recipe.scenes)),
-        ("left out", f"{problems} files" if problems else "nothing"),
-        *(("", str(problem)) for problem in stored.problems[:20]),
-        ("open with", f"xarray.open_zarr({str(path)!r})"),
-    ]
 
 
 def _recipe(
@@ -235,17 +237,16 @@ def _default_systems() -> list[Any]:
     return [DEFAULT_SYSTEM]
 
 
-def _systems(files: list[Path] | None, single: dict[str, Any]) -> list[Any] | None:
+def _systems(files: list[Path] | None, changes: SystemChanges, effects: Effects) -> list[Any] | None:
     """Systems of the command line: each file with the single options in place of its values."""
-    if not files and all(value is None for value in single.values()):
+    if not files and changes == SystemChanges() and effects == Effects():
         return None
     bases: list[Path | None] = [*files] if files else [None]
-    return [SystemOptions(system=file, **single).build() for file in bases]
+    return [changes.of(file, effects) for file in bases]
 
 
-def _light(signal: list[float] | None, sbr: list[float] | None) -> dict[str, Any] | None:
-    given = {"signal": signal or None, "sbr": sbr or None}
-    return {name: value for name, value in given.items() if value is not None} or None
+def _given(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _size(option: str, text: str | None) -> Any:
@@ -258,66 +259,3 @@ def _size(option: str, text: str | None) -> Any:
     if len(numbers) not in (1, 2):
         raise ValueError(f"{option} must be one integer or HEIGHT,WIDTH, got {text!r}")
     return numbers[0] if len(numbers) == 1 else numbers
-
-
-def _tell(done: Generated) -> None:
-    exposures = math.prod(done.shape[:4])
-    busy = done.simulate_s + done.write_s
-    share = f"; {100 * done.simulate_s / busy:.0f} % of the threads' time simulating" if busy else ""
-    before = f", {done.parts_before} were there" if done.parts_before else ""
-    table(
-        [
-            ("generated", _shape(done.shape)),
-            ("parts", f"{done.parts} made{before}"),
-            ("time", f"{done.seconds:.3g} s for {exposures:,} pixel exposures{share}"),
-            ("dataset", f"{done.path}, {_bytes(_on_disk(done.path))}"),
-            ("open with", f"xarray.open_zarr({str(done.path)!r})"),
-            ("left out", f"{len(done.problems)} files" if done.problems else "nothing"),
-        ]
-    )
-    _tell_problems(done.problems)
-
-
-def _tell_problems(problems: tuple[Problem, ...]) -> None:
-    for problem in problems:
-        say(f"left out: {problem}")
-
-
-def _tell_estimate(told: Estimate) -> None:
-    rows = [
-        ("dataset", _shape(told.shape)),
-        ("scenes", f"{told.scenes:,}"),
-        ("size", f"about {_bytes(told.bytes)} on disk, of {_bytes(told.dense_bytes)} dense; {told.shards:,} shards"),
-        ("chunk", " × ".join(map(str, told.chunk))),
-        ("time", f"about {_span(told.seconds)} on {told.threads} threads of this machine"),
-        ("memory", f"at most {_bytes(told.memory_bytes)}"),
-    ]
-    short = told.free_bytes is not None and told.bytes > told.free_bytes
-    if told.free_bytes is not None:
-        rows.append(("disk", f"{_bytes(told.free_bytes)} free{': NOT ENOUGH' if short else ''}"))
-    table(rows)
-    _tell_problems(told.problems)
-    if short:
-        raise typer.Exit(BAD_INPUT)
-
-
-def _shape(shape: tuple[int, ...]) -> str:
-    return " × ".join(map(str, shape)) + " (sample, realization, y, x, time)"
-
-
-def _on_disk(path: Path) -> int:
-    return sum(part.stat().st_size for part in path.rglob("*") if part.is_file())
-
-
-def _bytes(number: float) -> str:
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if number < 1000 or unit == "TB":
-            break
-        number /= 1000
-    return f"{number:.3g} {unit}"
-
-
-def _span(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.2g} s"
-    return f"{seconds / 60:.3g} minutes" if seconds < 7200 else f"{seconds / 3600:.3g} hours"

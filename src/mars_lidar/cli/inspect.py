@@ -26,7 +26,7 @@ def info(
     from mars_lidar.io import verify as same_again
 
     with reported():
-        from mars_lidar.cli.generate import dataset_rows
+        from mars_lidar.cli.dataset_tables import dataset_rows
 
         rows = dataset_rows(file)
         if rows is not None:

@@ -9,7 +9,9 @@ import typer
 
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, say, table
-from mars_lidar.cli.system_options import SystemOptions
+from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.pulse_options import PulseOptions
+from mars_lidar.cli.system_options import SystemChanges
 
 if TYPE_CHECKING:
     from mars_lidar.learn.neural import NeuralMap
@@ -28,6 +30,7 @@ def _range(name: str) -> typer.models.OptionInfo:
 
 
 @app.command()
+@grouped
 def train(
     *,
     out: Annotated[Path, typer.Option("-o", "--out", help="The network: .npz. Curves go beside it: .csv and .png.")],
@@ -35,11 +38,7 @@ def train(
     period_ns: options.PeriodNs = None,
     dead_time_ns: options.DeadTimeNs = None,
     bins: options.Bins = None,
-    pulse_sigma_ns: options.PulseSigmaNs = None,
-    pulse_fwhm_ns: options.PulseFwhmNs = None,
-    pulse_file: options.PulseFile = None,
-    pulse_bin_ns: options.PulseBinNs = None,
-    pulse_origin: options.PulseOrigin = None,
+    pulse: PulseOptions,
     signal: Annotated[str, _range("--signal")] = "0.002,12",
     background: Annotated[str, _range("--background")] = "0.002,12",
     returns: Annotated[int, typer.Option(help="Most returns of a flux, 1 or 2.", rich_help_panel=_FLUX)] = 2,
@@ -50,10 +49,8 @@ def train(
 ) -> None:
     """Train the network of a system on the Markov chain of phases, and validate it on held-out fluxes."""
     with reported():
-        instrument = SystemOptions(
-            system=system, period_ns=period_ns, bins=bins, dead_time_ns=dead_time_ns, pulse_sigma_ns=pulse_sigma_ns,
-            pulse_fwhm_ns=pulse_fwhm_ns, pulse_file=pulse_file, pulse_bin_ns=pulse_bin_ns, pulse_origin=pulse_origin,
-        ).build()  # fmt: skip
+        given = SystemChanges(period_ns=period_ns, dead_time_ns=dead_time_ns, bins=bins, pulse=pulse)
+        instrument = given.of(system)
         from mars_lidar.learn.neural import FluxRange, Training
         from mars_lidar.learn.neural.model import check_target
         from mars_lidar.learn.neural.training import Point, save_curves
@@ -64,6 +61,7 @@ def train(
             signal=_pair("--signal", signal), background=_pair("--background", background), returns=returns
         )
         chosen = Training(fluxes=fluxes, steps=steps, pairs=pairs, seed=seed)
+
         def tell(point: Point) -> None:
             say(
                 f"step {point.step}: total variation {point.tv_mean:.4f}, 95 % {point.tv_95:.4f}, largest "

@@ -81,29 +81,6 @@ Bins = Annotated[
     int | None,
     _option("--bins", panel=_SYSTEM, help="Histogram bins per period.", default="1024"),
 ]
-PulseSigmaNs = Annotated[
-    float | None,
-    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse: standard deviation, ns.", default="0.5"),
-]
-PulseFwhmNs = Annotated[
-    float | None,
-    _option("--pulse-fwhm-ns", panel=_SYSTEM, help="Gaussian pulse: full width at half maximum, ns."),
-]
-PulseFile = Annotated[
-    Path | None,
-    _option("--pulse-file", panel=_SYSTEM, help="Measured impulse response: 1-D .npy array."),
-]
-PulseBinNs = Annotated[
-    float | None,
-    _option("--pulse-bin-ns", panel=_SYSTEM, help="Sample width of --pulse-file, ns."),
-]
-PulseOrigin = Annotated[
-    str | None,
-    _option(
-        "--pulse-origin", panel=_SYSTEM,
-        help="What a delay refers to in --pulse-file: peak, centroid or first.", default="peak",
-    ),
-]
 Start = Annotated[
     str | None,
     _option(

@@ -24,6 +24,23 @@ _OF_TRANSIENT = (
 )  # fmt: skip
 
 
+Attenuation = Annotated[
+    str | None,
+    _option(
+        "--attenuation", panel=_LIGHT, default="none",
+        help="Signal against depth z: none or inverse_square (1 / z^2).",
+    ),
+]
+Ambient = Annotated[
+    str | None,
+    _option(
+        "--ambient", panel=_LIGHT,
+        help="Ambient light over the image: uniform, reflectivity, or map (of the scene).",
+        default="map where there is one, else uniform",
+    ),
+]
+
+
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
     """One of a built-in scene, depth, and a transient; None: not given."""
@@ -139,21 +156,8 @@ class LightOptions:
         float | None,
         _option("--sbr", panel=_LIGHT, help="Mean signal / mean ambient photons per period.", default="1"),
     ] = None
-    attenuation: Annotated[
-        str | None,
-        _option(
-            "--attenuation", panel=_LIGHT, default="none",
-            help="Signal against depth z: none or inverse_square (1 / z^2).",
-        ),
-    ] = None
-    ambient: Annotated[
-        str | None,
-        _option(
-            "--ambient", panel=_LIGHT,
-            help="Ambient light over the image: uniform, reflectivity, or map (of the scene).",
-            default="map where there is one, else uniform",
-        ),
-    ] = None
+    attenuation: Attenuation = None
+    ambient: Ambient = None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +11,7 @@ from mars_lidar.cli.console import say
 from mars_lidar.cli.effect_options import StreamEffects
 from mars_lidar.cli.inspect import parsed_pixel
 from mars_lidar.cli.options import _SYSTEM, _option
+from mars_lidar.cli.pulse_options import FittedPulseOptions
 
 if TYPE_CHECKING:
     from mars_lidar.detector import Detector
@@ -66,10 +67,6 @@ Mode = Annotated[
         help="nonparalyzable, or paralyzable: every arrival restarts the dead time.",
     ),
 ]
-PulseSigmaNs = Annotated[
-    float | None,
-    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse, sigma in ns.", default="fitted"),
-]
 Free = Annotated[
     bool,
     _option("--free", panel=_SYSTEM, help="Any shape of light, bin by bin: fluorescence, haze, many surfaces."),
@@ -121,11 +118,7 @@ class FitOptions:
     dead_time_ns: DeadTimeNs = None
     mode: Mode = None
     hold_off_ns: HoldOffNs = None
-    pulse_sigma_ns: PulseSigmaNs = None
-    pulse_fwhm_ns: options.PulseFwhmNs = None
-    pulse_file: options.PulseFile = None
-    pulse_bin_ns: options.PulseBinNs = None
-    pulse_origin: options.PulseOrigin = None
+    pulse: FittedPulseOptions = field(default_factory=FittedPulseOptions)
     free: Free = False
     returns: Returns = 1
 
@@ -153,7 +146,7 @@ class FitOptions:
         else:
             base = Detector(dead_time_ns=dead)
         detector = stream_detector(with_given(base, given | ({} if dead is None else {"dead_time_ns": dead})))
-        pulse = self._pulse() or (GaussianPulse(sigma_ns=0.01 * times.period_ns) if known is None else known.pulse)
+        pulse = self.pulse.build() or (GaussianPulse(sigma_ns=0.01 * times.period_ns) if known is None else known.pulse)
         if known is not None:
             return known.replace(detector=detector, pulse=pulse)
         return SystemOf(
@@ -161,19 +154,12 @@ class FitOptions:
             start="armed",
         )  # fmt: skip
 
-    def _pulse(self) -> Pulse | None:
-        from mars_lidar.cli.system_options import pulse_of
-
-        return pulse_of(
-            self.pulse_sigma_ns, self.pulse_fwhm_ns, self.pulse_file, self.pulse_bin_ns, self.pulse_origin
-        )
-
     def calibrate(self, times: Timestamps, effects: StreamEffects) -> tuple[Calibration, Detector | None]:
         """The light of the stream by maximum likelihood, and the detector where it is more than a dead time."""
         from mars_lidar.estimate import calibrate as fitted
         from mars_lidar.estimate.detector_model import is_plain
 
-        told, pulse = self.told(times, effects), self._pulse()
+        told, pulse = self.told(times, effects), self.pulse.build()
         shape: Pulse | Literal["free", "gaussian"] | None = pulse if told is None else None
         if told is not None and pulse is None and self.system is None and times.system is None:
             shape = "gaussian"

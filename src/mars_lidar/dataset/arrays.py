@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -31,10 +32,22 @@ _COORDINATES = "scene system signal_level sbr period_ns seed"  # for xarray, as 
 def histogram_blocks(
     recipe: DatasetRecipe, number: int, shape: tuple[int, int]
 ) -> tuple[tuple[int, ...], np.dtype[Any], tuple[int, ...], tuple[int, ...]]:
-    """Shape, type, chunk and shard of the histogram."""
+    """Shape, type, chunk and shard of the histogram.
+
+    Raises
+    ------
+    ValueError
+        Pixels depend on each other (crosstalk) and an image does not fit in a chunk.
+    """
     dtype = np.result_type(*(one.histogram_dtype for one in recipe.systems))
     whole = (number, recipe.realizations, *shape, recipe.systems[0].bins)
     chunk = samples.fitting(whole, (1, 1, 1, 1, whole[-1]), dtype.itemsize, recipe.chunk_mib * 2**20)
+    if chunk[2:4] != shape and any(one.detector.crosstalk is not None for one in recipe.systems):
+        needed = math.prod(whole[2:]) * dtype.itemsize / 2**20
+        raise ValueError(
+            "with crosstalk an image is made at once, for its pixels depend on each other: "
+            f"store.chunk_mib must be at least {needed:.4g}, got {recipe.chunk_mib:g}"
+        )
     shard = samples.fitting(whole, chunk, dtype.itemsize, recipe.shard_mib * 2**20)
     return whole, dtype, chunk, shard
 

@@ -19,6 +19,7 @@ from mars_lidar.dataset.arrays import (
     create_histogram,
     create_list,
     create_maps,
+    histogram_blocks,
     mark,
 )
 from mars_lidar.dataset.recipe import DatasetRecipe
@@ -43,6 +44,7 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
                 problems.append(one)
                 continue
             if writer is None:  # nothing on the disk is touched before there is something to put on it
+                histogram_blocks(recipe, 1, one.scene.shape)
                 group = begin(path, recipe)
                 writer = SceneWriter(group, len(found) * (recipe.crops if recipe.crop else 1))
             writer.add(one.name, one.scene)

@@ -183,4 +183,5 @@ def _engine(engine: Any, systems: tuple[System, ...]) -> str:
     found = find_engine(engine)
     for system in systems:
         found.check_mode(system)
+        found.check_effects(system)
     return engine

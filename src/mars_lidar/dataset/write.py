@@ -8,6 +8,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -65,18 +66,37 @@ class Maker:
     def _packed(self, item: Item) -> Iterator[bytes | None]:
         """The chunks of a shard, one after the other."""
         array = self.dataset.histogram
-        pack = packer(self.dataset.recipe.layout, array.dtype)
-        for region in chunks_of(item.region, array.chunks, array.shards):
-            if region is None:
-                yield None
-                continue
-            began = time.perf_counter()
-            counts = self.counts(region)
-            self._simulate_s += time.perf_counter() - began
-            if counts.shape != array.chunks:  # at the edge of the array: chunks are stored whole
-                ends = [(0, whole - have) for whole, have in zip(array.chunks, counts.shape, strict=True)]
-                counts = np.pad(counts, ends)
-            yield pack(counts)
+        regions = list(chunks_of(item.region, array.chunks, array.shards))
+        if not self._waveforms:
+            for region in regions:
+                yield None if region is None else self._chunk(region)
+            return
+        # exposures of the same pixels together, for their waveforms take longer than they do; packed they are small
+        made: dict[int, bytes] = {}
+        places = {k: region for k, region in enumerate(regions) if region is not None}
+        for k in sorted(places, key=lambda k: [places[k][axis].start for axis in (0, 2, 3, 1)]):
+            made[k] = self._chunk(places[k])
+        for k in range(len(regions)):
+            yield made.pop(k, None)
+
+    def _chunk(self, region: tuple[slice, ...]) -> bytes:
+        """A chunk, packed."""
+        array = self.dataset.histogram
+        began = time.perf_counter()
+        counts = self.counts(region)
+        self._simulate_s += time.perf_counter() - began
+        if counts.shape != array.chunks:  # at the edge of the array: chunks are stored whole
+            ends = [(0, whole - have) for whole, have in zip(array.chunks, counts.shape, strict=True)]
+            counts = np.pad(counts, ends)
+        return self._pack(counts)
+
+    @cached_property
+    def _pack(self) -> Callable[[NDArray[Any]], bytes]:
+        return packer(self.dataset.recipe.layout, self.dataset.histogram.dtype)
+
+    @cached_property
+    def _waveforms(self) -> bool:
+        return self.dataset.scenes.waveform_parts(self.dataset.recipe.systems) > 0
 
     def maps(self, some: slice) -> dict[str, NDArray[np.float32]]:
         """Maps of some samples (samples, H, W)."""

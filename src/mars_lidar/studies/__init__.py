@@ -94,6 +94,7 @@ STUDIES: dict[str, tuple[str, Study]] = {
     ),
     "transients": ("two returns in fog through the dead time of three detectors", _study("transients")),
     "downstream": ("T5: networks trained on every simulator's data, tested on gold; --config", _study("downstream")),
+    "start-up": ("what the shape of a table leaves out: the start-up at other delays", _study("start_up")),
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _study("table")),
 }
 

@@ -1,0 +1,81 @@
+"""The options of a pulse, for every command that takes one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from mars_lidar.cli.effect_options import read_array
+from mars_lidar.cli.options import _SYSTEM, _option
+from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
+
+Sigma = Annotated[
+    float | None,
+    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse: standard deviation, ns.", default="0.5"),
+]
+FittedSigma = Annotated[
+    float | None,
+    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse: standard deviation, ns.", default="fitted"),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PulseOptions:
+    """A Gaussian pulse or a measured one; None: not given."""
+
+    pulse_sigma_ns: Sigma = None
+    pulse_fwhm_ns: Annotated[
+        float | None,
+        _option("--pulse-fwhm-ns", panel=_SYSTEM, help="Gaussian pulse: full width at half maximum, ns."),
+    ] = None
+    pulse_file: Annotated[
+        Path | None, _option("--pulse-file", panel=_SYSTEM, help="Measured impulse response: 1-D .npy array.")
+    ] = None
+    pulse_bin_ns: Annotated[
+        float | None, _option("--pulse-bin-ns", panel=_SYSTEM, help="Sample width of --pulse-file, ns.")
+    ] = None
+    pulse_origin: Annotated[
+        str | None,
+        _option(
+            "--pulse-origin", panel=_SYSTEM,
+            help="What a delay refers to in --pulse-file: peak, centroid or first.", default="peak",
+        ),
+    ] = None
+
+    def build(self) -> Pulse | None:
+        """The pulse that is meant, or None where none is given."""
+        one_of = (
+            ("--pulse-sigma-ns", self.pulse_sigma_ns),
+            ("--pulse-fwhm-ns", self.pulse_fwhm_ns),
+            ("--pulse-file", self.pulse_file),
+        )
+        given = [name for name, value in one_of if value is not None]
+        if len(given) > 1:
+            raise ValueError(f"the pulse is given once: choose one of {' and '.join(given)}")
+        if self.pulse_file is None and (self.pulse_bin_ns is not None or self.pulse_origin is not None):
+            raise ValueError("--pulse-bin-ns and --pulse-origin belong to --pulse-file, which is not given")
+        if self.pulse_sigma_ns is not None:
+            return GaussianPulse(sigma_ns=self.pulse_sigma_ns)
+        if self.pulse_fwhm_ns is not None:
+            return GaussianPulse.from_fwhm(fwhm_ns=self.pulse_fwhm_ns)
+        if self.pulse_file is None:
+            return None
+        if self.pulse_bin_ns is None:
+            raise ValueError(f"--pulse-file {self.pulse_file} needs --pulse-bin-ns, the width of its samples in ns")
+        return _measured(self.pulse_file, self.pulse_bin_ns, self.pulse_origin or "peak")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedPulseOptions(PulseOptions):
+    """The same where a Gaussian is fitted if none is given."""
+
+    pulse_sigma_ns: FittedSigma = None
+
+
+def _measured(file: Path, bin_ns: float, origin: str) -> SampledPulse:
+    values = read_array("--pulse-file", file)
+    try:
+        return SampledPulse(values, bin_ns, origin)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{file}: {error}") from error

@@ -353,3 +353,14 @@ def test_help_flows(monkeypatch):
 
 def test_the_studies_help_names_the_command():
     assert "usage: mars-lidar study" in CliRunner().invoke(app, ["study", "--help"]).output
+
+
+def test_a_pipe_without_unicode_gets_plain_text(tmp_path):
+    out = tmp_path / "a.zarr"
+    assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0
+    done = subprocess.run(
+        [sys.executable, "-c", "from mars_lidar.cli import main; main()", "info", str(out)],
+        env=os.environ | {"PYTHONIOENCODING": "ascii"}, capture_output=True, check=True,
+    )  # fmt: skip
+    assert b"1 ? " in done.stdout
+    assert done.stderr == b""

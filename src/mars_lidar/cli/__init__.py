@@ -5,6 +5,8 @@ Exit codes: 0 done, 1 failed (disk full, a bug), 2 bad input, 130 interrupted.
 
 from __future__ import annotations
 
+import io
+import sys
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -91,4 +93,7 @@ def _root(
 
 def main() -> None:
     """Entry point of the command `mars-lidar`."""
+    for stream in (sys.stdout, sys.stderr):  # a sign that a terminal or a pipe cannot show is no error
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     app()

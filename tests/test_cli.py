@@ -331,3 +331,36 @@ def test_help_teaches_and_starts_light():
     code = f"import sys, mars_lidar.cli; print(*({heavy!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+def test_nothing_is_written_into_a_store(tmp_path):
+    store = tmp_path / "a.zarr"
+    assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", store).exit_code == 0
+    before = sorted(store.rglob("*"))
+    for inside in (store / "b.zarr", store / "depth" / "b.h5"):
+        done = run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", inside)
+        assert done.exit_code == 2
+        assert f"inside of another store, {store}" in done.stderr
+    assert sorted(store.rglob("*")) == before
+
+
+def test_help_flows(monkeypatch):
+    """A paragraph of a command's help has no line end where its docstring has one."""
+    monkeypatch.setenv("COLUMNS", "400")
+    assert "interruptions: the same recipe gives the same files" in run("generate", "--help").output
+    assert "opens a .zarr with named dimensions and units" in run("simulate", "--help").output
+
+
+def test_the_studies_help_names_the_command():
+    assert "usage: mars-lidar study" in CliRunner().invoke(app, ["study", "--help"]).output
+
+
+def test_a_pipe_without_unicode_gets_plain_text(tmp_path):
+    out = tmp_path / "a.zarr"
+    assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0
+    done = subprocess.run(
+        [sys.executable, "-c", "from mars_lidar.cli import main; main()", "info", str(out)],
+        env=os.environ | {"PYTHONIOENCODING": "ascii"}, capture_output=True, check=True,
+    )  # fmt: skip
+    assert b"1 ? " in done.stdout
+    assert done.stderr == b""

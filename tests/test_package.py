@@ -90,3 +90,14 @@ def test_every_argument_is_documented_and_typed(name: str):
 
 def test_package_is_marked_as_typed():
     assert (Path(ml.__file__).parent / "py.typed").exists()
+
+
+def test_packages_of_formats_and_learning_are_there_when_they_are_asked_for():
+    code = (
+        "import sys, mars_lidar as ml\n"
+        "assert 'h5py' not in sys.modules and {'io', 'learn', 'plot'} <= set(dir(ml))\n"
+        "ml.io.load, ml.learn, ml.plot\n"
+        "print(hasattr(ml, 'lern'), 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]

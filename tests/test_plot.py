@@ -179,3 +179,19 @@ def test_the_predicted_histogram_is_the_mean_of_many(name, engine):
 
 def test_no_prediction_where_it_would_take_too_long():
     assert data.predicted_counts(cube_of(step(2, 2), SYSTEM.replace(cycles=20_001)), 0, 0) is None
+
+
+def test_a_headline_names_what_is_not_plain():
+    plain = ml.System(
+        period_ns=100.0, cycles=1, bins=1, pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=50.0),
+    )  # fmt: skip
+    assert data.instrument(plain) == "1 bin of 100 ns; 1 laser period of 100 ns; dead time 50 ns"
+    odd = plain.replace(
+        bins=1000, cycles=2000,
+        detector=ml.Detector(dead_time_ns=0.0, mode="synchronous", dark_count_hz=5.0, max_events_per_exposure=4),
+    )  # fmt: skip
+    assert data.instrument(odd) == (
+        "1,000 bins of 100 ps; 2,000 laser periods of 100 ns; dead time 0 ns, synchronous, dark count, "
+        "max events per exposure"
+    )

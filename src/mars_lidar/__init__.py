@@ -1,5 +1,7 @@
 """mars-lidar: exact, fast simulation of single-photon LiDAR under SPAD dead time."""
 
+from typing import TYPE_CHECKING
+
 from mars_lidar._version import __version__
 from mars_lidar.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.dark_counts import dark_count_map
@@ -58,3 +60,20 @@ __all__ = [
     "simulate_timestamps",
     "validate",
 ]
+
+if TYPE_CHECKING:
+    from mars_lidar import io as io
+    from mars_lidar import learn as learn
+    from mars_lidar import plot as plot
+else:
+    _LATER = ("io", "learn", "plot")  # with what they import, only where they are used: `ml.io.load`
+
+    def __getattr__(name: str) -> object:
+        if name in _LATER:
+            from importlib import import_module
+
+            return import_module(f"mars_lidar.{name}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *_LATER})

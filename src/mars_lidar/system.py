@@ -198,12 +198,14 @@ class System:
         source = Path(path)
         if source.suffix not in (".json", ".yaml", ".yml"):
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
-        text = source.read_text()
+        text = source.read_text(encoding="utf-8-sig")
         try:
             if source.suffix == ".json":
                 return cls.from_dict(json.loads(text))
             import yaml
 
-            return cls.from_dict(yaml.safe_load(text))
+            from mars_lidar._yaml import loader
+
+            return cls.from_dict(yaml.load(text, Loader=loader()))  # a safe loader
         except Exception as error:
             raise ValueError(f"{source}: {error}") from error

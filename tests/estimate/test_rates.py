@@ -116,3 +116,22 @@ def test_one_cycle_of_an_armed_pixel():
     assert estimate.generalised_coates_rates(mean, free)[:49] == pytest.approx(
         estimate.coates_rates(mean, clock)[:49], abs=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [{"electronics_dead_time_ns": 80.0}, {"jitter": ml.Jitter(sigma_ns=0.5)}, {"max_events_per_period": 1}],
+    ids=["electronics", "jitter", "limit"],
+)
+def test_what_no_method_knows_of_the_detector_is_told(effect):
+    plain = ml.System(
+        period_ns=100.0, cycles=100, bins=100, pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=50.0, detection_efficiency=0.5),
+    )  # fmt: skip
+    cube = ml.simulate(ml.Flux(1.0, 0.5, 37.0), plain)
+    ml.reconstruct(cube, plain)  # no word of an efficiency
+    odd = plain.replace(detector=ml.Detector(dead_time_ns=50.0, **effect))
+    with pytest.warns(UserWarning, match=next(iter(effect))):
+        ml.reconstruct(cube, odd)
+    with pytest.raises(ValueError, match=f"cramer_rao does not do {next(iter(effect))}"):
+        ml.cramer_rao(1.0, 0.5, odd, delay_ns=37.0)

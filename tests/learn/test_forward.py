@@ -85,6 +85,24 @@ def test_expected_histogram_is_the_exact_mean(start, dead_ns):
         np.testing.assert_allclose(found, closed, rtol=1e-6, atol=1e-6)
 
 
+def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
+    """Photons on the pixel in, as everywhere: the model detects a share of them and adds what is dark."""
+    dim = system().replace(
+        detector=ml.Detector(dead_time_ns=42.3, detection_efficiency=0.3, dark_count_hz=2e6), cycles=2000
+    )
+    at = point(*AT)
+    mean = expected_histogram(*at, dim, refine=4)
+    exact = ml.statistics.mean_histogram(AT[0], AT[1], dim, delay_ns=AT[2])
+    assert np.abs(mean.detach().numpy() - exact).sum(-1).max() < 2e-3 * exact.sum(-1).min()
+    counts = mean.detach().round()
+    likely = histogram_log_likelihood(counts, *at, dim)
+    seen = [at[0] * 0.3, at[1] * 0.3 + 0.2, at[2]]
+    assert torch.equal(likely, histogram_log_likelihood(counts, *seen, dim.detected()))
+    assert torch.autograd.gradcheck(lambda *x: histogram_log_likelihood(counts, *x, dim), at)
+    with pytest.raises(ValueError, match=r"beyond efficiency and dark counts.* and jitter"):
+        expected_histogram(*at, dim.replace(detector=ml.Detector(dead_time_ns=42.3, jitter=ml.Jitter(sigma_ns=1.0))))
+
+
 def test_narrow_pulse_at_many_bins():
     """1024 bins, a pulse of half a bin: nothing dense would fit."""
     one = ml.System(

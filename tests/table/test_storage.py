@@ -181,3 +181,15 @@ def test_commands(tmp_path, own_cache):
     assert "removed 2 files" in run("table", "clear", "--yes").output
     assert [p.name for p in own_cache.iterdir()] == ["notes.txt"]
     assert "holds no tables" in run("table", "clear", "--yes").output
+
+
+def test_a_cache_that_cannot_be_written_costs_the_next_build_and_no_more(tmp_path, monkeypatch):
+    """Homes of compute nodes are read-only often enough; for root no folder is, so a file stands in its way."""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("MARS_LIDAR_CACHE", str(tmp_path / "file" / "cache"))
+    system = small_table().system
+    with pytest.warns(UserWarning, match=r"cannot be kept in .*file.cache .*MARS_LIDAR_CACHE"):
+        table = ml.Table.cached(system, [0.5, 1.0], [0.2, 0.4], threads=1)
+    assert table.lookup(0.7, 0.3).cumulants.shape == (1, 4)
+    with pytest.raises(OSError):  # a path cannot be given
+        cache.cached_path(system, [0.5, 1.0], [0.2, 0.4], threads=1)

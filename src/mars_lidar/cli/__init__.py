@@ -5,7 +5,10 @@ Exit codes: 0 done, 1 failed (disk full, a bug), 2 bad input, 130 interrupted.
 
 from __future__ import annotations
 
-from typing import Annotated
+import io
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
 
@@ -30,20 +33,31 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command(no_args_is_help=True, epilog=EPILOG)(simulate)
-app.command(no_args_is_help=True, epilog=COMPARE_EPILOG)(compare)
-app.command(no_args_is_help=True, epilog=GENERATE_EPILOG)(generate)
-app.command(no_args_is_help=True)(verify)
-app.command(no_args_is_help=True)(info)
-app.command(no_args_is_help=True)(view)
-app.command(no_args_is_help=True, epilog=CONVERT_EPILOG)(convert)
-app.command(no_args_is_help=True, epilog=TIMESTAMPS_EPILOG)(timestamps)
-app.command(no_args_is_help=True, epilog=INSPECT_EPILOG)(inspect)
-app.command(no_args_is_help=True, epilog=CALIBRATE_EPILOG)(calibrate)
-app.command(no_args_is_help=True, epilog=VALIDATE_EPILOG)(validate)
-app.command(no_args_is_help=True, epilog=RECONSTRUCT_EPILOG)(reconstruct)
-app.command(context_settings=STUDY_SETTINGS)(study)
-app.command()(init)
+
+
+def _add(command: Callable[..., None], epilog: str | None = None, **more: Any) -> None:
+    """A command whose help flows: typer keeps the line ends of a docstring, whatever the width of the screen."""
+    paragraphs = (command.__doc__ or "").split("\n\n")
+    app.command(help="\n\n".join(" ".join(text.split()) for text in paragraphs), epilog=epilog, **more)(command)
+
+
+for _command, _epilog in (
+    (simulate, EPILOG),
+    (compare, COMPARE_EPILOG),
+    (generate, GENERATE_EPILOG),
+    (verify, None),
+    (info, None),
+    (view, None),
+    (convert, CONVERT_EPILOG),
+    (timestamps, TIMESTAMPS_EPILOG),
+    (inspect, INSPECT_EPILOG),
+    (calibrate, CALIBRATE_EPILOG),
+    (validate, VALIDATE_EPILOG),
+    (reconstruct, RECONSTRUCT_EPILOG),
+):
+    _add(_command, _epilog, no_args_is_help=True)
+_add(study, context_settings=STUDY_SETTINGS)
+_add(init)
 app.add_typer(table_app, name="table")
 app.add_typer(neural_app, name="neural")
 
@@ -79,4 +93,7 @@ def _root(
 
 def main() -> None:
     """Entry point of the command `mars-lidar`."""
+    for stream in (sys.stdout, sys.stderr):  # a sign that a terminal or a pipe cannot show is no error
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     app()

@@ -91,8 +91,8 @@ def reconstruct(
                     stored, names, level=level, attenuation=attenuation, threads=threads, progress=progress
                 )
             results = {name: each.found for name, each in found.items()}
+            _show(stored, found)  # first: a disk that is full takes nothing from what is known
             save_maps(out, results, source=str(cube), overwrite=overwrite)
-            _show(stored, found)
             rows = [("maps", str(out))]
             if picture:
                 _draw(stored, results, png)

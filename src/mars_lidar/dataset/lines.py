@@ -21,9 +21,11 @@ def read_yaml(path: Path) -> tuple[Any, dict[Key, int]]:
     """The data of a YAML file and the line (from 1) of each key, numbers of list entries among them."""
     import yaml
 
+    from mars_lidar._yaml import loader as exponents
+
     try:
-        text = path.read_text(encoding="utf-8")
-        loader = yaml.SafeLoader(text)
+        text = path.read_text(encoding="utf-8-sig")
+        loader = exponents()(text)
         try:
             node = loader.get_single_node()
             lines: dict[Key, int] = {}

@@ -64,6 +64,13 @@ class Dataset:
             raise ValueError(f"{path} has layout version {told}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
+    def __repr__(self) -> str:
+        if not self.planned:
+            return f"Dataset({str(self.path)!r}, its scenes are not all there)"
+        sizes = " x ".join(map(str, self.group["histogram"].shape))  # type: ignore[union-attr]
+        state = "" if self.complete else ", incomplete"
+        return f"Dataset({str(self.path)!r}, {sizes} (sample, realization, y, x, time){state})"
+
     @property
     def planned(self) -> bool:
         """Whether all scenes are in, so that the parts of the store are known."""

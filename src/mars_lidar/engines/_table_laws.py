@@ -17,7 +17,7 @@ IndexArray = NDArray[np.int64]
 
 
 def untrusted(run: Run, reader: TableReader, entries: Entries) -> IndexArray:
-    """Which of the pixels (ascending) need an exact law: `statistics.trusted`. None of a table of Gaussians."""
+    """Which of the pixels (ascending) need an exact law: `statistics.matched.trusted`. None of a table of Gaussians."""
     if reader.table.method == "mars" or run.task.system.dead_time_periods == 0.0:
         return np.empty(0, np.int64)
     from mars_lidar.statistics.matched import trusted

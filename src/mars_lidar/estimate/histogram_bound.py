@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
 from mars_lidar._brief import brief
+from mars_lidar.effects import LIGHT_EFFECTS, require_effects
 from mars_lidar.estimate.method import FloatArray
 from mars_lidar.estimate.recording import core_ns, open_bins, relative_width
 from mars_lidar.system import System
@@ -51,7 +52,8 @@ def cramer_rao(
         S and B > 0, photons per period as a `Flux` has them (on the pixel, where the detector has an efficiency, and
         without its dark counts); they broadcast with `delay_ns` to (...).
     system
-        Detectors of mode nonparalyzable, synchronous, or gated with a gate that stays.
+        Detectors of mode nonparalyzable, synchronous, or gated with a gate that stays, without effects beyond detection
+        efficiency and dark counts.
     delay_ns
         Delay of the return, ns.
     threads
@@ -63,6 +65,7 @@ def cramer_rao(
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     MaximumLikelihood().check(system)
+    require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, lambda _: ", and neither do the estimators")
     mean = mean_histogram(signal, background, system, delay_ns=delay_ns, threads=threads)  # checks the arguments
     s, b, tau = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (signal, background, delay_ns)))
     if not (b > 0).all():

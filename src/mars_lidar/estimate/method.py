@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import _validate
 from mars_lidar.detector import Mode
+from mars_lidar.effects import LIGHT_EFFECTS
 from mars_lidar.estimate.recording import check_window, recording_of
 from mars_lidar.system import System
 
@@ -104,6 +106,18 @@ class Method(ABC):
     @abstractmethod
     def estimate(self, histograms: Histograms) -> Estimates:
         """Estimates of every pixel; the system is one that `check` let pass."""
+
+
+def tell_effects(system: System) -> None:
+    """Warn of what the detector does and no method knows: a histogram shows it, and the estimates take it for light."""
+    beyond = [name for name in system.detector.effects if name not in LIGHT_EFFECTS]
+    if beyond:
+        warnings.warn(
+            f"no method of reconstruction knows {', '.join(beyond)} of the detector: estimates are biased by it, which "
+            "their standard errors do not tell",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar import _validate
 from mars_lidar._brief import brief
 from mars_lidar.estimate.histograms import checked
-from mars_lidar.estimate.method import Estimates, Flags, FloatArray, Method, Progress
+from mars_lidar.estimate.method import Estimates, Flags, FloatArray, Method, Progress, tell_effects
 from mars_lidar.system import System
 
 ATTENUATIONS = ("none", "inverse_square")
@@ -115,6 +115,7 @@ def reconstruct(
         level = _validate.real("level", level, low=0.0, strict_low=True)
     given, shape = checked(cube, system, threads, progress)
     used.check(system)
+    tell_effects(system)
     return assembled(used.name, system, used.estimate(given), shape, level, attenuation)
 
 

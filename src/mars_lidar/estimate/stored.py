@@ -11,7 +11,7 @@ import numpy as np
 
 from mars_lidar import _validate
 from mars_lidar.estimate.histograms import checked, default_threads
-from mars_lidar.estimate.method import Estimates, Method, Progress
+from mars_lidar.estimate.method import Estimates, Method, Progress, tell_effects
 from mars_lidar.estimate.reconstruct import Reconstruction, assembled, find_method
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ def reconstruct_stored(
     used = [find_method(method) for method in methods]
     for method in used:
         method.check(system)
+    tell_effects(system)
     if attenuation is None:
         attenuation = str(cube.flux.info.get("attenuation", "none"))
     scale = true_level(cube, attenuation) if level is None else _validate.real("level", level, low=0.0, strict_low=True)

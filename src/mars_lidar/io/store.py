@@ -150,6 +150,9 @@ def check_target(path: Path, *, folder: bool, overwrite: bool) -> None:
         raise FileNotFoundError(f"out must lie in an existing folder, got {str(path)!r}")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise PermissionError(f"out must lie in a folder that can be written to, got {str(path)!r}")
+    for folder_above in (*reversed(parent.parents), parent):  # the outermost is the store, others are its arrays
+        if (folder_above / "zarr.json").is_file():
+            raise ValueError(f"out must not lie inside of another store, {folder_above}, got {str(path)!r}")
     if not (path.exists() or path.is_symlink()):
         return
     if not overwrite:

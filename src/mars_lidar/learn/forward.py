@@ -14,7 +14,7 @@ except ImportError as _error:
 
 from mars_lidar import _validate
 from mars_lidar.learn.circle import TOLERANCE, Delay, fired, registered
-from mars_lidar.learn.light import bin_photons, check_detector, inputs
+from mars_lidar.learn.light import bin_photons, check_detector, detected, inputs
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.system import System
 
@@ -36,16 +36,16 @@ def expected_histogram(
     preceding dead time, L those of one dead time ago; e and b are what the dead time that outlasts the exposure adds
     where it began armed (docs/joint_law.md, 3.2 and 4.6). The gradient is that of the solution, by one solution of the
     transposed equation, not of the steps that led there. Exact, up to the grid, where the exposure forgets its start
-    before its end; `mars_lidar.mean_histogram` needs no such condition. The error of the grid falls with the square of
-    `refine`: at the default a total variation below 1e-4, but some 1e-3 where the dead time is within a bin of 0 or of
-    whole periods.
+    before its end; `mars_lidar.statistics.mean_histogram` needs no such condition. The error of the grid falls with the
+    square of `refine`: at the default a total variation below 1e-4, but some 1e-3 where the dead time is within a bin
+    of 0 or of whole periods.
 
     Parameters
     ----------
     signal, background, delay_ns
         As for `bin_photons`.
     system
-        Non-paralyzable, without gate or effects.
+        Non-paralyzable, without gate, or effects beyond detection efficiency and dark counts.
     refine
         Parts that each bin is cut into for the solution; None: four to a sigma of the pulse (1 for a measured pulse).
 
@@ -61,8 +61,9 @@ def expected_histogram(
     O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.circle`). At less cost and to the
     accuracy of a table: `HistogramTable`.
     """
-    check_detector(system)
+    check_detector(system, light=True)
     given = inputs(signal, background, delay_ns)
+    given[0], given[1], system = detected(given[0], given[1], system)
     if given[0].numel() == 0:
         return given[0].new_empty((*given[0].shape, system.bins))
     if refine is None:

@@ -12,6 +12,7 @@ except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
 from mars_lidar import _validate
+from mars_lidar.effects import LIGHT_EFFECTS
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.system import System
 
@@ -75,12 +76,27 @@ def inputs(*given: torch.Tensor) -> list[torch.Tensor]:
         raise ValueError(f"signal, background and delay_ns must broadcast, got shapes {told}") from None
 
 
-def check_detector(system: System) -> None:
-    """Raise where the differentiable model does not describe it."""
+def detected(
+    signal: torch.Tensor, background: torch.Tensor, system: System
+) -> tuple[torch.Tensor, torch.Tensor, System]:
+    """What the pixel detects of them, and the system for that: as `Flux.detected`, efficiency and dark counts."""
+    detector = system.detector
+    dark = 1e-9 * detector.dark_count_hz * system.period_ns
+    if detector.detection_efficiency == 1.0 and dark == 0.0:
+        return signal, background, system.detected()
+    share = detector.detection_efficiency
+    return signal * share, background * share + dark, system.detected()
+
+
+def check_detector(system: System, *, light: bool = False) -> None:
+    """Raise where the differentiable model does not describe it; `light`: efficiency and dark counts are welcome."""
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     detector = system.detector
-    if detector.mode != "nonparalyzable" or detector.effects:
+    effects = [name for name in detector.effects if not (light and name in LIGHT_EFFECTS)]
+    if detector.mode != "nonparalyzable" or effects:
+        beyond = " beyond efficiency and dark counts" if light else ""
         raise ValueError(
-            f"the detector must be nonparalyzable and without effects, got mode {detector.mode!r}, {detector.effects}"
+            f"the detector must be nonparalyzable and without effects{beyond}, got mode {detector.mode!r}"
+            + (f" and {', '.join(effects)}" if effects else "")
         )

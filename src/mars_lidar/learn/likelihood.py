@@ -10,7 +10,7 @@ except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
 from mars_lidar.learn.circle import Delay
-from mars_lidar.learn.light import bin_photons, check_detector
+from mars_lidar.learn.light import bin_photons, check_detector, detected, inputs
 from mars_lidar.system import System
 
 
@@ -21,7 +21,7 @@ def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
     and a re-arming count half. What the dead time covers after the end of the exposure is taken for its beginning,
     where the pixel was armed (or blind from before): D is at most t_d / t_r + 1 periods off, whatever the exposure.
     """
-    check_detector(system)
+    check_detector(system, light=True)
     if not isinstance(histogram, torch.Tensor) or histogram.shape[-1:] != (system.bins,):
         told = getattr(histogram, "shape", histogram)
         raise ValueError(f"histogram must be a tensor (..., {system.bins}), got {told!r}")
@@ -47,6 +47,8 @@ def histogram_log_likelihood(
     or two registrations do. Background must be > 0. Its negative is a loss that needs no truth.
     """
     armed = armed_periods(histogram, system)
+    signal, background, delay_ns = inputs(signal, background, delay_ns)
+    signal, background, system = detected(signal, background, system)
     photons = bin_photons(signal, background, delay_ns, system)
     counts = histogram.to(photons.dtype)
     out: torch.Tensor = (torch.xlogy(counts, photons) - photons * armed.to(photons.dtype)).sum(-1)

@@ -104,6 +104,10 @@ class StoredDataset(IterableDataset[dict[str, Any]]):
         self._block = array.chunks[:2]
         self._opened: Dataset | None = None
 
+    def __repr__(self) -> str:
+        exposures = self._samples.size * self._realizations
+        return f"StoredDataset({str(self.path)!r}, {exposures} exposures, maps={self._maps}, seed={self._seed})"
+
     def set_epoch(self, epoch: int) -> None:
         """Choose the order of the next pass. Call it before every epoch, as with `DistributedSampler`.
 

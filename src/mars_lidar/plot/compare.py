@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mars_lidar.plot.compare_panels import draw_points, draw_times, engine_colours, label_panels
+from mars_lidar.plot.data import instrument
 from mars_lidar.plot.figures import _draw_map
 from mars_lidar.plot.pixel import _steps, _zoom_ns, quiet_corner
 from mars_lidar.plot.style import DPI, INK, style
@@ -221,8 +222,7 @@ def _headline(found: Comparison) -> str:
     drawn = [s.realizations for row in found.statistics.values() for s in row.values()]
     each = f"{min(drawn):,}" if min(drawn) == max(drawn) else f"{min(drawn):,} to {max(drawn):,}"
     return (
-        f"{width} × {height} pixels, {system.bins} bins; {system.cycles:,} laser periods of {system.period_ns:.4g} ns; "
-        f"dead time {system.detector.dead_time_ns:.4g} ns; mean S = {flux.signal.mean():.3g}, "
+        f"{height} × {width} pixels, {instrument(system)}; mean S = {flux.signal.mean():.3g}, "
         f"B = {flux.background.mean():.3g} photons per period; {each} exposures of each pixel"
     )
 

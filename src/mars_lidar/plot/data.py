@@ -72,6 +72,17 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
     return named
 
 
+def instrument(system: System) -> str:
+    """A system in the words of a headline: bins, exposure, dead time, and what is not plain of the detector."""
+    detector, width = system.detector, system.bin_ns
+    bins = f"{system.bins:,} bin{'s' if system.bins > 1 else ''} of "
+    bins += f"{width:.4g} ns" if width >= 1.0 else f"{1e3 * width:.4g} ps"
+    periods = f"{system.cycles:,} laser period{'s' if system.cycles > 1 else ''} of {system.period_ns:.4g} ns"
+    mode = "" if detector.mode == "nonparalyzable" else f", {detector.mode}"
+    effects = [name.removesuffix("_ns").removesuffix("_hz").replace("_", " ") for name in detector.effects]
+    return f"{bins}; {periods}; dead time {detector.dead_time_ns:.4g} ns{mode}" + "".join(f", {one}" for one in effects)
+
+
 def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
     """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
     background = np.full(system.bins, flux.background[y, x] / system.bins)

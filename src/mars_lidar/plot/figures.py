@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.plot.data import count_maps, depth_error_m, example_pixels, incident_rate
+from mars_lidar.plot.data import count_maps, depth_error_m, example_pixels, incident_rate, instrument
 from mars_lidar.plot.pixel import draw_pixel, quiet_corner
 from mars_lidar.plot.style import COLOURS, DPI, MISSING, style
 
@@ -178,12 +178,10 @@ def _draw_pixels(
 
 def _headline(cube: Cube, realization: int) -> str:
     system, flux = cube.system, cube.flux
-    _, height, width, bins = cube.shape
+    _, height, width, _ = cube.shape
     which = f", realization {cube.recipe.first_realization + realization}" if cube.shape[0] > 1 else ""
     return (
-        f"{width} × {height} pixels, {bins} bins of {1e3 * system.bin_ns:.4g} ps; "
-        f"{system.cycles:,} laser periods of {system.period_ns:.4g} ns; "
-        f"dead time {system.detector.dead_time_ns:.4g} ns; mean S = {flux.signal.mean():.3g}, "
+        f"{height} × {width} pixels, {instrument(system)}; mean S = {flux.signal.mean():.3g}, "
         f"B = {flux.background.mean():.3g} photons per period; {cube.engine} engine{which}"
     )
 

@@ -14,14 +14,14 @@ from mars_lidar.studies import STUDIES, OtherRunsError, Request
 from mars_lidar.studies.classifiers import MissingExtra
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(command: str) -> argparse.ArgumentParser:
     told = "\n".join(f"  {name:<17} {words}" for name, (words, _) in STUDIES.items())
     parser = argparse.ArgumentParser(
-        prog="python -m mars_lidar.studies",
+        prog=command,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Run studies. Each writes NAME.md, its figures and NAME.csv into the output folder.",
         epilog=f"studies:\n{told}\n\nexample:\n"
-        "  python -m mars_lidar.studies covariance law --out docs/studies\n\n"
+        f"  {command} covariance law --out docs/studies\n\n"
         "exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted",
     )
     parser.add_argument(
@@ -56,9 +56,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    parser = _parser()
+def main(arguments: Sequence[str] | None = None, command: str = "python -m mars_lidar.studies") -> int:
+    """Entry point; returns the exit code. `command` is what was called, for the help."""
+    parser = _parser(command)
     given = parser.parse_args(arguments)
     if "reference" in given.studies and given.data is None:
         parser.error("study 'reference' needs --data DIR, the folder of the reference cases")

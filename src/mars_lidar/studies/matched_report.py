@@ -44,7 +44,7 @@ def _text(settings: Settings, parts: list[Part], others: list[Part], quick: bool
         "# A law of the count from four cumulants",
         "_Quick form: a look, not for citing._" if quick else "",
         "A table that stores mean, variance, third and fourth cumulant of the number N of registrations needs "
-        "a law on the integers that has them (`mars_lidar.statistics.matched_pmf`). Here its total variation "
+        "a law on the integers that has them (`mars_lidar.statistics.matched.matched_pmf`). Here its total variation "
         "to the exact law, `count_law(method=\"exact\")`, beside that of the Gaussian with the exact mean and "
         f"variance. No sampling, no noise. The aim is {AIM:g}.",
         "## Configuration",

@@ -9,10 +9,12 @@ import contextlib
 import hashlib
 import json
 import os
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mars_lidar._version import __version__
+from mars_lidar.io.store import reason
 from mars_lidar.statistics._cells import FloatArray
 from mars_lidar.system import System
 from mars_lidar.table.axes import Grid, axis_values
@@ -62,10 +64,23 @@ def request_key(
 
 
 def cached(system: System, signal: Grid, background: Grid, **options: Any) -> Table:
-    """The table from the cache, or built and put there."""
+    """The table from the cache, or built and put there; where nothing can be written, built, with a warning."""
     from mars_lidar.table.table import Table
 
-    return Table.load(cached_path(system, signal, background, **options), system)
+    own, found = _search(system, signal, background, options)
+    if found is None:
+        table = Table.build(system.detected(), signal, background, **options)
+        try:
+            _keep(table, own)
+        except OSError as error:
+            warnings.warn(
+                f"the table cannot be kept in {own.parent} ({reason(error)}) and will be built again the next time; "
+                "MARS_LIDAR_CACHE names another folder",
+                UserWarning,
+                stacklevel=3,
+            )
+            return table
+    return Table.load(found or own, system)
 
 
 def cached_path(system: System, signal: Grid, background: Grid, **options: Any) -> Path:
@@ -73,6 +88,16 @@ def cached_path(system: System, signal: Grid, background: Grid, **options: Any) 
 
     A table made for another number of cycles is taken where every entry of it holds for those of `system`.
     """
+    from mars_lidar.table.table import Table
+
+    own, found = _search(system, signal, background, options)
+    if found is None:
+        _keep(Table.build(system.detected(), signal, background, **options), own)
+    return found or own
+
+
+def _search(system: System, signal: Grid, background: Grid, options: dict[str, Any]) -> tuple[Path, Path | None]:
+    """Where the table belongs, and the file that serves, if there is one."""
     from mars_lidar.table.table import Table
 
     if not isinstance(system, System):
@@ -91,16 +116,18 @@ def cached_path(system: System, signal: Grid, background: Grid, **options: Any) 
     own = folder / f"{key}-{system.cycles}{SUFFIX}"
     others = sorted(folder.glob(f"{key}-*{SUFFIX}")) if folder.is_dir() else []
     for path in [own, *(other for other in others if other != own)]:
-        with contextlib.suppress(FileNotFoundError, ValueError):  # absent, damaged, or of too few cycles
+        with contextlib.suppress(OSError, ValueError):  # absent, out of reach, damaged, or of too few cycles
             law = Table.load(path, system).provenance["law"]
             if law is not None or not chosen.get("check_law", False):
-                return path
-    table = Table.build(system, signal, background, **options)
-    folder.mkdir(parents=True, exist_ok=True)
+                return own, path
+    return own, None
+
+
+def _keep(table: Table, own: Path) -> None:
+    own.parent.mkdir(parents=True, exist_ok=True)
     mine = own.with_name(f"{own.stem}-{os.getpid()}{SUFFIX}")  # several processes may build the same table at once
     table.save(mine, overwrite=True)
     os.replace(mine, own)
-    return own
 
 
 def files(folder: Path | None = None) -> list[Path]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class LawError:
     """Total variation between count laws at random pixels: that with the table's four cumulants, and the exact one.
 
-    Interpolation, start-phase correction and the law itself (`statistics.matched_pmf`) err together here.
+    Interpolation, start-phase correction and the law itself (`statistics.matched.matched_pmf`) err together here.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class LawError:
     within
         Share of pixels within 0.002.
     trusted
-        Share of pixels that `statistics.trusted` holds to be within 0.002.
+        Share of pixels that `statistics.matched.trusted` holds to be within 0.002.
     largest_trusted
         Largest total variation among those.
     worst_signal, worst_background, worst_delay_ns

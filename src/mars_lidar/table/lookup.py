@@ -35,8 +35,8 @@ class Lookup:
     def trusted(self) -> NDArray[np.bool_]:
         """Pixels (P,) whose four cumulants fix the law of the count to about 0.002 in total variation.
 
-        See `statistics.trusted`; elsewhere (few photons, saturation, mode locking) an exact law may be worth its
-        cost. False `outside`.
+        See `statistics.matched.trusted`; elsewhere (few photons, saturation, mode locking) an exact law may be worth
+        its cost. False `outside`.
         """
         from mars_lidar.statistics.matched import trusted
 

@@ -82,7 +82,7 @@ def node_laws(
     threads: int,
     progress: Progress | None = None,
 ) -> NodeLaws:
-    """Laws of the entries of a table with axes `signal`, `background` that `statistics.trusted` does not vouch for."""
+    """Laws of the entries of a table with axes `signal`, `background` for which `matched.trusted` does not vouch."""
     from mars_lidar.statistics.matched import trusted
 
     if system.dead_time_periods == 0.0:

@@ -52,7 +52,7 @@ class Table:
     provenance
         How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
     laws
-        Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.trusted`).
+        Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.matched.trusted`).
     """
 
     system: System

@@ -26,11 +26,18 @@ def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
     low, middle, high = counted.quantiles_ns
     dead = f"{found.dead_time_ns:.6g} ns"
     if estimated:
-        dead += f" ± {found.dead_time_error_ns:.2g}, by the smallest interval"
-    return [
+        by = {"edge": "the middle of an edge that jitter blurs"}.get(found.dead_time_by, "the smallest interval")
+        dead += f" ± {found.dead_time_error_ns:.2g}, by {by}"
+    rows = [
         ("intervals", f"smallest {counted.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),
         ("dead time", dead),
     ]
+    if found.jitter_ns:
+        error = f" ± {found.jitter_error_ns:.2g}, by that edge" if found.jitter_error_ns else ", given"
+        rows.append(("jitter", f"sigma {found.jitter_ns:.4g} ns{error}; the recorded pulse holds it"))
+    elif found.jitter_limit_ns:
+        rows.append(("jitter", f"none seen: the edge is sharp; one below {found.jitter_limit_ns:.2g} ns could hide"))
+    return rows
 
 
 def light_rows(found: Calibration) -> list[tuple[str, str]]:

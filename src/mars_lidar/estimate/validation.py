@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from mars_lidar import _validate
 from mars_lidar.detector import Detector
-from mars_lidar.estimate.calibration import Calibration, _free_bins, calibrate
+from mars_lidar.estimate.calibration import Calibration, calibrate
 from mars_lidar.estimate.detector_model import stream_detector
 from mars_lidar.estimate.intervals import FloatArray, stream_of
+from mars_lidar.estimate.phase_bins import free_bins
 from mars_lidar.estimate.prediction import Prediction, cut, predict, system_of
 from mars_lidar.estimate.recovery import Recovery, recovery_of
 from mars_lidar.studies.distance import KL_FLOOR, Pmf, g_test, kl_divergence, total_variation, two_sample_g_test
@@ -193,7 +194,7 @@ def validate(
             f"cycles must leave at least {_LEAST_REALIZATIONS} realizations of a stream of {stream.cycles:,} periods, "
             f"got {number:,}: {size}"
         )
-    system = system_of(calibration, detector, number, _free_bins(stream.bins))
+    system = system_of(calibration, detector, number, free_bins(stream.bins))
     law = predict(calibration, system, drawn)
     label = 2 * law.groups + law.window
     table, histogram = cut(stream, system, label)

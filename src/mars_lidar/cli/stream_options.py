@@ -42,7 +42,14 @@ DeadTimeNs = Annotated[
     float | None,
     _option(
         "--dead-time-ns", panel=_SYSTEM, help="Dead time, ns.",
-        default="of --system or a simulated stream, else by the smallest interval",
+        default="of --system or a simulated stream, else by the edge of the recovery",
+    ),
+]
+JitterNs = Annotated[
+    float | None,
+    _option(
+        "--jitter-ns", panel=_SYSTEM, help="Sigma of the Gaussian jitter of each photon's time, ns.",
+        default="of --system, else fitted with the dead time",
     ),
 ]
 HoldOffNs = Annotated[
@@ -107,6 +114,7 @@ class FitOptions:
 
     system: System = None
     dead_time_ns: DeadTimeNs = None
+    jitter_ns: JitterNs = None
     hold_off_ns: HoldOffNs = None
     pulse_sigma_ns: PulseSigmaNs = None
     pulse_fwhm_ns: options.PulseFwhmNs = None
@@ -137,7 +145,7 @@ class FitOptions:
             shape = "free"
         found = fitted(
             times, self.known, pulse=shape, dead_time_ns=self.dead_time_ns, hold_off_ns=self.hold_off_ns,
-            returns=self.returns,
+            returns=self.returns, jitter_ns=self.jitter_ns,
         )  # fmt: skip
         if not found.converged:
             say("warning: the likelihood was not maximised; what is printed is where it stopped")

@@ -24,9 +24,10 @@ class Inspection:
     Attributes
     ----------
     calibration
-        With a free shape: light bin by bin, dead time by the smallest interval (or as given), `Summary`.
+        With a free shape: light bin by bin, dead time and jitter by the edge of the recovery (or as given), `Summary`.
     recovery
-        Registrations by time since the last one: whether there is more than one dead time.
+        Registrations by time since the last one: whether there is more than one dead time. Its `dead_time_ns` is the end
+        of the edge, where jitter has blurred it.
     phase_histogram
         (bins,) registrations over the period.
     interval_edges_ns, interval_histogram
@@ -55,13 +56,15 @@ def inspect(times: Timestamps, *, dead_time_ns: float | None = None) -> Inspecti
     """
     free = calibrate(_bare(times), pulse="free", dead_time_ns=dead_time_ns)
     longer = 2.0 * free.dead_time_ns
-    if longer > 0.0:  # so that what happens right after the dead time does not pass for light
+    if longer > free.hold_off_ns:  # so that what happens right after the dead time does not pass for light
         careful = calibrate(_bare(times), pulse="free", dead_time_ns=free.dead_time_ns, hold_off_ns=longer)
         kept = careful if careful.armed.used >= max(_ENOUGH, 0.05 * free.armed.used) else free
     else:
         kept = free
     stream = stream_of(times)
-    found = recovery_of(stream, kept.rate, free.dead_time_ns, kept.hold_off_ns)
+    # an edge that jitter has blurred is no recovery: ages are judged from where it is over
+    edge = free.dead_time_ns if free.jitter_ns == 0.0 else free.hold_off_ns
+    found = recovery_of(stream, kept.rate, edge, max(kept.hold_off_ns, edge))
     assert free.waveform is not None
     histogram = stream.histogram(free.waveform.size).astype(np.float64)
     reach = max(4.0 * stream.period_ns, free.dead_time_ns + 3.0 * stream.period_ns)

@@ -10,7 +10,7 @@ is the rate of records, given all records before. It repeats with the laser, bec
 e^-Lambda(t_r) from one period to the next, and its integral over a period is that of lambda. A jittered pixel that is
 watched only from its dead time and some widths of the jitter on is thus exactly a pixel without jitter in the
 light lambda', whose likelihood is known. Where little light falls within a width of the jitter lambda' is
-lambda * f; a bright pulse is recorded earlier than that, because its first photons shut the pixel.
+lambda * f; of a bright pulse it is later and narrower, because the first photons shut the pixel.
 """
 
 from __future__ import annotations

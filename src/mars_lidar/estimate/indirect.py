@@ -31,6 +31,10 @@ def indirect(found: Calibration, system: System, once: Callable[[Stream], Calibr
     """
     from mars_lidar.simulate import simulate_timestamps
 
+    if found.waveform is not None and system.detector.jitter is not None:
+        # a free shape is the light as it is recorded, which a pixel without jitter records as it is
+        plain = system.replace(detector=system.detector.without("jitter"))
+        return replace(indirect(replace(found, jitter_ns=0.0), plain, once), jitter_ns=found.jitter_ns)
     counted = found.summary
     times = min(TIMES, _MOST / max(counted.registrations, 1))
     cycles = int(max(1, np.ceil(times * counted.cycles / _PIXELS)))
@@ -38,7 +42,8 @@ def indirect(found: Calibration, system: System, once: Callable[[Stream], Calibr
     light, converged = found, False
     for _ in range(_STEPS):
         made_by = system.replace(cycles=cycles, bins=bins, pulse=light.system(1, bins).pulse, start="armed")
-        stream = simulate_timestamps(light.flux(_PIXELS), made_by, seed=_SEED)
+        # of its own for each stream, or the error of the simulation would be shared by all that are calibrated
+        stream = simulate_timestamps(light.flux(_PIXELS), made_by, seed=_SEED + counted.registrations)
         step = _nearest(found, found.parameters - once(stream_of(stream, pooled=True)).parameters)
         light = light.moved(step)
         if _small(found, step):

@@ -26,8 +26,8 @@ class Inspection:
     calibration
         With a free shape: light bin by bin, dead time and jitter by the edge of the recovery (or as given), `Summary`.
     recovery
-        Registrations by time since the last one: whether there is more than one dead time. Its `dead_time_ns` is the end
-        of the edge, where jitter has blurred it.
+        Registrations by time since the last one: whether there is more than one dead time. Its `dead_time_ns` is the
+        end of the edge, where jitter has blurred it.
     phase_histogram
         (bins,) registrations over the period.
     interval_edges_ns, interval_histogram

@@ -22,6 +22,8 @@ __all__ = ["Calibration", "calibrate"]
 
 _MAX_RETURNS = 16
 _LEAST_REGISTRATIONS = 10
+_LEAST_USED = 3
+_MOST_LIGHT = 1e6  # photons per period: what a `Flux` may have
 
 
 def calibrate(
@@ -98,11 +100,16 @@ def calibrate(
             f"{stream.registrations}"
         )
     counted = summary_of(stream)
+    if 2 * counted.same_time > stream.registrations:
+        raise ValueError(
+            f"times must be of photons one after the other, got {counted.same_time:,} of {stream.registrations:,} at "
+            "exactly the time of the one before"
+        )
     if detector is None and dead is None:
-        return Unknown(stream, counted, shape, hold, number, jitter).calibrated()
+        return _bounded(Unknown(stream, counted, shape, hold, number, jitter).calibrated())
     watch = _watch(detector, dead, hold, jitter)
 
-    found = fitted(stream, counted, shape, watch, number)
+    found = _bounded(fitted(stream, counted, shape, watch, number))
     if told is None or detector is None or not needs_simulation(detector):
         return found
     model = told.replace(period_ns=stream.period_ns, detector=detector)
@@ -111,6 +118,24 @@ def calibrate(
         return fitted(seen, summary_of(seen), shape, watch, number, found)
 
     return indirect(found, model, once)
+
+
+def _bounded(found: Calibration) -> Calibration:
+    """Raise ValueError where hardly a registration is left, or where all come as soon as they can."""
+    seen, counted = found.armed, found.summary
+    if seen.used < _LEAST_USED:
+        raise ValueError(
+            f"dead_time_ns and hold_off_ns must leave at least {_LEAST_USED} registrations, got {seen.used} of "
+            f"{counted.registrations:,} later than {found.hold_off_ns:.6g} ns after the one before; half of the "
+            f"intervals are shorter than {counted.quantiles_ns[1]:.5g} ns"
+        )
+    if not found.total <= _MOST_LIGHT or float(seen.passes.mean()) * _MOST_LIGHT < seen.used:
+        raise ValueError(
+            f"times must leave the pixel armed for some time between registrations, got a saturated stream: nearly all "
+            f"of its intervals are the dead time of {found.dead_time_ns:.6g} ns, which {_MOST_LIGHT:g} photons per "
+            "period would make, or more"
+        )
+    return found
 
 
 def _watch(detector: Detector | None, dead: float | None, hold: float | None, jitter: float | None) -> Watch:

@@ -54,7 +54,8 @@ def fitted(
         seen = armed_time(stream, hold, bins)
         rate = seen.rate
         # var of h / D is h / D^2; the bins are independent given the armed time
-        spread = float((seen.registrations / np.maximum(seen.passes, 1e-300) ** 2)[seen.passes > 0].sum())
+        some = seen.passes > 0
+        spread = float((seen.registrations[some] / seen.passes[some] ** 2).sum())
         return Calibration(
             0.0, np.empty(0), np.empty(0), None, rate, dead, watch.dead_error_ns, hold, short, ("signal",),
             np.array([[spread]]), rapp, seen, counted, True, watch.jitter_ns, watch.jitter_error_ns, watch.by,

@@ -57,6 +57,9 @@ class Calibration:
     jitter_limit_ns
         Where none is seen: nine in ten jitters of this much would have been. One that hides moves `dead_time_ns` down,
         by its own size or so. Else 0.
+    edge_fits
+        False where the dead time was to be estimated from an edge that is neither sharp nor one that a Gaussian jitter
+        makes: a slow quench, a second dead time, a clock too coarse.
     dead_time_by
         ``"given"``; ``"smallest interval"``, less its mean excess over the dead time, where the edge of the recovery is
         sharp; ``"edge"``, the middle of an edge that jitter has blurred.
@@ -84,6 +87,7 @@ class Calibration:
     jitter_error_ns: float = 0.0
     dead_time_by: Literal["given", "smallest interval", "edge"] = "given"
     jitter_limit_ns: float = 0.0
+    edge_fits: bool = True
     simulated: float = 0.0
 
     @property
@@ -117,6 +121,17 @@ class Calibration:
         lights = [k for k, name in enumerate(self.names) if name.startswith(("signal", "background"))]
         part = self.covariance[np.ix_(lights, lights)]
         return float(np.sqrt(np.nansum(part)))
+
+    @property
+    def disagreement(self) -> float:
+        """How far Rapp's total is from this one, in standard errors; NaN where there is none to compare.
+
+        The likelihood is as sure as can be, so that the variance of the difference is that of Rapp's less its own.
+        """
+        rapp, mine = self.rapp.total_error, self.total_error
+        if self.simulated or not (math.isfinite(self.rapp.total) and 0.0 < rapp < math.inf):
+            return math.nan
+        return (self.rapp.total - self.total) / math.sqrt(max(rapp**2 - mine**2, 0.25 * rapp**2))
 
     @property
     def rate(self) -> FloatArray:

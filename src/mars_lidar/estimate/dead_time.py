@@ -15,6 +15,7 @@ from mars_lidar.estimate.edge import ORDINARY, Edge, edge_of
 from mars_lidar.estimate.intervals import Stream
 from mars_lidar.estimate.stream_summary import Summary
 from mars_lidar.pulse import GaussianPulse, Pulse
+from mars_lidar.statistics import ConvergenceError
 
 SHARP = 0.01  # false-alarm probability of a blurred edge
 HIDDEN = 14.0  # of a jitter this many mean excesses of the smallest interval wide nine in ten are seen
@@ -38,47 +39,66 @@ class Unknown:
 
     def calibrated(self) -> Calibration:
         """By the smallest interval where the edge is sharp, else with edge and light fitted in turn."""
+        if self.counted.smallest_ns.size == 0:
+            raise ValueError("dead_time_ns must be given where no recording in times holds two registrations")
         smallest, hold, told = float(self.counted.smallest_ns[0]), self.hold_off_ns, self.jitter_ns or 0.0
         if hold is not None and hold < smallest:
             raise ValueError(f"hold_off_ns must be at least the dead time of {smallest:g} ns, got {hold:g}")
         least = smallest + CERTAIN * told
         first = self._pass(Watch(smallest, max(least, hold or 0.0), told, by="smallest interval"))
-        found = None if smallest == 0.0 or self.jitter_ns == 0.0 else self._blurred(first)
-        return self._sharp(first) if found is None else found
+        if smallest == 0.0 or self.jitter_ns == 0.0:
+            return self._sharp(first)
+        sharp, found = self._blurred(first)
+        if found is not None:
+            return found
+        return self._sharp(first) if sharp else replace(self._sharp(first), edge_fits=False, jitter_limit_ns=0.0)
 
     def _pass(self, watch: Watch, near: Calibration | None = None) -> Calibration:
         return fitted(self.stream, self.counted, self.shape, watch, self.returns, near)
 
     def _sharp(self, first: Calibration) -> Calibration:
         """The smallest of n intervals exceeds t_d by 1 / (sum of the rates at re-arming) in the mean."""
-        stream = self.stream
+        stream, smallest = self.stream, first.dead_time_ns
         excess = stream.period_ns / max(stream.registrations * _rate_after(stream, first), 1e-300)
+        # a dead time as short as that would have let one interval more pass: far less where no light fell before
+        error = max(excess, smallest - _shortest_likely(stream, first))
+        limit = math.hypot(HIDDEN * excess, stream.unit_ns)
+        told = self.jitter_ns is not None or smallest < limit  # no edge, no jitter to be seen by it
         return replace(
             first,
-            dead_time_ns=max(first.dead_time_ns - excess, 0.0),
-            dead_time_error_ns=math.hypot(excess, stream.unit_ns, first.jitter_ns),
-            jitter_limit_ns=math.hypot(HIDDEN * excess, stream.unit_ns) if self.jitter_ns is None else 0.0,
+            dead_time_ns=max(smallest - excess, 0.0),
+            dead_time_error_ns=math.hypot(error, stream.unit_ns, first.jitter_ns),
+            jitter_limit_ns=0.0 if told else limit,
         )
 
-    def _blurred(self, first: Calibration) -> Calibration | None:
-        """By the edge; None where it is sharp, or not one that a Gaussian jitter makes."""
+    def _blurred(self, first: Calibration) -> tuple[bool, Calibration | None]:
+        """Whether the edge is sharp; and by the edge, None where that is sharp or no Gaussian jitter makes it."""
         ages = shortest(self.stream, first.dead_time_ns)
         if ages.interval_ns.size < FEW:
-            return None
+            return True, None
+        try:
+            return self._started(first, ages)
+        except (ConvergenceError, ValueError):  # light beyond what the laws do: far more than one photon per period
+            return True, None
+
+    def _started(self, first: Calibration, ages: Ages) -> tuple[bool, Calibration | None]:
+        """From several rough edges, if the edge is not sharp."""
         sharp = _behind(first, first.dead_time_ns, 0.0)
         if self.jitter_ns is None:
             chance, reach = is_sharp(ages, sharp)
             if chance > SHARP:
-                return None
+                return True, None
             widths = [reach * part for part in _STARTS]
         else:
             widths = [math.sqrt(2.0) * self.jitter_ns]
         found = (self._from(first, ages, extrapolated(ages, sharp, width), width) for width in widths)
-        return next((one for one in found if one is not None), None)
+        return False, next((one for one in found if one is not None), None)
 
     def _from(self, first: Calibration, ages: Ages, dead: float, width: float) -> Calibration | None:
         """The edge and the light in turn, from a rough edge."""
         found = first
+        if dead <= 0.0:
+            return None
         for _ in range(_ROUNDS):
             edge = self._edge(ages, found, dead, width)
             if edge is None or not _is_jitter(edge, ages, found):
@@ -149,3 +169,12 @@ def _rate_after(stream: Stream, found: Calibration) -> float:
         again -= np.floor(again)
         total += float(rate[np.minimum((again * bins).astype(np.int64), bins - 1)].sum()) * bins
     return total / max(stream.registrations, 1)
+
+
+def _shortest_likely(stream: Stream, found: Calibration) -> float:
+    """The dead time, ns, with which one interval is expected that is shorter than the smallest; at least 0."""
+    smallest, rate = found.dead_time_ns, found.rate
+    behind = Underlying(rate, stream.histogram(rate.size).astype(np.float64), stream.period_ns)
+    before = np.append(np.geomspace(1e-9 * stream.period_ns, smallest, 60), smallest) if smallest > 0.0 else np.zeros(1)
+    number = np.array([behind.count(smallest - gap, np.array([gap]))[0] for gap in before])
+    return smallest - float(np.interp(1.0, np.maximum.accumulate(number), before))

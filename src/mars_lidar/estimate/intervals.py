@@ -36,7 +36,8 @@ class Stream:
     """Pieces of the stream of one pixel, and its clock.
 
     `bins` the stream's own bins per period; `unit_ns` the resolution of its clock, 0 where it is not known or finer
-    than anything that matters; `units` how many of them make up the period, 0 where times are not whole units.
+    than anything that matters; `units` how many of them make up the period, 0 where times are not whole units;
+    `same_time` how many records are at exactly the time of the one before.
     """
 
     pieces: tuple[Piece, ...]
@@ -45,6 +46,7 @@ class Stream:
     bins: int
     unit_ns: float
     units: int
+    same_time: int = 0
 
     @property
     def registrations(self) -> int:
@@ -79,7 +81,7 @@ def stream_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = False)
     divide the period into whole bins, times are spread evenly over their unit (seeded), which is what they are:
     otherwise some bins would hold a unit more than others.
     """
-    parts = [times] if isinstance(times, Timestamps) else list(times)
+    parts = [times] if isinstance(times, Timestamps) else list(times) if isinstance(times, Sequence) else []
     if not parts or not all(isinstance(part, Timestamps) for part in parts):
         raise TypeError(f"times must be Timestamps or a sequence of them, got {times!r}")
     first = parts[0]
@@ -88,6 +90,7 @@ def stream_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = False)
     unit, units = _clock(first)
     random = np.random.default_rng(_DITHER_SEED)
     pieces: list[Piece] = []
+    same = 0
     for part in parts:
         if part.period_ns != first.period_ns or part.bins != first.bins:
             raise ValueError(
@@ -103,13 +106,29 @@ def stream_of(times: Timestamps | Sequence[Timestamps], *, pooled: bool = False)
         armed = part.system is not None and part.system.start == "armed"
         for k in range(pixels):
             t = part.times_ns[part.offsets[k] : part.offsets[k + 1]]
+            same += _repeated(t)
             if unit and not units:
                 spread = unit * (random.random(t.size) - 0.5)
                 t = np.sort(np.clip(t + spread, 0.0, None))
             end = max(part.cycles * part.period_ns, float(t[-1]) if t.size else 0.0)
             pieces.append(Piece(t, end, armed))
     cycles = sum(part.cycles * part.shape[0] * part.shape[1] for part in parts)
-    return Stream(tuple(pieces), first.period_ns, cycles, first.bins, unit, units)
+    return Stream(tuple(pieces), first.period_ns, cycles, first.bins, unit, units, same)
+
+
+def _repeated(times_ns: FloatArray) -> int:
+    """How many times are that of the one before; ValueError where they are no times of a recording."""
+    same = 0
+    for start in range(0, times_ns.size, CHUNK):
+        part = times_ns[start : start + CHUNK + 1]
+        apart = np.diff(part)
+        bad = ~np.isfinite(part)
+        if bad.any():
+            raise ValueError(f"times must be finite, got {part[bad][0]} among times_ns")
+        if (apart < 0.0).any() or part[0] < 0.0:
+            raise ValueError("times must be sorted within a pixel, and >= 0: times_ns is not")
+        same += int((apart == 0.0).sum())
+    return same
 
 
 def _clock(times: Timestamps) -> tuple[float, int]:

@@ -57,14 +57,13 @@ def summary_of(stream: Stream) -> Summary:
     """`summary` of a stream that is at hand."""
     smallest = np.empty(0)
     sample = []
-    same = 0
     for dt in stream.intervals():
-        same += int((dt == 0.0).sum())
         head = np.partition(dt, 19)[:20] if dt.size > 20 else dt
         smallest = np.sort(np.concatenate([smallest, head]))[:20]
         sample.append(dt[:: max(1, stream.registrations // 10**6)])
     kept = np.concatenate(sample) if sample else np.empty(0)
     quantiles = np.quantile(kept, (0.01, 0.5, 0.99)) if kept.size else np.full(3, math.nan)
     return Summary(
-        stream.registrations, stream.cycles, stream.period_ns, stream.unit_ns, stream.bins, smallest, quantiles, same
+        stream.registrations, stream.cycles, stream.period_ns, stream.unit_ns, stream.bins, smallest, quantiles,
+        stream.same_time,
     )

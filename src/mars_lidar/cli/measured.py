@@ -93,7 +93,8 @@ def inspect(
         recovered = found.recovery.findings()
         if not recovered:
             ages = found.recovery.edges_ns[-1]
-            told = f"at once: the rate is that of the light from {light.dead_time_ns:.5g} to {ages:.4g} ns"
+            how = "behind an edge that jitter blurs" if light.jitter_ns else "at once"
+            told = f"{how}: the rate is that of the light from {found.recovery.dead_time_ns:.5g} to {ages:.4g} ns"
             rows.append(("recovery", told))
         rows += [("does not fit", text) for text in found.problems or ("nothing",)]
         if out is not None:

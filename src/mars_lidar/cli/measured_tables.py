@@ -9,6 +9,9 @@ if TYPE_CHECKING:
     from mars_lidar.estimate import Calibration
 
 
+_APART = 5.0  # standard errors
+
+
 def clock_rows(found: Calibration) -> list[tuple[str, str]]:
     """Laser, duration and rate."""
     counted = found.summary
@@ -27,11 +30,23 @@ def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
     low, middle, high = counted.quantiles_ns
     dead = f"{found.dead_time_ns:.6g} ns"
     if estimated:
-        dead += f" ± {found.dead_time_error_ns:.2g}, by the smallest interval"
-    return [
+        by = {"edge": "the middle of an edge that jitter blurs"}.get(found.dead_time_by, "the smallest interval")
+        dead += f" ± {found.dead_time_error_ns:.2g}, by {by}"
+    rows = [
         ("intervals", f"smallest {counted.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),
         ("dead time", dead),
     ]
+    if found.jitter_ns:
+        error = f" ± {found.jitter_error_ns:.2g}, by that edge" if found.jitter_error_ns else ", given"
+        rows.append(("jitter", f"sigma {found.jitter_ns:.4g} ns{error}; the recorded pulse holds it"))
+    elif not found.edge_fits:
+        rows.append(
+            ("does not fit", "the edge of the recovery is neither sharp nor one that jitter makes: see `mars-lidar "
+             "inspect`, and give a dead time and a hold-off")
+        )  # fmt: skip
+    elif found.jitter_limit_ns:
+        rows.append(("jitter", f"none seen: the edge is sharp; one below {found.jitter_limit_ns:.2g} ns could hide"))
+    return rows
 
 
 def light_rows(found: Calibration, detector: Detector | None = None) -> list[tuple[str, str]]:
@@ -42,6 +57,8 @@ def light_rows(found: Calibration, detector: Detector | None = None) -> list[tup
     rows = interval_rows(found, found.dead_time_error_ns > 0)
     if found.hold_off_ns > found.dead_time_ns + found.dead_time_error_ns:
         rows.append(("hold-off", f"{found.hold_off_ns:.5g} ns: {found.armed.left_out:,} photons not used"))
+    if found.summary.same_time:
+        rows.append(("does not fit", f"{found.summary.same_time:,} photons at exactly the time of the one before"))
     if found.too_short:
         expected = detector is not None and moves_records(detector)
         smallest = f"the smallest {found.summary.smallest_ns[0]:.5g} ns"
@@ -57,9 +74,12 @@ def light_rows(found: Calibration, detector: Detector | None = None) -> list[tup
             tail, which = (f"_{k}", f" {k}") if many else ("", "")
             depth = 0.5 * SPEED_OF_LIGHT_M_PER_NS * delay
             rows.append((f"signal S{which}", f"{signal:.6g} ± {errors[f'signal{tail}']:.2g} photons per period"))
-            rows.append((f"delay{which}", f"{delay:.7g} ± {errors[f'delay_ns{tail}']:.2g} ns, {depth:.6g} m"))
-        width = f", sigma ± {errors['sigma_ns']:.2g} ns (fitted)" if "sigma_ns" in errors else ""
-        rows.append(("pulse", f"{found.pulse!r}{width}"))
+            error = errors[f"delay_ns{tail}"]
+            told = f"{delay:.7g} ± {error:.2g} ns, {depth:.6g} m" if error == error else "none: no signal is seen"
+            rows.append((f"delay{which}", told))
+        width = errors.get("sigma_ns", 0.0)
+        if width == width:
+            rows.append(("pulse", f"{found.pulse!r}" + (f", sigma ± {width:.2g} ns (fitted)" if width else "")))
     if found.simulated:
         longer = f"streams {found.simulated:.3g} times as long"
         rows.append(("by simulation", f"bias by the detector's effects taken off, by {longer}"))
@@ -67,4 +87,9 @@ def light_rows(found: Calibration, detector: Detector | None = None) -> list[tup
     split = "" if rapp.signal != rapp.signal else f"; by shape B {rapp.background:.5g}, S {rapp.signal:.5g}"
     rows.append(("by Rapp", f"Lambda {rapp.total:.6g} ± {rapp.total_error:.2g}, above {found.total:.6g} ± "
                  f"{found.total_error:.2g}{split}"))  # fmt: skip
+    if abs(found.disagreement) > _APART:
+        rows.append(
+            ("does not fit", f"Rapp's Lambda is {abs(found.disagreement):.0f} standard errors off: a wrong laser "
+             "period or dead time, afterpulses, or light that is not constant: see `mars-lidar inspect`")
+        )  # fmt: skip
     return rows

@@ -43,7 +43,7 @@ DeadTimeNs = Annotated[
     float | None,
     _option(
         "--dead-time-ns", panel=_SYSTEM, help="Dead time of the pixel, ns.",
-        default="of --system or a simulated stream, else by the smallest interval",
+        default="of --system or a simulated stream, else by the edge of the recovery",
     ),
 ]
 HoldOffNs = Annotated[
@@ -135,7 +135,7 @@ class FitOptions:
         known = times.system if self.system is None else SystemOf.load(self.system)
         given = effects.given() | ({} if self.mode is None else {"mode": self.mode})
         dead = self.dead_time_ns
-        if known is None and self.detector is None and not given:
+        if known is None and self.detector is None and (not given or (dead is None and set(given) == {"jitter"})):
             return None
         if self.detector is not None:
             base = Detector.preset(self.detector)
@@ -156,10 +156,12 @@ class FitOptions:
 
     def calibrate(self, times: Timestamps, effects: StreamEffects) -> tuple[Calibration, Detector | None]:
         """The light of the stream by maximum likelihood, and the detector where it is more than a dead time."""
+        from mars_lidar.cli.system_options import with_given
+        from mars_lidar.detector import Detector
         from mars_lidar.estimate import calibrate as fitted
-        from mars_lidar.estimate.detector_model import is_plain
+        from mars_lidar.estimate.detector_model import is_plain, jitter_sigma
 
-        told, pulse = self.told(times, effects), self.pulse.build()
+        told, pulse, alone = self.told(times, effects), self.pulse.build(), effects.given().get("jitter")
         shape: Pulse | Literal["free", "gaussian"] | None = pulse if told is None else None
         if told is not None and pulse is None and self.system is None and times.system is None:
             shape = "gaussian"
@@ -168,9 +170,13 @@ class FitOptions:
                 raise ValueError("the light has one shape: choose --free or a pulse")
             shape = "free"
         dead = self.dead_time_ns if told is None else None
+        # of a jitter without a dead time beside it the dead time is found
+        blurred = with_given(Detector(dead_time_ns=0.0), {"jitter": alone}) if told is None and alone else None
+        jitter = None if blurred is None else jitter_sigma(blurred)
         found = fitted(
-            times, told, pulse=shape, dead_time_ns=dead, hold_off_ns=self.hold_off_ns, returns=self.returns
-        )
+            times, told, pulse=shape, dead_time_ns=dead, hold_off_ns=self.hold_off_ns, returns=self.returns,
+            jitter_ns=jitter,
+        )  # fmt: skip
         if not found.converged:
             say("warning: the likelihood was not maximised; what is printed is where it stopped")
         return found, None if told is None or is_plain(told.detector) else told.detector

@@ -8,7 +8,6 @@ from mars_lidar.estimate.coates import Coates, coates_rates
 from mars_lidar.estimate.generalised_coates import GeneralisedCoates, generalised_coates_rates
 from mars_lidar.estimate.histogram_bound import HistogramBound, cramer_rao, window_error, window_weights
 from mars_lidar.estimate.inspection import Inspection, inspect
-from mars_lidar.estimate.intervals import Summary, summary
 from mars_lidar.estimate.matched_filter import MatchedFilter
 from mars_lidar.estimate.maximum_likelihood import MaximumLikelihood, log_likelihood
 from mars_lidar.estimate.mchc import ChainCorrection, mchc_rates
@@ -16,6 +15,7 @@ from mars_lidar.estimate.method import Flags, Method
 from mars_lidar.estimate.peak import Peak
 from mars_lidar.estimate.reconstruct import Reconstruction, reconstruct
 from mars_lidar.estimate.recovery import Recovery, recovery
+from mars_lidar.estimate.stream_summary import Summary, summary
 from mars_lidar.estimate.validation import Validation, validate
 
 METHODS: dict[str, Method] = {

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.estimate.armed_time import places
 from mars_lidar.estimate.fitted import Fitted, tested
-from mars_lidar.estimate.intervals import FloatArray, Stream, places
+from mars_lidar.estimate.intervals import FloatArray, Stream
 
 _MOST = 4_000_000  # intervals looked at
 _CHUNK = 2**18

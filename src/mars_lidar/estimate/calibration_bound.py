@@ -8,7 +8,7 @@ import numpy as np
 
 from mars_lidar import _validate
 from mars_lidar._brief import brief
-from mars_lidar.estimate.calibration_fit import Light
+from mars_lidar.estimate.calibration_light import Light
 from mars_lidar.estimate.intervals import FloatArray
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.statistics.grid import default_bins

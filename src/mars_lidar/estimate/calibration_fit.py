@@ -11,78 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar.estimate.intervals import ArmedTime, FloatArray
+from mars_lidar.estimate.armed_time import ArmedTime
+from mars_lidar.estimate.calibration_light import LEAST, Light
+from mars_lidar.estimate.intervals import FloatArray
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 
 _STEPS = 200
 _CONVERGED = 1e-8  # Newton decrement: twice what log L could still gain
 _DIGITS, _CORNERS = 1e-3, 0.5  # the same where no step gains: half a standard error, with corners
-_LEAST = 1e-9  # photons per period that stand for none
 _WIDTHS = 24  # pulse widths tried to begin with, where it is not known
-_SPREAD = 1e-3  # step of a numerical derivative, in widths of the pulse
-
-
-@dataclass(frozen=True)
-class Light:
-    """Background, K returns and the pulse: the parameters, in the order background, signals, delays, width.
-
-    With `fit_width` the pulse is Gaussian and its sigma is the last parameter.
-    """
-
-    period_ns: float
-    bins: int
-    pulse: Pulse
-    returns: int
-    fit_width: bool
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the parameters; those of several returns are numbered from 1."""
-        tails = [""] if self.returns == 1 else [f"_{k}" for k in range(1, self.returns + 1)]
-        width = ("sigma_ns",) if self.fit_width else ()
-        return ("background", *(f"signal{t}" for t in tails), *(f"delay_ns{t}" for t in tails), *width)
-
-    def pulse_of(self, theta: FloatArray) -> Pulse:
-        """The pulse with its fitted width."""
-        return GaussianPulse(sigma_ns=float(theta[-1])) if self.fit_width else self.pulse
-
-    def rate(self, theta: FloatArray) -> FloatArray:
-        """Photons per period in each bin (n,)."""
-        k = self.returns
-        pulse = self.pulse_of(theta)
-        energy = pulse.bin_energy(theta[1 + k : 1 + 2 * k], self.period_ns, self.bins)
-        return np.asarray(theta[0] / self.bins + theta[1 : 1 + k] @ energy)
-
-    def jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rate (n,) and its derivatives (n, parameters)."""
-        k = self.returns
-        signal, delay = theta[1 : 1 + k], theta[1 + k : 1 + 2 * k]
-        pulse = self.pulse_of(theta)
-        step = _SPREAD * pulse.sigma_ns if isinstance(pulse, GaussianPulse) else 0.5 * _sample_ns(pulse)
-        energy = pulse.bin_energy(delay, self.period_ns, self.bins)
-        later = pulse.bin_energy(delay + step, self.period_ns, self.bins)
-        earlier = pulse.bin_energy(delay - step, self.period_ns, self.bins)
-        columns = [np.full((1, self.bins), 1.0 / self.bins), energy, signal[:, None] * (later - earlier) / (2 * step)]
-        if self.fit_width:
-            sigma = float(theta[-1])
-            step = _SPREAD * sigma
-            wide = GaussianPulse(sigma_ns=sigma + step).bin_energy(delay, self.period_ns, self.bins)
-            narrow = GaussianPulse(sigma_ns=sigma - step).bin_energy(delay, self.period_ns, self.bins)
-            columns.append((signal @ (wide - narrow) / (2 * step))[None])
-        return theta[0] / self.bins + signal @ energy, np.concatenate(columns).T
-
-    def bounded(self, theta: FloatArray) -> FloatArray:
-        """Parameters within their ranges."""
-        k = self.returns
-        out = theta.copy()
-        out[: 1 + k] = np.maximum(out[: 1 + k], _LEAST)
-        if self.fit_width:
-            out[-1] = np.clip(out[-1], 2e-6 * self.period_ns, 0.5 * self.period_ns)
-        return out
-
-
-def _sample_ns(pulse: Pulse) -> float:
-    return pulse.bin_ns if isinstance(pulse, SampledPulse) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +43,15 @@ def log_likelihood(seen: ArmedTime, rate: FloatArray) -> float:
 def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
     """Fisher scoring with step halving from `theta`; parameters at 0 that want to be negative stay there."""
     theta = light.bounded(theta)
-    best = log_likelihood(seen, light.rate(theta))
+    best = log_likelihood(seen, light.rate(theta)) + light.known(theta)[0]
     converged = False
     information = np.zeros((theta.size, theta.size))
     for _ in range(_STEPS):
         rate, slopes = light.jacobian(theta)
         rate = np.maximum(rate, 1e-300)
-        score = slopes.T @ (seen.registrations / rate - seen.passes)
-        information = slopes.T @ ((seen.passes / rate)[:, None] * slopes)
+        _, pull, stiff = light.known(theta)
+        score = slopes.T @ (seen.registrations / rate - seen.passes) + pull
+        information = slopes.T @ ((seen.passes / rate)[:, None] * slopes) + stiff
         free = _free(light, theta, score, information)
         step = np.zeros(theta.size)
         step[free] = _solve(information[np.ix_(free, free)], score[free])
@@ -124,7 +62,7 @@ def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
         scale = 1.0
         while scale > 1e-8:
             trial = light.bounded(theta + scale * step)
-            found = log_likelihood(seen, light.rate(trial))
+            found = log_likelihood(seen, light.rate(trial)) + light.known(trial)[0]
             if found > best:
                 break
             scale *= 0.5
@@ -139,11 +77,13 @@ def _free(light: Light, theta: FloatArray, score: FloatArray, information: Float
     """Which parameters may move: not a light at 0 that should be less, and no delay of a return without light."""
     k = light.returns
     free = np.ones(theta.size, bool)
-    at_zero = (theta[: 1 + k] <= _LEAST) & (score[: 1 + k] <= 0)
+    at_zero = (theta[: 1 + k] <= LEAST) & (score[: 1 + k] <= 0)
     free[: 1 + k] = ~at_zero
     free[1 + k : 1 + 2 * k] = ~at_zero[1:]
     if light.fit_width and at_zero[1:].all():
-        free[-1] = False
+        free[1 + 2 * k] = False
+    if light.fit_width and theta[1 + 2 * k] <= light.least_sigma_ns and score[1 + 2 * k] <= 0:
+        free[1 + 2 * k] = False
     free &= np.diag(information) > 0
     return free
 
@@ -159,10 +99,10 @@ def covariance(light: Light, found: Fit) -> FloatArray:
     """Inverse of the information (parameters, parameters); NaN for what cannot be told (a delay without light)."""
     k = light.returns
     told = np.diag(found.information) > 0
-    dark = found.theta[1 : 1 + k] <= 2 * _LEAST
+    dark = found.theta[1 : 1 + k] <= 2 * LEAST
     told[1 + k : 1 + 2 * k] &= ~dark
     if light.fit_width and dark.all():
-        told[-1] = False
+        told[1 + 2 * k] = False
     out = np.full(found.information.shape, np.nan)
     matrix = found.information[np.ix_(told, told)]
     scale = 1.0 / np.sqrt(np.diag(matrix))
@@ -194,7 +134,10 @@ def initial(seen: ArmedTime, light: Light) -> FloatArray:
         delays.append(delay)
         left = left - strength * pulse.bin_energy(delay, light.period_ns, light.bins) * weight
     background = max(float(rate.sum()) - sum(signals), 1e-2 * total, 1e-6)
-    return np.array([background, *signals, *delays, *([sigma] if light.fit_width else [])])
+    jitter = light.jitter_ns
+    if light.fit_jitter:  # well within the pulse: at its width the likelihood is flat
+        jitter = min(jitter, 0.7 * (sigma if light.fit_width else getattr(pulse, "sigma_ns", jitter)))
+    return light.before(np.array([background, *signals, *delays, sigma]), jitter)
 
 
 def _matched(rate: FloatArray, pulse: Pulse, light: Light) -> tuple[FloatArray, float]:

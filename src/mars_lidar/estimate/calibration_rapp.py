@@ -16,6 +16,7 @@ import numpy as np
 from mars_lidar import _validate
 from mars_lidar.estimate.intervals import Stream, stream_of
 from mars_lidar.pulse import Pulse
+from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.law import registration_pdf
 from mars_lidar.system import Detector, System
 from mars_lidar.timestamps import Timestamps
@@ -94,7 +95,10 @@ def split(
         shape = registration_pdf(found.total - back, back, system, "stationary", delay_ns=delay_ns, threads=1)
         return -float(histogram @ np.log(np.maximum(shape, 1e-300))) / max(int(histogram.sum()), 1)
 
-    best = minimize_scalar(misfit, bounds=(1e-6, 1.0 - 1e-6), method="bounded", options={"xatol": 1e-6})
+    try:
+        best = minimize_scalar(misfit, bounds=(1e-6, 1.0 - 1e-6), method="bounded", options={"xatol": 1e-6})
+    except ConvergenceError:  # far more than one photon per period: there is no law to compare with
+        return found
     back = found.total * float(best.x)
     return RappEstimate(found.total, found.total_error, found.intervals, found.total - back, back)
 

@@ -44,6 +44,20 @@ def moves_records(detector: Detector) -> bool:
     return bool(set(detector.effects) & set(TIMING_EFFECTS))
 
 
+def needs_simulation(detector: Detector) -> bool:
+    """Whether the likelihood of a stream is not known: more than one dead time and Gaussian jitter."""
+    return detector.mode != "nonparalyzable" or bool(set(detector.effects) - {*_IN_THE_LIGHT, "jitter"})
+
+
+def jitter_sigma(detector: Detector) -> float:
+    """Sigma of the detector's jitter, ns; ValueError for one that is not Gaussian."""
+    jitter = detector.jitter
+    if jitter is None:
+        return 0.0
+    _gaussian(None, jitter)
+    return jitter.std_ns
+
+
 def watched(detector: Detector) -> tuple[float, float]:
     """Smallest interval between records that a detector allows, and the age from which on a pixel is armed, ns.
 
@@ -78,9 +92,11 @@ def pulse_of_the_light(recorded: Pulse, detector: Detector) -> Pulse:
 
 
 def _gaussian(pulse: Pulse | None, jitter: object) -> float:
-    if not isinstance(pulse, GaussianPulse) or not isinstance(jitter, Jitter) or jitter.tail_fraction > 0.0:
+    """Sigma of the pulse, 0 without one."""
+    gaussian = isinstance(jitter, Jitter) and jitter.tail_fraction == 0.0
+    if not gaussian or not (pulse is None or isinstance(pulse, GaussianPulse)):
         raise ValueError(
             "jitter and pulse are told apart only where both are Gaussian: leave the detector's jitter out, and give "
             "the pulse as it was recorded, jitter and all"
         )
-    return pulse.sigma_ns
+    return pulse.sigma_ns if isinstance(pulse, GaussianPulse) else 0.0

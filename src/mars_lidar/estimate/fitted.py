@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.estimate.calibration import Calibration
-from mars_lidar.estimate.calibration_fit import Light
-from mars_lidar.estimate.intervals import FloatArray, Stream, armed_time
+from mars_lidar.estimate.armed_time import armed_time
+from mars_lidar.estimate.calibration_light import Light
+from mars_lidar.estimate.calibration_result import Calibration
+from mars_lidar.estimate.intervals import FloatArray, Stream
 
 LEAST_LEFT = 0.05  # share of a variance that the fit must leave to a statistic, or it is taken for fitted
 _MOST_BINS, _PHOTONS = 2048, 20
@@ -66,10 +67,10 @@ class Fitted:
             slopes = np.eye(rate.size)
         else:
             rate = calibration.rate
-            light = Light(period, seen.passes.size, pulse, number, "sigma_ns" in calibration.names)
-            theta = [calibration.background, *calibration.returns_signal, *calibration.returns_delay_ns]
-            theta += [pulse.sigma_ns] if light.fit_width else []  # type: ignore[attr-defined]
-            slopes = light.jacobian(np.array(theta))[1]
+            names, jitter = calibration.names, calibration.jitter_ns
+            error = calibration.jitter_error_ns if "jitter_ns" in names else 0.0
+            light = Light(period, seen.passes.size, pulse, number, "sigma_ns" in names, jitter, error)
+            slopes = light.recorded_jacobian(calibration.parameters)
             covariance = np.nan_to_num(calibration.covariance) / (1.0 + more)
         return cls(period, rate, slopes, covariance, more, seen.registrations, seen.passes, own)
 

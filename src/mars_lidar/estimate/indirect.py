@@ -1,7 +1,8 @@
 """Calibration of detectors whose likelihood is not known: by simulation of the same detector (indirect inference).
 
 Gourieroux, Monfort, Renault, J. Appl. Econometrics 8, S85 (1993): the light is right with which streams of the exact
-engine, calibrated in the same way, give the same estimates as the measured stream, whatever their bias.
+engine, calibrated in the same way, give the same estimates as the measured stream, whatever their bias. There are as
+many estimates as there are parameters, for returns of a known or fitted width as for a free shape, bin by bin.
 """
 
 from __future__ import annotations
@@ -11,10 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mars_lidar.estimate.calibration import Calibration
-from mars_lidar.flux import Flux
+from mars_lidar.estimate.calibration_result import Calibration
+from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
 from mars_lidar.system import System
-from mars_lidar.timestamps import Timestamps
 
 TIMES = 4.0  # the simulated stream is so much longer than the measured one
 _MOST = 8_000_000  # registrations of it, about
@@ -24,38 +24,53 @@ _PIXELS = 16
 _SEED = 20_252
 
 
-def indirect(
-    found: Calibration, system: System, calibrated: Callable[[Timestamps], Calibration]
-) -> Calibration:
-    """`found` with the light of `system` that `calibrated` sees as it sees the measured stream.
+def indirect(found: Calibration, system: System, once: Callable[[Stream], Calibration]) -> Calibration:
+    """`found` with the light of `system` that `once` calibrates as it does the measured stream.
 
-    One return of a known pulse. The covariance is that of the fit, enlarged by that of the simulation.
+    The covariance is that of the fit, enlarged by that of the simulation. The pulse of `system` is not used.
     """
     from mars_lidar.simulate import simulate_timestamps
 
+    if found.waveform is not None and system.detector.jitter is not None:
+        # a free shape is the light as it is recorded, which a pixel without jitter records as it is
+        plain = system.replace(detector=system.detector.without("jitter"))
+        return replace(indirect(replace(found, jitter_ns=0.0), plain, once), jitter_ns=found.jitter_ns)
     counted = found.summary
     times = min(TIMES, _MOST / max(counted.registrations, 1))
     cycles = int(max(1, np.ceil(times * counted.cycles / _PIXELS)))
-    made_by = system.replace(cycles=cycles, bins=counted.bins if counted.bins <= 2**16 else 1024, start="armed")
-    seen = np.array([found.background, found.signal, found.delay_ns])
-    errors = np.sqrt(np.diag(found.covariance))
-    light, converged, row = seen.copy(), False, np.ones((1, _PIXELS))
+    bins = counted.bins if counted.bins <= 2**16 else 1024
+    light, converged = found, False
     for _ in range(_STEPS):
-        flux = Flux(max(light[1], 0.0) * row, max(light[0], 0.0), light[2])
-        stream = simulate_timestamps(flux, made_by, seed=_SEED)
-        again = calibrated(stream)
-        step = seen - np.array([again.background, again.signal, again.delay_ns])
-        step[2] = (step[2] + 0.5 * counted.period_ns) % counted.period_ns - 0.5 * counted.period_ns
-        light += step
-        if (np.abs(step) < _NEAR * errors).all():
+        made_by = system.replace(cycles=cycles, bins=bins, pulse=light.system(1, bins).pulse, start="armed")
+        # of its own for each stream, or the error of the simulation would be shared by all that are calibrated
+        stream = simulate_timestamps(light.flux(_PIXELS), made_by, seed=_SEED + counted.registrations)
+        step = _nearest(found, found.parameters - once(stream_of(stream, pooled=True)).parameters)
+        light = light.moved(step)
+        if _small(found, step):
             converged = True
             break
     return replace(
-        found,
-        background=float(max(light[0], 0.0)),
-        returns_signal=np.array([max(light[1], 0.0)]),
-        returns_delay_ns=np.array([light[2] % counted.period_ns]),
+        light,
         covariance=found.covariance * (1.0 + 1.0 / times),
         simulated=times,
         converged=found.converged and converged,
     )
+
+
+def _small(found: Calibration, step: FloatArray) -> bool:
+    """Whether a step is small beside the standard errors: of each parameter, or of all light of a free shape."""
+    errors = np.sqrt(np.diag(found.covariance))
+    if found.waveform is not None:
+        return bool(abs(step.sum()) < _NEAR * errors[0])
+    told = np.isfinite(errors)
+    return bool((np.abs(step[told]) < _NEAR * errors[told]).all())
+
+
+def _nearest(found: Calibration, step: FloatArray) -> FloatArray:
+    """A step whose delays do not go around the period."""
+    if found.waveform is not None:
+        return step
+    k, period = found.returns_signal.size, found.summary.period_ns
+    out = step.copy()
+    out[1 + k : 1 + 2 * k] = (step[1 + k : 1 + 2 * k] + 0.5 * period) % period - 0.5 * period
+    return out

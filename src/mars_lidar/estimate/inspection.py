@@ -9,6 +9,7 @@ import numpy as np
 from mars_lidar._brief import brief
 from mars_lidar.estimate.calibration import Calibration, calibrate
 from mars_lidar.estimate.intervals import FloatArray, stream_of
+from mars_lidar.estimate.periodicity import other_period
 from mars_lidar.estimate.recovery import Recovery, recovery_of
 from mars_lidar.timestamps import Timestamps
 
@@ -25,9 +26,10 @@ class Inspection:
     Attributes
     ----------
     calibration
-        With a free shape: light bin by bin, dead time by the smallest interval (or as given), `Summary`.
+        With a free shape: light bin by bin, dead time and jitter by the edge of the recovery (or as given), `Summary`.
     recovery
-        Registrations by time since the last one: whether there is more than one dead time.
+        Registrations by time since the last one: whether there is more than one dead time. Its `dead_time_ns` is the
+        end of the edge, where jitter has blurred it.
     phase_histogram
         (bins,) registrations over the period.
     interval_edges_ns, interval_histogram
@@ -56,15 +58,18 @@ def inspect(times: Timestamps, *, dead_time_ns: float | None = None) -> Inspecti
     dead_time_ns
         The dead time, ns, where it is known; default: estimated, even where the stream tells its system.
     """
+    if not isinstance(times, Timestamps):
+        raise TypeError(f"times must be Timestamps, got {type(times).__name__}")
     free = calibrate(_bare(times), pulse="free", dead_time_ns=dead_time_ns)
-    longer = 2.0 * free.dead_time_ns
-    if longer > 0.0:  # so that what happens right after the dead time does not pass for light
-        careful = calibrate(_bare(times), pulse="free", dead_time_ns=free.dead_time_ns, hold_off_ns=longer)
-        kept = careful if careful.armed.used >= max(_ENOUGH, 0.05 * free.armed.used) else free
-    else:
-        kept = free
     stream = stream_of(times)
-    found = recovery_of(stream, kept.rate, free.dead_time_ns, kept.hold_off_ns)
+    longer, kept = 2.0 * free.dead_time_ns, free
+    left = sum(int((dt > longer).sum()) for dt in stream.intervals())
+    if longer > free.hold_off_ns and left >= max(_ENOUGH, 0.05 * free.armed.used):
+        # so that what happens right after the dead time does not pass for light
+        kept = calibrate(_bare(times), pulse="free", dead_time_ns=free.dead_time_ns, hold_off_ns=longer)
+    # an edge that jitter has blurred is no recovery: ages are judged from where it is over
+    edge = free.dead_time_ns if free.jitter_ns == 0.0 else free.hold_off_ns
+    found = recovery_of(stream, kept.rate, edge, max(kept.hold_off_ns, edge))
     assert free.waveform is not None
     histogram = stream.histogram(free.waveform.size).astype(np.float64)
     reach = max(4.0 * stream.period_ns, free.dead_time_ns + 3.0 * stream.period_ns)
@@ -72,7 +77,10 @@ def inspect(times: Timestamps, *, dead_time_ns: float | None = None) -> Inspecti
     apart = np.zeros(_INTERVAL_BINS)
     for dt in stream.intervals():
         apart += np.histogram(dt, edges)[0]
-    return Inspection(free, found, histogram, edges, apart, tuple(_problems(times, free, found, histogram)))
+    # a stream that registers nearly as soon as it can repeats with the dead time
+    hurried = free.summary.quantiles_ns[1] < 1.2 * free.summary.smallest_ns[0]
+    problems = _problems(times, free, found, histogram, None if hurried else other_period(stream))
+    return Inspection(free, found, histogram, edges, apart, tuple(problems))
 
 
 def _bare(times: Timestamps) -> Timestamps:
@@ -82,7 +90,9 @@ def _bare(times: Timestamps) -> Timestamps:
     return replace(times, info={name: value for name, value in times.info.items() if name != "system"})
 
 
-def _problems(times: Timestamps, free: Calibration, found: Recovery, histogram: FloatArray) -> list[str]:
+def _problems(
+    times: Timestamps, free: Calibration, found: Recovery, histogram: FloatArray, period_ns: float | None
+) -> list[str]:
     from scipy.stats import chi2
 
     told = []
@@ -99,6 +109,11 @@ def _problems(times: Timestamps, free: Calibration, found: Recovery, histogram: 
             f"{free.too_short:,} of {counted.registrations:,} intervals are shorter than the dead time of "
             f"{free.dead_time_ns:.5g} ns, the smallest {counted.smallest_ns[0]:.5g} ns: crosstalk, jitter, or a "
             "shorter dead time"
+        )
+    if period_ns is not None:
+        told.append(
+            f"the photons repeat every {period_ns:.6g} ns, not every {free.summary.period_ns:.7g} ns: a wrong laser "
+            "period, and what else is told follows from it"
         )
     coarse = _coarse(histogram)
     flat = float(((coarse - coarse.mean()) ** 2).sum() / coarse.mean())

@@ -86,9 +86,11 @@ def system_of(calibration: Calibration, detector: Detector | None, cycles: int, 
     plain = calibration.system(cycles, bins)
     if detector is None:
         return plain
-    if detector.jitter is not None and calibration.pulse is None:
-        raise ValueError("a free shape holds the detector's jitter already: leave detector.jitter out")
-    return plain.replace(detector=detector, pulse=pulse_of_the_light(plain.pulse, detector))
+    if calibration.pulse is None:
+        if detector.jitter is not None and calibration.jitter_ns == 0.0:
+            raise ValueError("a free shape holds the detector's jitter already: leave detector.jitter out")
+        return plain.replace(detector=detector)
+    return plain.replace(detector=detector, pulse=pulse_of_the_light(calibration.pulse, detector))
 
 
 def predict(calibration: Calibration, system: System, realizations: int, light: Fitted) -> Prediction:

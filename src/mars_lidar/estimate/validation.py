@@ -13,11 +13,12 @@ from mars_lidar import _validate
 from mars_lidar._brief import brief
 from mars_lidar.detector import Detector
 from mars_lidar.estimate.ages import age_table
-from mars_lidar.estimate.calibration import Calibration, _free_bins, _system_of, calibrate
+from mars_lidar.estimate.calibration import Calibration, _system_of, calibrate
 from mars_lidar.estimate.checks import Check, Compared
 from mars_lidar.estimate.detector_model import is_plain, moves_records, stream_detector
 from mars_lidar.estimate.fitted import Fitted
 from mars_lidar.estimate.intervals import FloatArray, stream_of
+from mars_lidar.estimate.phase_bins import free_bins
 from mars_lidar.estimate.prediction import Prediction, cut, predict, system_of
 from mars_lidar.estimate.recovery import Recovery, recovery_of
 from mars_lidar.studies.distance import Pmf, kl_divergence, total_variation
@@ -187,7 +188,7 @@ def validate(
             f"cycles must leave at least {_LEAST_REALIZATIONS} realizations of a stream of {stream.cycles:,} periods, "
             f"got {number:,}: {size}"
         )
-    system = system_of(calibration, detector, number, _free_bins(stream.bins))
+    system = system_of(calibration, detector, number, free_bins(stream.bins))
     light, dead = Fitted.of(calibration, stream), calibration.dead_time_ns
     law = predict(calibration, system, drawn, light)
     label = 2 * law.groups + law.window

@@ -71,7 +71,7 @@ MISMATCHES = (
     Mismatch("paralyzable detector, B = 0.1", detector=_PARALYZABLE),
     Mismatch("paralyzable detector, B = 0.1, told", detector=_PARALYZABLE, told=True, fits=True),
     Mismatch("jitter 0.2 ns, pulse as without", detector=_JITTER),
-    Mismatch("jitter 0.2 ns, all fitted", detector=_JITTER, assumed_ns=None, known_pulse=False),
+    Mismatch("jitter 0.2 ns, all fitted", detector=_JITTER, assumed_ns=None, known_pulse=False, fits=True),
     Mismatch("jitter 0.2 ns, told", detector=_JITTER, told=True, fits=True),
     Mismatch("afterpulses 2 %", detector=_AFTERPULSES),
     Mismatch("afterpulses 2 %, hold-off 400 ns", detector=_AFTERPULSES, hold_off_ns=400.0),

@@ -75,7 +75,7 @@ def test_only_what_was_set_is_shown():
     assert eval(repr(SYSTEM), vars(ml)) == SYSTEM  # a system can be copied from a notebook
     bound = estimate.HistogramBound(np.zeros((3, 3)), np.float64(1.0), np.ones(2), np.ones(5), np.ones(0))
     assert brief(bound) == (
-        "HistogramBound(information=<float64 (3, 3)>, signal=np.float64(1.0), background=[1., 1.], "
+        "HistogramBound(information=<float64 (3, 3)>, signal=1.0, background=[1., 1.], "
         "delay_ns=<float64 (5,)>, depth_m=[])"
     )
 

@@ -33,6 +33,8 @@ def _shown(value: Any) -> str:
         return f"<{value.dtype} {value.shape}>"
     if isinstance(value, np.ndarray):
         return np.array2string(value, precision=6, separator=", ", max_line_width=10**6).replace("\n", "")
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, list | tuple) and len(value) > _MOST_VALUES:
         return f"<{type(value).__name__} of {len(value)}>"
     text = repr(value)

@@ -51,12 +51,12 @@ void draw_starts(const Job& job, const WaveformBlock& block, std::vector<int32_t
 // Cuts a job into blocks, realizations of one pixel together because they share its table.
 void run_waveform(const BoundJob& job, WaveformBlock proto, int threads, const std::string& level,
                   const nb::object& progress) {
-    constexpr int64_t kMostLanes = 32, kTableBytes = int64_t{64} << 20;
+    constexpr int64_t kTableBytes = int64_t{64} << 20;
     const WaveformKernel kernel = kernel_of(level, job);
     const TableLayout layout(job.samples);
     const int64_t table_bytes = 4 * layout.edges + 2 * layout.cells;
     proto.job = &job;
-    proto.team = std::max<int64_t>(1, std::min(kMostLanes, kTableBytes / table_bytes));
+    proto.team = std::max<int64_t>(1, std::min<int64_t>(kMostWaveLanes, kTableBytes / table_bytes));
     const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));
     const int64_t items = std::min(kMaxItems, share);
     const int64_t realizations = std::min(items, job.realizations), pixels = items / realizations;

@@ -95,7 +95,7 @@ MARS_INLINE WaveWait draw_wave(const WaveRates& rates, UInt key0, UInt key1, UIn
 struct WaveTables {
     const int32_t* edge;
     const uint16_t* guide;
-    Int edges, guides;  // where each lane's table begins
+    alignas(64) int32_t edges[kLanes], guides[kLanes];  // where each lane's table begins
     int32_t parts, shift, group;
 };
 
@@ -116,16 +116,15 @@ MARS_NOINLINE inline int32_t part_beyond(const int32_t* edge, int32_t parts, int
 // Lanes with more edges to look at than one vector of them: one by one.
 MARS_NOINLINE inline void search_on(const WaveTables& tables, const Int& energy, Mask lanes, Int& part, Int& low,
                                     Int& high) {
-    alignas(64) int32_t e[kLanes], k[kLanes], begin[kLanes], a[kLanes], b[kLanes];
+    alignas(64) int32_t e[kLanes], k[kLanes], a[kLanes], b[kLanes];
     store(e, energy);
     store(k, part);
     store(a, low);
     store(b, high);
-    store(begin, tables.edges);
     uint64_t left = lane_bits(lanes);
     for (int lane = 0; left; ++lane, left >>= 1) {
         if (!(left & 1)) continue;
-        const int32_t* const edge = tables.edge + begin[lane];
+        const int32_t* const edge = tables.edge + tables.edges[lane];
         k[lane] = part_beyond(edge, tables.parts, e[lane], k[lane]);
         a[lane] = edge[k[lane]];
         b[lane] = edge[k[lane] + 1];
@@ -135,23 +134,33 @@ MARS_NOINLINE inline void search_on(const WaveTables& tables, const Int& energy,
     high = load<Int>(b);
 }
 
+// Of one lane: the place of an energy among its edges, or the last one that was looked at.
+struct WaveSearch {
+    const WaveTables& tables;
+    const int32_t *cell, *energy;
+
+    MARS_INLINE int32_t operator()(int lane) const {
+        const int32_t first = tables.edges[lane] + (tables.guide[cell[lane]] << tables.group);
+        return first + count_not_above(tables.edge + first + 1, energy[lane]);
+    }
+};
+
 // The part of each lane's waveform that encloses an energy, and the energies at its edges: from the guide on, as many
 // edges as a vector holds at once.
 MARS_INLINE void find_part(const WaveTables& tables, Int energy, Int& part, Int& low, Int& high) {
-    alignas(64) int32_t e[kLanes], cell[kLanes], begin[kLanes], place[kLanes];
+    alignas(64) int32_t e[kLanes], cell[kLanes];
     spill(e, energy);
-    spill(cell, tables.guides + (energy >> tables.shift));
-    spill(begin, tables.edges);
-    const int32_t* const edge = tables.edge;
-    const uint16_t* const guide = tables.guide;
-    const int group = tables.group;
+    spill(cell, load<Int>(tables.guides) + (energy >> tables.shift));
+    const WaveSearch find{tables, cell, e};
+#if defined(MARS_LEVEL_avx512)  // one loop over all lanes: it leaves the other registers alone
+    alignas(64) int32_t place[kLanes];
 #pragma GCC unroll 4
-    for (int lane = 0; lane < kLanes; ++lane) {
-        const int32_t first = begin[lane] + (guide[cell[lane]] << group);
-        place[lane] = first + count_not_above(edge + first + 1, e[lane]);
-    }
-    gather_two(edge, place, low, high);
-    part = load<Int>(place) - tables.edges;
+    for (int lane = 0; lane < kLanes; ++lane) place[lane] = find(lane);
+    gather_found(tables.edge, Given{place}, low, high);
+    part = load<Int>(place) - load<Int>(tables.edges);
+#else
+    part = gather_found(tables.edge, find, low, high) - load<Int>(tables.edges);
+#endif
     const Mask more = energy >= high;
     if (any(more)) search_on(tables, energy, more, part, low, high);
 }
@@ -159,7 +168,7 @@ MARS_INLINE void find_part(const WaveTables& tables, Int energy, Int& part, Int&
 // C^-1(C(from) + wait).
 MARS_INLINE WaveTime next_arrival(const WaveTables& tables, const WaveTime& from, const WaveWait& wait) {
     Int low, high;
-    gather_two(tables.edge, tables.edges + from.part, low, high);
+    gather_two(tables.edge, load<Int>(tables.edges) + from.part, low, high);
     const Int width = high - low;
     const Int here = low + minimum(truncate(to_float(width) * from.inside), width);
     const UInt sum = as_uint(here) + as_uint(wait.energy);
@@ -169,7 +178,7 @@ MARS_INLINE WaveTime next_arrival(const WaveTables& tables, const WaveTime& from
 
     Int part;
     find_part(tables, energy, part, low, high);
-    const Float inside = quotient(to_float(energy - low) + 0.5f, to_float(high - low));
+    const Float inside = (to_float(energy - low) + 0.5f) / to_float(high - low);
     const WaveTime hit = {from.cycle + turns, part, minimum(inside, splat(kLastInside))};
     return earlier(before(hit, from), from, hit);  // rounding must not turn time back
 }

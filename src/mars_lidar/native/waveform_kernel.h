@@ -9,6 +9,8 @@
 
 namespace mars {
 
+constexpr int kMostWaveLanes = 32;  // of any level
+
 // Pixels times realizations of a job.
 struct WaveformBlock {
     const Job* job;

@@ -1,13 +1,13 @@
-// The inner loop of waveforms. As in exact_runner.h lanes work on different items and a lane whose exposure has ended takes
-// the next one, waits are drawn ahead, and registrations are logged before they are counted; but here every pixel has
-// a table of its own, which its realizations share. Compiled once more with a recorder between registrations and log.
+// The inner loop of waveforms. As in exact_runner.h lanes work on different items and a lane whose exposure has ended
+// takes the next one, and registrations are logged before they are counted; but here every pixel has a table of its own,
+// which its realizations share (waveform_feed.h). Compiled once more with a recorder between registrations and log.
 #pragma once
 #include <cstring>
 #include <type_traits>
 
 #include "lane_log.h"
 #include "trap_lanes.h"
-#include "waveform_kernel.h"
+#include "waveform_feed.h"
 #include "waveform_modes.h"
 #include "waveform_recorder.h"
 
@@ -18,10 +18,9 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
-constexpr int kWaitsAhead = 8;             // registrations drawn ahead
-constexpr int64_t kFetchAhead = 16384;      // numbers
+constexpr int kRound = 8;                  // steps between looks at which lanes have finished
 constexpr int kRoundsToPoll = 512;         // between looks at `stop`
-constexpr int32_t kIdleCycle = 100000001;  // every exposure has ended; + kWaitsAhead (kForever + t_d) fits 32 bits
+constexpr int32_t kIdleCycle = 100000001;  // every exposure has ended; + kRound (kForever + t_d) fits 32 bits
 
 // `timed` runners can tell the times of registrations; those with a recorder always can.
 template <DetectorMode mode, Stage stage, bool timed>
@@ -30,33 +29,27 @@ class WaveRunner {
 
 public:
     explicit WaveRunner(const WaveformBlock& block)
-        : block_(block), job_(*block.job), system_(wave_system(job_)), layout_(job_.samples),
-          places_(job_), recorder_(job_),
+        : block_(block), job_(*block.job), system_(wave_system(job_)), feed_(block), places_(job_), recorder_(job_),
           traps_(job_), twilight_(mode == DetectorMode::kNonparalyzable && job_.twilight > 0.0),
           twilight_span_(wave_span(job_.twilight, system_.parts)), log_(block.output, job_) {
         tables_.edge = block.edges;
         tables_.guide = block.guides;
         tables_.parts = system_.parts;
-        tables_.shift = layout_.shift;
-        tables_.group = layout_.group;
+        tables_.shift = feed_.layout().shift;
+        tables_.group = feed_.layout().group;
+        for (int lane = 0; lane < kLanes; ++lane) take(lane);
+        load_items();
     }
 
     void run() {
-        for (int lane = 0; lane < kLanes; ++lane) take(lane);
-        load_items();
-        fetch_from(pixel_);
-        for (int round = 1; running_ > 0; ++round) {
-            // each draw beside the search of the one before it, which waits for tables
-            WaveWait wait = draw(0);
-            for (int k = 0; k < kWaitsAhead; ++k) {
-                const WaveWait next = k + 1 < kWaitsAhead ? draw(k + 1) : wait;
-                step(wait, k);
-                wait = next;
-                fetch();
+        for (int round = 1; feed_.running() > 0; ++round) {
+            for (int k = 0; k < kRound; ++k) {
+                step(k);
+                feed_.fetch();
             }
             if constexpr (kRecords) record();
-            event_ = event_ + static_cast<uint32_t>(kWaitsAhead);
-            log_.advance(kWaitsAhead);
+            event_ = event_ + static_cast<uint32_t>(kRound);
+            log_.advance(kRound);
             if (any(from_.cycle >= system_.cycles)) exchange();
             if (log_.full()) log_.flush();
             if (round % kRoundsToPoll == 0 && block_.stop->load(std::memory_order_relaxed)) return;
@@ -68,7 +61,10 @@ private:
         return draw_wave(rates_, key0_, key1_, event_ + static_cast<uint32_t>(k));
     }
 
-    MARS_INLINE void step(const WaveWait& wait, int k) {
+    // A function of its own: in the loop over a round compilers keep several steps' numbers in too few registers, which costs
+    // a quarter of the time where there are 16 of them.
+    MARS_NOINLINE void step(int k) {
+        const WaveWait wait = draw(k);
         WaveTime from = from_;
         if constexpr (kTraps) from = search_start(k);
         WaveTime hit = next_arrival(tables_, from, wait);
@@ -97,7 +93,7 @@ private:
     // Records the registrations of a round.
     MARS_INLINE void record() {
         recorder_.take(seen_, key0_, key1_, event_, log_.wants_times());
-        for (int k = 0; k < kWaitsAhead; ++k) {
+        for (int k = 0; k < kRound; ++k) {
             log_.put(k, seen_[k].lost, seen_[k].bin);
             log_.put_cycle(k, seen_[k].cycle);
             memcpy(log_.phase(k), seen_[k].phase, sizeof seen_[k].phase);
@@ -132,10 +128,7 @@ private:
         if constexpr (kTraps) traps_.save_lanes();
         for (int lane = 0; lane < kLanes; ++lane) {
             if (cycle_[lane] < system_.cycles) continue;
-            if (log_.busy(lane)) {
-                --running_;
-                --users_[slot_[lane]];
-            }
+            if (log_.busy(lane)) feed_.give_back(slot_[lane]);
             take(lane);
         }
         load_items();
@@ -155,28 +148,20 @@ private:
         ready_cycle_[lane] = INT32_MIN;
         ready_part_[lane] = 0;
         ready_inside_[lane] = 0.0f;
-        for (; running_ < block_.team && pixel_ < block_.pixels; ++pixel_, realization_ = 0) {
-            const int64_t pixel = block_.first_pixel + pixel_;
-            if (realization_ == 0) prepare(pixel);
-            while (realization_ < block_.realizations) {
-                const int64_t place = pixel_ * block_.realizations + realization_;
-                const int64_t r = block_.first_realization + realization_++, item = r * job_.pixels + pixel;
-                log_.clear(item);
-                if (!(photons_ >= 1e-30)) continue;
-                begin(lane, place);
-                rates_.total[lane] = photons_;
-                rates_.inverse[lane] = 1.0 / photons_;
-                const Pair<uint32_t> key = stream_key(job_.seed, job_.first_realization + static_cast<uint32_t>(r),
-                                                      job_.pixel_index[pixel]);
-                key0s_[lane] = key.first;
-                key1s_[lane] = key.second;
-                if constexpr (kTraps) traps_.open(lane, key.first, key.second);
-                log_.assign(lane, item);
-                slot_[lane] = latest_;
-                ++users_[latest_];
-                ++running_;
-                return;
-            }
+        while (feed_.more()) {
+            const WaveItem next = feed_.next();
+            log_.clear(next.item);
+            if (next.dark()) continue;
+            begin(lane, next.place);
+            rates_.total[lane] = next.photons;
+            rates_.inverse[lane] = 1.0 / next.photons;
+            key0s_[lane] = next.key.first;
+            key1s_[lane] = next.key.second;
+            if constexpr (kTraps) traps_.open(lane, next.key.first, next.key.second);
+            log_.assign(lane, next.item);
+            slot_[lane] = next.slot;
+            feed_.take(next.slot);
+            return;
         }
     }
 
@@ -191,42 +176,11 @@ private:
         inside_[lane] = at.rest;
     }
 
-    // The table of the next pixel, in a slot that no lane uses.
-    void prepare(int64_t pixel) {
-        latest_ = 0;
-        while (users_[latest_] > 0) ++latest_;
-        photons_ = fill_table(layout_, job_.waveform + pixel * job_.samples, job_.background[pixel],
-                              block_.edges + edges_of(latest_), block_.guides + latest_ * layout_.cells);
-        fetch_from(pixel_ + 1);
-    }
-
-    int32_t edges_of(int32_t slot) const { return slot * static_cast<int32_t>(layout_.edges) + kFirstEdge; }
-
-    // Asks for the waveforms of the next pixels, a little at a time: the memory then works while the lanes do. Several lanes
-    // may end together, so it runs ahead of the next pixel by kFetchAhead.
-    void fetch_from(int64_t pixel) {
-        const double* const next = job_.waveform + (block_.first_pixel + pixel) * job_.samples;
-        const int64_t left = (block_.pixels - pixel) * job_.samples;
-        if (fetch_ < next) fetch_ = next;
-        fetch_end_ = next + (left < kFetchAhead ? left : kFetchAhead);
-    }
-    MARS_INLINE void fetch() {
-#if defined(__GNUC__)
-        constexpr int kLines = 32, kLine = 8;
-        if (fetch_ >= fetch_end_) return;
-        for (int line = 0; line < kLines; ++line) __builtin_prefetch(fetch_ + line * kLine, 0, 2);
-        fetch_ += kLines * kLine;
-#endif
-    }
-
     void load_items() {
-        alignas(64) int32_t edges[kLanes], guides[kLanes];
         for (int lane = 0; lane < kLanes; ++lane) {
-            edges[lane] = edges_of(slot_[lane]);
-            guides[lane] = slot_[lane] * static_cast<int32_t>(layout_.cells);
+            tables_.edges[lane] = feed_.edges_of(slot_[lane]);
+            tables_.guides[lane] = feed_.guide_of(slot_[lane]);
         }
-        tables_.edges = load<Int>(edges);
-        tables_.guides = load<Int>(guides);
         key0_ = load<UInt>(key0s_);
         key1_ = load<UInt>(key1s_);
         event_ = load<UInt>(events_);
@@ -239,7 +193,7 @@ private:
     const WaveformBlock& block_;
     const Job& job_;
     const WaveSystem system_;
-    const TableLayout layout_;
+    WaveFeed feed_;
     const WavePlaces places_;
 
     // the lanes
@@ -257,14 +211,8 @@ private:
     uint32_t key0s_[kLanes] = {}, key1s_[kLanes] = {}, events_[kLanes];
     int32_t slot_[kLanes];  // the table of a lane
 
-    int64_t pixel_ = 0, realization_ = 0;  // the next item
-    const double *fetch_ = nullptr, *fetch_end_ = nullptr;  // of its waveform, what has not been asked for
-    int32_t latest_ = 0;                   // slot of the latest pixel's table ...
-    double photons_ = 0.0;                 // ... and its photons per period
-    int users_[kLanes + 1] = {};           // lanes that use each slot
-    int running_ = 0;
     std::conditional_t<kRecords, Recorder<PartClock>, NoRecorder> recorder_;
-    PartClock::Registration seen_[kRecords ? kWaitsAhead : 1];
+    PartClock::Registration seen_[kRecords ? kRound : 1];
     std::conditional_t<kTraps, TrapLanes<PartClock>, NoTraps> traps_;
     const bool twilight_;
     const WaveSpan twilight_span_;

@@ -153,6 +153,8 @@ class FitOptions:
         else:
             base = Detector(dead_time_ns=dead)
         detector = stream_detector(with_given(base, given | ({} if dead is None else {"dead_time_ns": dead})))
+        if self.free and "jitter" not in given and "jitter" in detector.effects:
+            detector = detector.without("jitter")  # a free shape has it in it
         pulse = self._pulse() or (GaussianPulse(sigma_ns=0.01 * times.period_ns) if known is None else known.pulse)
         if known is not None:
             return known.replace(detector=detector, pulse=pulse)

@@ -13,7 +13,7 @@ import mars_lidar as ml
 from harness import ledger
 from mars_lidar.estimate.ages import Underlying, is_sharp, shortest
 from mars_lidar.estimate.intervals import stream_of
-from mars_lidar.estimate.jittered import Records, normal_kernel, unblurred
+from mars_lidar.estimate.jittered import Records, after_blur, normal_kernel, unblurred
 
 PERIOD, DELAY, DEAD, SIGMA = 1e3 / 7.5, 40.0, 85.0, 0.5
 
@@ -161,3 +161,40 @@ def test_jitter_that_is_given():
     assert none.dead_time_by == "smallest interval"
     with pytest.raises(ValueError, match="jitter_ns must be a finite number in"):
         ml.calibrate(times, jitter_ns=9.0)
+
+
+def test_a_measured_pulse_holds_the_jitter():
+    """The recorded response is given; light, dead time and jitter come out, and the pulse before the jitter."""
+    t, jitter, number = np.arange(100), 0.3, 3
+    shape = (t / 6.0) ** 2 * np.exp(-t / 6.0)
+    with pytest.raises(ValueError, match="add zeros at its end"):
+        after_blur(ml.SampledPulse(shape, 0.05, "centroid"), jitter)
+    laser = ml.SampledPulse(np.pad(shape, (0, 80)), 0.05, "centroid")
+    detector = ml.Detector(dead_time_ns=DEAD, jitter=ml.Jitter(sigma_ns=jitter))
+    made_by = ml.System(period_ns=PERIOD, cycles=60_000, bins=1024, pulse=laser, detector=detector)
+    light = ml.Flux(np.full((1, number), 0.8), 0.5, DELAY)
+    times = dataclasses.replace(ml.simulate_timestamps(light, made_by, seed=53), info={})
+    response = after_blur(laser, jitter)
+    edges = np.linspace(-4.0, 6.0, 101)
+    kernel = np.diff(stats.norm.cdf(np.linspace(-2.005, 2.005, 402), scale=jitter))
+    blurred = np.diff(np.convolve(laser.cumulative(np.linspace(-6.0, 8.0, 1401)), kernel, "valid")[::10])
+    assert np.diff(response.cumulative(edges)) == pytest.approx(blurred, abs=2e-4)
+    scores = []
+    for k in range(number):
+        found = ml.calibrate(times.pixel(0, k), pulse=response)
+        errors = found.errors
+        scores.append([
+            (found.dead_time_ns - DEAD) / found.dead_time_error_ns, (found.jitter_ns - jitter) / found.jitter_error_ns,
+            (found.background - 0.5) / errors["background"], (found.signal - 0.8) / errors["signal"],
+        ])  # fmt: skip
+        assert abs(found.delay_ns - DELAY) < 6.0 * errors["delay_ns"]
+        assert abs(float(found.flux().delay_ns.item()) - DELAY) < 6.0 * errors["delay_ns"] + 1e-3
+    z = np.array(scores)
+    bias = 2.0 * stats.norm.sf(np.abs(z.sum(0)) / math.sqrt(number))
+    outcomes = {name: float(p) for name, p in zip("tjBS", bias, strict=True)}
+    ledger.require(outcomes, "measured pulse, jitter")
+    told = found.system(60_000, 1024)
+    again = ml.calibrate(times.pixel(0, number - 1), told)
+    assert again.signal == pytest.approx(found.signal, rel=1e-3)
+    assert again.delay_ns == pytest.approx(found.flux().delay_ns.item(), abs=2e-3)
+    assert ml.validate(times.pixel(0, number - 1), found, cycles=500, simulated=400).consistent

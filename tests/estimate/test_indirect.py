@@ -12,7 +12,7 @@ from scipy import stats
 import mars_lidar as ml
 from harness import ledger
 
-PERIOD, BINS, SIGMA, NUMBER = 1e3 / 7.5, 512, 0.5, 6
+PERIOD, BINS, SIGMA, NUMBER = 1e3 / 7.5, 512, 0.5, 4
 DETECTORS = {
     "afterpulses": ml.Detector(dead_time_ns=85.0, afterpulsing=ml.Afterpulsing(probability=0.05, delay_ns=100.0)),
     "electronics": ml.Detector(dead_time_ns=50.0, electronics_dead_time_ns=85.0),
@@ -27,7 +27,7 @@ ONE = ml.Flux(0.8 * ROW, 0.5, 40.0)
 TWO = ml.Flux.multi(ml.Flux(0.8 * ROW, 0.0 * ROW, 40.0), ml.Flux(0.3 * ROW, 0.5 * ROW, 46.0))
 
 
-def streams(detector: ml.Detector, light: ml.Flux, cycles: int = 40_000) -> tuple[ml.System, ml.Timestamps]:
+def streams(detector: ml.Detector, light: ml.Flux, cycles: int = 30_000) -> tuple[ml.System, ml.Timestamps]:
     system = ml.System(
         period_ns=PERIOD, cycles=cycles, bins=BINS, pulse=ml.GaussianPulse(sigma_ns=SIGMA), detector=detector
     )
@@ -61,7 +61,7 @@ def test_returns(kind, name):
     outcomes = {f"bias {k}": float(2 * stats.norm.sf(abs(v) / math.sqrt(NUMBER))) for k, v in enumerate(z.sum(0))}
     outcomes |= {f"scatter {k}": sides(float(v), NUMBER) for k, v in enumerate((z**2).sum(0))}
     ledger.require(outcomes, f"{name} told, {kind}")
-    assert abs(np.mean(plain)) > 3.0  # there was a bias to be taken off
+    assert abs(np.mean(plain)) > 2.5  # there was a bias to be taken off
 
 
 @pytest.mark.parametrize("name", DETECTORS)
@@ -89,9 +89,9 @@ def test_free_shape(name):
 
 def test_what_was_found_fits(tmp_path):
     detector = DETECTORS["afterpulses, jitter"]
-    system, times = streams(detector, ONE, 60_000)
+    system, times = streams(detector, ONE, 50_000)
     one = times.pixel(0, 0)
     for arguments in ({"pulse": "gaussian"}, {"pulse": "free"}):
         found = ml.calibrate(one, system, **arguments)
-        judged = ml.validate(one, found, cycles=500, detector=detector, simulated=600)
+        judged = ml.validate(one, found, cycles=500, detector=detector, simulated=400)
         assert judged.consistent, judged.failed

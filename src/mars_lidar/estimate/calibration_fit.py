@@ -37,7 +37,8 @@ def log_likelihood(seen: ArmedTime, rate: FloatArray) -> float:
     some = seen.registrations > 0
     if (rate[some] <= 0).any():
         return -np.inf
-    return float(seen.registrations[some] @ np.log(rate[some]) - rate @ seen.passes)
+    # sums, not products of vectors: BLAS starts threads for these, and waits for them on a busy machine
+    return float((seen.registrations[some] * np.log(rate[some])).sum() - (rate * seen.passes).sum())
 
 
 def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:

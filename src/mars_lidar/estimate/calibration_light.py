@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mars_lidar.estimate.intervals import FloatArray
-from mars_lidar.estimate.jittered import Records, normal_kernel, split_sigma
+from mars_lidar.estimate.jittered import Records, before_blur, normal_kernel, split_sigma
 from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 
 LEAST = 1e-9  # photons per period that stand for none
@@ -19,8 +19,8 @@ _SPREAD = 1e-3  # step of a numerical derivative, in widths of the pulse
 class Light:
     """Background, K returns and the pulse: the parameters, in the order background, signals, delays, width, jitter.
 
-    `pulse` is the recorded one. With `jitter_ns` it is a Gaussian that holds the jitter's sigma, and rates are those
-    of the records (`Records`); with a `jitter_error_ns` the jitter is a parameter that something else, the edge of
+    `pulse` is the recorded one. With `jitter_ns` it holds the jitter, and rates are those of the records
+    (`Records`); with a `jitter_error_ns` the jitter is a parameter that something else, the edge of
     the recovery, knows this well. With `fit_width` the pulse is Gaussian, and the sigma that it has before the
     jitter is a parameter; `recorded` tells what it is with the jitter.
     """
@@ -66,15 +66,25 @@ class Light:
         pulse, jitter = self.pulse, self.jitter_of(theta)
         if self.fit_width:
             return GaussianPulse(sigma_ns=float(theta[1 + 2 * self.returns])), jitter
+        if jitter > 0.0 and isinstance(pulse, SampledPulse):
+            return before_blur(pulse, jitter)[0], jitter
         if jitter == 0.0 or not isinstance(pulse, GaussianPulse):
             return pulse, 0.0
         sigma, jitter = split_sigma(pulse.sigma_ns, jitter)
         return GaussianPulse(sigma_ns=sigma), jitter
 
+    @property
+    def shift_ns(self) -> float:
+        """What the pulse before the jitter is further away than the recorded one: its delay is that of its centroid."""
+        if self.jitter_ns > 0.0 and isinstance(self.pulse, SampledPulse):
+            return before_blur(self.pulse, self.jitter_ns)[1]
+        return 0.0
+
     def arriving(self, theta: FloatArray) -> FloatArray:
         """Photons per period in each bin (n,), as they arrive."""
         k = self.returns
-        energy = self.before_jitter(theta)[0].bin_energy(theta[1 + k : 1 + 2 * k], self.period_ns, self.bins)
+        delay = theta[1 + k : 1 + 2 * k] + self.shift_ns
+        energy = self.before_jitter(theta)[0].bin_energy(delay, self.period_ns, self.bins)
         return np.asarray(theta[0] / self.bins + theta[1 : 1 + k] @ energy)
 
     def rate(self, theta: FloatArray) -> FloatArray:
@@ -86,7 +96,7 @@ class Light:
     def jacobian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rate (n,) and its derivatives (n, parameters)."""
         k = self.returns
-        signal, delay = theta[1 : 1 + k], theta[1 + k : 1 + 2 * k]
+        signal, delay = theta[1 : 1 + k], theta[1 + k : 1 + 2 * k] + self.shift_ns
         pulse, jitter = self.before_jitter(theta)
         step = _SPREAD * pulse.sigma_ns if isinstance(pulse, GaussianPulse) else 0.5 * _sample_ns(pulse)
         energy = pulse.bin_energy(delay, self.period_ns, self.bins)

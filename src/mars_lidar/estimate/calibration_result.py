@@ -203,15 +203,19 @@ class Calibration:
         return np.asarray(np.repeat(waveform / each, each), dtype=np.float64)
 
     def flux(self, pixels: int = 1) -> Flux:
-        """The light of one pixel, to simulate with; or of a row of so many alike."""
+        """The light of one pixel, to simulate with `system`; or of a row of so many alike.
+
+        Delays are those of the pulse of `system`: of a measured pulse with jitter, of the centroid.
+        """
         row = np.ones((1, pixels))
         if self.waveform is not None:
             return Flux(waveform=row[..., None] * self._sharp_waveform, background=0.0)
-        lights = zip(self.returns_signal.tolist(), self.returns_delay_ns.tolist(), strict=True)
+        delays = (self.returns_delay_ns + self._light.shift_ns) % self.summary.period_ns
+        lights = zip(self.returns_signal.tolist(), delays.tolist(), strict=True)
         each = [Flux(s * row, 0.0, tau) for s, tau in lights]
         if len(each) > 1:
             return Flux.multi(*each, Flux(0.0 * row, self.background, 0.0))
-        return Flux(float(self.returns_signal[0]) * row, self.background, self.delay_ns)
+        return Flux(float(self.returns_signal[0]) * row, self.background, float(delays[0]))
 
     def system(self, cycles: int, bins: int, start: Literal["armed", "stationary"] = "stationary") -> System:
         """The instrument, to simulate and predict with; a stretch cut from a running stream is ``stationary``."""
@@ -231,9 +235,20 @@ class Calibration:
         if self.waveform is not None:
             return {"signal": None, "background": 0.0, "waveform": self._sharp_waveform}
         if self.returns_signal.size == 1:
-            return {"signal": self.signal, "background": self.background, "delay_ns": self.delay_ns}
+            delay = self.delay_ns + self._light.shift_ns
+            return {"signal": self.signal, "background": self.background, "delay_ns": delay}
         return {"signal": None, "background": self.background, "waveform": self.arriving - self.background / self._bins}
 
     @property
     def _bins(self) -> int:
         return self.armed.passes.size
+
+
+def nearest(found: Calibration, step: FloatArray) -> FloatArray:
+    """A step whose delays do not go around the period."""
+    if found.waveform is not None:
+        return step
+    k, period = found.returns_signal.size, found.summary.period_ns
+    out = step.copy()
+    out[1 + k : 1 + 2 * k] = (step[1 + k : 1 + 2 * k] + 0.5 * period) % period - 0.5 * period
+    return out

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from mars_lidar.estimate.calibration_once import CERTAIN, Watch, fitted
-from mars_lidar.estimate.calibration_result import Calibration
+from mars_lidar.estimate.calibration_result import Calibration, nearest
 from mars_lidar.estimate.edge import ORDINARY, Edge, edge_of
 from mars_lidar.estimate.intervals import Stream
 from mars_lidar.estimate.shortest import FEW, Ages, Underlying, extrapolated, is_sharp, shortest
@@ -103,10 +103,10 @@ class Unknown:
             edge = self._edge(ages, found, dead, width)
             if edge is None or not _is_jitter(edge, ages, found):
                 return None
-            moved = abs(edge.dead_time_ns - dead) / edge.dead_time_error_ns
+            shift = abs(edge.dead_time_ns - dead) / edge.dead_time_error_ns
             found = self._pass(self._watch(edge), None if found is first else found)
             dead, width = edge.dead_time_ns, math.hypot(math.sqrt(2.0) * edge.jitter_ns, ages.clock_ns)
-            if moved < _SAME:
+            if shift < _SAME:
                 break
         edge = self._edge(ages, found, dead, width, _uncertain(found, dead, width))
         if edge is None or not edge.fits > ORDINARY:
@@ -114,8 +114,12 @@ class Unknown:
         if abs(found.jitter_ns - edge.jitter_ns) > _AGREE * edge.jitter_error_ns > 0.0:  # the pulse is no Gaussian
             found = self._pass(replace(self._watch(edge), jitter_error_ns=0.0), found)
             found = replace(found, jitter_error_ns=edge.jitter_error_ns)
-        elif edge.jitter_error_ns > 0.0:
+        elif "jitter_ns" in found.names:
             edge = edge.known(found.jitter_ns, found.jitter_error_ns)
+        elif found.pulse is not None and edge.jitter_error_ns > 0.0:  # a measured pulse: the light with another jitter
+            watch = replace(self._watch(edge), jitter_ns=edge.jitter_ns + edge.jitter_error_ns)
+            moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
+            found = replace(found, covariance=found.covariance + np.outer(moved, moved))
         return replace(found, dead_time_ns=edge.dead_time_ns, dead_time_error_ns=edge.dead_time_error_ns)
 
     def _edge(

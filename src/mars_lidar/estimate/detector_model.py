@@ -6,7 +6,8 @@ import math
 
 from mars_lidar.detector import Detector
 from mars_lidar.effects import TIMING_EFFECTS, Jitter
-from mars_lidar.pulse import GaussianPulse, Pulse
+from mars_lidar.estimate.jittered import after_blur
+from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.system import System
 
 _UNKNOWN = {
@@ -69,10 +70,15 @@ def watched(detector: Detector) -> tuple[float, float]:
 
 
 def recorded_pulse(system: System) -> Pulse:
-    """The pulse as the records show it: blurred by the detector's jitter, where both are Gaussian."""
+    """The pulse as the records show it: blurred by the detector's jitter, where that is Gaussian.
+
+    A measured pulse must be told about its centroid, which a jitter leaves in its place.
+    """
     jitter, pulse = system.detector.jitter, system.pulse
     if jitter is None:
         return pulse
+    if isinstance(pulse, SampledPulse) and pulse.origin == "centroid":
+        return after_blur(pulse, jitter_sigma(system.detector))
     sigma = _gaussian(pulse, jitter)
     return GaussianPulse(sigma_ns=math.hypot(sigma, jitter.std_ns))
 
@@ -96,7 +102,7 @@ def _gaussian(pulse: Pulse | None, jitter: object) -> float:
     gaussian = isinstance(jitter, Jitter) and jitter.tail_fraction == 0.0
     if not gaussian or not (pulse is None or isinstance(pulse, GaussianPulse)):
         raise ValueError(
-            "jitter and pulse are told apart only where both are Gaussian: leave the detector's jitter out, and give "
-            "the pulse as it was recorded, jitter and all"
+            "jitter and pulse are told apart only where both are Gaussian (or the pulse is a measured one about its "
+            "centroid): leave the detector's jitter out, and give the pulse as it was recorded, jitter and all"
         )
     return pulse.sigma_ns if isinstance(pulse, GaussianPulse) else 0.0

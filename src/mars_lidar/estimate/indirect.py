@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mars_lidar.estimate.calibration_result import Calibration
+from mars_lidar.estimate.calibration_result import Calibration, nearest
 from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
 from mars_lidar.system import System
 
@@ -44,7 +44,7 @@ def indirect(found: Calibration, system: System, once: Callable[[Stream], Calibr
         made_by = system.replace(cycles=cycles, bins=bins, pulse=light.system(1, bins).pulse, start="armed")
         # of its own for each stream, or the error of the simulation would be shared by all that are calibrated
         stream = simulate_timestamps(light.flux(_PIXELS), made_by, seed=_SEED + counted.registrations)
-        step = _nearest(found, found.parameters - once(stream_of(stream, pooled=True)).parameters)
+        step = nearest(found, found.parameters - once(stream_of(stream, pooled=True)).parameters)
         light = light.moved(step)
         if _small(found, step):
             converged = True
@@ -64,13 +64,3 @@ def _small(found: Calibration, step: FloatArray) -> bool:
         return bool(abs(step.sum()) < _NEAR * errors[0])
     told = np.isfinite(errors)
     return bool((np.abs(step[told]) < _NEAR * errors[told]).all())
-
-
-def _nearest(found: Calibration, step: FloatArray) -> FloatArray:
-    """A step whose delays do not go around the period."""
-    if found.waveform is not None:
-        return step
-    k, period = found.returns_signal.size, found.summary.period_ns
-    out = step.copy()
-    out[1 + k : 1 + 2 * k] = (step[1 + k : 1 + 2 * k] + 0.5 * period) % period - 0.5 * period
-    return out

@@ -16,13 +16,15 @@ lambda * f; of a bright pulse it is later and narrower, because the first photon
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
 from mars_lidar.estimate.intervals import FloatArray
+from mars_lidar.pulse import SampledPulse
 
 REACH = 8.5  # widths of a Gaussian that are taken along: less than 1e-16 lie outside
-_LUCY = 100  # steps of Richardson and Lucy
+_LUCY = 1000  # steps of Richardson and Lucy for a pulse, which was measured with many photons
 _BRIGHT = 20.0  # photons per period above which rounding of a Fourier transform would show behind the pulse
 
 
@@ -83,15 +85,49 @@ def split_sigma(recorded_ns: float, jitter_ns: float) -> tuple[float, float]:
     return math.sqrt(recorded_ns**2 - jitter**2), jitter
 
 
-def unblurred(values: FloatArray, kernel: FloatArray) -> FloatArray:
+def unblurred(values: FloatArray, kernel: FloatArray, steps: int = 100) -> FloatArray:
     """Values (n,) >= 0 of the period as they were before a `kernel` (n,) blurred them.
 
-    Richardson (1972) and Lucy (1974): non-negative, of the same sum, stopped before noise is made into peaks.
+    Richardson (1972) and Lucy (1974): non-negative, of the same sum, stopped after some `steps`, before noise is made
+    into peaks.
     """
     gain = np.fft.rfft(kernel)
     sharp = values
-    for _ in range(_LUCY):
+    for _ in range(steps):
         seen = np.fft.irfft(np.fft.rfft(sharp) * gain, values.size)
         share = np.where(seen > 0.0, values / np.maximum(seen, 1e-300), 1.0)
         sharp = np.maximum(sharp * np.fft.irfft(np.fft.rfft(share) * np.conj(gain), values.size), 0.0)
     return np.asarray(sharp * (float(values.sum()) / max(float(sharp.sum()), 1e-300)))
+
+
+@lru_cache(maxsize=16)
+def before_blur(recorded: SampledPulse, jitter_ns: float) -> tuple[SampledPulse, float]:
+    """A measured pulse without the jitter that it holds, about its centroid; and where that is in the recorded one, ns.
+
+    The centroid stays where it is under a jitter of mean 0.
+    """
+    size, low = recorded.values.size, recorded.support_ns()[0]
+    mass = np.diff(recorded.cumulative(low + recorded.bin_ns * np.arange(size + 1)))
+    sharp = unblurred(mass, normal_kernel(jitter_ns, size * recorded.bin_ns, size), _LUCY)
+    turn = np.exp(2j * np.pi * (np.arange(size) + 0.5) / size) @ sharp
+    centre = float(np.angle(turn)) / (2.0 * np.pi) * size % size
+    return SampledPulse(sharp, recorded.bin_ns, "centroid"), low + centre * recorded.bin_ns
+
+
+def after_blur(pulse: SampledPulse, jitter_ns: float) -> SampledPulse:
+    """A pulse about its centroid as a jitter records it, about its centroid too.
+
+    Records of another length would have another (circular) centroid: ValueError where the jitter needs more room.
+    """
+    size, low = pulse.values.size, pulse.support_ns()[0]
+    kernel = normal_kernel(jitter_ns, size * pulse.bin_ns, size)
+    mass = np.diff(pulse.cumulative(low + pulse.bin_ns * np.arange(size + 1)))
+    bright = np.flatnonzero(mass > 1e-3 * mass.max())
+    room = size - int(bright[-1] - bright[0])
+    if room * pulse.bin_ns < 6.0 * jitter_ns:
+        raise ValueError(
+            f"values of a measured pulse must leave 6 sigma of a jitter of {jitter_ns:.4g} ns without light, got "
+            f"{room * pulse.bin_ns:.4g} ns: add zeros at its end"
+        )
+    blurred = np.fft.irfft(np.fft.rfft(mass) * np.fft.rfft(kernel), size)
+    return SampledPulse(np.maximum(blurred, 0.0), pulse.bin_ns, "centroid")

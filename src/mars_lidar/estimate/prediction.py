@@ -16,6 +16,7 @@ from mars_lidar.estimate.detector_model import is_plain, pulse_of_the_light
 from mars_lidar.estimate.fitted import Fitted
 from mars_lidar.estimate.intervals import FloatArray, Piece, Stream, stream_of
 from mars_lidar.estimate.recovery import Recovery, recovery_of
+from mars_lidar.pulse import SampledPulse
 from mars_lidar.statistics import ConvergenceError, JointLaw, count_law, joint_law, mean_histogram
 from mars_lidar.studies.distance import Pmf
 from mars_lidar.system import System
@@ -89,6 +90,8 @@ def system_of(calibration: Calibration, detector: Detector | None, cycles: int, 
     if calibration.pulse is None:
         if detector.jitter is not None and calibration.jitter_ns == 0.0:
             raise ValueError("a free shape holds the detector's jitter already: leave detector.jitter out")
+        return plain.replace(detector=detector)
+    if isinstance(calibration.pulse, SampledPulse) and calibration.jitter_ns > 0.0:  # its jitter is off already
         return plain.replace(detector=detector)
     return plain.replace(detector=detector, pulse=pulse_of_the_light(calibration.pulse, detector))
 

@@ -95,7 +95,8 @@ class Underlying:
             return np.asarray(low + part * (high - low) + cycle * total)
 
         armed = light(dead_time_ns)
-        return np.array([float(self.phases @ -np.expm1(armed - light(dead_time_ns + u))) for u in after_ns])
+        # sums, not products of vectors: BLAS starts threads for these, and waits for them on a busy machine
+        return np.array([-float((self.phases * np.expm1(armed - light(dead_time_ns + u))).sum()) for u in after_ns])
 
 
 def is_sharp(ages: Ages, behind: Underlying) -> tuple[float, float]:

@@ -34,8 +34,8 @@ def refused(call: Callable[[], Any], kind: type[Exception], *fragments: str) -> 
 @pytest.mark.parametrize(
     ("field", "value", "kind", "fragments"),
     [
-        ("period_ns", 0.0, ValueError, ["(0, inf]", "got 0.0"]),
-        ("period_ns", -1.0, ValueError, ["(0, inf]", "got -1.0"]),
+        ("period_ns", 0.0, ValueError, ["(0, inf)", "got 0.0"]),
+        ("period_ns", -1.0, ValueError, ["(0, inf)", "got -1.0"]),
         ("period_ns", NAN, ValueError, ["finite", "got nan"]),
         ("period_ns", INF, ValueError, ["finite", "got inf"]),
         ("period_ns", "100", TypeError, ["number", "got '100'", "str"]),
@@ -90,7 +90,7 @@ def test_system_as_a_whole():
 @pytest.mark.parametrize(
     ("changes", "kind", "fragments"),
     [
-        ({"dead_time_ns": -0.1}, ValueError, ["dead_time_ns", "[0, inf]", "got -0.1"]),
+        ({"dead_time_ns": -0.1}, ValueError, ["dead_time_ns", "[0, inf)", "got -0.1"]),
         ({"dead_time_ns": NAN}, ValueError, ["dead_time_ns", "finite", "got nan"]),
         ({"dead_time_ns": INF}, ValueError, ["dead_time_ns", "finite", "got inf"]),
         ({"dead_time_ns": "5 ns"}, TypeError, ["dead_time_ns", "number", "got '5 ns'"]),
@@ -105,12 +105,12 @@ def test_detector(changes: dict[str, Any], kind: type[Exception], fragments: lis
 @pytest.mark.parametrize(
     ("make", "kind", "fragments"),
     [
-        (lambda: ml.GaussianPulse(sigma_ns=0.0), ValueError, ["sigma_ns", "(0, inf]", "got 0.0"]),
-        (lambda: ml.GaussianPulse(sigma_ns=-1.0), ValueError, ["sigma_ns", "(0, inf]", "got -1.0"]),
+        (lambda: ml.GaussianPulse(sigma_ns=0.0), ValueError, ["sigma_ns", "(0, inf)", "got 0.0"]),
+        (lambda: ml.GaussianPulse(sigma_ns=-1.0), ValueError, ["sigma_ns", "(0, inf)", "got -1.0"]),
         (lambda: ml.GaussianPulse(sigma_ns=NAN), ValueError, ["sigma_ns", "finite", "got nan"]),
         (lambda: ml.GaussianPulse(sigma_ns="1"), TypeError, ["sigma_ns", "number", "got '1'"]),
         (lambda: ml.GaussianPulse(sigma_ns=np.ones(2)), TypeError, ["sigma_ns", "number", "ndarray"]),
-        (lambda: ml.GaussianPulse.from_fwhm(fwhm_ns=0.0), ValueError, ["fwhm_ns", "(0, inf]", "got 0.0"]),
+        (lambda: ml.GaussianPulse.from_fwhm(fwhm_ns=0.0), ValueError, ["fwhm_ns", "(0, inf)", "got 0.0"]),
         (lambda: ml.SampledPulse([], 1.0), ValueError, ["values", "at least one sample", "(0,)"]),
         (lambda: ml.SampledPulse([[1.0]], 1.0), ValueError, ["values", "1-D", "(1, 1)"]),
         (lambda: ml.SampledPulse(3.0, 1.0), ValueError, ["values", "1-D", "()"]),
@@ -122,7 +122,7 @@ def test_detector(changes: dict[str, Any], kind: type[Exception], fragments: lis
         (lambda: ml.SampledPulse([1.0, NAN], 1.0), ValueError, ["values", "finite", "values[1] = nan"]),
         (lambda: ml.SampledPulse([1.0, INF], 1.0), ValueError, ["values", "finite", "values[1] = inf"]),
         (lambda: ml.SampledPulse([0.0, 0.0], 1.0), ValueError, ["values", "positive", "got 0.0"]),
-        (lambda: ml.SampledPulse([1.0], 0.0), ValueError, ["bin_ns", "(0, inf]", "got 0.0"]),
+        (lambda: ml.SampledPulse([1.0], 0.0), ValueError, ["bin_ns", "(0, inf)", "got 0.0"]),
         (lambda: ml.SampledPulse([1.0], NAN), ValueError, ["bin_ns", "finite", "got nan"]),
         (lambda: ml.SampledPulse([1.0], "1"), TypeError, ["bin_ns", "number", "got '1'"]),
         (lambda: ml.SampledPulse([1.0], 1.0, "middle"), ValueError, ["origin", "'centroid'", "got 'middle'"]),

@@ -9,7 +9,8 @@ from typing import Any
 
 def real(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False) -> float:
     """A finite real number in [low, high] (or (low, high] with `strict_low`), as float."""
-    allowed = f"a finite number in {'(' if strict_low else '['}{low:g}, {high:g}]"
+    left, right = "(" if strict_low or math.isinf(low) else "[", ")" if math.isinf(high) else "]"
+    allowed = f"a finite number in {left}{low:g}, {high:g}{right}"
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be {allowed}, got {value!r} ({type(value).__name__})")
     number = float(value)

@@ -77,7 +77,7 @@ def tell_estimate(told: Estimate) -> None:
     rows = [
         ("dataset", _shape(told.shape)),
         ("scenes", f"{told.scenes:,}"),
-        ("size", f"about {_bytes(told.bytes)} on disk, of {_bytes(told.dense_bytes)} dense; {told.shards:,} shards"),
+        ("size", f"about {_bytes(told.bytes)} on disk, of {_bytes(told.dense_bytes)} dense; {told.shards:,} shard{'s' * (told.shards > 1)}"),
         ("chunk", _size(told.chunk)),
         ("time", f"about {_span(told.seconds)} on {told.threads} threads of this machine"),
         ("memory", f"at most {_bytes(told.memory_bytes)}"),

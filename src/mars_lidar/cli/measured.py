@@ -120,14 +120,13 @@ def calibrate(
         _check_system_out(out, light.free, overwrite)
         times, rows = source.load(stream)
         found, detector = light.calibrate(times, effects)
-        rows += clock_rows(found) + light_rows(found, detector)
+        table(rows + clock_rows(found) + light_rows(found, detector))
         if out is not None:
             from mars_lidar.estimate.prediction import system_of
 
             bins = times.bins if times.bins <= 2**20 else 1024
             system_of(found, detector, max(times.cycles, 1), bins).replace(start="armed").save(out)
-            rows.append(("wrote", str(out)))
-        table(rows)
+            table([("wrote", str(out))])
 
 
 @grouped

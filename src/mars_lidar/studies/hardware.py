@@ -50,7 +50,7 @@ class Settings:
 FULL = Settings()
 QUICK = Settings(
     cycles=500, realizations=300, swept_cycles=200, swept_realizations=200, fault_cycles=500, fault_realizations=200,
-    replicates=8, replicate_cycles=4000, fluxes=(0.5,), signals=(0.1, 3.0), delays=(0.2,), alarms=5, sensed=1,
+    replicates=8, replicate_cycles=4000, fluxes=(0.5,), signals=(0.1, 3.0), delays=(0.2,), alarms=2, sensed=1,
     mismatched=4,
 )  # fmt: skip
 

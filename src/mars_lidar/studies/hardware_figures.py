@@ -101,4 +101,4 @@ def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
 
 def _short(name: str) -> str:
     name = name.replace(", sequential engine", "")
-    return name.replace("electronics dead 85 ns, detector 50 ns", "t_e 85 ns, t_d 50 ns")
+    return name.replace("electronics dead 85 ns, detector 50 ns", "t_e 85, t_d 50")

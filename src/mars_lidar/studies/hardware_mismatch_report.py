@@ -59,7 +59,7 @@ def _fault_row(one: Mismatch, case: Case) -> Row:
 def _fault_finding(faults: Sequence[tuple[Mismatch, Case]]) -> str:
     lines = []
     wrong = [case.name for one, case in faults if not one.fits and case.found.consistent]
-    alarms = [case.name for one, case in faults if one.fits and not case.found.consistent]
+    alarms = [case for one, case in faults if one.fits and not case.found.consistent]
     number = sum(not one.fits for one, _ in faults)
     lines.append(f"- {number - len(wrong)} of {number} mismatches are told apart from the model.")
     for name in wrong:
@@ -69,7 +69,13 @@ def _fault_finding(faults: Sequence[tuple[Mismatch, Case]]) -> str:
             f"{case.found.calibration.background:.4f} passes all tests at this length; the light is off by "
             f"{case.scores[0]:+.1f} and {case.scores[1]:+.1f} standard errors, so a fit is no proof of the detector."
         )
-    lines += [f"- **False alarm**: {name}." for name in alarms]
+    right = sum(one.fits for one, _ in faults)
+    for case in alarms:
+        by = "; ".join(f"{check.name} (p = {check.p:.1g})" for check in case.found.failed)
+        lines.append(
+            f"- **False alarm**: {case.name}, by {by}. "
+            f"Of {right} streams that should fit, each is refused with a probability of 1 %."
+        )
     below = [case.name for one, case in faults if not case.found.consistent and case.ratio < AT_FLOOR]
     lines.append(
         f"- Total variation of the count law alone is within {AT_FLOOR} floors in {len(below)} of the streams "

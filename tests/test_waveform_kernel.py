@@ -73,6 +73,21 @@ def test_levels_agree_and_registrations_lie_where_there_is_light(name: str, phot
                 assert np.array_equal(getattr(records, what), getattr(first, what))
 
 
+@pytest.mark.parametrize("parts", [3, 7, 8, 9, 15, 16, 17, 31, 32, 33, 63, 65, 127, 2047, 2049])
+def test_levels_agree_at_any_number_of_parts(parts: int):
+    """Tables are filled in vectors, whose last one is not full."""
+    wave = np.random.default_rng(parts).random((1, 9, parts)) ** 8
+    flux = ml.Flux(waveform=2.0 * wave / wave.sum(-1, keepdims=True), background=np.linspace(0.0, 2.0, 9)[None])
+    system = view(0.37, 300, parts)
+    task = Task(flux, system, 2, 0, np.arange(9, dtype=np.uint32), parts, 1, None)
+    cubes = []
+    for level in _core.levels():
+        cubes.append(np.empty((task.items, parts), system.histogram_dtype))
+        ExactEngine(level).histogram(task, cubes[-1])
+    assert all(np.array_equal(cube, cubes[0]) for cube in cubes)
+    assert cubes[0].sum() > 2000
+
+
 @pytest.mark.parametrize("parts", [64, 1024, 140_001])
 def test_parts_have_their_energy_over_many_decades(parts: int):
     """First arrivals of armed periods, without re-arming: Coates 1968. In bins of the waveform's own order."""

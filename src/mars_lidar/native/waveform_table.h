@@ -19,6 +19,7 @@ constexpr int32_t kFull = 0x7fffffff;   // energy at the end of the period, one 
 constexpr int64_t kSpareEdges = kScan;  // beyond the last one
 constexpr int64_t kFirstEdge = 15;      // before it: the ends of each group of parts then lie in few lines of the cache
 constexpr int kGroup = 3;               // a guide's entry stands for 2^kGroup parts, or more
+constexpr int64_t kFewParts = 2048;     // up to here half as many parts to a cell: the guides then stay in the caches
 constexpr int64_t kPartsPerCell = 4;    // in the mean, or fewer
 constexpr int kMostCellBits = 17;
 
@@ -30,8 +31,9 @@ struct TableLayout {
 
     explicit TableLayout(int64_t number)
         : parts(number), edges((number + kFirstEdge + kSpareEdges + 16) / 16 * 16), group(kGroup) {
+        const int64_t in_cell = number > kFewParts ? kPartsPerCell : kPartsPerCell / 2;
         int bits = 1;
-        while (bits < kMostCellBits && (int64_t{kPartsPerCell} << bits) < number) ++bits;
+        while (bits < kMostCellBits && (in_cell << bits) < number) ++bits;
         shift = 31 - bits;
         cells = (int64_t{1} << bits) + kSpareCells;
         while ((number - 1) >> group > 0xffff) ++group;  // 16 bits must do

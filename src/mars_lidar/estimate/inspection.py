@@ -72,7 +72,7 @@ def inspect(times: Timestamps, *, dead_time_ns: float | None = None) -> Inspecti
     found = recovery_of(stream, kept.rate, edge, max(kept.hold_off_ns, edge))
     assert free.waveform is not None
     histogram = stream.histogram(free.waveform.size).astype(np.float64)
-    reach = max(4.3 * stream.period_ns, free.dead_time_ns + 3.3 * stream.period_ns)  # whole peaks
+    reach = max(4.3 * stream.period_ns, free.dead_time_ns + 3.3 * stream.period_ns)
     edges = np.linspace(0.0, reach, _INTERVAL_BINS + 1)
     apart = np.zeros(_INTERVAL_BINS)
     for dt in stream.intervals():

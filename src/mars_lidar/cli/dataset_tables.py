@@ -74,10 +74,11 @@ def _tell_problems(problems: tuple[Problem, ...]) -> None:
 
 def tell_estimate(told: Estimate) -> None:
     """What `--dry-run` expects; exit code 2 where the disk is too small."""
+    shards = f"{told.shards:,} shard{'s' * (told.shards > 1)}"
     rows = [
         ("dataset", _shape(told.shape)),
         ("scenes", f"{told.scenes:,}"),
-        ("size", f"about {_bytes(told.bytes)} on disk, of {_bytes(told.dense_bytes)} dense; {told.shards:,} shard{'s' * (told.shards > 1)}"),
+        ("size", f"about {_bytes(told.bytes)} on disk, of {_bytes(told.dense_bytes)} dense; {shards}"),
         ("chunk", _size(told.chunk)),
         ("time", f"about {_span(told.seconds)} on {told.threads} threads of this machine"),
         ("memory", f"at most {_bytes(told.memory_bytes)}"),

@@ -13,7 +13,8 @@ from mars_lidar.statistics import ConvergenceError, PhaseChain
 from mars_lidar.statistics import _cells as cells_module
 from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics._cells import Cells
-from mars_lidar.statistics.exposure import exposure_moments, stationary_histogram
+from mars_lidar.statistics.exposure import exposure_moments
+from mars_lidar.statistics.stationary import stationary_histogram
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 

@@ -195,24 +195,24 @@ private:
         const Mask more = except(in_time, empty);
         if (any(more)) queue(more, release, generation + 1);
     }
+    // The later one of the next release and this one goes into the heap. Chosen in vectors: loads of vectors that were
+    // changed number by number wait for the cache.
     MARS_NOINLINE void queue(Mask lanes, const Time& release, const Int& generation) {
+        const Mask tie = except(lanes, before(next_, release) | before(release, next_));
+        const Mask first = lanes & (before(release, next_) | (tie & (generation_ > generation)));
         typename Clock::TimeArray times;
         alignas(64) int32_t generations[kLanes];
-        times.save(release);
-        store(generations, generation);
-        save_next();
+        times.save(earlier(first, next_, release));
+        store(generations, select(first, generation_, generation));
+        next_ = earlier(first, release, next_);
+        generation_ = select(first, generation, generation_);
+        behind_ = plus_if(behind_, lanes);
         uint64_t left = lane_bits(lanes);
         for (int lane = 0; left; ++lane, left >>= 1) {
             if (!(left & 1)) continue;
-            Carrier first = {next_array_.get(lane), generation_array_[lane]}, other = {times.get(lane), generations[lane]};
-            if (first < other) std::swap(first, other);
-            next_array_.set(lane, first.time);
-            generation_array_[lane] = first.generation;
-            waiting_[lane].push_back(other);
+            waiting_[lane].push_back({times.get(lane), generations[lane]});
             std::push_heap(waiting_[lane].begin(), waiting_[lane].end());
-            ++behind_array_[lane];
         }
-        load_next();
     }
 
     void save_next() {

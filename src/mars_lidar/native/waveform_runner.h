@@ -43,8 +43,16 @@ public:
 
     void run() {
         for (int round = 1; feed_.running() > 0; ++round) {
+            WaveWait ahead;
+            if constexpr (kLanes == 1) ahead = draw(0);
             for (int k = 0; k < kRound; ++k) {
-                step(k);
+                if constexpr (kLanes > 1) {
+                    draw_and_step(k);
+                } else {  // each draw beside the search of the one before it, which waits for tables
+                    const WaveWait wait = ahead;
+                    if (k + 1 < kRound) ahead = draw(k + 1);
+                    step(wait, k);
+                }
                 feed_.fetch();
             }
             if constexpr (kRecords) record();
@@ -63,8 +71,9 @@ private:
 
     // A function of its own: in the loop over a round compilers keep several steps' numbers in too few registers, which costs
     // a quarter of the time where there are 16 of them.
-    MARS_NOINLINE void step(int k) {
-        const WaveWait wait = draw(k);
+    MARS_NOINLINE void draw_and_step(int k) { step(draw(k), k); }
+
+    MARS_INLINE void step(const WaveWait& wait, int k) {
         WaveTime from = from_;
         if constexpr (kTraps) from = search_start(k);
         WaveTime hit = next_arrival(tables_, from, wait);

@@ -280,7 +280,7 @@ def test_extreme_depths_and_maps_do_not_overflow(system):
 @pytest.mark.parametrize(
     ("changes", "error", "told"),
     [
-        ({"signal": 0.0}, ValueError, r"signal must be a finite number in \(0, inf\], got 0.0"),
+        ({"signal": 0.0}, ValueError, r"signal must be a finite number in \(0, inf\), got 0.0"),
         ({"signal": NAN}, ValueError, "signal must be"),
         ({"signal": "1"}, TypeError, "signal must be"),
         ({"sbr": 0.0}, ValueError, r"sbr must be a number in \(0, inf\].*got 0.0"),

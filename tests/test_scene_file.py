@@ -44,7 +44,7 @@ def options_of(*names: str) -> dict[str, object]:
 
 def test_the_commands_that_take_a_system_take_the_same_options():
     simulate, compare, table = options_of("simulate"), options_of("compare"), options_of("table", "build")
-    system = list(simulate)[list(simulate).index("--system") : list(simulate).index("--code-density-file") + 1]
+    system = list(simulate)[list(simulate).index("--system") : list(simulate).index("--max-events-per-exposure") + 1]
     assert len(system) > 30
     assert {"--detector", "--mode", "--jitter-fwhm-ns", "--electronics-dead-time-ns", "--crosstalk"} < set(system)
     for name in system:

@@ -250,7 +250,7 @@ def test_wrong_kinds_are_told_apart(tmp_path):
     with pytest.raises(ValueError, match=r"cube\.h5 is not Photon-HDF5"):
         ml.Timestamps.load(tmp_path / "cube.h5")
     photons().save(tmp_path / "photons.npz")
-    with pytest.raises(ValueError, match=r"photons\.npz is not a cube"):
+    with pytest.raises(ValueError, match=r"photons\.npz holds a photon stream, not a cube"):
         io.load(tmp_path / "photons.npz")
     with pytest.raises(ValueError, match=r"must end in one of \.npz, \.ptu, \.h5"):
         photons().save(tmp_path / "photons.csv")

@@ -11,7 +11,6 @@ import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.statistics import ConvergenceError, PhaseChain
 from mars_lidar.statistics import _cells as cells_module
-from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics._cells import Cells
 from mars_lidar.statistics.exposure import exposure_moments
 from mars_lidar.statistics.stationary import stationary_histogram
@@ -241,7 +240,7 @@ def test_waveforms():
 
 
 def test_convergence_errors_name_the_cell(monkeypatch):
-    monkeypatch.setattr(exposure_module, "_MAX_BINS", 256)
+    monkeypatch.setattr(exposure_module, "MOST_BINS", 256)
     with pytest.raises(ConvergenceError, match=r"S = 200, B = 1 .* still move"):
         exposure_moments([200.0], 1.0, make_system(0.001, bins=1, sigma=0.05), tolerance=1e-8)
     monkeypatch.undo()

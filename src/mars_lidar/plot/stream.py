@@ -32,7 +32,7 @@ def stream_figure(found: Inspection, title: str = "") -> Figure:
         left.set_title("Intervals", loc="left")
         left.legend(frameon=False)
         _phases(middle, found)
-        draw_recovery(right, found.recovery)
+        draw_recovery(right, found.recovery, light.dead_time_ns)
         _tidy(figure, title)
     return figure
 
@@ -86,15 +86,18 @@ def draw_histogram(ax: Axes, found: Validation) -> None:
     ax.legend(frameon=False)
 
 
-def draw_recovery(ax: Axes, found: Recovery) -> None:
-    """Registrations by time since the last one, over the light that fell on the pixel at that age."""
+def draw_recovery(ax: Axes, found: Recovery, dead_time_ns: float | None = None) -> None:
+    """Registrations by time since the last one, over the light that fell on the pixel at that age.
+
+    The line is at the dead time; by default where ages are judged from, which is later behind a blurred edge.
+    """
     middle = 0.5 * (found.edges_ns[1:] + found.edges_ns[:-1])
     shown = found.expected >= 10
     error = np.sqrt(np.maximum(found.expected, 1.0)) / np.maximum(found.expected, 1.0)
     ratio = np.minimum(np.nan_to_num(found.ratio), _SHOWN_RATIO)
     ax.axhline(1.0, color=MUTED, lw=0.6)
     ax.errorbar(middle[shown], ratio[shown], error[shown], fmt=".", ms=3, lw=0.7, color=COLOURS[0])
-    ax.axvline(found.dead_time_ns, color=COLOURS[1], lw=0.9)
+    ax.axvline(found.dead_time_ns if dead_time_ns is None else dead_time_ns, color=COLOURS[1], lw=0.9)
     top = float(np.max(ratio[shown] + error[shown], initial=1.2))
     ax.set(xlabel="time since the last registration (ns)", ylabel="rate / light")
     ax.set_ylim(0, min(1.1 * top, _SHOWN_RATIO))

@@ -87,7 +87,7 @@ private:
         Count* const cleared = row<Count>(item);
         const size_t bytes = bins_ * sizeof(Count);
         const char* const next = reinterpret_cast<const char*>(cleared) + bytes;
-        for (size_t k = 0; k < (bytes < most ? bytes : most); k += line) __builtin_prefetch(next + k, 1, 2);
+        for (size_t k = 0; k < (bytes < most ? bytes : most); k += line) prefetch<1, 2>(next + k);
         memset(cleared, 0, bytes);
     }
 

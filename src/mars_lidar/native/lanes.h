@@ -40,6 +40,20 @@
 #define MARS_NOINLINE __attribute__((noinline))
 #endif
 
+namespace mars {
+inline namespace MARS_LEVEL {
+
+// Asks for the line of memory that holds `at` before it is read or, with `write`, written; `locality` 3: into all caches.
+template <int write = 0, int locality = 3>
+MARS_INLINE void prefetch([[maybe_unused]] const void* at) {
+#if defined(__GNUC__) && !defined(__CUDACC__)
+    __builtin_prefetch(at, write, locality);
+#endif
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars
+
 #if MARS_LANES > 1
 #include "lanes_vector.h"
 #else

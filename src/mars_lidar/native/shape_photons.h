@@ -18,11 +18,9 @@ inline int popcount(uint64_t x) {
     return n;
 }
 inline int lowest_bit(uint64_t x) { return popcount(~x & (x - 1)); }
-MARS_INLINE void prefetch(const void*) {}
 #else
 MARS_INLINE int popcount(uint64_t x) { return __builtin_popcountll(x); }
 MARS_INLINE int lowest_bit(uint64_t x) { return __builtin_ctzll(x); }
-MARS_INLINE void prefetch(const void* at) { __builtin_prefetch(at); }
 #endif
 
 class Photons : public PhotonPlan<OneThread> {

@@ -57,12 +57,10 @@ public:
 
     // Asks for the waveforms of the next pixels, a little at a time: the memory then works while the lanes do.
     MARS_INLINE void fetch() {
-#if defined(__GNUC__)
         constexpr int kLines = 32, kLine = 8;
         if (fetch_ >= fetch_end_) return;
-        for (int line = 0; line < kLines; ++line) __builtin_prefetch(fetch_ + line * kLine, 0, 2);
+        for (int line = 0; line < kLines; ++line) prefetch<0, 2>(fetch_ + line * kLine);
         fetch_ += kLines * kLine;
-#endif
     }
 
 private:

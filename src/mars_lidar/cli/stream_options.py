@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mars_lidar.cli import options
 from mars_lidar.cli.console import say
@@ -122,18 +122,18 @@ class FitOptions:
     free: Free = False
     returns: Returns = 1
 
-    def told(self, times: Timestamps, effects: StreamEffects) -> SystemObject | None:
-        """The system that file, stream and options tell, of the light's own pulse; None where they tell no detector."""
+    def _told(self, times: Timestamps, given: dict[str, Any], pulse: Pulse | None) -> SystemObject | None:
+        """The system that file, stream and options tell, of the light's own pulse; None where they tell no detector.
+
+        `given`: fields of the detector, of the options. A jitter alone tells none: the dead time is found beside it.
+        """
         from mars_lidar.cli.system_options import with_given
         from mars_lidar.detector import Detector
         from mars_lidar.estimate.detector_model import stream_detector
         from mars_lidar.pulse import GaussianPulse
         from mars_lidar.system import System as SystemOf
 
-        if self.mode not in (None, "nonparalyzable", "paralyzable"):
-            raise ValueError(f"--mode must be nonparalyzable or paralyzable for a running stream, got {self.mode!r}")
         known = times.system if self.system is None else SystemOf.load(self.system)
-        given = effects.given() | ({} if self.mode is None else {"mode": self.mode})
         dead = self.dead_time_ns
         if known is None and self.detector is None and (not given or (dead is None and set(given) == {"jitter"})):
             return None
@@ -146,7 +146,7 @@ class FitOptions:
         else:
             base = Detector(dead_time_ns=dead)
         detector = stream_detector(with_given(base, given | ({} if dead is None else {"dead_time_ns": dead})))
-        pulse = self.pulse.build() or (GaussianPulse(sigma_ns=0.01 * times.period_ns) if known is None else known.pulse)
+        pulse = pulse or (GaussianPulse(sigma_ns=0.01 * times.period_ns) if known is None else known.pulse)
         if known is not None:
             return known.replace(detector=detector, pulse=pulse)
         return SystemOf(
@@ -161,7 +161,11 @@ class FitOptions:
         from mars_lidar.estimate import calibrate as fitted
         from mars_lidar.estimate.detector_model import is_plain, jitter_sigma
 
-        told, pulse, alone = self.told(times, effects), self.pulse.build(), effects.given().get("jitter")
+        if self.mode not in (None, "nonparalyzable", "paralyzable"):
+            raise ValueError(f"--mode must be nonparalyzable or paralyzable for a running stream, got {self.mode!r}")
+        given = effects.given() | ({} if self.mode is None else {"mode": self.mode})
+        pulse = self.pulse.build()
+        told = self._told(times, given, pulse)
         shape: Pulse | Literal["free", "gaussian"] | None = pulse if told is None else None
         if told is not None and pulse is None and self.system is None and times.system is None:
             shape = "gaussian"
@@ -170,9 +174,7 @@ class FitOptions:
                 raise ValueError("the light has one shape: choose --free or a pulse")
             shape = "free"
         dead = self.dead_time_ns if told is None else None
-        # of a jitter without a dead time beside it the dead time is found
-        blurred = with_given(Detector(dead_time_ns=0.0), {"jitter": alone}) if told is None and alone else None
-        jitter = None if blurred is None else jitter_sigma(blurred)
+        jitter = jitter_sigma(with_given(Detector(dead_time_ns=0.0), given)) if told is None and given else None
         found = fitted(
             times, told, pulse=shape, dead_time_ns=dead, hold_off_ns=self.hold_off_ns, returns=self.returns,
             jitter_ns=jitter,

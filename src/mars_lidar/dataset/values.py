@@ -71,7 +71,7 @@ def key_name(key: Key) -> str:
 
 
 def number(value: Any) -> Any:
-    """YAML 1.1 takes 1e-3 and inf for texts."""
+    """YAML takes inf for a text."""
     if isinstance(value, str):
         try:
             return float(value)

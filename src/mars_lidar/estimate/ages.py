@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.estimate.armed_time import places
+from mars_lidar.estimate.armed_time import begun, places
 from mars_lidar.estimate.fitted import Fitted, tested
 from mars_lidar.estimate.intervals import FloatArray, Stream
 
@@ -175,19 +175,12 @@ def _passes(
     for edge in edges[1:]:
         end = places(start + np.minimum(dt, edge), period_ns, bins)
         whole = np.bincount(group, end[0] - begin[0], minlength=number)[:, None]
-        found.append(whole + _begun(group, end, number, bins) - _begun(group, begin, number, bins))
+        over, under = (begun(group * bins + place, part, number, bins) for _, place, part in (end, begin))
+        found.append(whole + over - under)
         alive = dt > edge
         start, dt, group = start[alive], dt[alive], group[alive]
         begin = (end[0][alive], end[1][alive], end[2][alive])
     return found
-
-
-def _begun(group: IntArray, place: tuple[FloatArray, IntArray, FloatArray], number: int, bins: int) -> FloatArray:
-    """How much of each bin lies before the places, added up for each group (groups, bins)."""
-    cell = group * bins + place[1]
-    some = np.bincount(cell, minlength=number * bins).reshape(number, bins)
-    part = np.bincount(cell, place[2], minlength=number * bins).reshape(number, bins)
-    return np.asarray(some.sum(1, keepdims=True) - np.cumsum(some, axis=1) + part, dtype=np.float64)
 
 
 def _compared(table: AgeTable, other: AgeTable | None) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -120,8 +120,8 @@ def _watch(
     opens, closes = opens[kept], closes[kept]
     cycle_a, bin_a, part_a = places(opens, period_ns, passes.size)
     cycle_b, bin_b, part_b = places(closes, period_ns, passes.size)
-    passes += float((cycle_b - cycle_a).sum()) + _begun(bin_b, part_b, passes.size)
-    passes -= _begun(bin_a, part_a, passes.size)
+    passes += float((cycle_b - cycle_a).sum()) + begun(bin_b, part_b, 1, passes.size)[0]
+    passes -= begun(bin_a, part_a, 1, passes.size)[0]
     if closed_by_photon:
         events += np.bincount(bin_b, minlength=passes.size)
     return int(closes.size)
@@ -137,8 +137,12 @@ def places(t: FloatArray, period_ns: float, bins: int) -> tuple[FloatArray, NDAr
     return cycle, place, x - place
 
 
-def _begun(place: NDArray[np.int64], part: FloatArray, bins: int) -> FloatArray:
-    """How much of each bin lies before the times (place, part) of a period, added up (bins,)."""
-    number = np.bincount(place, minlength=bins)
-    later = number.sum() - np.cumsum(number)
-    return np.asarray(later + np.bincount(place, part, minlength=bins), dtype=np.float64)
+def begun(place: NDArray[np.int64], part: FloatArray, groups: int, bins: int) -> FloatArray:
+    """How much of each bin lies before the times (place, part) of a period, added up for each group (groups, bins).
+
+    `place` counts the bins of all groups, those of the first one first.
+    """
+    number = np.bincount(place, minlength=groups * bins).reshape(groups, bins)
+    later = number.sum(1, keepdims=True) - np.cumsum(number, axis=1)
+    within = np.bincount(place, part, minlength=groups * bins).reshape(groups, bins)
+    return np.asarray(later + within, dtype=np.float64)

@@ -144,6 +144,13 @@ class Calibration:
         return self._light.rate(self._parameters)
 
     @property
+    def slopes(self) -> FloatArray:
+        """Derivatives (n, parameters) of `rate` by `parameters`; not of a free shape."""
+        error = self.jitter_error_ns if "jitter_ns" in self.names else 0.0
+        light = replace(self._light, fit_width="sigma_ns" in self.names, jitter_error_ns=error)
+        return light.recorded_jacobian(self.parameters)
+
+    @property
     def arriving(self) -> FloatArray:
         """Photons per period (n,) in each of the bins of `armed`, as they arrive: without the jitter of the records."""
         if self.waveform is not None:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.estimate.armed_time import armed_time
-from mars_lidar.estimate.calibration_light import Light
 from mars_lidar.estimate.calibration_result import Calibration
 from mars_lidar.estimate.intervals import FloatArray, Stream
 
@@ -57,8 +56,8 @@ class Fitted:
         """Of a calibration, to be compared with `stream`."""
         seen, period = calibration.armed, calibration.summary.period_ns
         more = 0.0 if calibration.simulated == 0.0 else 1.0 / calibration.simulated
-        pulse, number, own = calibration.pulse, calibration.returns_signal.size, _same(calibration, stream)
-        if pulse is None:
+        own = _same(calibration, stream)
+        if calibration.pulse is None:
             if own:
                 seen = armed_time(stream, seen.hold_off_ns, _fine(seen.passes.size, seen.used))
             rate = seen.rate
@@ -67,10 +66,7 @@ class Fitted:
             slopes = np.eye(rate.size)
         else:
             rate = calibration.rate
-            names, jitter = calibration.names, calibration.jitter_ns
-            error = calibration.jitter_error_ns if "jitter_ns" in names else 0.0
-            light = Light(period, seen.passes.size, pulse, number, "sigma_ns" in names, jitter, error)
-            slopes = light.recorded_jacobian(calibration.parameters)
+            slopes = calibration.slopes
             covariance = np.nan_to_num(calibration.covariance) / (1.0 + more)
         return cls(period, rate, slopes, covariance, more, seen.registrations, seen.passes, own)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,9 @@ _WIDEST_GUESS = 1024
 _EDGE = 1e-10  # probability at the ends of a guessed window that holds all
 _LIKE_CUMULANTS = 0.02  # standard deviations by which the mean may differ from the one that was guessed by
 _BLOCK = 64  # cells at a time
+_ALL_POINTS = 256  # of the circle: narrower laws take all points
+_QUIET = 1e-15  # of the transform of a wide law, that counts as 0
+_SHORT_VARIANCE, _SHORTER = 4.0, 6  # of the exposure in which other peaks are looked for: variance, and how much shorter
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +90,8 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
             lows, highs, outside = _supports(cells.part(block), cumulants[block], int(n), threads)
             for k, cell in enumerate(block):
                 one = cells.part(block[k : k + 1])
-                window = _window(one, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads)
+                spread = float(cumulants[cell, 1])
+                window = _window(one, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
                 _check(cells, int(cell), window, cumulants[cell])
                 windows[cell] = window
     return [window for window in windows if window is not None]
@@ -187,15 +191,54 @@ def _supports(
     return first.astype(np.int64), last.astype(np.int64), outside
 
 
-def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int) -> Window:
+def _window(
+    cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float
+) -> Window:
     counts = last - first + 1
     size = counts + counts % 2
-    angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
-    re, im = _characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads)
+    value = _narrow(cell, size, bins, threads, variance) if size > _ALL_POINTS else None
+    if value is None:
+        angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
+        re, im = _characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads)
+        value = re[0] - 1j * im[0]
     # numpy's transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
-    folded = np.fft.irfft(re[0] - 1j * im[0], size)
-    pmf = folded[np.arange(first, first + counts) % size]
+    folded = np.fft.irfft(value, size)
+    pmf = np.take(folded, np.arange(first, first + counts), mode="wrap")
     return Window(first, pmf, outside)
+
+
+def _narrow(cell: Cells, size: int, bins: int, threads: int, variance: float) -> NDArray[np.complex128] | None:
+    """Conjugate of E z^N on the points (size // 2 + 1,) of the circle where it is not 0; None where that is not certain.
+
+    A wide law has a narrow transform, about 1 at z = 1 and nothing beyond some 9 standard deviations of its own width,
+    unless counts keep to a lattice (all even, say): then it has other peaks, as narrow. Those are looked for in a much
+    shorter exposure, whose transform has them too, and wide enough to be seen on few points (27).
+    """
+    cycles = cell.system.cycles
+    shorter = max(1, math.ceil(_SHORT_VARIANCE * cycles / max(variance, 1e-300)))
+    if shorter * _SHORTER > cycles:
+        return None
+    angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
+    value = np.zeros(angle.size, np.complex128)
+    step = max(8, math.ceil(2.0 * size / (2.0 * np.pi * math.sqrt(variance))))  # some two standard deviations
+    end = 0
+    while end < angle.size:
+        some = slice(end, min(end + step, angle.size))
+        re, im = _characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads)
+        value[some] = re[0] - 1j * im[0]
+        end = some.stop
+        if np.abs(value[some]).max() <= _QUIET:
+            break
+    spread = math.sqrt(variance * shorter / cycles)
+    begin = min(4.0 / spread, np.pi)
+    between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
+    re, im = _characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads)
+    beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
+    brief = replace(cell, system=cell.system.replace(cycles=shorter))
+    short_re, short_im = _characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads)
+    highest = float(np.hypot(short_re, short_im).max())
+    faint = float(np.hypot(re, im).max()) <= 10.0 * _QUIET
+    return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None
 
 
 def _characteristic(

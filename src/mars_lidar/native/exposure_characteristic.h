@@ -81,10 +81,10 @@ class CharacteristicRun {
         Stationary start{};
         if (grid_.stationary) {
             const auto lanes = responses(*block_.flux, block_.entry, 1);
-            start = stationary_state(grid_, lanes, 1, *block_.stop);
+            start = warm_state(grid_, *block_.flux, block_.entry, 1, lanes, *block_.stop);
             for (Registrations<Real>& r : start.bins) r = {splat(lane(r.mass, 0)), splat(lane(r.moment, 0))};
             if (!start.settled[0]) {
-                for (int k = 0; k < block_.count; ++k) block_.settled[k] = kUnsettled;
+                for (int k = 0; k < block_.count; ++k) block_.settled[k] = kNotWarm;
                 return;
             }
         }

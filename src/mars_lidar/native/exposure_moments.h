@@ -28,7 +28,8 @@ class MomentsRun {
             advance(recursion, Stationary{});
         } else {
             Stationary start{};
-            if (grid_.stationary) start = stationary_state(grid_, response_, block_.count, *block_.stop);
+            if (grid_.stationary)
+                start = warm_state(grid_, *block_.flux, block_.first, block_.count, response_, *block_.stop);
             Pixel<Moments, Real> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr,
                                            block_.ends != nullptr);
             recursion.armed.c[0] = grid_.stationary ? start.armed : splat(1.0);
@@ -57,7 +58,7 @@ class MomentsRun {
         int64_t streak[kReals]{}, left = block_.count;
         for (int k = 0; k < block_.count; ++k)
             if (!kParalyzable && grid_.stationary && !start.settled[k]) {
-                block_.settled[block_.first + k] = kUnsettled;
+                block_.settled[block_.first + k] = kNotWarm;
                 done[k] = true;
                 --left;
             }

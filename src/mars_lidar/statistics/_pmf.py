@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._paralyzable_rate import registration_rates
+from mars_lidar.statistics._warm import NOT_WARM, warm_history
 
 _TAIL = 1e-12  # probability that may lie outside the support, at either end
 _TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # standard deviations of reach
@@ -25,6 +26,7 @@ _MAX_LOG_GROWTH = 600.0  # of one period, below the largest double
 _CONSISTENT = 1e-5  # agreement demanded of the pmf with the cumulants, in standard deviations
 _CONSISTENT_PER_CYCLE = 1e-13  # and what extrapolation over so many cycles may add by rounding
 _UNSETTLED = -2
+_MAX_STEPS, _LANES = 100_000_000, 8  # bins x periods of a cell's points together, some 2 s; points that run at once
 _MAX_COUNTS = 2**24
 _REACH, _MARGIN = 7.5, 6.0  # of a guessed window: standard deviations, and counts beside them
 _WIDEST_GUESS = 1024
@@ -33,7 +35,7 @@ _LIKE_CUMULANTS = 0.02  # standard deviations by which the mean may differ from 
 _BLOCK = 64  # cells at a time
 _ALL_POINTS = 256  # of the circle: narrower laws take all points
 _QUIET = 1e-15  # of the transform of a wide law, that counts as 0
-_SHORT_VARIANCE, _SHORTER = 4.0, 6  # of the exposure in which other peaks are looked for: variance, and how much shorter
+_SHORT_VARIANCE, _SHORTER = 4.0, 6  # the exposure in which other peaks are looked for: variance, and how much shorter
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +210,7 @@ def _window(
 
 
 def _narrow(cell: Cells, size: int, bins: int, threads: int, variance: float) -> NDArray[np.complex128] | None:
-    """Conjugate of E z^N on the points (size // 2 + 1,) of the circle where it is not 0; None where that is not certain.
+    """Conjugate of E z^N on the points (size // 2 + 1,) of the circle where it is not 0; None where that is not sure.
 
     A wide law has a narrow transform, about 1 at z = 1 and nothing beyond some 9 standard deviations of its own width,
     unless counts keep to a lattice (all even, say): then it has other peaks, as narrow. Those are looked for in a much
@@ -247,6 +249,8 @@ def _characteristic(
     """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
     from mars_lidar import _core
 
+    steps = _MAX_STEPS // math.ceil(z_re.shape[1] / _LANES)
+    grid = cells.grid(bins, 1, steps)
     re, im = np.empty(z_re.shape), np.empty(z_re.shape)
     settled = np.empty(z_re.shape, np.int64)
     points: dict[str, Any] = {
@@ -260,18 +264,26 @@ def _characteristic(
             some = cells.part(part)
             mine: dict[str, Any] = {name: x[part] if isinstance(x, np.ndarray) else x for name, x in points.items()}
             rates = registration_rates(some, bins)
-            _core.paralyzable_characteristic(grid=some.grid(bins, 1), photons=some.total, rates=rates, **mine)
+            _core.paralyzable_characteristic(grid=grid, photons=some.total, rates=rates, **mine)
     else:
         energy, row = cells.energies(bins)
         photons, flat = cells.native_flux
-        _core.exposure_characteristic(
-            grid=cells.grid(bins, 1), signal=photons, background=flat, shape=row, shapes=energy, **points
-        )
+        arrays = {"signal": photons, "background": flat, "shape": row}
+        _core.exposure_characteristic(grid=grid, shapes=energy, **arrays, **points)
+        cold = np.flatnonzero((settled == NOT_WARM).any(-1))
+        if cold.size:
+            every: dict[str, Any] = points | arrays
+            again = every | {name: np.ascontiguousarray(x[cold]) for name, x in every.items() if np.ndim(x)}
+            history = warm_history(cells, cold, bins)
+            _core.exposure_characteristic(grid=grid, shapes=energy, history=history, **again)
+            for name, array in (("re", re), ("im", im), ("settled", settled)):
+                array[cold] = again[name]
     lost = (settled == _UNSETTLED).any(-1)
     if lost.any():
         raise ConvergenceError(
-            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat from "
-            "period to period for so long that the exposure cannot be run to its end"
+            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
+            f"{steps:.1g} bins x periods, too many to run the exposure to its end at {z_re.shape[1]} points; mean, "
+            f"variance and two more cumulants are known; for the law {cells.instead}"
         )
     return re, im
 

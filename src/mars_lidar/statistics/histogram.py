@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from mars_lidar.detector import MODES
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.statistics._cells import Cells, FloatArray
+from mars_lidar.statistics._cells import LAW_STEPS, Cells, FloatArray
 from mars_lidar.statistics._timing import recorded
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments
 from mars_lidar.statistics.exposure import refined_moments
@@ -61,5 +61,5 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
         return np.asarray(armed * (mean / seen)[:, None], dtype=np.float64)
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)
-    exposure = refined_moments(cells, bins, tolerance=tolerance, threads=threads)
+    exposure = refined_moments(cells, bins, tolerance=tolerance, threads=threads, steps=LAW_STEPS)
     return exposure.histogram.reshape(cells.size, bins)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -251,13 +251,13 @@ class FoldedGrid:
         row[:d], row[n : n + d] = -pa[:d], -qa[:d]
         order = np.arange(3 * n).reshape(3, n).T.reshape(-1)  # bin after bin: entries near the diagonal
         try:
-            solve = splu(matrix[order][:, order]).solve
+            factors: Any = splu(matrix[order][:, order])
         except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
             raise ConvergenceError(f"the feedback equation is singular: {error}") from None
 
         def bare(right: FloatArray, trans: str) -> FloatArray:
-            out = np.empty_like(right)
-            out[order] = solve(np.ascontiguousarray(right[order]), "T" if trans == "T" else "N")
+            out, ordered = np.empty_like(right), np.ascontiguousarray(right[order])
+            out[order] = factors.solve(ordered, trans=trans)
             return out
 
         one = np.zeros(3 * n)

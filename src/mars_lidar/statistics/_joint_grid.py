@@ -54,6 +54,8 @@ class FoldedGrid:
         dead = cells.system.dead_time_periods
         whole = int(np.floor(dead))
         position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
+        if cells.system.start == "armed":  # a dead time beyond the end of the exposure is as good as one up to it
+            whole = min(whole, cells.system.cycles)
         shift = int(np.floor(position))
         fraction = position - shift
         if fraction < 1e-9:

@@ -26,7 +26,8 @@ _MAX_LOG_GROWTH = 600.0  # of one period, below the largest double
 _CONSISTENT = 1e-5  # agreement demanded of the pmf with the cumulants, in standard deviations
 _CONSISTENT_PER_CYCLE = 1e-13  # and what extrapolation over so many cycles may add by rounding
 _UNSETTLED = -2
-_MAX_STEPS, _LANES = 100_000_000, 8  # bins x periods of a cell's points together, some 2 s; points that run at once
+_MAX_STEPS, _LANES = 60_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
+_NEAR_BYTES, _FAR = 1 << 21, 4  # a dead time's history beyond that makes a step cost as many
 _MAX_COUNTS = 2**24
 _REACH, _MARGIN = 7.5, 6.0  # of a guessed window: standard deviations, and counts beside them
 _WIDEST_GUESS = 1024
@@ -36,6 +37,13 @@ _BLOCK = 64  # cells at a time
 _ALL_POINTS = 256  # of the circle: narrower laws take all points
 _QUIET = 1e-15  # of the transform of a wide law, that counts as 0
 _SHORT_VARIANCE, _SHORTER = 4.0, 6  # the exposure in which other peaks are looked for: variance, and how much shorter
+
+
+class Purse:
+    """Steps (bins x periods, `_LANES` points at once) that are left for the law of one cell."""
+
+    def __init__(self) -> None:
+        self.left = float(_MAX_STEPS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +92,10 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
     """Exact pmf of each cell, on the grid of `bins` (cells,) that its `cumulants` (cells, 4) needed."""
     if cells.system.dead_time_periods == 0.0:
         return [poisson_window(float(mean)) for mean in cumulants[:, 0]]
-    windows: list[Window | None] = [None] * cells.size
-    for n in np.unique(bins):
-        index = np.flatnonzero(bins == n)
+    dark = cells.total == 0.0
+    windows: list[Window | None] = [Window(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
+    for n in np.unique(bins[~dark]):
+        index = np.flatnonzero((bins == n) & ~dark)
         cells.check_history(int(n))
         for block in np.array_split(index, math.ceil(index.size / 64)):
             lows, highs, outside = _supports(cells.part(block), cumulants[block], int(n), threads)
@@ -186,7 +195,7 @@ def _supports(
         k = int(np.argmax(last - first))
         raise ConvergenceError(
             f"count law of {cells.name(k)}: its support of {last[k] - first[k]:.3g} counts exceeds "
-            f"{_MAX_COUNTS}"
+            f"{_MAX_COUNTS}; mean, variance and cumulants are known; use method 'mars' or 'renewal' for a Gaussian"
         )
     # where the support ends at the least or the largest possible count nothing lies beyond
     outside = _TAIL * ((first > 0).astype(np.float64) + (last < most))
@@ -196,12 +205,12 @@ def _supports(
 def _window(
     cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float
 ) -> Window:
-    counts = last - first + 1
+    counts, purse = last - first + 1, Purse()
     size = counts + counts % 2
-    value = _narrow(cell, size, bins, threads, variance) if size > _ALL_POINTS else None
+    value = _narrow(cell, size, bins, threads, variance, purse) if size > _ALL_POINTS else None
     if value is None:
         angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
-        re, im = _characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads)
+        re, im = _characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, purse)
         value = re[0] - 1j * im[0]
     # numpy's transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
     folded = np.fft.irfft(value, size)
@@ -209,7 +218,9 @@ def _window(
     return Window(first, pmf, outside)
 
 
-def _narrow(cell: Cells, size: int, bins: int, threads: int, variance: float) -> NDArray[np.complex128] | None:
+def _narrow(
+    cell: Cells, size: int, bins: int, threads: int, variance: float, purse: Purse
+) -> NDArray[np.complex128] | None:
     """Conjugate of E z^N on the points (size // 2 + 1,) of the circle where it is not 0; None where that is not sure.
 
     A wide law has a narrow transform, about 1 at z = 1 and nothing beyond some 9 standard deviations of its own width,
@@ -226,7 +237,7 @@ def _narrow(cell: Cells, size: int, bins: int, threads: int, variance: float) ->
     end = 0
     while end < angle.size:
         some = slice(end, min(end + step, angle.size))
-        re, im = _characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads)
+        re, im = _characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, purse)
         value[some] = re[0] - 1j * im[0]
         end = some.stop
         if np.abs(value[some]).max() <= _QUIET:
@@ -234,22 +245,24 @@ def _narrow(cell: Cells, size: int, bins: int, threads: int, variance: float) ->
     spread = math.sqrt(variance * shorter / cycles)
     begin = min(4.0 / spread, np.pi)
     between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
-    re, im = _characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads)
+    re, im = _characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, purse)
     beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
     brief = replace(cell, system=cell.system.replace(cycles=shorter))
-    short_re, short_im = _characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads)
+    short_re, short_im = _characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, purse)
     highest = float(np.hypot(short_re, short_im).max())
     faint = float(np.hypot(re, im).max()) <= 10.0 * _QUIET
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None
 
 
 def _characteristic(
-    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int
+    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, purse: Purse | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
     from mars_lidar import _core
 
-    steps = _MAX_STEPS // math.ceil(z_re.shape[1] / _LANES)
+    purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
+    reach = 256.0 * bins * (min(cells.system.dead_time_periods, float(cells.system.cycles)) + 1.0)
+    steps = max(int(purse.left / (_FAR if reach > _NEAR_BYTES else 1)) // batches, bins)
     grid = cells.grid(bins, 1, steps)
     re, im = np.empty(z_re.shape), np.empty(z_re.shape)
     settled = np.empty(z_re.shape, np.int64)
@@ -285,6 +298,8 @@ def _characteristic(
             f"{steps:.1g} bins x periods, too many to run the exposure to its end at {z_re.shape[1]} points; mean, "
             f"variance and two more cumulants are known; for the law {cells.instead}"
         )
+    taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
+    purse.left = max(purse.left - float(taken) * bins * batches * (_FAR if reach > _NEAR_BYTES else 1), 1.0)
     return re, im
 
 
@@ -295,13 +310,19 @@ def _check(cells: Cells, cell: int, window: Window, cumulants: FloatArray) -> No
     spread = max(math.sqrt(cumulants[1]), 1e-3)
     total, mean = float(pmf.sum()), float((pmf * offset).sum())
     variance, least = float((pmf * offset**2).sum()), float(pmf.min())
-    error = max(abs(total - 1.0), abs(mean) / spread, abs(variance - cumulants[1]) / spread**2, -least)
-    allowed = _CONSISTENT + _CONSISTENT_PER_CYCLE * cells.system.cycles
-    if not error <= allowed:
+    # rounding and extrapolation err in probabilities, whatever the width: for a locked count, more than its variance
+    rounding, unit = _CONSISTENT_PER_CYCLE * cells.system.cycles, max(spread, 1.0)
+    error = max(
+        abs(total - 1.0) / (_CONSISTENT + rounding),
+        abs(mean) / (_CONSISTENT * spread + rounding * unit),
+        abs(variance - cumulants[1]) / (_CONSISTENT * spread**2 + rounding * unit**2),
+        -least / (_CONSISTENT + rounding),
+    )
+    if not error <= 1.0:
         raise ConvergenceError(
             f"count law of {cells.name(cell)}: its pmf on {window.first} .. {window.first + pmf.size - 1} "
-            f"disagrees with the cumulants by {error:.2g} (allowed {allowed:.2g}): sum - 1 = "
+            f"disagrees with the cumulants {error:.2g} times as much as is allowed: sum - 1 = "
             f"{total - 1.0:.2g}, mean off by {mean:.2g}, variance {variance:.6g} for {cumulants[1]:.6g}, "
-            f"least {least:.2g}"
+            f"least {least:.2g}; mean, variance and cumulants are known; for the law {cells.instead}"
         )
     np.maximum(pmf, 0.0, out=pmf)

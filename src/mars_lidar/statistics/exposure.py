@@ -166,10 +166,14 @@ def refined_moments(
     if cells.system.dead_time_periods == 0.0:
         return _poisson(cells, out_bins)
     result = _blank(cells, out_bins)
-    pending = np.arange(cells.size)
+    pending = np.flatnonzero(cells.total > 0.0)
     bins = cells.first_bins(out_bins)
+    if pending.size < cells.size:
+        _darkness(result, cells.total == 0.0, bins)
+        if not pending.size:
+            return _shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
-    coarse = _run(cells, bins // 2, shared, team, progress, steps)
+    coarse = _run(cells.part(pending), bins // 2, shared, team, progress, steps)
     last = spent = _spent(coarse, cells.system.cycles)
     while True:
         _affordable(cells, pending, spent + 2.0 * last, steps)
@@ -229,6 +233,13 @@ def thread_count(threads: int | None) -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on this system
         return os.cpu_count() or 1
+
+
+def _darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
+    """Nothing is registered where nothing arrives."""
+    for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
+        array[which] = 0
+    result.bins[which] = bins
 
 
 def _blank(cells: Cells, out_bins: int) -> Exposure:

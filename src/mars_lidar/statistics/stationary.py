@@ -34,7 +34,7 @@ def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threa
         if pending.size and bins > max(MOST_BINS, 4 * out_bins):
             raise ConvergenceError(
                 f"stationary histogram of {cells.name(int(pending[0]))}: with {bins // 2} bins per period it "
-                f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g})"
+                f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g}); {cells.instead}"
             )
     return result
 

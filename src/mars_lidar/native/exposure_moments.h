@@ -72,6 +72,7 @@ class MomentsRun {
             const Moments step = growth(recursion.total);
             cumulative_ = cumulative_ + step;
             increments_[slot(q)] = step;
+            slide(q);
             if constexpr (!kParalyzable) {
                 recursion.armed = weighted(exp_series(-1.0 * step), recursion.armed);
                 totals_[slot(q)] = recursion.total;
@@ -129,8 +130,22 @@ class MomentsRun {
     Moments factor(int64_t q, int64_t ago) const {
         Moments exponent{};
         if (ago <= q && !kParalyzable) exponent.c[1] += splat(1.0);  // there G itself is delayed, not registrations
-        for (int64_t i = std::max<int64_t>(q - ago, 0); i < q; ++i) exponent = exponent - increments_[slot(i)];
+        exponent = exponent - recent_;
+        if (ago > grid_.whole && q >= ago) exponent = exponent - increments_[slot(q - ago)];
         return exp_series(exponent);
+    }
+
+    // The sum of the last K increments before period q + 1: what left and what came; afresh now and then, for rounding.
+    void slide(int64_t q) {
+        const int64_t whole = grid_.whole;
+        if (whole == 0) return;
+        if (q % (whole + 1) == 0) {
+            recent_ = Moments{};
+            for (int64_t i = std::max<int64_t>(q + 1 - whole, 0); i <= q; ++i) recent_ = recent_ + increments_[slot(i)];
+        } else {
+            recent_ = recent_ + increments_[slot(q)];
+            if (q >= whole) recent_ = recent_ - increments_[slot(q - whole)];
+        }
     }
 
     int64_t slot(int64_t period) const { return period % static_cast<int64_t>(increments_.size()); }
@@ -200,7 +215,7 @@ class MomentsRun {
     const MomentsBlock& block_;
     const ExposureGrid grid_;
     const Responses response_;
-    Moments cumulative_{};
+    Moments cumulative_{}, recent_{};                   // since the start, and over the last K periods
     std::vector<Moments> increments_, totals_, tails_;  // of the last K + 1 periods, by `slot`
     Real history_total_{}, history_tail_{};             // of a period before the exposure
 };

@@ -26,9 +26,11 @@ _MAX_LOG_GROWTH = 600.0  # of one period, below the largest double
 _CONSISTENT = 1e-5  # agreement demanded of the pmf with the cumulants, in standard deviations
 _CONSISTENT_PER_CYCLE = 1e-13  # and what extrapolation over so many cycles may add by rounding
 _UNSETTLED = -2
-_MAX_STEPS, _LANES = 60_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
-_NEAR_BYTES, _FAR = 1 << 21, 4  # a dead time's history beyond that makes a step cost as many
+_MAX_STEPS, _LANES = 80_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
+_NEAR_BYTES, _FAR = 1 << 21, 4  # a history beyond that, or a dead time below a bin, makes a step cost as many
 _MAX_COUNTS = 2**24
+_FOR_SUPPORT = 0.25  # of the steps of a law, to bound its support; a guess must do beyond
+_WIDE_REACH = 12.0  # standard deviations, and counts beside them, of that guess
 _REACH, _MARGIN = 7.5, 6.0  # of a guessed window: standard deviations, and counts beside them
 _WIDEST_GUESS = 1024
 _EDGE = 1e-10  # probability at the ends of a guessed window that holds all
@@ -39,11 +41,15 @@ _QUIET = 1e-15  # of the transform of a wide law, that counts as 0
 _SHORT_VARIANCE, _SHORTER = 4.0, 6  # the exposure in which other peaks are looked for: variance, and how much shorter
 
 
+class TooLongError(ConvergenceError):
+    """A transform whose state does not repeat for longer than a law is to take."""
+
+
 class Purse:
     """Steps (bins x periods, `_LANES` points at once) that are left for the law of one cell."""
 
-    def __init__(self) -> None:
-        self.left = float(_MAX_STEPS)
+    def __init__(self, share: float = 1.0) -> None:
+        self.left = share * _MAX_STEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +104,10 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
         index = np.flatnonzero((bins == n) & ~dark)
         cells.check_history(int(n))
         for block in np.array_split(index, math.ceil(index.size / 64)):
-            lows, highs, outside = _supports(cells.part(block), cumulants[block], int(n), threads)
+            try:
+                lows, highs, outside = _supports(cells.part(block), cumulants[block], int(n), threads)
+            except TooLongError:
+                lows, highs, outside = _guessed_supports(cells, cumulants[block])
             for k, cell in enumerate(block):
                 one = cells.part(block[k : k + 1])
                 spread = float(cumulants[cell, 1])
@@ -179,7 +188,7 @@ def _supports(
     unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, _MAX_TILT) / _TILTS[-1])
     tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
-    log_value = _characteristic(cells, np.exp(tilt), None, bins, threads)[0]
+    log_value = _characteristic(cells, np.exp(tilt), None, bins, threads, Purse(_FOR_SUPPORT))[0]
     with np.errstate(invalid="ignore"):
         # P(N >= edge) <= tail for a positive tilt, P(N <= edge) <= tail for a negative one
         edge = (log_value - math.log(_TAIL)) / tilt
@@ -200,6 +209,15 @@ def _supports(
     # where the support ends at the least or the largest possible count nothing lies beyond
     outside = _TAIL * ((first > 0).astype(np.float64) + (last < most))
     return first.astype(np.int64), last.astype(np.int64), outside
+
+
+def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """Supports by mean and variance alone; `_check` then tells whether they hold all of the law."""
+    spread, mean = np.sqrt(cumulants[:, 1]), cumulants[:, 0]
+    half = np.ceil(_WIDE_REACH * (spread + 1.0))
+    most = min(math.floor(cells.system.cycles / cells.system.dead_time_periods) + 1.0, 9e15)
+    first, last = np.maximum(np.floor(mean) - half, 0.0), np.minimum(np.ceil(mean) + half, most)
+    return first.astype(np.int64), last.astype(np.int64), (last - first) * _EDGE
 
 
 def _window(
@@ -261,8 +279,12 @@ def _characteristic(
     from mars_lidar import _core
 
     purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
-    reach = 256.0 * bins * (min(cells.system.dead_time_periods, float(cells.system.cycles)) + 1.0)
-    steps = max(int(purse.left / (_FAR if reach > _NEAR_BYTES else 1)) // batches, bins)
+    dead = cells.system.dead_time_periods
+    reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
+    dear = float(_FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1)
+    # at real points the blind of every period of a dead time are summed
+    dear *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
+    steps = max(int(purse.left / dear) // batches, bins)
     grid = cells.grid(bins, 1, steps)
     re, im = np.empty(z_re.shape), np.empty(z_re.shape)
     settled = np.empty(z_re.shape, np.int64)
@@ -293,13 +315,13 @@ def _characteristic(
                 array[cold] = again[name]
     lost = (settled == _UNSETTLED).any(-1)
     if lost.any():
-        raise ConvergenceError(
+        raise TooLongError(
             f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
             f"{steps:.1g} bins x periods, too many to run the exposure to its end at {z_re.shape[1]} points; mean, "
             f"variance and two more cumulants are known; for the law {cells.instead}"
         )
     taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
-    purse.left = max(purse.left - float(taken) * bins * batches * (_FAR if reach > _NEAR_BYTES else 1), 1.0)
+    purse.left = max(purse.left - float(taken) * bins * batches * dear, 1.0)
     return re, im
 
 
@@ -308,6 +330,14 @@ def _check(cells: Cells, cell: int, window: Window, cumulants: FloatArray) -> No
     pmf: NDArray[np.float64] = window.pmf
     offset = window.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
+    if window.outside > _TAIL * 4.0:  # a guessed support
+        ends = max(abs(float(pmf[-1])), abs(float(pmf[0])) if window.first > 0 else 0.0)
+        if ends > _EDGE + _CONSISTENT_PER_CYCLE * cells.system.cycles:
+            raise ConvergenceError(
+                f"count law of {cells.name(cell)}: it reaches beyond {window.first} .. {window.first + pmf.size - 1}, "
+                f"where mean and variance let expect its end; mean, variance and cumulants are known; for the law "
+                f"{cells.instead}"
+            )
     total, mean = float(pmf.sum()), float((pmf * offset).sum())
     variance, least = float((pmf * offset**2).sum()), float(pmf.min())
     # rounding and extrapolation err in probabilities, whatever the width: for a locked count, more than its variance

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.statistics._cells import Cells, FloatArray
-from mars_lidar.statistics._electronics_grid import RecordGrid, RecordRun, Rows
+from mars_lidar.statistics._electronics_grid import LAW_EFFORT, RecordGrid, RecordRun, Rows
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._pmf import Window, exact_windows
 from mars_lidar.statistics.electronics import refined, without_effect
@@ -24,7 +24,6 @@ ComplexArray = NDArray[np.complex128]
 _REACH, _MARGIN = 7.5, 6.0  # of a window: standard deviations, and counts beside them
 _EDGE = 1e-9  # probability at the ends of a window that holds all
 _POINTS = 64  # of the circle at a time
-_MAX_STEPS = 3e11  # multiplications for them: half a minute
 _SETTLED, _QUIET = 1e-11, 1e-17
 _LIKE_MOMENTS = 3.0  # times the tolerance by which the pmf's mean and variance may differ from those of the grid
 
@@ -43,9 +42,9 @@ def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Window]
 def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Window:
     if float(cell.total[0]) == 0.0:
         return Window(0, np.ones(1), 0.0)
-    mean, variance, _, bins = refined(cell, electronics_ns, tolerance)
+    mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW_EFFORT)
     electronics = electronics_ns / cell.system.period_ns
-    grids = [RecordGrid(cell, n, electronics) for n in (bins, bins // 2)]
+    grids = [RecordGrid(cell, n, electronics, LAW_EFFORT) for n in (bins, bins // 2)]
     most = math.floor(cell.system.cycles / electronics) + 1
     spread = math.sqrt(variance)
     half = math.ceil(_REACH * spread + _MARGIN)
@@ -99,7 +98,7 @@ def _values(grid: RecordGrid, z: ComplexArray) -> ComplexArray:
     run = RecordRun(grid, np.ones_like(z), weigh)
     value, streak, ratio = np.ones_like(z), np.zeros(z.size, np.int64), np.zeros_like(z)
     before: ComplexArray = np.zeros((z.size, grid.bins + 2), np.complex128)
-    budget = max(10, int(_MAX_STEPS / (4.0 * z.size * grid.bins * (grid.shift + 64.0))))
+    budget = max(10, int(grid.effort.points / (4.0 * z.size * grid.bins * (grid.shift + 64.0))))
     for period in range(grid.cycles):
         records, earlier = run.period(), value
         value = value + (z[index] - 1.0) * records.sum(-1)

@@ -57,7 +57,7 @@ class Calibration:
         recovery; 0 where there is none, or none is seen.
     jitter_limit_ns
         Where none is seen, or none fits: jitters up to this leave the shortest intervals as likely, to a factor of
-        e^2. What one that hides does to dead time and light is in their errors. Else 0.
+        e^4. What one that hides does to dead time and light is in their errors. Else 0.
     edge_fits
         False where the dead time was to be estimated from an edge that is neither sharp nor one that a Gaussian jitter
         makes: a slow quench, a second dead time, a clock too coarse.

@@ -32,6 +32,12 @@ _SAME = 0.05  # standard errors by which a last round may move the edge
 _AGREE = 4.0  # standard errors between the jitter by the edge and that by the shape of the pulse
 _MATTERS = 0.15  # of the pulse: a jitter that may hide and is wider moves the light of more than ...
 _BRIGHT = 0.02  # ... so many photons of signal
+_SHUT = 4.0  # photons of signal of which the pixel sees the first alone
+_HIDES = (
+    "signal, delay and width are not known: the pulse is bright, only its first photons are seen, and how much of its "
+    "width is jitter is not"
+)
+_PARTS = (0.6, 1.0)  # of it that are tried
 _ALL = 0.98  # of the pulse that may be jitter
 _WIDEST = 0.1  # periods that a jitter may be wide where no pulse limits it
 _STEPS = 30  # of Richardson and Lucy
@@ -97,9 +103,16 @@ class Unknown:
             return found
         if found.signal < _BRIGHT or isinstance(self.shape, Pulse):
             return found
-        watch = Watch(found.armed.hold_off_ns, found.armed.hold_off_ns, jitter, by=found.dead_time_by)
-        moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
-        return replace(found, covariance=found.covariance + np.outer(moved, moved))
+        if found.signal > _SHUT:
+            lost = np.array([name.startswith(("signal", "delay", "sigma")) for name in found.names])
+            covariance = np.where(lost | lost[:, None], math.nan, found.covariance)
+            return replace(found, covariance=covariance, unknown=(*found.unknown, _HIDES))
+        hold, covariance = found.armed.hold_off_ns, found.covariance
+        for part in _PARTS:
+            watch = Watch(hold, hold, part * jitter, by=found.dead_time_by)
+            moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
+            covariance = covariance + np.outer(moved, moved)
+        return replace(found, covariance=covariance)
 
     def _ages(self, reach_ns: float = 0.0) -> Ages:
         """The shortest intervals, up to at least `reach_ns` above the smallest."""

@@ -30,7 +30,7 @@ _REACH = 4.0  # widths from beyond which nothing comes
 _DROPS = (1.0, 3.0, 6.0, 10.0)  # of log likelihood: an error is right at each of them
 _ORDINARY = 3.0  # drop up to which that holds above, where a jitter far from ordinary could hide
 _EDGE = 10.0  # intervals that the dead time has kept away, or there is no edge
-_SEEN = 2.0  # drop of log likelihood at which a jitter would have been seen
+_SEEN = 4.0  # drop of log likelihood at which a jitter would have been seen
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ def told(found: Calibration, *, edge: bool) -> Calibration:
 
     `edge`: dead time and jitter were estimated too, so that light which does not fit may be theirs.
     """
-    reasons: list[str] = []
+    reasons = list(found.unknown)
     lost: set[str] = set()
     if not found.converged:
         reasons.append("the likelihood was not maximised: the light is not known")

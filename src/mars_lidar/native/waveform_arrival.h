@@ -66,27 +66,36 @@ struct WaveRates {
     double total[kLanes], inverse[kLanes];
 };
 
-// In double precision, because the energy beyond the whole periods has to be right to 2^-31 of a period's.
+// In double precision, because the energy beyond the whole periods has to be right to 2^-31 of a period's. Waits are
+// drawn again within their cells, as in `split_wait` of registration.h.
 MARS_INLINE WaveWait draw_wave(const WaveRates& rates, UInt key0, UInt key1, UInt event) {
-    alignas(64) float exponentials[kLanes];
-    alignas(64) uint32_t fresh[kLanes];
-    alignas(64) int32_t whole[kLanes], energy[kLanes];
+    alignas(64) float exponentials[kLanes], powers[kLanes];
+    alignas(64) int32_t places[kLanes], whole[kLanes], energy[kLanes];
     const Pair<UInt> words = threefry<13>(event, splat(kStageArrival), key0, key1);
-    store(exponentials, exponential(words.first));
+    const Float drawn = exponential(words.first, dither(words.second) * 0x1p15f);
+    store(exponentials, from_bits(bits(drawn) & 0xffffff00u));
+    store(powers, from_bits(bits(drawn) & 0x7f800000u));
+    store(places, as_int(words.second >> 1));
     for (int lane = 0; lane < kLanes; ++lane) {
-        const double wait = static_cast<double>(exponentials[lane]) * rates.inverse[lane];
+        const double place = (static_cast<double>(places[lane]) + 0.5) * 0x1p-46;
+        const double wait = (static_cast<double>(exponentials[lane]) + static_cast<double>(powers[lane]) * place) *
+                            rates.inverse[lane];
         const double periods = wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever);
         whole[lane] = static_cast<int32_t>(periods);
         energy[lane] = static_cast<int32_t>((periods - static_cast<double>(whole[lane])) * 0x1p31);
     }
     const Int count = load<Int>(whole);
-    if (any(count >= static_cast<int32_t>(kLongWait))) {  // a fresh fraction: `refresh` of registration.h
-        store(fresh, words.second);
-        for (int lane = 0; lane < kLanes; ++lane) {
-            const double v = (fresh[lane] + 0.5) * 0x1p-32, total = rates.total[lane];
+    if (any(count >= static_cast<int32_t>(kLongWait))) {  // `refresh_long` of registration.h
+        store(powers, drawn);
+        for (int lane = 0; lane < kLanes; ++lane) {  // all of a cell or none of it
+            if (!(static_cast<double>(exponentials[lane]) * rates.inverse[lane] >= static_cast<double>(kLongWait))) continue;
+            const double wait = static_cast<double>(powers[lane]) * rates.inverse[lane];
+            whole[lane] = static_cast<int32_t>(wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever));
+            const double v = (static_cast<double>(places[lane]) + 0.5) * 0x1p-31, total = rates.total[lane];
             const double x = v - 0.5 * total * v * (1.0 - v) * (1.0 - total * (1.0 - 2.0 * v) * (1.0 / 3.0));
-            if (whole[lane] >= static_cast<int32_t>(kLongWait)) energy[lane] = static_cast<int32_t>(x * 0x1p31);
+            energy[lane] = static_cast<int32_t>(x * 0x1p31);
         }
+        return {load<Int>(whole), load<Int>(energy)};
     }
     return {count, load<Int>(energy)};
 }

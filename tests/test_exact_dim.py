@@ -1,11 +1,12 @@
 """Dim light and far tails: the exact engine's waits have no lattice, and its tails hold to 1e-10 of the energy.
 
-Without background, with a dead time that ends before the next pulse, every pulse is alone: of S photons the first is in a
-bin with the probability e^-F_j - e^-F_(j+1), F_j the photons before the bin's edge.
+Without background, with a dead time that ends before the next pulse, every pulse is alone: of S photons the first is in
+a bin with the probability e^-F_j - e^-F_(j+1), F_j the photons before the bin's edge.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ def tails(hist: NDArray[np.int64], law: NDArray[np.float64], pulses: float, dela
     """p-values of the numbers of registrations in windows of the tails, given the law of one pulse (bins,)."""
     centre = (np.arange(hist.size) + 0.5) * (PERIOD / hist.size) - delay
     outcomes = {}
-    for a, b in zip(EDGES[:-1], EDGES[1:], strict=True):
+    for a, b in pairwise(EDGES):
         inside = (centre > a) & (centre < b)
         number, mean = float(hist[inside].sum()), pulses * float(law[inside].sum())
         if a == -4.0:
@@ -66,13 +67,17 @@ def tails(hist: NDArray[np.int64], law: NDArray[np.float64], pulses: float, dela
     return outcomes
 
 
-# photons of a pulse, and some 1e8 registrations in all but the first
+# photons of a pulse, and pixels and cycles for some 1e8 registrations, the dimmest 2e6
 @pytest.mark.parametrize(
-    ("signal", "pixels"), [(1e-6, 20_000), (1e-3, 1000), (0.01, 100), (0.02, 50), (0.23, 5), (1.0, 2), (30.0, 1)]
-)
-def test_tails_of_a_dim_pulse(signal: float, pixels: int):
+    ("signal", "pixels", "cycles"),
+    [
+        (1e-6, 20_000, 100_000_000), (1e-3, 1000, 100_000_000), (0.01, 100, 100_000_000), (0.02, 64, 80_000_000),
+        (0.23, 64, 8_000_000), (1.0, 64, 2_500_000), (30.0, 64, 1_500_000),
+    ],
+)  # fmt: skip
+def test_tails_of_a_dim_pulse(signal: float, pixels: int, cycles: int):
     """Waits of up to a million periods; before, 0.01 photons put hundreds beyond -6 sigma and none in -5.5 to -5."""
-    view = system()
+    view = system(cycles=cycles)
     law = first_arrival(signal * view.pulse.bin_energy(DELAY, PERIOD, view.bins))
     hist = histogram(ml.Flux(np.full((1, pixels), signal), 0.0, DELAY), view, seed=17)
     require(tails(hist, law, pixels * view.cycles), f"tails, S = {signal:g}")
@@ -80,12 +85,12 @@ def test_tails_of_a_dim_pulse(signal: float, pixels: int):
 
 @pytest.mark.parametrize("signal", [100.0, 1000.0])
 def test_early_tail_of_a_blinding_pulse(signal: float):
-    """What registers is the tail: at 1000 photons 70 in 1e8 beyond -6.25 sigma, where the tables ended once at 6.4."""
-    view = system(bins=1600)
+    """What registers is the tail: of 1000 photons 20 in 1e8 beyond -6.25 sigma; the tables ended once at 6.4."""
+    view = system(bins=1600, cycles=1_500_000)
     law = first_arrival(signal * view.pulse.bin_energy(DELAY, PERIOD, view.bins))
-    hist = histogram(ml.Flux(np.full((1, 1), signal), 0.0, DELAY), view, seed=23)
+    hist = histogram(ml.Flux(np.full((1, 64), signal), 0.0, DELAY), view, seed=23)
     end = int(np.searchsorted(np.cumsum(law), 1e-4))
-    expected = view.cycles * law
+    expected = 64 * view.cycles * law
     outcomes = {"beyond -4": goodness(hist[:end], expected[:end], fixed_total=False, least=25)}
     time = view.time_ns - DELAY
     for a, b in ((-9.0, -6.5), (-6.5, -6.25), (-6.25, -6.0), (-6.0, -5.5)):
@@ -94,8 +99,12 @@ def test_early_tail_of_a_blinding_pulse(signal: float):
     require(outcomes, f"early tail, S = {signal:g}")
 
 
-@pytest.mark.parametrize(("mode", "start"), [(m, "armed") for m in MODES] + [("free running", "stationary"),
-                         ("paralyzable", "stationary"), ("synchronous", "stationary"), ("gated", "stationary")])  # fmt: skip
+STARTS = [(mode, "armed") for mode in MODES] + [
+    (mode, "stationary") for mode in ("free running", "paralyzable", "synchronous", "gated")
+]
+
+
+@pytest.mark.parametrize(("mode", "start"), STARTS)
 def test_tails_in_every_mode(mode: str, start: str):
     view = system(detector=ml.Detector(dead_time_ns=40.0, **MODES[mode]), start=start)
     law = first_arrival(0.02 * view.pulse.bin_energy(DELAY, PERIOD, view.bins))
@@ -117,9 +126,9 @@ def test_tails_of_several_returns():
 
 
 def test_tails_after_a_dead_time_of_one_period():
-    """Re-arming at the energy of the registration: energies are uniform; before, 471 for 18 in 5.5e9 below -5.8 sigma."""
-    view = system(detector=ml.Detector(dead_time_ns=PERIOD))
-    hist = histogram(ml.Flux(np.full((1, 4), 0.6), 0.0, DELAY), view, seed=2)
+    """Re-arming at the energy of the registration: uniform energies; before, 471 for 18 of 5.5e9 below -5.8 sigma."""
+    view = system(detector=ml.Detector(dead_time_ns=PERIOD), cycles=6_000_000)
+    hist = histogram(ml.Flux(np.full((1, 64), 0.6), 0.0, DELAY), view, seed=2)
     law = view.pulse.bin_energy(DELAY, PERIOD, view.bins)
     outcomes = tails(hist, law, float(hist.sum()))
     del outcomes["core"]  # given the total
@@ -129,14 +138,14 @@ def test_tails_after_a_dead_time_of_one_period():
 @pytest.mark.parametrize("signal", [1.0, 100.0, 1000.0])
 @pytest.mark.parametrize("part", [1.2, 1.6, 2.5, 6.0])
 def test_armed_in_the_late_tail(signal: float, part: float):
-    """Armed each period where `part` times what the engine draws afresh is left of the pulse: all of the rest is right."""
+    """Armed each period where `part` times what the engine draws afresh is left of the pulse."""
     left = part * min(2.0**-14, 2.0**-8 / signal)
     depth = -special.ndtri(left)
-    cycles = 100_000_000 if signal == 1.0 else 20_000_000
+    cycles = 1_000_000 if signal == 1.0 else 300_000
     view = system(cycles=cycles, detector=ml.Detector(dead_time_ns=0.0, mode="synchronous"), bins=1000)
     law = first_arrival(signal * view.pulse.bin_energy(PERIOD - depth, PERIOD, view.bins))
-    hist = histogram(ml.Flux(np.full((1, 1), signal), 0.0, PERIOD - depth), view, seed=4)
-    expected = cycles * law
+    hist = histogram(ml.Flux(np.full((1, 64), signal), 0.0, PERIOD - depth), view, seed=4)
+    expected = 64 * cycles * law
     require(
         {
             "late tail": goodness(hist[:200], expected[:200], fixed_total=False, least=25),
@@ -153,8 +162,8 @@ def test_faint_parts_of_a_sampled_pulse(signal: float):
     shape[[0, 10, 100]] = 1e-6, 1e-7, 1e-6
     shape[40:61] = np.exp(-0.5 * ((np.arange(21) - 10) / 3.0) ** 2)
     shape[40:61] *= (1.0 - 2.1e-6) / shape[40:61].sum()
-    view = system(pulse=ml.SampledPulse(shape, 0.2))
-    pixels = 120 if signal == 0.01 else 1
+    pixels = 120 if signal == 0.01 else 64
+    view = system(pulse=ml.SampledPulse(shape, 0.2), cycles=100_000_000 if signal == 0.01 else 2_000_000)
     law = first_arrival(signal * view.pulse.bin_energy(DELAY, PERIOD, view.bins))
     hist = histogram(ml.Flux(np.full((1, pixels), signal), 0.0, DELAY), view, seed=12)
     expected = pixels * view.cycles * law
@@ -174,10 +183,10 @@ def test_faint_parts_of_a_sampled_pulse(signal: float):
 
 def test_pulse_of_one_sample():
     """All energy in one sample has no edge near its middle: the tables make two of it."""
-    view = system(pulse=ml.SampledPulse(np.ones(1), 10.0), bins=2000, cycles=10_000_000)
+    view = system(pulse=ml.SampledPulse(np.ones(1), 10.0), bins=2000, cycles=200_000)
     law = first_arrival(0.5 * view.pulse.bin_energy(DELAY, PERIOD, view.bins))
-    hist = histogram(ml.Flux(np.full((1, 1), 0.5), 0.0, DELAY), view, seed=1)
-    require({"bins": goodness(hist, view.cycles * law + 1e-9, fixed_total=False)}, "one sample")
+    hist = histogram(ml.Flux(np.full((1, 64), 0.5), 0.0, DELAY), view, seed=1)
+    require({"bins": goodness(hist, 64 * view.cycles * law + 1e-9, fixed_total=False)}, "one sample")
 
 
 @pytest.mark.parametrize("background", [1e-5, 0.01, 0.02, 0.6])
@@ -193,15 +202,18 @@ def test_first_phases_have_no_lattice(background: float):
 
 
 @pytest.mark.parametrize(
-    ("width", "background", "pixels"),
-    [(1e-5, 0.0105, 100), (1.3e-5, 0.0105, 100), (2e-5, 0.0105, 100), (1e-5, 0.6, 2), (1e-5, 100.0, 1)],
-)
-def test_short_gates(width: float, background: float, pixels: int):
+    ("width", "background", "pixels", "cycles"),
+    [
+        (1e-5, 0.0105, 300, 100_000_000), (1.3e-5, 0.0105, 100, 100_000_000), (2e-5, 0.0105, 100, 100_000_000),
+        (1e-5, 0.6, 100, 3_000_000), (1e-5, 100.0, 100, 1_000_000),
+    ],
+)  # fmt: skip
+def test_short_gates(width: float, background: float, pixels: int, cycles: int):
     """Counts behind gates of 1e-5 of a period; before, 23 % too many at B = 0.0105."""
     gate = {"mode": "gated", "gate_start_ns": 61.7, "gate_width_ns": width * PERIOD}
-    view = system(detector=ml.Detector(dead_time_ns=10.0, **gate), cycles=100_000_000)
+    view = system(detector=ml.Detector(dead_time_ns=10.0, **gate), cycles=cycles)
     counts = histogram(ml.Flux(np.zeros((1, pixels)), background, DELAY), view, seed=6).sum()
-    mean = -np.expm1(-background * width) * pixels * view.cycles
+    mean = -np.expm1(-background * width) * pixels * cycles
     # edges are phases of 24 bits: half of one at most is amiss
     slack = 0.5 * 2.0**-24 / width * mean
     error = max(0.0, abs(counts - mean) - slack)

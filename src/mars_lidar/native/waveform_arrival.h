@@ -1,6 +1,7 @@
 // From one time to the next arrival at a pixel with a waveform, one pixel per lane.
 #pragma once
 #include "registration.h"
+#include "standard.h"
 #include "waveform_gather.h"
 #include "waveform_table.h"
 
@@ -66,32 +67,34 @@ struct WaveRates {
     double total[kLanes], inverse[kLanes];
 };
 
-// In double precision, because the energy beyond the whole periods has to be right to 2^-31 of a period's. Waits are
-// drawn again within their cells, as in `split_wait` of registration.h.
+// `cell`, of which 16 bits are left, continued by a random word: a number in the cell, as in `split_wait` of registration.h.
+MARS_INLINE double continued(float cell, uint32_t word) {
+    return bits_double(double_bits(static_cast<double>(cell)) | static_cast<uint64_t>(word) << 5 | 16u);
+}
+
+// In double precision, because the energy beyond the whole periods has to be right to 2^-31 of a period's.
 MARS_INLINE WaveWait draw_wave(const WaveRates& rates, UInt key0, UInt key1, UInt event) {
-    alignas(64) float exponentials[kLanes], powers[kLanes];
-    alignas(64) int32_t places[kLanes], whole[kLanes], energy[kLanes];
+    alignas(64) float exponentials[kLanes], cells[kLanes];
+    alignas(64) uint32_t fresh[kLanes];
+    alignas(64) int32_t whole[kLanes], energy[kLanes];
     const Pair<UInt> words = threefry<13>(event, splat(kStageArrival), key0, key1);
-    const Float drawn = exponential(words.first, dither(words.second) * 0x1p15f);
-    store(exponentials, from_bits(bits(drawn) & 0xffffff00u));
-    store(powers, from_bits(bits(drawn) & 0x7f800000u));
-    store(places, as_int(words.second >> 1));
+    const Float drawn = exponential(words.first);
+    store(cells, from_bits(bits(drawn) & 0xffffff00u));
+    store(fresh, words.second);
     for (int lane = 0; lane < kLanes; ++lane) {
-        const double place = (static_cast<double>(places[lane]) + 0.5) * 0x1p-46;
-        const double wait = (static_cast<double>(exponentials[lane]) + static_cast<double>(powers[lane]) * place) *
-                            rates.inverse[lane];
+        const double wait = continued(cells[lane], fresh[lane]) * rates.inverse[lane];
         const double periods = wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever);
         whole[lane] = static_cast<int32_t>(periods);
         energy[lane] = static_cast<int32_t>((periods - static_cast<double>(whole[lane])) * 0x1p31);
     }
     const Int count = load<Int>(whole);
     if (any(count >= static_cast<int32_t>(kLongWait))) {  // `refresh_long` of registration.h
-        store(powers, drawn);
+        store(exponentials, drawn);
         for (int lane = 0; lane < kLanes; ++lane) {  // all of a cell or none of it
-            if (!(static_cast<double>(exponentials[lane]) * rates.inverse[lane] >= static_cast<double>(kLongWait))) continue;
-            const double wait = static_cast<double>(powers[lane]) * rates.inverse[lane];
+            if (!(static_cast<double>(cells[lane]) * rates.inverse[lane] >= static_cast<double>(kLongWait))) continue;
+            const double wait = static_cast<double>(exponentials[lane]) * rates.inverse[lane];
             whole[lane] = static_cast<int32_t>(wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever));
-            const double v = (static_cast<double>(places[lane]) + 0.5) * 0x1p-31, total = rates.total[lane];
+            const double v = (fresh[lane] + 0.5) * 0x1p-32, total = rates.total[lane];
             const double x = v - 0.5 * total * v * (1.0 - v) * (1.0 - total * (1.0 - 2.0 * v) * (1.0 / 3.0));
             energy[lane] = static_cast<int32_t>(x * 0x1p31);
         }

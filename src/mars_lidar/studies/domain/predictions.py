@@ -76,12 +76,13 @@ class Predictions:
         pmf = np.asarray(self.law.pmf)
         support = self.law.support
         sd = max(float(np.sqrt(self.law.variance)), 1e-6)
-        mean = float(pmf @ support)
-        variance = float(pmf @ (support - mean) ** 2)
+        off = support - float(self.law.mean)  # of the mean, which may be 1e8, to parts of a count
+        mean = float(pmf @ off)
+        variance = float(pmf @ (off - mean) ** 2)
         found = [
             _sane("pmf", bool(np.isfinite(pmf).all() and pmf.min() > -1e-9)),
             _agree("pmf", "count_law", "total", pmf.sum() - 1.0),
-            _agree("pmf", "count_law", "mean of the count", (mean - float(self.law.mean)) / max(sd, 1e-3)),
+            _agree("pmf", "count_law", "mean of the count", mean / max(sd, 1e-3)),
         ]
         if self.law.variance > 1e-6:
             found.append(_agree("pmf", "count_law", "variance of the count", variance / float(self.law.variance) - 1.0))

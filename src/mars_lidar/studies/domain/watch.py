@@ -59,11 +59,13 @@ class Watched:
             try:
                 if not self._heard(patience):
                     self._stop()
-                    return Outcome(case.name, subject, SLOW, patience, f"stopped after {patience:g} s")
+                    slow = Outcome(case.name, subject, SLOW, patience, f"stopped after {patience:g} s")
+                    return [slow] if subject == "between steps" else slow
                 told = self.pipe.recv()
             except (EOFError, OSError):
                 self._stop()
-                return Outcome(case.name, subject, FAILED, 0.0, "the process ended")
+                ended = Outcome(case.name, subject, FAILED, 0.0, "the process ended")
+                return [ended] if subject == "between steps" else ended
             if isinstance(told, list):
                 return told
             subject = told[0] if told[1] == "begin" else "between steps"

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.engines._feedback_grid import internal_cells
+from mars_lidar.engines._feedback_rule import draw_rest
 from mars_lidar.engines.base import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.engines.parts import draw_pixels, stage
+from mars_lidar.engines.parts import stage
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
 
@@ -32,8 +33,8 @@ class AutoEngine(Engine):
     and the system only, so that any part of an image has the bits of the whole: more than 4 expected registrations
     for every internal cell (`internal_cells`) go to feedback, the rest, and what feedback refuses, to exact.
 
-    Reports ``pixels drawn by exact`` and ``pixels drawn by feedback``. Draws histograms only: of its pixels'
-    registrations the feedback engine knows the bins, not the times.
+    Reports ``pixels drawn by exact`` and ``pixels drawn by feedback``, and what feedback reports. Draws histograms
+    only: of its pixels' registrations the feedback engine knows the bins, not the times.
     """
 
     name = "auto"
@@ -49,10 +50,10 @@ class AutoEngine(Engine):
         share = float(many.mean())
         first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))
         refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many))
-        rest = np.sort(np.concatenate([np.flatnonzero(~many), refused]))
-        draw_pixels(ExactEngine(self.level), second, out, rest)
-        task.report["pixels drawn by exact"] = float(rest.size)
-        task.report["pixels drawn by feedback"] = float(many.size - rest.size)
+        rest = replace(refused, pixels=np.sort(np.concatenate([np.flatnonzero(~many), refused.pixels])))
+        draw_rest(ExactEngine(self.level), second, out, rest)
+        task.report["pixels drawn by exact"] = float(rest.pixels.size)
+        task.report["pixels drawn by feedback"] = float(many.size - rest.pixels.size)
 
 
 def expected_registrations(flux: Flux, system: System) -> NDArray[np.float64]:

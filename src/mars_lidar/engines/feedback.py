@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -10,17 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _core
-from mars_lidar.engines._feedback_grid import MOST_CELLS, cell_cuts, internal_cells, meets_echo, near_pulse
-from mars_lidar.engines.base import Engine, Task
+from mars_lidar.engines._feedback_grid import near_pulse
+from mars_lidar.engines._feedback_rule import Grid, Reason, Rest, draw_rest, refusals, sweep_pixels
+from mars_lidar.engines.base import Engine, Progress, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.flux import Flux
 from mars_lidar.system import System
-
-FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly ...
-FEWEST_PERIODS_ECHO = 1000  # ... and where pulses meet their echo: phases settle slowly
-BRIGHTEST_ECHO = 4.0  # signal photons of a pulse that meets its own echo; beyond, phases hardly settle at all
 
 
 class FeedbackEngine(Engine):
@@ -32,16 +28,23 @@ class FeedbackEngine(Engine):
     ``H = lambda (N_r + e - G H) + M``; the law is right bin by bin and jointly (docs/feedback.md).
     The cost is that of some sweeps over the bins, whatever the number of cycles.
 
+    Pixels whose sweeps would not forget their past within a period (locked ones, of a bright pulse or background and a
+    dead time just below a period) are cut into pieces of several periods that go through their bins together, with
+    numbers of their own in each.
+
     Pixels that it cannot do are given to the exact engine, by a rule on the pixel and the system alone: exposures
     below 100 dead times, sweeps that contract too slowly (about eight or more background photons per dead time),
     counts that hardly vary under a dead time of more than a period, pulses that meet their own echo after whole
-    periods (bright, or below 1000 dead times), more than 65,536 internal cells. Without dead time the bins are
-    independent Poisson numbers.
+    periods (bright, or below 1000 dead times), locked pixels below 1e5 periods, more than 65,536 internal cells.
+    Every drawn exposure is checked before it is written: its history must agree with itself, arm no negative number
+    of exposures, and have a count that its law allows; else that exposure is drawn by the exact engine. Without dead
+    time the bins are independent Poisson numbers.
 
     The same seed gives the same bits whatever the threads, chunks, parts of the image and vector width. `level`
     forces one of ``_core.levels()``.
 
-    Reports ``pixels given to exact``.
+    Reports ``pixels given to exact`` and ``exposures drawn again by exact``, and each of them by reason where there
+    are any, such as ``pixels given to exact, slow sweeps``.
     """
 
     name = "feedback"
@@ -77,47 +80,29 @@ class FeedbackEngine(Engine):
             ExactEngine(self.level).histogram(part, here)
             rows[...] = machine.array(here)
 
-        able = np.flatnonzero(_in_range(task.flux, task.system))
-        task.report["pixels given to exact"] = float(feedback_histogram(task, out, able, machine, draw_exactly))
+        feedback_histogram(task, out, machine, draw_exactly)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Poisson numbers, feedback, or the exact engine, pixel by pixel."""
         share = 1.0
         if task.system.dead_time_periods > 0.0:
-            share = float(_in_range(task.flux, task.system).mean())
+            share = float((refusals(task.flux, task.system) == Reason.DRAWN).mean())
         every = np.arange(task.pixel_index.size)
         rest = self.sample(replace(task, progress=stage(task.progress, 0.0, share)), out, every)
-        draw_pixels(ExactEngine(self.level), replace(task, progress=stage(task.progress, share, 1.0)), out, rest)
-        task.report["pixels given to exact"] = float(rest.size)
+        draw_rest(ExactEngine(self.level), replace(task, progress=stage(task.progress, share, 1.0)), out, rest)
 
-    def sample(self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
+    def sample(self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64]) -> Rest:
         """Fill the rows of `pixels` (n,) and return those that this engine cannot do, whose rows are not filled."""
         if task.system.dead_time_periods == 0.0:
             draw_pixels(PoissonEngine(), task, out, pixels)
-            return pixels[:0]
-        merge, parts = (cuts.reshape(-1)[pixels] for cuts in cell_cuts(task.flux, task.system))
-        able = _in_range(task.flux, task.system).reshape(-1)[pixels]
-        refused = [pixels[~able]]
-        # lanes go through their sweeps together: neighbours in background need about as many
-        order = np.flatnonzero(able)
-        order = order[np.argsort(task.flux.background.reshape(-1)[pixels[order]], kind="stable")]
-        kinds = np.unique(np.stack([merge[order], parts[order]], -1), axis=0)
-        for k, (factor, cuts) in enumerate(kinds):
-            group = np.ascontiguousarray(pixels[order[(merge[order] == factor) & (parts[order] == cuts)]])
-            status = np.zeros(group.size, np.uint8)
+            return Rest.of(task, pixels[:0], np.zeros((task.realizations, 0), np.uint8))
+
+        def sweep(group: NDArray[np.int64], grid: Grid, progress: Progress | None) -> NDArray[np.uint8]:
+            status = np.empty((task.realizations, group.size), np.uint8)
             _core.feedback_histogram(
-                task.job, task.pulse, out, group, status, int(factor), int(cuts), near_pulse(task.system, int(factor)),
-                task.threads, self.level, stage(task.progress, k / len(kinds), (k + 1) / len(kinds)),
+                task.job, task.pulse, out, group, status, grid.merge, grid.parts, near_pulse(task.system, grid.merge),
+                grid.laps, task.threads, self.level, progress,
             )  # fmt: skip
-            refused.append(group[status != 0])
-        return np.sort(np.concatenate(refused))
+            return status
 
-
-def _in_range(flux: Flux, system: System) -> NDArray[np.bool_]:
-    """Pixels (H, W) that the sweeps may be tried on."""
-    periods = math.ceil(system.dead_time_periods)
-    echo = meets_echo(flux, system)
-    fewest = np.where(echo.remembered, FEWEST_PERIODS_ECHO, FEWEST_PERIODS)
-    fine = internal_cells(flux, system) <= MOST_CELLS
-    bright = echo.remembered & (flux.signal > BRIGHTEST_ECHO)
-    return np.asarray((system.cycles >= fewest * periods) & ~bright & fine)
+        return sweep_pixels(task, pixels, sweep)

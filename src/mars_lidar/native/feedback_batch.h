@@ -1,7 +1,8 @@
 // A batch of the feedback engine: from mean histograms to integer ones.
 #pragma once
 #include "feedback_output.h"
-#include "feedback_workspace.h"
+#include "feedback_pixels.h"
+#include "feedback_remainder.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -10,103 +11,51 @@ namespace {
 constexpr uint64_t kDomain = 0x466565646261636bu;  // "Feedback": not another engine's numbers at one seed
 constexpr uint32_t kEndEvent = 0xffffffffu;        // the counter, not a cell, of the state at the ends of the exposure
 
-constexpr int kMeanSweeps = 40, kLinearSweeps = 60, kIntegerSweeps = 40;
-constexpr float kSlowest = 0.85f;      // contraction of a sweep beyond which a pixel is refused
-constexpr float kLinearFrom = 0.1f;    // and from which the linear response is worth its sweeps
-constexpr double kLeastVariance = 12.0;  // of the count, for each whole period of dead time: 0.2 to 0.5 are added
-constexpr float kFewArmed = 32.0f, kFewCounts = 0.03f;  // quantiles are taken anew below this many exposures armed
+constexpr int kLinearSweeps = 60, kLapSweeps = 16;
+// Quantiles are taken anew where fewer exposures are armed, and more counts expected, or firing more likely.
+constexpr float kFewArmed = 32.0f, kFewCounts = 0.03f, kLikely = 0.02f;
 
-class Batch {
+class Batch : private BatchPixels {
 public:
-    explicit Batch(const FeedbackBatch& batch)
-        : batch_(batch), grid_(*batch.grid), n_(batch.grid->cells), work_(batch) {}
+    explicit Batch(const FeedbackBatch& batch) : BatchPixels(batch) {}
 
     bool run() {
         solve_mean();
-        if (grid_.whole > 0) refuse_locked();
+        bound_counts();
         int32_t most = 0;
         for (int i = 0; i < kTeam; ++i) most = batch_.draws[i] > most ? batch_.draws[i] : most;
         for (int32_t draw = 0; draw < most; ++draw) {
             if (batch_.stopped()) return true;
             bool some = false;
             for (int i = 0; i < kTeam; ++i) {
-                drawing_[i] = draw < batch_.draws[i] && batch_.status[i] == FeedbackStatus::kDrawn;
+                drawing_[i] = draw < batch_.draws[i] && refused_[i] == FeedbackStatus::kDrawn;
+                if (draw < batch_.draws[i]) status(i, draw) = refused_[i];
                 some = some || drawing_[i];
             }
-            if (!some) break;
+            if (!some) continue;
             draw_numbers(draw);
+            if (draw == 0) {
+                choose_laps(fewest_);
+                for (int i = 0; i < kTeam; ++i) {
+                    if (drawing_[i]) status(i, draw) = refused_[i];
+                    drawing_[i] = drawing_[i] && refused_[i] == FeedbackStatus::kDrawn;
+                    exposure_.active[i] = drawing_[i] ? -1 : 0;
+                }
+            }
             start_history();
-            if (!sweep_integers()) return true;
+            const bool done = grid_.whole > 0      ? sweep_integers<true, true>()
+                              : grid_.stationary ? sweep_integers<false, true>()
+                                                 : sweep_integers<false, false>();
+            if (!done) return true;
+            check_draws(draw);
             if (!write_histograms(batch_, work_.history[0], drawing_, draw)) return false;
+            if (grid_.remainder > 0 && !draw_remainders(draw)) return false;
         }
         return true;
     }
 
 private:
-    int64_t row(int32_t j) const { return static_cast<int64_t>(j) * kRow; }
-    static float clip(float x) { return x > 1e-12f ? x : 1e-12f; }
-    static float lesser(float x, float y) { return x < y ? x : y; }
-    static double size(double x) { return x < 0.0 ? -x : x; }
-
-    // w and sum w, by sweeps from nothing; how fast they contract.
-    void solve_mean() {
-        alignas(64) float ones[kTeam], change[kTeam];
-        alignas(64) int32_t active[kTeam];
-        float first[kTeam], last[kTeam];
-        for (int i = 0; i < kTeam; ++i) {
-            ones[i] = 1.0f;
-            active[i] = 1;
-            least_[i] = 1;
-            rate_[i] = first[i] = last[i] = 0.0f;
-        }
-        for (int64_t k = 0; k < row(n_ + 1); ++k) work_.sums[k] = 0.0f;
-
-        const double wanted = 0.1 / root(static_cast<double>(grid_.cycles > 10000 ? grid_.cycles : 10000));
-        const float tolerance = wanted < 4e-6 ? 4e-6f : static_cast<float>(wanted);  // what float32 sums allow
-        for (int sweep = 1; sweep <= kMeanSweeps; ++sweep) {
-            real_sweep<false>(grid_, work_.rates, ones, nullptr, nullptr, active, work_.sums, work_.spare_sums, change);
-            std::swap(work_.sums, work_.spare_sums);
-            bool some = false;
-            for (int i = 0; i < kTeam; ++i) {
-                if (!active[i]) continue;
-                const float moved = clip(change[i]);
-                if (sweep == 1) first[i] = moved;
-                if (change[i] <= tolerance && sweep > 1) {
-                    active[i] = 0;
-                    const float once = moved / last[i];
-                    const float often = exp_of(lesser(log_of(moved / first[i]) / static_cast<float>(sweep - 1), 0.0f));
-                    rate_[i] = once > often ? once : often;
-                } else {
-                    some = true;
-                }
-                last[i] = moved;
-            }
-            if (!some) break;
-        }
-        for (int i = 0; i < kTeam; ++i) {
-            if (active[i] || rate_[i] > kSlowest) batch_.status[i] = FeedbackStatus::kSlow;
-            // sweeps until what rounding did to the first history is forgotten to 3 %
-            for (float left = rate_[i]; left > 0.03f && least_[i] < kIntegerSweeps / 2; left *= rate_[i]) ++least_[i];
-            total_[i] = static_cast<double>(work_.sums[row(n_) + i]);
-            share_[i] = 1.0 / (1.0 + grid_.whole * total_[i]);
-            scale_[i] = static_cast<float>(grid_.cycles * share_[i]);
-        }
-    }
-
-    // Where whole periods of the dead time are blind, the total is found by a fixed point, to half a count.
-    void refuse_locked() {
-        MeanLaw law(grid_, work_.rates, work_.sums, scale_);
-        for (int32_t j = 0; j < n_; ++j) {
-            law.next(j);
-            for (int i = 0; i < kTeam; ++i) work_.noise[row(j) + i] = law.variance[i];
-        }
-        double variance[kTeam];
-        count_variance(grid_, work_.rates, work_.noise, work_.spare_sums, work_.more_sums, work_.alpha, kMeanSweeps,
-                       variance);
-        for (int i = 0; i < kTeam; ++i)
-            if (variance[i] * share_[i] * share_[i] < kLeastVariance * grid_.whole)
-                batch_.status[i] = FeedbackStatus::kLocked;
-    }
+    FeedbackStatus& status(int i, int32_t draw) const { return batch_.status[i][draw * batch_.status_step]; }
 
     // Everything random of one draw: the quantiles of all cells, and the state at the ends of the exposure.
     void draw_numbers(int32_t draw) {
@@ -118,30 +67,42 @@ private:
         }
         alignas(64) uint32_t words[kTeam], other[kTeam];
         Uniforms uniforms;
-        MeanLaw law(grid_, work_.rates, work_.sums, scale_);
-        for (int32_t j = 0; j < n_; ++j) {
-            draw_words(key0_, key1_, j, words, other);
-            uniforms.set(words);
-            law.next(j);
-            work_.exact[static_cast<int64_t>(j) * kTeams] = law.rare(kFewArmed, kFewCounts);
-            uint16_t* dither = work_.dither + row(j);
-            for (int i = 0; i < kTeam; ++i) dither[i] = static_cast<uint16_t>(other[i] >> 16);
-            follow_quantile(law.mean, law.variance, uniforms, work_.alpha + row(j), work_.beta + row(j));
+        for (int i = 0; i < kTeam; ++i) fewest_[i] = static_cast<float>(grid_.pieces);
+        for (int32_t lap = 0, t = 0; lap < grid_.laps; ++lap) {
+            MeanLaw law(grid_, work_.rates, work_.sums, scale_);
+            for (int32_t j = 0; j < n_; ++j, ++t) {
+                draw_words(key0_, key1_, t, words, other);
+                uniforms.set(words);
+                law.next(j);
+                if (lap == 0) {
+                    for (int i = 0; i < kTeam; ++i) fewest_[i] = lesser(law.armed[i], fewest_[i]);
+                }
+                work_.exact[static_cast<int64_t>(t) * kTeams] = law.rare(j, kFewArmed, kFewCounts, kLikely);
+                uint16_t* dither = work_.dither + row(t);
+                for (int i = 0; i < kTeam; ++i) dither[i] = static_cast<uint16_t>(other[i] >> 16);
+                follow_quantile(law.mean, law.variance, work_.rates.fire(j), work_.rates.refire(j), uniforms,
+                                work_.alpha + row(t), work_.beta + row(t));
+            }
         }
         for (int i = 0; i < kTeam; ++i) {
-            const int32_t begin = batch_.first_bin[i] == 0 ? 0 : grid_.bin_cell[grid_.bins - batch_.first_bin[i]];
-            exposure_.place[i] = begin == 0 ? 0 : n_ - begin;
+            const int32_t edge = batch_.first_bin[i] == 0 ? 0 : grid_.bin_cell[grid_.bins - batch_.first_bin[i]];
+            exposure_.edge[i] = edge;
             exposure_.active[i] = drawing_[i] ? -1 : 0;
-            spare_[i] = blind_at_an_end(i, begin, 1u, exposure_.end[i]);
-            exposure_.start[i] = 0;
-            if (grid_.stationary) spare_[i] -= blind_at_an_end(i, begin, 2u, exposure_.start[i]);
+            spare_[i] = exposure_.start[i] = exposure_.end[i] = 0;
+            exposure_.rank[i] = static_cast<int32_t>(number_of_the_end(i, 1u) * grid_.pieces);
+            if (grid_.whole > 0) spare_[i] = blind_at_an_end(i, 1u, exposure_.end[i]);
+            if (grid_.stationary) spare_[i] -= blind_at_an_end(i, 2u, exposure_.start[i]);
         }
     }
 
-    int32_t blind_at_an_end(int i, int32_t begin, uint32_t stage, int32_t& cells) const {
+    double number_of_the_end(int i, uint32_t stage) const {
         const Pair<uint32_t> words = threefry<13, uint32_t>(kEndEvent, stage, key0_[i], key1_[i]);
-        const double u = (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
-        return blind_cells(grid_, work_.sums + i, total_[i], share_[i], begin, u, cells);
+        return (words.first + (words.second + 0.5) * 0x1p-32) * 0x1p-32;
+    }
+
+    int32_t blind_at_an_end(int i, uint32_t stage, int32_t& cells) const {
+        const double u = number_of_the_end(i, stage);
+        return blind_cells(grid_, work_.sums + i, total_[i], share_[i], exposure_.edge[i], u, cells);
     }
 
     // The first history: the mean, and the linear response to this draw's noise where sweeps contract slowly.
@@ -150,8 +111,9 @@ private:
         alignas(64) int32_t slow[kTeam], active[kTeam];
         int32_t some = 0;
         for (int i = 0; i < kTeam; ++i) {
-            number_[i] = grid_.cycles * share_[i] * total_[i];
-            slow[i] = active[i] = drawing_[i] && (grid_.whole > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
+            number_[i] = grid_.pieces * share_[i] * total_[i];
+            slow[i] = active[i] =
+                drawing_[i] && grid_.laps == 1 && (grid_.whole > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
             some |= active[i];
         }
         float *old = work_.spare_sums, *fresh = work_.more_sums;
@@ -176,7 +138,7 @@ private:
             }
             for (int i = 0; i < kTeam; ++i) number_[i] += moved_by[i];
         }
-        round_sums(n_, work_.sums, scale_, respond ? old : nullptr, slow, work_.history[0]);
+        round_sums(grid_, work_.sums, scale_, respond ? old : nullptr, slow, work_.history[0]);
         set_blind();
     }
 
@@ -195,57 +157,84 @@ private:
     void set_blind() {
         for (int i = 0; i < kTeam; ++i) {
             const double blind = grid_.whole * number_[i], whole = floor_of(blind);
-            exposure_.armed[i] = grid_.cycles - static_cast<int32_t>(whole) + spare_[i];
+            exposure_.armed[i] = grid_.pieces - static_cast<int32_t>(whole) + spare_[i];
             exposure_.part[i] = static_cast<float>(blind - whole);
         }
     }
 
     // Integer sweeps until the lanes' histories repeat. Returns false on stop.
+    template <bool periods, bool warm>
     bool sweep_integers() {
         const Quantiles quantiles{work_.alpha, work_.beta, work_.dither, work_.exact, key0_, key1_};
         alignas(64) int32_t change[kTeam];
         float last[kTeam];
+        const int sweeps = grid_.laps > 1 ? kLapSweeps : kIntegerSweeps;
+        const int64_t end = row(grid_.path());
         for (int i = 0; i < kTeam; ++i) last[i] = 0.0f;
-        for (int sweep = 1; sweep <= kIntegerSweeps; ++sweep) {
+        for (int sweep = 1; sweep <= sweeps; ++sweep) {
             if (batch_.stopped()) return false;
-            integer_sweep(grid_, work_.rates, quantiles, exposure_, work_.history[0], work_.history[1], change);
+            integer_sweep<periods, warm>(grid_, work_.rates, quantiles, exposure_, work_.history[0], work_.history[1],
+                                         change, negative_);
             std::swap(work_.history[0], work_.history[1]);
             bool some = false;
             for (int i = 0; i < kTeam; ++i) {
                 if (!exposure_.active[i]) continue;
                 double turn = 0.0;  // what the next sweep's total will move by
-                if (grid_.whole > 0) {
-                    const double seen = static_cast<double>(static_cast<uint32_t>(work_.history[0][row(n_) + i]));
+                if constexpr (periods) {
+                    const double seen = static_cast<double>(static_cast<uint32_t>(work_.history[0][end + i]));
                     const double step = (seen - number_[i]) * share_[i];
                     turn = grid_.whole * total_[i] * size(step);
                     number_[i] += step;
                 }
                 const float moved = static_cast<float>(change[i]);
-                const bool settled = moved <= 1.0f || (sweep > 1 && moved * moved <= 0.25f * last[i]);
+                const bool settled = grid_.laps > 1 ? moved == 0.0f && sweep > 1
+                                                    : moved <= still_[i] || (sweep > 1 && moved * moved <= 0.25f * last[i]);
                 last[i] = moved;
-                exposure_.active[i] = settled && turn <= 0.5 && sweep >= least_[i] ? 0 : -1;
+                const bool still = turn <= 0.5 * static_cast<double>(still_[i]);
+                exposure_.active[i] = settled && still && sweep >= least_[i] ? 0 : -1;
+                overdrawn_[i] = negative_[i] < 0;
                 some = some || exposure_.active[i];
             }
             if (!some) break;
-            if (grid_.whole > 0) set_blind();
+            if constexpr (periods) set_blind();
         }
         return true;
     }
 
-    const FeedbackBatch& batch_;
-    const FeedbackGrid& grid_;
-    const int32_t n_;
-    Workspace work_;
+    // Only a history that agrees with itself and with the law of its count is written.
+    void check_draws(int32_t draw) {
+        const int32_t* const total = work_.history[0] + row(grid_.path());
+        for (int i = 0; i < kTeam; ++i) {
+            if (!drawing_[i]) continue;
+            const double mean = mean_[i] - floor_of(mean_[i] * 0x1p-32) * 0x1p32;
+            const int32_t off = static_cast<int32_t>(static_cast<uint32_t>(total[i]) - static_cast<uint32_t>(mean));
+            const int32_t size = off < 0 ? -1 - off : off;
+            if (exposure_.active[i]) status(i, draw) = FeedbackStatus::kUnsettled;
+            else if (overdrawn_[i]) status(i, draw) = FeedbackStatus::kNegative;
+            else if (size > allowed_[i]) status(i, draw) = FeedbackStatus::kUnlikely;
+            drawing_[i] = status(i, draw) == FeedbackStatus::kDrawn;
+        }
+    }
+
+    bool draw_remainders(int32_t draw) {
+        bool fits = true;
+        for (int i = 0; i < kTeam; ++i) {
+            if (!drawing_[i]) continue;
+            const Remainder rest(grid_, work_.history[0] + i, work_.photons + i, exposure_.edge[i], exposure_.rank[i],
+                                 {key0_[i], key1_[i]});
+            rest.walk([&](int32_t cell) { fits = add_registration(batch_, i, draw, cell) && fits; });
+        }
+        return fits;
+    }
+
     Exposure exposure_;
     alignas(64) uint32_t key0_[kTeam], key1_[kTeam];
+    alignas(64) int32_t negative_[kTeam];
+    alignas(64) float fewest_[kTeam];  // exposures armed in any cell
     bool drawing_[kTeam];
-    float rate_[kTeam];      // contraction of a sweep
-    int32_t least_[kTeam];   // integer sweeps, at least
+    bool overdrawn_[kTeam];  // fewer than no exposures armed in the last sweep
     int32_t spare_[kTeam];   // whole periods blind beyond the end, less those at the start
-    double total_[kTeam];    // sum w
-    double share_[kTeam];    // 1 / (1 + K sum w)
-    double number_[kTeam];   // N, real
-    alignas(64) float scale_[kTeam];  // N_r / (1 + K sum w): exposures for each unit of w
+    double number_[kTeam];   // N of a piece, real
 };
 
 }  // namespace

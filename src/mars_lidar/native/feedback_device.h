@@ -19,7 +19,8 @@ struct FeedbackTask {
     FeedbackGrid grid;
     const int64_t* pixels;     // to draw, of the job
     int64_t streams, splits;   // a stream: every `splits`-th realization of one of the pixels
-    uint8_t* status;           // (streams) FeedbackStatus
+    int64_t number;            // of pixels to draw
+    uint8_t* status;           // (realizations, number) FeedbackStatus
     void* out;                 // (realizations, pixels of the job, bins)
     uint32_t* queue;           // 0 at first: the next batch of streams. On the processor one for each lane
     uint32_t* full;            // 0 at first: 1 where a bin exceeded the output's type
@@ -55,7 +56,8 @@ MARS_KERNEL feedback_histograms(const FeedbackTask task) {
         const int64_t at = (part * job.pixels + pixel) * job.bins;
         void* const row = wide ? static_cast<void*>(static_cast<uint32_t*>(task.out) + at)
                                : static_cast<void*>(static_cast<uint16_t*>(task.out) + at);
-        FeedbackStatus status = FeedbackStatus::kDrawn;
+        FeedbackStatus* const status =
+            reinterpret_cast<FeedbackStatus*>(task.status) + part * task.number + stream / task.splits;
         FeedbackBatch batch{};
         batch.grid = &task.grid;
         batch.first_bin = photons.first_bin;
@@ -74,10 +76,10 @@ MARS_KERNEL feedback_histograms(const FeedbackTask task) {
         batch.row_step = task.splits * job.pixels * job.bins;
         batch.wide = wide;
         batch.status = &status;
+        batch.status_step = task.splits * task.number;
         batch.memory = work + lit_bytes;
         batch.lane = place.lane;
         if (!Batch(batch).run()) add_later(task.full, 1u);
-        task.status[stream] = static_cast<uint8_t>(status);
     }
 }
 

@@ -13,8 +13,10 @@ class CellGrid {
 public:
     FeedbackGrid grid;
 
-    // `narrow` (bins * merge): base cells that are cut into `parts`.
-    CellGrid(const Job& job, int32_t merge, int32_t parts, const uint8_t* narrow) {
+    // `narrow` (bins * merge): base cells that are cut into `parts`; `laps` of the integer sweeps.
+    CellGrid(const Job& job, int32_t merge, int32_t parts, const uint8_t* narrow, int32_t laps) {
+        if (laps < 1 || laps > kMostLaps || (laps > 1 && job.dead_time >= 1.0))
+            throw nb::value_error("laps must be 1 to 64, and 1 where the dead time is a period or longer");
         const int32_t base = job.bins * merge;
         grid.width[0] = 1.0 / base;
         grid.width[1] = grid.width[0] / parts;
@@ -34,7 +36,9 @@ public:
 
         grid.bins = job.bins;
         grid.dead_time = job.dead_time;
-        grid.cycles = job.cycles;
+        grid.laps = laps;
+        grid.pieces = job.cycles / laps;
+        grid.remainder = job.cycles % laps;
         grid.stationary = job.stationary;
         grid.whole = static_cast<int32_t>(job.dead_time);
         double rest = (job.dead_time - grid.whole) * base;  // in base cells
@@ -43,7 +47,9 @@ public:
             rest += base;
         }
         set_edges(base, rest);
+        set_laps();
         grid.edge = edge_.data();
+        grid.lap_edge = lap_edge_.data();
         grid.place = place_.data();
         grid.bin_cell = bin_cell_.data();
         grid.narrow = narrow_.data();
@@ -55,6 +61,7 @@ public:
     const std::vector<double>& place() const { return place_; }
     const std::vector<uint8_t>& narrow() const { return narrow_; }
     const std::vector<FeedbackEdge>& edge() const { return edge_; }
+    const std::vector<FeedbackEdge>& lap_edge() const { return lap_edge_; }
 
 private:
     void set_edges(int32_t base, double rest) {
@@ -77,10 +84,27 @@ private:
         }
     }
 
+    // Every lap looks back to the one before, the first to the last.
+    void set_laps() {
+        const int32_t n = grid.cells, path = grid.path();
+        grid.lap_watch = path;
+        for (int32_t t = 0; t <= path; ++t) {
+            const int32_t lap = t == 0 ? 0 : (t - 1) / n;
+            FeedbackEdge edge = edge_[static_cast<size_t>(t - lap * n)];
+            int32_t from = lap - edge.turns;
+            edge.turns = 0;
+            for (; from < 0; from += grid.laps) ++edge.turns;
+            edge.late += from * n;
+            edge.early += from * n;
+            if (edge.turns > 0 && edge.early < grid.lap_watch) grid.lap_watch = edge.early;
+            lap_edge_.push_back(edge);
+        }
+    }
+
     std::vector<int32_t> bin_cell_, first_;
     std::vector<double> place_;
     std::vector<uint8_t> narrow_;
-    std::vector<FeedbackEdge> edge_;
+    std::vector<FeedbackEdge> edge_, lap_edge_;
 };
 
 }  // namespace mars

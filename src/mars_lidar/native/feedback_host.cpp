@@ -18,13 +18,17 @@ namespace mars {
 namespace {
 
 // The grid, to be copied to the device.
-nb::dict grid_arrays(const BoundJob& job, int32_t merge, int32_t parts, Vector<const uint8_t> narrow) {
+nb::dict grid_arrays(const BoundJob& job, int32_t merge, int32_t parts, Vector<const uint8_t> narrow, int32_t laps) {
     if (merge < 1 || parts < 1 || static_cast<int64_t>(narrow.shape(0)) != int64_t{job.bins} * merge)
         throw nb::value_error("narrow must be (bins * merge)");
-    const CellGrid cells(job, merge, parts, narrow.data());
-    const uint8_t* const edges = reinterpret_cast<const uint8_t*>(cells.edge().data());
+    const CellGrid cells(job, merge, parts, narrow.data(), laps);
+    auto bytes = [](const std::vector<FeedbackEdge>& edges) {
+        const uint8_t* const first = reinterpret_cast<const uint8_t*>(edges.data());
+        return copied(std::vector<uint8_t>(first, first + edges.size() * sizeof(FeedbackEdge)));
+    };
     nb::dict told;
-    told["edge"] = copied(std::vector<uint8_t>(edges, edges + cells.edge().size() * sizeof(FeedbackEdge)));
+    told["edge"] = bytes(cells.edge());
+    told["lap_edge"] = bytes(cells.lap_edge());
     told["place"] = copied(cells.place());
     told["bin_cell"] = copied(cells.bin_cell());
     told["narrow"] = copied(cells.narrow());
@@ -41,7 +45,7 @@ nb::dict pulse_arrays(const PulseTable& pulse) {
 }
 
 nb::bytes task_of(const BoundJob& job, const PulseTable& pulse, int32_t merge, int32_t parts,
-                  Vector<const uint8_t> narrow, const nb::dict& addresses, const nb::dict& numbers) {
+                  Vector<const uint8_t> narrow, int32_t laps, const nb::dict& addresses, const nb::dict& numbers) {
     const DeviceFields f(addresses, numbers);
     FeedbackTask task{};
     task.job = job;
@@ -57,15 +61,17 @@ nb::bytes task_of(const BoundJob& job, const PulseTable& pulse, int32_t merge, i
     task.energy.tail = f.at<const double>("tail");
     task.energy.density = f.at<const double>("density");
     task.energy.sampled.knots = f.at<const double>("knots");
-    const CellGrid cells(job, merge, parts, narrow.data());
+    const CellGrid cells(job, merge, parts, narrow.data(), laps);
     task.grid = cells.grid;
     task.grid.edge = f.at<const FeedbackEdge>("edge");
+    task.grid.lap_edge = f.at<const FeedbackEdge>("lap_edge");
     task.grid.place = f.at<const double>("place");
     task.grid.bin_cell = f.at<const int32_t>("bin_cell");
     task.grid.narrow = f.at<const uint8_t>("narrow");
     task.pixels = f.at<const int64_t>("pixels");
     task.streams = f.integer("streams");
     task.splits = f.integer("splits");
+    task.number = f.integer("number");
     task.status = f.at<uint8_t>("status");
     task.out = f.at<void>("out");
     task.queue = f.at<uint32_t>("queue");
@@ -79,15 +85,17 @@ nb::bytes task_of(const BoundJob& job, const PulseTable& pulse, int32_t merge, i
 
 void bind_feedback_device(nb::module_& module) {
     module.def("feedback_grid", &grid_arrays, nb::arg("job"), nb::arg("merge"), nb::arg("parts"), nb::arg("narrow"),
-               "The internal grid, to be copied to the device.");
+               nb::arg("laps"), "The internal grid, to be copied to the device.");
     module.def("feedback_pulse", &pulse_arrays, nb::arg("pulse"), "Tables of a pulse's energy, likewise.");
     module.def("feedback_task", &task_of, nb::arg("job"), nb::arg("pulse"), nb::arg("merge"), nb::arg("parts"),
-               nb::arg("narrow"), nb::arg("addresses"), nb::arg("numbers"),
+               nb::arg("narrow"), nb::arg("laps"), nb::arg("addresses"), nb::arg("numbers"),
                "Argument of the kernel feedback_histograms: device arrays and numbers by name.");
     module.def(
         "feedback_warp_bytes",
-        [](int64_t cells) { return (int64_t{8} * kRow * cells + feedback_bytes(cells, cells) + 63) / 64 * 64; },
-        nb::arg("cells"), "Bytes that a warp of feedback_histograms works in.");
+        [](int64_t cells, int64_t laps) {
+            return (int64_t{8} * kRow * cells + feedback_bytes(cells, laps, cells) + 63) / 64 * 64;
+        },
+        nb::arg("cells"), nb::arg("laps"), "Bytes that a warp of feedback_histograms works in.");
     module.def(
         "feedback_on_host",
         [](const std::string& kernel, const nb::bytes& argument, int64_t blocks, int32_t lanes, int64_t shared) {

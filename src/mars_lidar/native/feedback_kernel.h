@@ -27,26 +27,42 @@ struct FeedbackEdge {
 
 // One laser period on n internal cells; dead time K periods and a rest of at least two cells, at most one period and
 // a cell. All lanes share the grid; theirs is the period from the lane's first bin on. Made by feedback_grid.h.
+//
+// The integer sweeps run round a circle of L laser periods (laps), which pieces of the exposure go through together,
+// L > 1 for K = 0 only. What the pieces leave of the exposure, less than L periods, is drawn photon by photon.
 struct FeedbackGrid {
     int32_t cells;             // n
     int32_t bins;              // of the histogram
     int32_t whole;             // K
-    int32_t watch;             // cells from here on are within one dead time of the period's end
-    const FeedbackEdge* edge;  // (n + 1)
+    int32_t watch, lap_watch;  // cells from here on are within one dead time of the end of the period, of the laps
+    const FeedbackEdge* edge;      // (n + 1)
+    const FeedbackEdge* lap_edge;  // (L n + 1) of the laps
     const double* place;       // (n + 1) of the edges, in periods
     const int32_t* bin_cell;   // (bins + 1) cell that each bin of the histogram begins with
     const uint8_t* narrow;     // (n) 1: a cell of the finer kind
     double width[2];           // of the wide and the narrow cells, in periods
     double dead_time;          // in periods
-    int32_t cycles;
+    int32_t laps;              // L
+    int32_t pieces;            // floor(N_r / L)
+    int32_t remainder;         // N_r - L pieces
     bool stationary;
+
+    int32_t path() const { return cells * laps; }  // cells of all laps
 };
 
+// What became of an exposure. Refused ones are not written.
 enum class FeedbackStatus : uint8_t {
     kDrawn = 0,
-    kSlow = 1,    // the sweeps contract too slowly
-    kLocked = 2,  // a count law narrower than whole blind periods resolve
+    kSlow = 1,       // the sweeps contract too slowly: all of a pixel
+    kLocked = 2,     // a count law narrower than whole blind periods resolve: all of a pixel
+    kFew = 3,        // too few pieces of the exposure for the laps that it needs: all of a pixel
+    kUnsettled = 4,  // its sweeps did not end
+    kNegative = 5,   // fewer than no exposures armed
+    kUnlikely = 6,   // a count that its law does not allow
+    kLaps = 64,      // more laps are needed: kLaps + their number, all of a pixel
 };
+
+constexpr int32_t kMostLaps = 64;
 
 // One batch: kTeam exposures at a time, each lane its own pixel. A lane counts cells from a first bin of its own, so
 // that the pulses of different pixels lie in the same cells.
@@ -66,7 +82,8 @@ struct FeedbackBatch {
     void* const* rows;            // (kTeam): histogram of the first draw
     int64_t row_step;             // counts from draw to draw
     bool wide;                    // uint32 counts, else uint16
-    FeedbackStatus* status;       // (kTeam)
+    FeedbackStatus* const* status;  // (kTeam): of the first draw
+    int64_t status_step;          // from draw to draw
     unsigned char* memory;        // `feedback_bytes` of scratch
     int32_t lane;                 // of the rows in there: the batch's first
 #if defined(__CUDACC_RTC__)
@@ -77,10 +94,12 @@ struct FeedbackBatch {
 #endif
 };
 
-// Scratch of a batch, or of as many as share rows: `lit` cells may have signal.
-inline int64_t feedback_bytes(int64_t cells, int64_t lit) {
-    const int64_t row = kRow, rows = cells * row;
-    return 4 * (4 * row + 2 * lit * row + 8 * (rows + row)) + 2 * rows + 4 * cells * kTeams + 64 * 32;  // room to align
+// Scratch of a batch, or of as many as share rows: `lit` of its cells may have signal.
+inline int64_t feedback_bytes(int64_t cells, int64_t laps, int64_t lit) {
+    const int64_t row = kRow, rows = cells * row, path = laps * rows;
+    const int64_t periodic = 4 * row + 2 * lit * row + 4 * (rows + row), whole = 4 * (path + row);
+    const int64_t photons = laps > 1 ? 8 * (rows + row) : 0;
+    return 4 * (periodic + whole) + photons + 2 * (path + row) + 4 * laps * cells * kTeams + 64 * 32;  // room to align
 }
 
 #if !defined(__CUDACC_RTC__)

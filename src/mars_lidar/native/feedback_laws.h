@@ -76,14 +76,16 @@ public:
                  sums_ + static_cast<int64_t>(j) * kRow, scale_, re_, mean, variance, armed);
     }
 
-    // A bit per lane that has less than `few` exposures armed and a mean above `counts`.
-    MARS_INLINE uint32_t rare(float few, float counts) const {
+    // A bit per lane of cell j that has fewer than `few` exposures armed and a mean above `counts`, or fires with a
+    // probability above `likely`.
+    MARS_INLINE uint32_t rare(int32_t j, float few, float counts, float likely) const {
+        const float* p = rates_.fire(j);
+        auto is_rare = [&](int i) { return (armed[i] < few ? 1 : 0) & ((mean[i] > counts ? 1 : 0) | (p[i] > likely ? 1 : 0)); };
         int32_t some = 0;
-        for (int i = 0; i < kTeam; ++i) some |= (armed[i] < few ? 1 : 0) & (mean[i] > counts ? 1 : 0);
+        for (int i = 0; i < kTeam; ++i) some |= is_rare(i);
         if (!some) return 0u;
         uint32_t bits = 0;
-        for (int i = 0; i < kTeam; ++i)
-            bits |= static_cast<uint32_t>((armed[i] < few ? 1 : 0) & (mean[i] > counts ? 1 : 0)) << i;
+        for (int i = 0; i < kTeam; ++i) bits |= static_cast<uint32_t>(is_rare(i)) << i;
         return bits;
     }
 

@@ -11,6 +11,7 @@ namespace mars {
 inline namespace MARS_LEVEL {
 
 constexpr float kInversionBelow = 6.0f;
+constexpr float kFarBelowOne = 0.1f;
 constexpr int kMostTerms = 48;  // a mean of 6 exceeds it with a probability of 1e-26
 
 // The uniform numbers of a cell, one per lane.
@@ -111,16 +112,24 @@ MARS_INLINE bool any_few(const float* mean) {
     return some != 0;
 }
 
-// alpha and beta of a cell, for all lanes.
-MARS_INLINE void follow_quantile(const float* mean, const float* variance, const Uniforms& uniforms, float* alpha,
-                                 float* beta) {
+// The steepest line that a count may follow: one exposure more armed (p of mu), or re-armed (q), adds at most one count.
+// Beyond it deviations could grow from sweep to sweep (docs/feedback.md).
+MARS_INLINE float steepest(float p, float q) {
+    const float most = p > q ? p : q;
+    return 1.0f / (most > 1e-30f ? most : 1e-30f);
+}
+
+// alpha and beta of a cell that fires with probability p, or q where it was re-armed within, for all lanes.
+MARS_INLINE void follow_quantile(const float* mean, const float* variance, const float* p, const float* q,
+                                 const Uniforms& uniforms, float* alpha, float* beta) {
     for (int i = 0; i < kTeam; ++i) {
         const float mu = mean[i] > 1.0f ? mean[i] : 1.0f, least = mu * 1e-7f;
         const float var = variance[i] > least ? variance[i] : least;
         float growth;
         const float more = excess(mu, var, uniforms.normal[i], growth);
-        alpha[i] = 1.0f + growth / mu;
-        beta[i] = more - growth;
+        const float slope = 1.0f + growth / mu, limit = steepest(p[i], q[i]);
+        alpha[i] = slope < limit ? slope : limit;
+        beta[i] = more - (alpha[i] - 1.0f) * mu;
     }
     if (!any_few(mean)) return;
     Terms terms;
@@ -134,10 +143,15 @@ MARS_INLINE void follow_quantile(const float* mean, const float* variance, const
         const float past = (uniforms.above[i] - terms.beyond[i]) / term, ratio = none ? 0.0f : before / term;
         const float short_of = (terms.above[i] - uniforms.above[i]) / before, k = terms.count[i];
         float up = past / (1.0f + 0.5f * (ratio - 1.0f) * past);
+        // Far below one count the mean may well be several times what it is expected to be, and P(H > 1) = mu^2 / 2 -
+        // mu^3 / 3 is not of second order about it.
+        const float far = root(2.0f * uniforms.above[i]), second = far + far * far * 0.33333334f - mean[i];
+        up = k == 1.0f && mean[i] < kFarBelowOne && second > up ? second : up;
         up = up > 1e-6f ? (up < 1e3f ? up : 1e3f) : 1e-6f;
         float down = short_of / (1.0f - 0.5f * ((k - 1.0f) / (mean[i] > 1e-3f ? mean[i] : 1e-3f) - 1.0f) * short_of);
         down = down > 0.0f ? (down < 1e3f ? down : 1e3f) : 0.0f;
-        const float slope = none ? 1.0f : 1.0f / (up + down);
+        const float steps = none ? 1.0f : 1.0f / (up + down), limit = steepest(p[i], q[i]);
+        const float slope = steps < limit ? steps : limit;
         const bool few = mean[i] < kInversionBelow;
         alpha[i] = few ? slope : alpha[i];
         beta[i] = few ? k - slope * (mean[i] + up) : beta[i];

@@ -128,11 +128,12 @@ MARS_NOINLINE void real_sweep(const FeedbackGrid& grid, const Rates& rates, cons
 
 // What the lanes of an integer sweep know beside the prefix sums.
 struct Exposure {
-    alignas(64) int32_t armed[kTeam];   // N_r - floor(K N) + whole periods still blind at the end - those at the start
-    alignas(64) float part[kTeam];      // K N - floor(K N), one exposure less armed in that share of the cells
-    alignas(64) int32_t end[kTeam];     // cells of the period that are blind once more at the end ...
-    alignas(64) int32_t start[kTeam];   // ... and at the start
-    alignas(64) int32_t place[kTeam];   // of cell 0, in cells of the period
+    alignas(64) int32_t armed[kTeam];   // M - floor(K N) + whole periods still blind at the end - those at the start
+    alignas(64) float part[kTeam];      // K N - floor(K N), one exposure less armed in that share of the cells; K > 0
+    alignas(64) int32_t end[kTeam];     // K > 0: cells of the period that are blind once more at the end
+    alignas(64) int32_t rank[kTeam];    // K = 0: registrations after that of the exposure which ends, or M and more
+    alignas(64) int32_t start[kTeam];   // cells that are blind at the start
+    alignas(64) int32_t edge[kTeam];    // cell that the exposure begins with
     alignas(64) int32_t active[kTeam];  // -1, or 0: the lane keeps its sums
 };
 
@@ -171,69 +172,96 @@ MARS_NOINLINE void take_exactly(const Quantiles& quantiles, int32_t j, uint32_t 
     for (int i = 0; i < kTeam; ++i) count[i] = mask >> i & 1u ? exact[i] : count[i];
 }
 
-// Integer sweep. `change` as above, in counts.
+constexpr float kLargest = 2147483520.0f;  // the largest float that an integer holds
+
+// Integer sweep through all laps. `change` as above, in counts. `negative`: below 0 where fewer than no exposures were
+// armed in a cell.
+//
+// The ends of the exposure, K = 0: all M exposures begin armed, so that the one that ends at the edge of the exposure,
+// blind by the registration of that rank before it, is taken out of the history: its re-arming does not count. (What
+// the armed start of the first exposure is to the end of the last one, docs/feedback.md.) K > 0: `end` cells.
+//
+// `periods`: K > 0; `warm`: lanes may be blind at the start.
+template <bool periods, bool warm>
 MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, const Quantiles& quantiles,
                                  const Exposure& exposure, const int32_t* __restrict__ old,
-                                 int32_t* __restrict__ fresh, int32_t* __restrict__ change) {
-    const int32_t n = grid.cells;
-    const History<int32_t> history(old, fresh, n);
-    const uint16_t* const dither = quantiles.dither;
-    alignas(64) int32_t c[kTeam], re[kTeam], phase[kTeam];
+                                 int32_t* __restrict__ fresh, int32_t* __restrict__ change,
+                                 int32_t* __restrict__ negative) {
+    const int32_t path = grid.path();
+    const History<int32_t> history(old, fresh, path);
+    alignas(64) int32_t c[kTeam], re[kTeam], mark[kTeam];
+    alignas(64) int32_t phase[kTeam];  // cells after the beginning of the exposure
     alignas(64) int32_t armed[kTeam], rearmed[kTeam], count[kTeam];
     Moves<int32_t> moves(INT32_MAX / 2);
+    // One lot for each cell in which the re-armed were registered: whatever the edges, their order is kept.
     auto rearmed_by = [](const History<int32_t>::Rows& back, float part, uint16_t lot, int i) {
         const float late = part * static_cast<float>(minus(back.late[i], back.early[i]));
         const int32_t whole = static_cast<int32_t>(late + static_cast<float>(lot) * 0x1p-16f);
         return minus(minus(back.late[i], back.gone[i]), whole);
     };
+    auto lots = [&](const FeedbackEdge& edge) { return quantiles.dither + static_cast<int64_t>(edge.early) * kRow; };
     for (int i = 0; i < kTeam; ++i) {
-        fresh[i] = c[i] = 0;
-        phase[i] = exposure.place[i];
-        re[i] = rearmed_by(history.at(grid.edge[0]), grid.edge[0].part, dither[i], i);
+        fresh[i] = c[i] = negative[i] = 0;
+        phase[i] = path - 1 - exposure.edge[i];
+        re[i] = rearmed_by(history.at(grid.lap_edge[0]), grid.lap_edge[0].part, lots(grid.lap_edge[0])[i], i);
+        const int32_t before = old[static_cast<int64_t>(exposure.edge[i]) * kRow + i];
+        mark[i] = minus(minus(before, history.less[1][i]), exposure.rank[i]);
     }
-    for (int32_t j = 0; j < n; ++j) {
-        const float *p = rates.fire(j), *q = rates.refire(j), part = grid.edge[j + 1].part;
-        const auto back = history.at(grid.edge[j + 1]);
-        const int64_t row = static_cast<int64_t>(j) * kRow;
-        const float *alpha = quantiles.alpha + row, *beta = quantiles.beta + row;
-        const uint16_t* lot = dither + (j + 1 < n ? row + kRow : 0);
-        const int32_t* before = old + row + kRow;
-        int32_t* after = fresh + row + kRow;
-        const double golden = 0.61803398874989485 * j;  // evenly over the cells and over [0, 1)
-        const float turn = static_cast<float>(golden - static_cast<double>(static_cast<int64_t>(golden)));
-        auto quantise = [&](int i) {
-            const int32_t next = rearmed_by(back, part, lot[i], i);
-            const int32_t extra = (phase[i] < exposure.end[i] ? 1 : 0) - (phase[i] < exposure.start[i] ? 1 : 0) -
-                                  (exposure.part[i] > turn ? 1 : 0);
-            const int32_t left = exposure.armed[i] + extra - minus(c[i], re[i]), in = minus(next, re[i]);
-            armed[i] = left > 0 ? left : 0;
-            rearmed[i] = in > 0 ? in : 0;
-            re[i] = next;
-            const int32_t turned = phase[i] + 1;
-            phase[i] = turned == n ? 0 : turned;
-            const float mean = p[i] * static_cast<float>(armed[i]) + q[i] * static_cast<float>(rearmed[i]);
-            const float x = alpha[i] * mean + beta[i];
-            const int32_t down = static_cast<int32_t>(x), up = down + (x > static_cast<float>(down) ? 1 : 0);
-            count[i] = up > 0 ? up : 0;
-        };
-        auto add = [&](int i) {
-            const int32_t there = armed[i] + rearmed[i], kept = before[i];
-            const int32_t moved = plus(c[i], count[i] < there ? count[i] : there);
-            c[i] = kept ^ ((moved ^ kept) & exposure.active[i]);
-            after[i] = c[i];
-        };
-        if (const uint32_t anew = quantiles.exact[static_cast<int64_t>(j) * kTeams]) {
-            for (int i = 0; i < kTeam; ++i) quantise(i);
-            take_exactly(quantiles, j, anew, p, q, armed, rearmed, count);
-            for (int i = 0; i < kTeam; ++i) add(i);
-        } else {
-            for (int i = 0; i < kTeam; ++i) {
-                quantise(i);
-                add(i);
+    for (int32_t lap = 0, t = 0; lap < grid.laps; ++lap)
+        for (int32_t j = 0; j < grid.cells; ++j, ++t) {
+            const FeedbackEdge& edge = grid.lap_edge[t + 1];
+            const float *p = rates.fire(j), *q = rates.refire(j), part = edge.part;
+            const auto back = history.at(edge);
+            const int64_t row = static_cast<int64_t>(t) * kRow;
+            const float *alpha = quantiles.alpha + row, *beta = quantiles.beta + row;
+            const uint16_t* const lot = lots(edge);
+            const int32_t* before = old + row + kRow;
+            int32_t* after = fresh + row + kRow;
+            const double golden = 0.61803398874989485 * j;  // evenly over the cells and over [0, 1)
+            const float turn = static_cast<float>(golden - static_cast<double>(static_cast<int64_t>(golden)));
+            auto quantise = [&](int i) {
+                const int32_t next = rearmed_by(back, part, lot[i], i);
+                int32_t extra = 0, in = minus(next, re[i]);
+                if constexpr (warm) {
+                    phase[i] = phase[i] + 1 == path ? 0 : phase[i] + 1;
+                    extra -= phase[i] < exposure.start[i] ? 1 : 0;
+                }
+                if constexpr (periods) {
+                    extra += (phase[i] < exposure.end[i] ? 1 : 0) - (exposure.part[i] > turn ? 1 : 0);
+                } else {
+                    mark[i] = t == exposure.edge[i] ? minus(c[i], exposure.rank[i]) : mark[i];
+                    const int32_t out = minus(re[i], mark[i]) < 0 ? 1 : 0;
+                    extra += out;
+                    in += (minus(next, mark[i]) < 0 ? 1 : 0) - out;
+                }
+                const int32_t left = plus(exposure.armed[i] + extra, minus(re[i], c[i]));
+                negative[i] |= left;
+                armed[i] = left > 0 ? left : 0;
+                rearmed[i] = in > 0 ? in : 0;
+                re[i] = next;
+                const float mean = p[i] * static_cast<float>(armed[i]) + q[i] * static_cast<float>(rearmed[i]);
+                const float followed = alpha[i] * mean + beta[i], x = followed < kLargest ? followed : kLargest;
+                const int32_t down = static_cast<int32_t>(x), up = down + (x > static_cast<float>(down) ? 1 : 0);
+                count[i] = up > 0 ? up : 0;
+            };
+            auto add = [&](int i) {
+                const int32_t there = armed[i] + rearmed[i], kept = before[i];
+                const int32_t moved = plus(c[i], count[i] < there ? count[i] : there);
+                c[i] = kept ^ ((moved ^ kept) & exposure.active[i]);
+                after[i] = c[i];
+            };
+            if (const uint32_t anew = quantiles.exact[static_cast<int64_t>(t) * kTeams]) {
+                for (int i = 0; i < kTeam; ++i) quantise(i);
+                take_exactly(quantiles, t, anew, p, q, armed, rearmed, count);
+                for (int i = 0; i < kTeam; ++i) add(i);
+            } else {
+                for (int i = 0; i < kTeam; ++i) {
+                    quantise(i);
+                    add(i);
+                }
             }
+            if (t + 1 >= grid.lap_watch) moves.see(c, before);
         }
-        if (j + 1 >= grid.watch) moves.see(c, before);
-    }
     moves.largest(c, history.less[1], change);
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 import mars_lidar as ml
 from mars_lidar.engines._feedback_grid import cell_cuts, internal_cells
+from mars_lidar.engines._feedback_rule import draw_rest
 from mars_lidar.engines.base import Task
+from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.studies import Request
 from mars_lidar.studies.machine import machine
@@ -40,7 +42,9 @@ class _Sampled(FeedbackEngine):
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         out[...] = 0
         rest = self.sample(task, out, np.arange(task.pixel_index.size))
-        task.report["refused"] = float(rest.size)
+        task.report["refused"] = float(rest.pixels.size)
+        # single exposures that did not settle: a simulation would draw them again
+        draw_rest(ExactEngine(), task, out, replace(rest, pixels=rest.pixels[:0]))
 
 
 def run(request: Request) -> list[Path]:

@@ -1,0 +1,145 @@
+"""Pixels locked within one period: pieces of several laps, against the exact engine; and what an image may not hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from feedback_cases import GIVEN, Sampler, case, drawn
+from scipy import stats
+
+import mars_lidar as ml
+from harness import COUNTS, JOINT, SHAPE, Case, check, require, task_of
+from mars_lidar import _core
+from mars_lidar.engines import ENGINES
+from mars_lidar.engines._feedback_grid import near_pulse
+from mars_lidar.engines._feedback_rule import Reason
+
+PERIOD_NS = 1e3 / 7.5
+
+
+def locked(signal: float, background: float, dead: float, cycles: int, sigma: float, bins: int, **changes: Any) -> Case:
+    return case(signal, background, dead, cycles, sigma=sigma, bins=bins, **changes)
+
+
+LOCKED = {  # feedback failed in all of them before it had laps
+    "S 8, dead time 0.93": locked(8.0, 1.0, 0.93, 20_000, 0.00375, 64),
+    "S 4.6, B 7.7, dead time 0.964": locked(4.6, 7.7, 0.964, 100_003, 0.0032, 16, items=800),
+    "S 6.94, dead time 0.887": locked(6.94, 1.45, 0.887, 20_003, 0.0064, 16),
+    "S 20, dead time 0.97": locked(20.0, 2.0, 0.97, 20_000, 0.00375, 64, start="stationary"),
+    "S 9, dim background, dead time 0.9": locked(9.0, 0.1, 0.9, 20_000, 0.01, 128),
+    "S 67, stationary": locked(66.8, 1.0, 0.766, 20_000, 0.0023, 64, delay=0.98, start="stationary"),
+}
+
+
+@pytest.mark.parametrize("name", LOCKED)
+def test_law_is_that_of_exact(name: str):
+    check(Sampler(), LOCKED[name], ENGINES["exact"], {COUNTS, SHAPE, JOINT})
+
+
+def test_shadow_of_a_bright_pulse():
+    """Bins of less than one count per exposure, fired in bursts by exposures that are out of phase with the others."""
+    request = locked(76.5, 2.08, 0.887, 100_007, 0.0047, 16, delay=0.66, items=6000)
+    x = drawn(Sampler(), request).astype(float)
+    y = drawn(ENGINES["exact"], request, seed=2).astype(float)
+    assert 0.2 < y[:, 1].mean() < 1.0
+    p = {}
+    for k in (0, 1, 2, 3, 14, 15):
+        error = np.sqrt((x[:, k].var() + y[:, k].var()) / len(x))
+        p[f"bin {k} mean"] = float(2 * stats.norm.sf(abs(x[:, k].mean() - y[:, k].mean()) / error))
+        square = [(z[:, k] - z[:, k].mean()) ** 2 for z in (x, y)]
+        spread = np.sqrt(sum(z.var() for z in square) / len(x))
+        p[f"bin {k} variance"] = float(2 * stats.norm.sf(abs(square[0].mean() - square[1].mean()) / spread))
+    require(p, "feedback, shadow of a bright pulse")
+
+
+SYSTEM = ml.System(
+    period_ns=PERIOD_NS, cycles=1_000_000, bins=1024, pulse=ml.GaussianPulse(sigma_ns=0.5),
+    detector=ml.Detector(dead_time_ns=0.97 * PERIOD_NS),
+)  # fmt: skip
+
+
+def test_a_million_cycles_with_a_count_that_cannot_vary():
+    """auto gave counts of 0 and 2^31 in 24 of these 200 pixels."""
+    report: dict[str, float] = {}
+    flux = ml.Flux(np.full((10, 20), 20.0), 2.0, 60.0)
+    counts = ml.simulate(flux, SYSTEM, engine="auto", seed=1, report=report).sum(-1)
+    assert np.abs(counts.astype(np.int64) - 1_000_000).max() <= 2
+    assert report["pixels drawn by feedback"] == 200
+
+
+@pytest.mark.parametrize(
+    ("engine", "signal", "background", "dead", "cycles"),
+    [("auto", 20.0, 0.5, 0.93, 30_000), ("auto", 20.0, 2.0, 0.93, 30_000), ("feedback", 7.0, 2.0, 0.95, 100)],
+)
+def test_narrow_histograms_do_not_overflow(engine: str, signal: float, background: float, dead: float, cycles: int):
+    system = SYSTEM.replace(cycles=cycles, detector=ml.Detector(dead_time_ns=dead * PERIOD_NS))
+    counts = ml.simulate(ml.Flux(np.full((4, 20), signal), background, 60.0), system, engine=engine, seed=1).sum(-1)
+    assert counts.min() >= cycles - 5
+    assert counts.max() <= cycles + 1
+
+
+def test_random_locked_systems_count_as_exact_does():
+    """Counts and their spread in 24 systems near their lock; z of the mean and of the spread beyond 5 fails: 3e-5."""
+    random = np.random.default_rng(6)
+    for _ in range(24):
+        signal, background = np.exp(random.uniform(np.log([4.0, 0.05]), np.log([80.0, 8.0])))
+        request = locked(
+            float(signal), float(background), float(random.uniform(0.7, 0.995)), int(random.integers(20_000, 40_000)),
+            float(np.exp(random.uniform(np.log(0.002), np.log(0.02)))), 32, delay=float(random.random()), items=600,
+        )  # fmt: skip
+        task = task_of(request, 3)
+        x = np.empty((task.items, 32), request.system.histogram_dtype)
+        ENGINES["feedback"].histogram(task, x)
+        y = drawn(ENGINES["exact"], request, seed=4)
+        a, b = x.sum(1, dtype=np.int64), y.sum(1)
+        error = np.sqrt((a.var() + b.var()) / 600) + 1e-2
+        assert abs(a.mean() - b.mean()) < 5 * error, request.name
+        spread = np.sqrt(sum((((z - z.mean()) ** 2).var()) for z in (a, b)) / 600) + 1e-2
+        assert abs(a.var() - b.var()) < 5 * spread, request.name
+
+
+# The kernel's own word
+
+
+def statuses(request: Case, laps: int) -> np.ndarray[Any, Any]:
+    task = task_of(request, 1, realizations=3)
+    out = np.full((task.items, request.system.bins), 7, request.system.histogram_dtype)
+    status = np.empty((3, task.pixel_index.size), np.uint8)
+    _core.feedback_histogram(
+        task.job, task.pulse, out, np.arange(task.pixel_index.size), status, 2, 1, near_pulse(task.system, 2), laps, 1
+    )
+    assert (out[(status != Reason.DRAWN).reshape(-1)] == 7).all(), "a refused row is not written"
+    return status
+
+
+def test_the_kernel_asks_for_laps():
+    request = LOCKED["S 8, dead time 0.93"]
+    asked = statuses(request, 1)
+    laps = int(asked[0, 0]) - Reason.LAPS
+    assert 3 <= laps <= 64
+    assert (asked == asked[0, 0]).all()
+    assert (statuses(request, laps) == Reason.DRAWN).all()
+    assert (statuses(request, laps + 1) == asked).all(), "no other number than that of the pixel"
+    short = replace(request, system=request.system.replace(cycles=2000))
+    assert (statuses(short, 1) == Reason.FEW).all()
+
+
+@pytest.mark.parametrize("laps", [0, 65])
+def test_laps_are_checked(laps: int):
+    with pytest.raises(ValueError, match="laps must be 1 to 64, and 1 where the dead time is a period or longer"):
+        statuses(LOCKED["S 8, dead time 0.93"], laps)
+    with pytest.raises(ValueError, match="laps must be 1 to 64, and 1 where the dead time is a period or longer"):
+        statuses(case(1.0, 1.0, 1.5, 1000), 2)
+
+
+def test_reports_count_by_reason():
+    report: dict[str, float] = {}
+    flux = ml.Flux([[20.0, 1.0, 1.0]], [[2.0, 1.0, 60.0]], 60.0)
+    ml.simulate(flux, SYSTEM.replace(cycles=3000), engine="feedback", seed=1, report=report)
+    assert report[GIVEN] == 2
+    assert report[f"{GIVEN}, locked, short exposure"] == 1
+    assert report[f"{GIVEN}, slow sweeps"] == 1
+    assert report["exposures drawn again by exact"] == 0

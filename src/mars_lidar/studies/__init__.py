@@ -20,7 +20,7 @@ class Request:
     """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
-    the study "hardware"; `config` the size of the study "downstream".
+    the study "hardware"; `config` the size of the study "downstream"; `seed` another sweep of the study "domain".
     """
 
     out: Path
@@ -30,6 +30,7 @@ class Request:
     truth: str = "sequential"
     stream: Path | None = None
     config: str = "small"
+    seed: int | None = None
 
 
 class OtherRunsError(ValueError):
@@ -62,6 +63,10 @@ STUDIES: dict[str, tuple[str, Study]] = {
     "long-exposures": (
         "the feedback engine at a million cycles and more against the closed form",
         _study("long_exposures"),
+    ),
+    "domain": (
+        "every engine and prediction on random systems over the declared domain; --seed draws others",
+        _study("domain"),
     ),
     "law": ("where each count law holds: total variation to simulation over flux and exposure", _study("law_report")),
     "detectors": (

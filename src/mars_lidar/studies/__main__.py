@@ -36,8 +36,8 @@ def _parser(command: str) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--data", type=Path, metavar="DIR",
-        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance'), or of measured scenes, "
-        "rgbd/ (study 'downstream')",
+        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance', 'domain'), or of "
+        "measured scenes, rgbd/ (study 'downstream')",
     )
     parser.add_argument(
         "--stream", type=Path, metavar="FILE",
@@ -53,6 +53,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
         help="size of the study 'downstream': an hour or two of two cores, or a GPU (default: %(default)s); with "
         "--quick a tiny one, seconds",
     )  # fmt: skip
+    parser.add_argument("--seed", type=int, metavar="N", help="another sweep (study 'domain')")
     return parser
 
 
@@ -71,7 +72,7 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m mars_
     except OSError as error:
         parser.error(f"--out must be a folder that can be made, got {str(given.out)!r}: {error.strerror}")
     tell = partial(print, file=sys.stderr, flush=True)
-    request = Request(given.out, given.quick, given.data, tell, given.truth, given.stream, given.config)
+    request = Request(given.out, given.quick, given.data, tell, given.truth, given.stream, given.config, given.seed)
     try:
         for name in dict.fromkeys(given.studies):
             began = time.monotonic()

@@ -93,10 +93,10 @@ def _waveform_cuts(flux: Flux, system: System, widest: NDArray[np.float64]) -> N
     """Parts (H, W) that a bin is cut into, for a rate that is constant on parts of the period.
 
     Cells of width w are crossed by the edges of parts, and re-arm those of the part one dead time before, whose rate
-    falls within it as its photons are used up. A rate that steps by J parts' photons, or is l in a part, then puts
-    (J + l^2) N_r / 8 (w / part)^2 exposures wrong at the edges of a cell one dead time on, where m photons a part see
-    them: an error of (J + l^2) sqrt(N_r m) / 8 standard deviations, for w as wide as a part, second order in w. J
-    and l as differences from the parts beside it, so that smooth light needs no cuts. Edges of cells are those of
+    falls within it as its photons are used up. Where the photons of parts differ by J, and one has l, this puts
+    J (1 + l) N_r / 8 (w / part)^2 exposures wrong at the edges of a cell one dead time on, where m photons a part see
+    them: an error of J (1 + l) sqrt(N_r m) / 8 standard deviations, for w as wide as a part, second order in w.
+    Smooth light needs no cuts. Edges of cells are those of
     parts where bins and parts allow it within twice as many cells.
     """
     assert flux.waveform is not None

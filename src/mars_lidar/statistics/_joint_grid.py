@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-MOST_FACTORED = 2**15  # bins of an equation that is factorised: some 2 s
+MOST_FACTORED = 2**14  # bins of an equation that is factorised: a second
 _SWEEPS = 200  # beyond, a factorisation is cheaper
 _TOLERANCE = 1e-10  # of a solution, relative to its largest value
 _GOOD = 1e-9  # relative residual with which a solution is accepted

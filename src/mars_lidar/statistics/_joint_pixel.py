@@ -13,7 +13,7 @@ from mars_lidar.statistics._joint_window import SettledLaw, Windows
 
 _INSTEAD = "use exposure_moments (count and mean histogram), or simulate it with engine 'exact'"
 _SETTLED = 1e-9  # distance from the stationary state (total variation) at which the start is forgotten
-_MAX_STEPS = 200_000_000  # bins x periods after which an exposure counts as not settling: a second
+_MAX_STEPS = 40_000_000  # bins x periods after which an exposure counts as not settling: half a second
 _MAX_RECURSION = 2**22  # bins x periods of an exposure that is run through for every window
 
 

@@ -33,7 +33,7 @@ def warm_history(cells: Cells, which: IndexArray, bins: int) -> FloatArray:
             grid = FoldedGrid.of(cells.part(np.array([k])), bins)
             state = grid.state
         except ConvergenceError as error:
-            raise ConvergenceError(f"stationary state of {cells.name(int(k))}: {error}") from None
+            raise ConvergenceError(f"stationary state of {cells.name(int(k))}: {error}; {cells.instead}") from None
         tail = float(grid.blind(state)[0]) - grid.whole * float(state[0].sum())
         row[:-2] = state.T.reshape(-1)
         row[-2:] = max(1.0 - tail - grid.whole * float(state[0].sum()), 0.0), tail

@@ -90,7 +90,7 @@ def paralyzable_moments(
 
 
 def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
-    """Mean histograms (cells, bins) of checked cells, any dead time; their sum to `tolerance` standard deviations."""
+    """Mean histograms (cells, bins) of checked cells, any dead time; sums to 10 x `tolerance` standard deviations."""
     return _refined(cells, tolerance, with_variance=False).histogram.reshape(cells.size, -1)
 
 
@@ -107,13 +107,13 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
         coarse = _Grid(cell, n // 2, with_variance)
         while True:
             fine = _Grid(cell, n, with_variance)
-            if _moved(coarse, fine) <= tolerance and (with_variance or _total_moved(coarse, fine) <= tolerance):
+            if _moved(coarse, fine) <= tolerance and (with_variance or _total_moved(coarse, fine) <= 10.0 * tolerance):
                 break
             coarse, n = fine, 2 * n
             if n > max(_MAX_BINS, 4 * system.bins):
                 raise ConvergenceError(
                     f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still move by "
-                    f"more than {tolerance:g}"
+                    f"more than {tolerance:g}; use a larger tolerance, or simulate it with engine 'exact'"
                 )
         mean[k], variance[k], histogram[k], bins[k] = fine.mean, fine.variance, fine.histogram, n
         if not with_variance:  # the limit for fine grids

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -28,11 +30,27 @@ def test_a_pane_hides_behind_what_is_nearer():
     np.testing.assert_allclose(flux.background, 0.5 * np.array([[0.5, 1.0, 1.5]]))  # the map of the first layer
     near = seen.flux(SYSTEM, signal=2.0, sbr=4.0, attenuation="inverse_square", ambient="reflectivity")
     np.testing.assert_allclose(near.returns_signal[:, 0, 1] / near.signal[0, 0], [0.4 / 16 / 0.5, 0.1 / 4 / 0.5])
-    np.testing.assert_allclose(near.background / near.background[0, 0], [[1.0, 1.0, 1.0]])
+    np.testing.assert_allclose(near.background / near.background[0, 0], [[1.0, 1.0, 0.2]])  # the last: the pane alone
     twice = LayeredScene.behind_pane(seen, 1.5, 0.2)
     assert len(twice.layers) == 3
     assert twice[:, 1:].shape == (1, 2)
     assert twice.resize((2, 6)).shape == (2, 6)
+
+
+@pytest.mark.filterwarnings("ignore:.* have no return")
+def test_ambient_light_of_layers_in_any_order():
+    nan, rng = np.nan, np.random.default_rng(5)
+    depths = [[[1.0, nan, nan, 3.0, nan]], [[2.0, 2.0, nan, nan, nan]], [[4.0, nan, 4.0, nan, nan]]]
+    layers = [ml.Scene(depth, rng.uniform(0.1, 0.9, (1, 5))) for depth in depths]
+    share = [one.reflectivity[0] for one in layers]
+    sums = [share[0][0] + share[1][0] + share[2][0], share[1][1], share[2][2], share[0][3], max(s[4] for s in share)]
+    for order in itertools.permutations(range(3)):
+        flux = LayeredScene([layers[k] for k in order]).flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
+        np.testing.assert_allclose(flux.background[0] / flux.background[0, 1], np.array(sums) / sums[1], rtol=1e-12)
+        assert flux.background[0, :4].mean() == pytest.approx(0.5)  # over the pixels with a return
+    alone = layers[0].flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
+    one = LayeredScene(layers[:1]).flux(SYSTEM, signal=2.0, sbr=4.0, ambient="reflectivity")
+    np.testing.assert_array_equal(alone.background, one.background)
 
 
 def test_bad_layers(tmp_path):

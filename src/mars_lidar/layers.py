@@ -119,7 +119,8 @@ class LayeredScene:
             S_k = signal * w_k / mean_V(sum_k w_k)
 
         so that all returns of a pixel together have the mean `signal`. Ambient ``"reflectivity"`` is the sum of the
-        reflectivities.
+        reflectivities of the surfaces that a pixel sees, and where it sees none the largest reflectivity of all
+        layers, in whatever order they come.
         """
         return scene_flux(self.layers, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
 

@@ -92,9 +92,11 @@ def _ambient_light(layers: Sequence[Scene], name: str) -> FloatArray:
     scene = layers[0]
     if name == "uniform":
         return np.ones(scene.shape)
-    if name == "reflectivity":  # each surface scatters it
-        more = [np.where(one.valid, one.reflectivity, 0.0) for one in layers[1:]]
-        return sum(more, start=scene.reflectivity)
+    if name == "reflectivity":  # each surface scatters it, and what has no known range all the same
+        surfaces = np.stack([np.where(one.valid, one.reflectivity, 0.0) for one in layers])
+        nowhere = ~_any([one.valid for one in layers])
+        beyond = np.max([one.reflectivity for one in layers], axis=0)
+        return np.asarray(np.where(nowhere, beyond, surfaces.sum(0)), dtype=np.float64)
     if scene.background is None:
         raise ValueError("ambient='map' needs a scene with a background map, got one without")
     return scene.background

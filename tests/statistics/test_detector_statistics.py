@@ -24,6 +24,7 @@ from mars_lidar.statistics import (
     renewal_moments,
     renewal_pmf,
 )
+from mars_lidar.statistics import synchronous as synchronous_module
 
 DEAD = [0.0, 0.4, 1.0, 1.7, 5.02, 60.0]
 GATES = {"gate": (0.303, 0.11), "wrapping gate": (0.9, 0.5), "narrow gate": (0.38, 0.002)}
@@ -166,6 +167,36 @@ def test_synchronous_count_law(rate: float, dead: float, start: str):
     assert law.mean == pytest.approx(mean, rel=1e-8)
 
 
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "cycles", "start"),
+    [(1.0, 0.5, 1.5, 2000, "armed"), (0.3, 0.2, 40.3, 5000, "stationary"), (0.01, 0.01, 3.3, 20_000, "stationary"),
+     (3.0, 1.0, 0.93, 1000, "armed"), (20.0, 1.0, 2.93, 1000, "stationary")],
+)  # fmt: skip
+def test_synchronous_law_by_its_transform(
+    monkeypatch: pytest.MonkeyPatch, signal: float, background: float, dead: float, cycles: int, start: str
+):
+    system, laws = view("synchronous", dead, start, cycles), []
+    for terms in (0, 10**18):
+        monkeypatch.setattr(synchronous_module, "_MANY_TERMS", terms)
+        law = ml.count_law(signal, background, system, delay_ns=37.0)
+        laws.append(np.zeros(cycles + 1))
+        laws[-1][law.support] = law.pmf
+    assert laws[0] == pytest.approx(laws[1], abs=1e-11)
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize("dead", [0.4, 1.5, 300.25])
+def test_synchronous_law_of_long_exposures(dead: float, start: str):
+    """A renewal process: N / mu and N sigma^2 / mu^3 registrations, mu and sigma of the periods that one takes."""
+    rate, cycles = 1.3, 10**8
+    law = ml.count_law(0.0, rate, view("synchronous", dead, start, cycles))
+    q, late = -np.expm1(-rate), np.exp(-rate * (1 - dead % 1)) * -np.expm1(-rate * (dead % 1)) / -np.expm1(-rate)
+    mu, spread = np.floor(dead) + 1 + (1 - q) / q + late, (1 - q) / q**2 + late * (1 - late)
+    assert law.mean == pytest.approx(cycles / mu, abs=1.0)
+    assert law.variance == pytest.approx(cycles * spread / mu**3, rel=1e-4, abs=0.3)
+    assert law.pmf.sum() == pytest.approx(1.0, abs=1e-9)
+
+
 @pytest.mark.parametrize("cycles", [1, 1000, 1_000_000])
 def test_synchronous_is_binomial(cycles: int):
     system = view("synchronous", 0.0, cycles=cycles)
@@ -277,8 +308,6 @@ def test_too_long_dead_times_and_sharp_tolerances_are_refused():
     with pytest.raises(ValueError, match=r"dead_time_ns must be at most 20000 periods .*'paralyzable', got 30000"):
         paralyzable_moments(1.0, 1.0, view("paralyzable", 3e4))
     assert mean_histogram(1.0, 1.0, view("paralyzable", 3e4)).sum() == pytest.approx(1.0)
-    with pytest.raises(ConvergenceError, match=r"count law of S = 1.*'synchronous'.*use fewer cycles"):
-        ml.count_law(1.0, 1.0, view("synchronous", 1.5, cycles=10**8))
     with pytest.raises(ValueError, match=r"tolerance must be"):
         paralyzable_moments(1.0, 1.0, view("paralyzable", 1.0), tolerance=0.0)
     narrow = view("paralyzable", 0.3, pulse=ml.GaussianPulse(sigma_ns=1e-4))

@@ -109,3 +109,62 @@ def test_long_exposures_and_cells():
     assert both.mean == pytest.approx([0.0, float(a.mean)], abs=1e-6)
     assert both.pmf[0, 0] == 1.0
     assert pmf_of(ml.count_law(1e-9, 1e-9, view(0.4, 1.3)))[0] == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "electronics", "detector"),
+    [
+        (3.16, 0.12, 0.24, 0.95, {}),  # the case of Rapp's code: t_d < t_e below one period
+        (2.0, 0.3, 0.4, 1.3, {}),
+        (1.0, 0.3, 1.7, 2.05, {}),
+        (0.3, 0.1, 0.3, 5.05, {}),
+        (1.5, 0.1, 0.95, 1.9, {}),
+        (1.5, 0.8, 0.3, 0.9, {"mode": "gated", "gate_start_ns": 20.0, "gate_width_ns": 40.0}),
+        (1.5, 0.5, 0.3, 0.9, {"jitter": ml.Jitter(sigma_ns=1.0)}),
+    ],
+)
+def test_stationary_shape_is_that_of_long_exposures(
+    signal: float, background: float, dead: float, electronics: float, detector: dict[str, Any], start: str
+):
+    """Against the recursion of a long exposure, and against records of the sequential engine once it is warm."""
+    system = view(dead, electronics, start, 20_000, **detector)
+    shape = ml.registration_pdf(signal, background, system, "stationary", delay_ns=37.0)
+    assert shape.sum() == pytest.approx(1.0, abs=1e-12)
+    assert shape.min() >= 0.0
+    long = ml.registration_pdf(signal, background, system, "exposure", delay_ns=37.0)
+    assert 0.5 * np.abs(shape - long).sum() < 1e-3
+    again = ml.registration_pdf(signal, background, system.replace(cycles=3), "stationary", delay_ns=37.0)
+    np.testing.assert_allclose(again, shape, rtol=1e-9)  # whatever the exposure
+    free = ml.registration_pdf(signal, background, _without_electronics(system), "stationary", delay_ns=37.0)
+    assert 0.5 * np.abs(shape - free).sum() > 5e-3  # the electronics do something
+
+
+def _without_electronics(system: ml.System) -> ml.System:
+    return system.replace(detector=system.detector.without("electronics_dead_time_ns"))
+
+
+def test_stationary_shape_of_the_sequential_engine():
+    """Every bin within its error of some 2 million records, and of the law's tolerance; 50 bins, 4e-8 each."""
+    system = view(0.24, 0.95, "stationary", 10_000)
+    flux = flux_of(3.16, 0.12, 0.37)
+    drawn = ml.simulate(flux, system, engine="sequential", realizations=50, seed=20_264).reshape(-1, 50)
+    shape = ml.registration_pdf(3.16, 0.12, system, "stationary", delay_ns=37.0)
+    seen = drawn.sum(0).astype(float)
+    assert 0.5 * np.abs(seen / seen.sum() - shape).sum() < 3e-3
+    # bins of an exposure are correlated: errors from the scatter between exposures
+    share = drawn / drawn.sum(1, keepdims=True)
+    error = share.std(0, ddof=1) / np.sqrt(len(share))
+    z = (share.mean(0) - shape) / np.hypot(error, 1e-3 * shape)  # the law's own tolerance
+    assert np.abs(z).max() < 5.5
+
+
+def test_stationary_shape_where_electronics_do_nothing():
+    slower = view(0.7, 0.5)
+    same = ml.registration_pdf(2.0, 0.3, slower, "stationary", delay_ns=37.0)
+    np.testing.assert_array_equal(
+        same, ml.registration_pdf(2.0, 0.3, _without_electronics(slower), "stationary", delay_ns=37.0)
+    )
+    alone = ml.registration_pdf(2.0, 0.3, view(0.0, 0.7), "stationary", delay_ns=37.0)
+    np.testing.assert_allclose(alone, same, rtol=1e-9)
+    np.testing.assert_allclose(ml.registration_pdf([0.0, 1.0], 0.0, view(0.3, 0.7), "stationary")[0], 0.02)

@@ -181,6 +181,30 @@ def test_the_measured_error_is_the_error():
     assert paper.mean > 3 * law.mean  # start-up, skewness: the exact law tells them apart
 
 
+def test_the_error_of_long_exposures_is_measured_and_told(tmp_path):
+    from mars_lidar.cli.table import _rows
+
+    table = small_table()
+    made = table.provenance["error_longest"]
+    assert made["cycles"] == 10**8
+    longest = table.quantisation_error(samples=128, cycles=10**8)
+    assert longest.to_dict() == made
+    shorter = table.quantisation_error(samples=128, cycles=10**6)
+    assert longest.mean_max == pytest.approx(10.0 * shorter.mean_max, rel=0.05)  # as the root of the exposure
+    within = longest.cycles_within(0.05)
+    told = table.quantisation_error(samples=128, cycles=within)
+    assert 0.045 <= max(told.mean_max, told.delayed_mean_max) <= 0.055
+    assert longest.cycles_within(1e6) == 10**8
+    with pytest.raises(ValueError, match="allowed must be"):
+        longest.cycles_within(0.0)
+    table.save(tmp_path / "t.h5")
+    rows = dict(_rows(tmp_path / "t.h5"))
+    assert f"{table.system.cycles:,} cycles" in next(name for name in rows if name.startswith("error at"))
+    mean = max(made["mean_max"], made["delayed_mean_max"])
+    assert f"at 100,000,000 cycles {mean:.2g} at most" in rows["error at any"]
+    assert f"up to some {within:.2g}" in rows["error at any"]
+
+
 def test_axes_refined_until_the_error_is_met():
     system = make_system(0.6, bins=16, sigma=0.04)
     coarse = ml.Table.build(system, (1.0, 9.0, 4), (0.01, 0.3, 4), threads=2)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Lookup tables over (S, B).")
 
 _GRID = "Grid"
+_ALLOWED = 0.05  # standard deviations of the mean count, up to which a table is told to be good
 _DEPTHS = 1024  # values of a delay axis, where there had to be one: the paper's 108 GB
 _PAPER_BYTES = "105 MB, 108 GB with delays"
 
@@ -186,13 +187,8 @@ def _rows(path: Path) -> list[tuple[str, str]]:
             f"{system.detector.dead_time_ns:.6g} ns, start {system.start}",
         ),
         ("start phases", f"{header['phases']}" if header["phases"] else "none: nothing depends on the delay"),
-        (
-            "error",
-            f"between entries, {made['samples']} random pixels: mean {made['mean_max']:.2g} and variance "
-            f"{made['variance_max']:.2g} at most (in standard deviations), shape {made['shape_max']:.2g} in total "
-            f"variation; at random delays {made['delayed_mean_max']:.2g}, {made['delayed_variance_max']:.2g}, "
-            f"{made['delayed_shape_max']:.2g}",
-        ),
+        (f"error at {made['cycles']:,} cycles", _error(made)),
+        ("error at any", _any_error(told.get("error_longest"), never)),
     ]
     law = told.get("law")
     if law is not None:
@@ -204,6 +200,34 @@ def _rows(path: Path) -> list[tuple[str, str]]:
             )
         )
     return rows
+
+
+def _error(made: dict[str, Any]) -> str:
+    return (
+        f"between entries, {made['samples']} random pixels: mean {made['mean_max']:.2g} and variance "
+        f"{made['variance_max']:.2g} at most (in standard deviations), shape {made['shape_max']:.2g} in total "
+        f"variation; at random delays {made['delayed_mean_max']:.2g}, {made['delayed_variance_max']:.2g}, "
+        f"{made['delayed_shape_max']:.2g}"
+    )
+
+
+def _any_error(longest: dict[str, Any] | None, unsettled: int) -> str:
+    """What becomes of the error in longer exposures."""
+    if unsettled:
+        return "as above: the table serves no other number of cycles"
+    grows = "that of the mean grows as the root of the number of cycles (in standard deviations)"
+    if longest is None:
+        return f"{grows}; at long exposures it was not measured when this table was built"
+    from mars_lidar.table.error import QuantisationError
+
+    error = QuantisationError(**longest)
+    within = error.cycles_within(_ALLOWED)
+    mean, variance = max(error.mean_max, error.delayed_mean_max), max(error.variance_max, error.delayed_variance_max)
+    limit = "any number" if within >= error.cycles else f"up to some {within:.2g}"
+    return (
+        f"{grows}: at {error.cycles:,} cycles {mean:.2g} at most, variance {variance:.2g}; the mean is within "
+        f"{_ALLOWED:g} standard deviations for {limit} of cycles"
+    )
 
 
 def _laws(header: dict[str, Any]) -> str:

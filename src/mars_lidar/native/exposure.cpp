@@ -1,8 +1,10 @@
 // Bindings of the exposure recursion: batches of entries on threads, through the widest kernel that runs here.
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <vector>
 
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
 #include "bindings.h"
@@ -48,13 +50,14 @@ std::vector<Level> levels() {
     return found;
 }
 
-// The widest level, or the one named, whose batches do not remember more than kBatchBytes; scalar if none.
-Level level_for(const std::string& name, int64_t bytes_per_lane) {
+// The widest level, or the one named, whose batches do not remember more than kBatchBytes and whose lanes are filled by
+// `jobs`: a lane without work costs as much as another. Scalar if none.
+Level level_for(const std::string& name, int64_t bytes_per_lane, int64_t jobs) {
     Level chosen{};
     for (const Level& level : levels()) {
         if (!name.empty() && name != level.name) continue;
         chosen = level;
-        if (!name.empty() || level.lanes * bytes_per_lane <= kBatchBytes) break;
+        if (!name.empty() || (level.lanes * bytes_per_lane <= kBatchBytes && level.lanes < 2 * jobs)) break;
     }
     if (!chosen.moments) throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
     return chosen;
@@ -81,6 +84,16 @@ ExposureFlux make_flux(const ExposureGrid& grid, const Vector<const double>& sig
         if (shape.data()[i] < 0 || static_cast<size_t>(shape.data()[i]) >= shapes.shape(0))
             throw nb::value_error("shape must be rows of shapes");
     return flux;
+}
+
+using History = std::optional<Matrix<const double>>;
+
+void add_history(ExposureFlux& flux, const History& history) {
+    if (!history) return;
+    if (history->shape(0) != static_cast<size_t>(flux.entries) ||
+        history->shape(1) != 2 * static_cast<size_t>(flux.bins) + 2)
+        throw nb::value_error("history must be (entries, 2 bins + 2)");
+    flux.history = history->data();
 }
 
 template <class T>
@@ -110,7 +123,7 @@ void run_moments(const ExposureGrid& grid, const ExposureFlux* flux, const Expos
     expect("histogram", histogram, entries, grid.out_bins);
     expect("histogram_rate", histogram_rate, entries, grid.out_bins);
     if (static_cast<int64_t>(settled.shape(0)) != entries) throw nb::value_error("settled has the wrong shape");
-    const Level level = level_for(level_name, bytes_per_lane(grid, kExposureOrders + 1));
+    const Level level = level_for(level_name, bytes_per_lane(grid, kExposureOrders + 1), entries);
     const int64_t batches = (entries + level.lanes - 1) / level.lanes;
     run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
@@ -124,8 +137,10 @@ void run_moments(const ExposureGrid& grid, const ExposureFlux* flux, const Expos
 void moments(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
              Vector<const int32_t> shape, Matrix<const double> shapes, Matrix<double> cumulants,
              Matrix<double> cumulant_rates, Matrix<double> histogram, Matrix<double> histogram_rate,
-             Vector<int64_t> settled, int threads, const std::string& level_name, const nb::object& progress) {
-    const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
+             Vector<int64_t> settled, int threads, const std::string& level_name, const nb::object& progress,
+             History history) {
+    ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
+    add_history(flux, history);
     run_moments(grid, &flux, nullptr, flux.entries, cumulants, cumulant_rates, histogram, histogram_rate, settled,
                 threads, level_name, progress);
 }
@@ -155,7 +170,7 @@ void phases(const ExposureGrid& grid, Vector<const double> signal, Vector<const 
             throw nb::value_error("phase must be ascending edges of the grid");
     const std::vector<double>::size_type cells = static_cast<size_t>(flux.entries);
     std::vector<double> rates(cells * kExposureOrders), histogram(cells * grid.out_bins), rate(cells * grid.out_bins);
-    const Level level = level_for(level_name, 2 * bytes_per_lane(grid, kExposureOrders + 1));
+    const Level level = level_for(level_name, 2 * bytes_per_lane(grid, kExposureOrders + 1), flux.entries);
     const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
     run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
@@ -172,7 +187,7 @@ void stationary(const ExposureGrid& grid, Vector<const double> signal, Vector<co
     const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
     expect("histogram", histogram, flux.entries, grid.out_bins);
     if (static_cast<int64_t>(settled.shape(0)) != flux.entries) throw nb::value_error("settled has the wrong shape");
-    const Level level = level_for(level_name, 0);
+    const Level level = level_for(level_name, 0, flux.entries);
     const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
     run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
@@ -191,7 +206,7 @@ void run_characteristic(const ExposureGrid& grid, const ExposureFlux* flux, cons
     expect("re", re, entries, points);
     expect("im", im, entries, points);
     expect("settled", settled, entries, points);
-    const Level level = level_for(level_name, bytes_per_lane(grid, 2));
+    const Level level = level_for(level_name, bytes_per_lane(grid, 2), points);
     const int64_t batches = (points + level.lanes - 1) / level.lanes;
     run_chunks(entries * batches, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
         const int64_t entry = chunk / batches, first = chunk % batches * level.lanes, at = entry * points + first;
@@ -205,8 +220,9 @@ void run_characteristic(const ExposureGrid& grid, const ExposureFlux* flux, cons
 void characteristic(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
                     Vector<const int32_t> shape, Matrix<const double> shapes, bool tilted, Matrix<const double> z_re,
                     Matrix<const double> z_im, Matrix<double> re, Matrix<double> im, Matrix<int64_t> settled,
-                    int threads, const std::string& level_name, const nb::object& progress) {
-    const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
+                    int threads, const std::string& level_name, const nb::object& progress, History history) {
+    ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
+    add_history(flux, history);
     run_characteristic(grid, &flux, nullptr, flux.entries, tilted, z_re, z_im, re, im, settled, threads, level_name,
                        progress);
 }
@@ -228,16 +244,18 @@ void bind_exposure(nb::module_& module) {
         .def(
             "__init__",
             [](ExposureGrid* self, int64_t cycles, int64_t max_periods, int64_t whole, int32_t bins, int32_t out_bins,
-               int32_t shift, double fraction, bool stationary_start, double tolerance) {
+               int32_t shift, double fraction, bool stationary_start, double tolerance, int64_t warm_periods) {
                 if (cycles < 1 || whole < 0 || bins < 1 || out_bins < 1 || bins % out_bins != 0 || shift < 0 ||
                     shift >= bins || !(fraction >= 0.0 && fraction < 1.0))
                     throw nb::value_error("exposure grid: need 0 <= shift < bins, 0 <= fraction < 1, bins a "
                                           "multiple of out_bins");
                 new (self) ExposureGrid{cycles,  max_periods, whole,    bins,
-                                        out_bins, shift,      fraction, stationary_start, tolerance};
+                                        out_bins, shift,      fraction, stationary_start, tolerance,
+                                        warm_periods};
             },
             nb::kw_only(), nb::arg("cycles"), nb::arg("max_periods"), nb::arg("whole"), nb::arg("bins"),
-            nb::arg("out_bins"), nb::arg("shift"), nb::arg("fraction"), nb::arg("stationary"), nb::arg("tolerance"))
+            nb::arg("out_bins"), nb::arg("shift"), nb::arg("fraction"), nb::arg("stationary"), nb::arg("tolerance"),
+            nb::arg("warm_periods") = ExposureGrid{}.warm_periods)
         .def_prop_ro("bytes", [](const ExposureGrid& self) { return bytes_per_lane(self, kExposureOrders + 1); });
     module.attr("EXPOSURE_PARTS") = kExposureParts;
     module.def("paralyzable_moments", &paralyzable_moments, nb::kw_only(), nb::arg("grid"), nb::arg("photons"),
@@ -251,7 +269,7 @@ void bind_exposure(nb::module_& module) {
     module.def("exposure_moments", &moments, nb::kw_only(), nb::arg("grid"), nb::arg("signal"), nb::arg("background"),
                nb::arg("shape"), nb::arg("shapes"), nb::arg("cumulants"), nb::arg("cumulant_rates"),
                nb::arg("histogram"), nb::arg("histogram_rate"), nb::arg("settled"), nb::arg("threads"),
-               nb::arg("level"), nb::arg("progress").none());
+               nb::arg("level"), nb::arg("progress").none(), nb::arg("history") = nb::none());
     module.def("exposure_phases", &phases, nb::kw_only(), nb::arg("grid"), nb::arg("signal"), nb::arg("background"),
                nb::arg("shape"), nb::arg("shapes"), nb::arg("phase"), nb::arg("cumulants"), nb::arg("correction"),
                nb::arg("settled"), nb::arg("threads"), nb::arg("level"), nb::arg("progress").none());
@@ -261,7 +279,7 @@ void bind_exposure(nb::module_& module) {
     module.def("exposure_characteristic", &characteristic, nb::kw_only(), nb::arg("grid"), nb::arg("signal"),
                nb::arg("background"), nb::arg("shape"), nb::arg("shapes"), nb::arg("tilted"), nb::arg("z_re"),
                nb::arg("z_im"), nb::arg("re"), nb::arg("im"), nb::arg("settled"), nb::arg("threads"),
-               nb::arg("level"), nb::arg("progress").none());
+               nb::arg("level"), nb::arg("progress").none(), nb::arg("history") = nb::none());
 }
 
 }  // namespace mars

@@ -29,7 +29,7 @@ class BackwardRun {
         bool done[kReals]{};
         int64_t streak[kReals]{}, left = count;
         for (int64_t k = 0; k < count; ++k)
-            if (block_.moments.settled[first + k] == kUnsettled) {
+            if (block_.moments.settled[first + k] <= kUnsettled) {
                 done[k] = true;
                 --left;
             }

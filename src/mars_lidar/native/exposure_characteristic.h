@@ -72,6 +72,7 @@ class CharacteristicRun {
 
     void start_units() {
         const int64_t kept = std::min(grid_.whole + 1, grid_.cycles);
+        logs_.assign(kept, Real{});
         decays_.assign(kept, Real{});
         totals_.assign(kept, Real{});
         tails_.assign(kept, Real{});
@@ -81,10 +82,10 @@ class CharacteristicRun {
         Stationary start{};
         if (grid_.stationary) {
             const auto lanes = responses(*block_.flux, block_.entry, 1);
-            start = stationary_state(grid_, lanes, 1, *block_.stop);
+            start = warm_state(grid_, *block_.flux, block_.entry, 1, lanes, *block_.stop);
             for (Registrations<Real>& r : start.bins) r = {splat(lane(r.mass, 0)), splat(lane(r.moment, 0))};
             if (!start.settled[0]) {
-                for (int k = 0; k < block_.count; ++k) block_.settled[k] = kUnsettled;
+                for (int k = 0; k < block_.count; ++k) block_.settled[k] = kNotWarm;
                 return;
             }
         }
@@ -123,6 +124,8 @@ class CharacteristicRun {
                 state.re /= growth;
                 for (int k = 0; k < kReals; ++k) set_lane(growth, k, std::log(lane(growth, k)));
                 log_value_ += growth;
+                logs_[slot(q)] = growth;
+                slide(q);
             } else {  // (eq. 22)
                 value = value + weighted(z_ - Complex{splat(1.0), Real{}}, recursion.total);
             }
@@ -184,9 +187,27 @@ class CharacteristicRun {
         // where G itself is delayed there is no weight to add
         const Complex weight = ago <= q && !kParalyzable ? z_ : Complex{splat(1.0), Real{}};
         if (!block_.tilted) return weight;
-        Real unit = splat(1.0);
-        for (int64_t i = std::max<int64_t>(q - ago, 0); i < q; ++i) unit *= decays_[slot(i)];
-        return unit * weight;
+        Real log_unit = recent_;
+        if (ago > grid_.whole && q >= ago) log_unit += logs_[slot(q - ago)];
+        return exp_each(-log_unit) * weight;
+    }
+
+    static Real exp_each(Real x) {
+        for (int k = 0; k < kReals; ++k) set_lane(x, k, std::exp(lane(x, k)));
+        return x;
+    }
+
+    // The logarithms of the last K growths before period q + 1; afresh now and then, for rounding.
+    void slide(int64_t q) {
+        const int64_t whole = grid_.whole;
+        if (whole == 0) return;
+        if (q % (whole + 1) == 0) {
+            recent_ = Real{};
+            for (int64_t i = std::max<int64_t>(q + 1 - whole, 0); i <= q; ++i) recent_ += logs_[slot(i)];
+        } else {
+            recent_ += logs_[slot(q)];
+            if (q >= whole) recent_ -= logs_[slot(q - whole)];
+        }
     }
 
     int64_t slot(int64_t period) const { return period % static_cast<int64_t>(decays_.size()); }
@@ -209,7 +230,8 @@ class CharacteristicRun {
     const ExposureGrid grid_;
     const Responses response_;
     Complex z_{};
-    Real log_value_{};
+    Real log_value_{}, recent_{};
+    std::vector<Real> logs_;  // of the growths of the last K + 1 periods
     // When tilted, of the last K + 1 periods: 1 / growth, registrations, and those in the last d + f bins.
     std::vector<Real> decays_, totals_, tails_;
     Real history_total_{}, history_tail_{};  // registrations of a period before the exposure

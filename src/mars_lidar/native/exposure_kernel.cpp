@@ -20,7 +20,8 @@ void MARS_JOIN(exposure_phases_, MARS_LEVEL)(const PhasesBlock& block) {
     if (moments.stop->load(std::memory_order_relaxed)) return;
     const auto response = responses(*moments.flux, moments.first, moments.count);
     if (moments.grid->stationary) {
-        const Stationary start = stationary_state(*moments.grid, response, moments.count, *moments.stop);
+        const Stationary start =
+            warm_state(*moments.grid, *moments.flux, moments.first, moments.count, response, *moments.stop);
         BackwardRun(block, response, &start).run();
     } else {
         BackwardRun(block, response, nullptr).run();

@@ -20,6 +20,7 @@ struct ExposureGrid {
     double fraction = 0.0;    // f in [0, 1)
     bool stationary = false;
     double tolerance = 0.0;   // relative change per period below which a state counts as repeated
+    int64_t warm_periods = 20000;  // sweeps round the period after which the search for a warm state is given up
 
     int64_t delay() const { return whole * bins + shift; }  // whole bins of dead time
     // Bins whose registrations must be remembered: no more than the exposure has.
@@ -35,6 +36,9 @@ struct ExposureFlux {
     const int32_t* shape = nullptr;      // (entries) row of `shapes`
     const double* shapes = nullptr;      // (rows, n * kExposureParts)
     int32_t bins = 1;                    // n
+    // (entries, 2 n + 2), or null: the warm state if it is known. Mass and moment of each bin, then the probability of
+    // being armed at the start of the exposure, and the registrations in the d + f bins before it.
+    const double* history = nullptr;
 
     double photons(int64_t entry, int64_t part) const {
         const int64_t parts = static_cast<int64_t>(bins) * kExposureParts;
@@ -61,6 +65,7 @@ struct ExposureRate {
 // What `settled` holds besides the number of periods that were needed.
 constexpr int64_t kRanToEnd = -1;   // the exposure ended first: no extrapolation, nothing lost
 constexpr int64_t kUnsettled = -2;  // max_periods was reached: no result
+constexpr int64_t kNotWarm = -3;    // the warm state that the exposure starts from was not found: no result
 
 // Cumulants and mean histogram of entries [first, first + count), count at most the level's lanes.
 struct MomentsBlock {

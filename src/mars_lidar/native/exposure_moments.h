@@ -28,7 +28,8 @@ class MomentsRun {
             advance(recursion, Stationary{});
         } else {
             Stationary start{};
-            if (grid_.stationary) start = stationary_state(grid_, response_, block_.count, *block_.stop);
+            if (grid_.stationary)
+                start = warm_state(grid_, *block_.flux, block_.first, block_.count, response_, *block_.stop);
             Pixel<Moments, Real> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr,
                                            block_.ends != nullptr);
             recursion.armed.c[0] = grid_.stationary ? start.armed : splat(1.0);
@@ -57,7 +58,7 @@ class MomentsRun {
         int64_t streak[kReals]{}, left = block_.count;
         for (int k = 0; k < block_.count; ++k)
             if (!kParalyzable && grid_.stationary && !start.settled[k]) {
-                block_.settled[block_.first + k] = kUnsettled;
+                block_.settled[block_.first + k] = kNotWarm;
                 done[k] = true;
                 --left;
             }
@@ -71,6 +72,7 @@ class MomentsRun {
             const Moments step = growth(recursion.total);
             cumulative_ = cumulative_ + step;
             increments_[slot(q)] = step;
+            slide(q);
             if constexpr (!kParalyzable) {
                 recursion.armed = weighted(exp_series(-1.0 * step), recursion.armed);
                 totals_[slot(q)] = recursion.total;
@@ -128,8 +130,22 @@ class MomentsRun {
     Moments factor(int64_t q, int64_t ago) const {
         Moments exponent{};
         if (ago <= q && !kParalyzable) exponent.c[1] += splat(1.0);  // there G itself is delayed, not registrations
-        for (int64_t i = std::max<int64_t>(q - ago, 0); i < q; ++i) exponent = exponent - increments_[slot(i)];
+        exponent = exponent - recent_;
+        if (ago > grid_.whole && q >= ago) exponent = exponent - increments_[slot(q - ago)];
         return exp_series(exponent);
+    }
+
+    // The sum of the last K increments before period q + 1: what left and what came; afresh now and then, for rounding.
+    void slide(int64_t q) {
+        const int64_t whole = grid_.whole;
+        if (whole == 0) return;
+        if (q % (whole + 1) == 0) {
+            recent_ = Moments{};
+            for (int64_t i = std::max<int64_t>(q + 1 - whole, 0); i <= q; ++i) recent_ = recent_ + increments_[slot(i)];
+        } else {
+            recent_ = recent_ + increments_[slot(q)];
+            if (q >= whole) recent_ = recent_ - increments_[slot(q - whole)];
+        }
     }
 
     int64_t slot(int64_t period) const { return period % static_cast<int64_t>(increments_.size()); }
@@ -199,7 +215,7 @@ class MomentsRun {
     const MomentsBlock& block_;
     const ExposureGrid grid_;
     const Responses response_;
-    Moments cumulative_{};
+    Moments cumulative_{}, recent_{};                   // since the start, and over the last K periods
     std::vector<Moments> increments_, totals_, tails_;  // of the last K + 1 periods, by `slot`
     Real history_total_{}, history_tail_{};             // of a period before the exposure
 };

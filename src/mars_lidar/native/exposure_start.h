@@ -9,8 +9,6 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
-constexpr int64_t kStationaryPeriods = 20000;
-
 // Responses with one entry per lane.
 std::vector<Response<Real>> responses(const ExposureFlux& flux, int64_t first, int64_t count) {
     std::vector<Response<Real>> out(flux.bins);
@@ -81,7 +79,7 @@ Stationary stationary_state(const ExposureGrid& grid, const std::vector<Response
                             const std::atomic<bool>& stop) {
     ExposureGrid circle = grid;
     circle.whole = 0;
-    circle.cycles = kStationaryPeriods;
+    circle.cycles = grid.warm_periods;
     Recursion<Series<1>, Real> recursion(circle, response, nullptr, true);
     const Series<1> one{{splat(1.0)}};
     recursion.armed = one;
@@ -90,7 +88,7 @@ Stationary stationary_state(const ExposureGrid& grid, const std::vector<Response
     int64_t streak[kReals]{};
     std::vector<Series<1>> before = recursion.repeated;
     int64_t q = 0;
-    for (; q < kStationaryPeriods && !stop.load(std::memory_order_relaxed); ++q) {
+    for (; q < grid.warm_periods && !stop.load(std::memory_order_relaxed); ++q) {
         recursion.period(q, one, one, nullptr);
         const Real moved = change(recursion.repeated, before);
         before = recursion.repeated;
@@ -105,7 +103,7 @@ Stationary stationary_state(const ExposureGrid& grid, const std::vector<Response
     // Rescaled so that armed + blind = 1 on the circle, then K whole periods of blindness added (eq. 18).
     const int32_t n = grid.bins;
     for (int32_t j = 0; j < n; ++j) {
-        const Registrations<Series<1>> r = recursion.last_period(std::min(q, kStationaryPeriods - 1), j);
+        const Registrations<Series<1>> r = recursion.last_period(std::min(q, grid.warm_periods - 1), j);
         out.bins[j] = {r.mass.c[0], r.moment.c[0]};
     }
     const Real sum = recursion.total.c[0], tail = recursion.tail.c[0];
@@ -113,6 +111,25 @@ Stationary stationary_state(const ExposureGrid& grid, const std::vector<Response
     out.tail = tail * scale;
     for (Registrations<Real>& r : out.bins) r = {r.mass * scale, r.moment * scale};
     out.armed = recursion.armed.c[0] * scale;
+    return out;
+}
+
+// The same where the history of the entries may be known already.
+Stationary warm_state(const ExposureGrid& grid, const ExposureFlux& flux, int64_t first, int64_t count,
+                      const std::vector<Response<Real>>& response, const std::atomic<bool>& stop) {
+    if (!flux.history) return stationary_state(grid, response, count, stop);
+    Stationary out{};
+    out.bins.resize(grid.bins);
+    for (int k = 0; k < count; ++k) {
+        const double* known = flux.history + (first + k) * (2 * int64_t{grid.bins} + 2);
+        for (Registrations<Real>& r : out.bins) {
+            set_lane(r.mass, k, *known++);
+            set_lane(r.moment, k, *known++);
+        }
+        set_lane(out.armed, k, *known++);
+        set_lane(out.tail, k, *known);
+        out.settled[k] = true;
+    }
     return out;
 }
 

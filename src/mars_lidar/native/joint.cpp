@@ -1,5 +1,6 @@
 // Bindings of the joint law (statistics/joint.py): bin responses, the feedback equations of the folded exposure and
 // their transpose, and the exact recursion for exposures that do not settle. Python validates and composes.
+#include <cmath>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -127,7 +128,9 @@ std::pair<int64_t, double> forward(Matrix<const double> response, int32_t shift,
 
 // Runs an exposure that starts armed until its registrations per period are the stationary ones, `state` (n, 2),
 // within `tolerance` of their total, for K + 2 periods; at most `cycles` periods. `total` (n) gains the registrations.
-// Returns the periods after which that was so, -1 where the exposure ended first, -2 after `max_steps` bins.
+// Returns the periods after which that was so, -1 where the exposure ended first, -2 after `max_steps` bins. Given up, it
+// may have come so far that the rest is known: the distance falls by the same factor from window to window, and where it
+// would be within the tolerance in a third of the exposure the periods for that are returned.
 int64_t settle(Matrix<const double> response, int64_t whole, int32_t shift, double fraction, int64_t cycles,
                Matrix<const double> state, double tolerance, int64_t max_steps, Vector<double> total) {
     const FeedbackGrid grid = make_grid(response, whole, shift, fraction);
@@ -140,6 +143,7 @@ int64_t settle(Matrix<const double> response, int64_t whole, int32_t shift, doub
     run_chunks(1, 1, nb::none(), [&](int64_t, const std::atomic<bool>& stop) {
         Past past(grid, cycles);
         int64_t streak = 0;
+        std::vector<double> worst;  // distance in each window of K + 2 periods
         for (int64_t period = 0; period < cycles && !stop.load(std::memory_order_relaxed); ++period) {
             past.advance(grid, period, grid.row(0), grid.row(3), [](int32_t, double, const Pair&) {});
             const Pair* x = past.at(period);
@@ -148,6 +152,8 @@ int64_t settle(Matrix<const double> response, int64_t whole, int32_t shift, doub
                 off += std::fabs(x[j].mass - state.data()[2 * j]);
                 total.data()[j] += x[j].mass;
             }
+            if (period % (grid.whole + 2) == 0) worst.push_back(0.0);
+            worst.back() = std::fmax(worst.back(), off);
             streak = off <= tolerance * sum ? streak + 1 : 0;
             if (streak >= grid.whole + 2) {
                 result = period + 1 - streak;
@@ -155,6 +161,13 @@ int64_t settle(Matrix<const double> response, int64_t whole, int32_t shift, doub
             }
             if ((period + 1) * n > max_steps) {
                 result = -2;
+                if (worst.size() < 8) return;
+                const size_t last = worst.size() - 2, half = last / 2;  // the last one may not be full
+                const double fall = std::log(worst[half] / worst[last]) / static_cast<double>(last - half);
+                if (!(worst[last] < 0.5 * worst[half])) return;
+                const double more = std::log(worst[last] / (tolerance * sum)) / fall * static_cast<double>(grid.whole + 2);
+                const double end = static_cast<double>(period) + std::fmax(more, 0.0);
+                if (3.0 * end < static_cast<double>(cycles)) result = static_cast<int64_t>(end) + 1;
                 return;
             }
         }

@@ -25,7 +25,9 @@ _MAX_PHOTONS = 1e6
 _MIN_BINS = 128
 _MAX_FIRST_BINS = 2**14  # finer first grids only where the tolerance asks for them
 _BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # of 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
-_MAX_STEPS = 4_000_000_000  # bins x periods of one cell before it counts as not settling
+_MAX_STEPS = 4_000_000_000  # bins x periods of one cell before it counts as not settling: minutes
+LAW_STEPS = 50_000_000  # of the laws, which are to take 2 s at most
+_WARM_PERIODS = 400  # sweeps for a warm state; beyond, an equation is solved (_warm.py)
 _CHUNK_BYTES = 64 << 20
 _MAX_HISTORY_BYTES = 1 << 30  # for each thread
 _SETTLED = 1e-12  # relative change of the state per period (20)
@@ -143,6 +145,14 @@ class Cells:
         )
 
     @property
+    def instead(self) -> str:
+        """What to use where an exact law is refused, for errors."""
+        able = [] if self.system.detector.mode != "nonparalyzable" else [
+            "joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)"
+        ]  # fmt: skip
+        return f"use {', '.join(able)}{', or ' if able else ''}simulate it with engine 'exact'"
+
+    @property
     def _sharpness(self) -> float:
         """Integral of the squared shape of the signal over the period: 1 / width, the narrowest of all cells."""
         if self.waveform is not None:
@@ -165,8 +175,8 @@ class Cells:
         step = out_bins if out_bins % 2 == 0 else 2 * out_bins
         return step * math.ceil(wanted / step)
 
-    def grid(self, bins: int, out_bins: int) -> _core.ExposureGrid:
-        """The native grid of `bins` bins per period."""
+    def grid(self, bins: int, out_bins: int, steps: int | None = None) -> _core.ExposureGrid:
+        """The native grid of `bins` bins per period; a cell is given up after `steps` bins x periods (None: many)."""
         from mars_lidar import _core
 
         dead = self.system.dead_time_periods
@@ -182,7 +192,7 @@ class Cells:
             whole, shift = whole + 1, 0
         return _core.ExposureGrid(
             cycles=self.system.cycles,
-            max_periods=max(10_000, _MAX_STEPS // bins),
+            max_periods=max(10_000, _MAX_STEPS // bins) if steps is None else max(1, steps // bins),
             whole=whole,
             bins=bins,
             out_bins=out_bins,
@@ -190,6 +200,7 @@ class Cells:
             fraction=fraction,
             stationary=self.system.start == "stationary",
             tolerance=_SETTLED,
+            warm_periods=_WARM_PERIODS,
         )
 
     def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:
@@ -211,7 +222,7 @@ class Cells:
             raise MemoryError(
                 f"exposure statistics of {self.name(0)}: {bins} bins per period need "
                 f"{needed / 2**30:.3g} GiB to remember one dead time, at most "
-                f"{_MAX_HISTORY_BYTES / 2**30:g} GiB are allowed"
+                f"{_MAX_HISTORY_BYTES / 2**30:g} GiB are allowed; {self.instead}"
             )
 
     def energies(self, bins: int) -> tuple[FloatArray, NDArray[np.int32]]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,23 @@ from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._gate import photons_before
 from mars_lidar.statistics.stationary import stationary_histogram
 
-_MAX_NUMBERS = 1 << 27  # of the kernel: 1 GiB
 _ONE_THREAD = 250_000  # multiplications
 _BLOCK = 64  # bins that are advanced together
 
 Rows = NDArray[Any]  # real or complex
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What a statistic may cost: numbers of a kernel, multiplications of an exposure, and of a law's points."""
+
+    numbers: int
+    moments: float
+    points: float
+
+
+MOST_EFFORT = Effort(1 << 27, 3e10, 3e11)  # 1 GiB, and half a minute
+LAW_EFFORT = Effort(3 << 23, 3e9, 2e10)  # of the laws, which are to take 2 s at most
 
 
 class RecordGrid:
@@ -40,18 +53,19 @@ class RecordGrid:
         Within which the next record is, but for waiting.
     """
 
-    def __init__(self, cell: Cells, bins: int, electronics: float) -> None:
-        self.cell, self.bins, self.cycles = cell, bins, cell.system.cycles
+    def __init__(self, cell: Cells, bins: int, electronics: float, effort: Effort = MOST_EFFORT) -> None:
+        self.cell, self.bins, self.cycles, self.effort = cell, bins, cell.system.cycles, effort
         before = photons_before(cell, np.arange(bins + 1) / bins)[0]
         self.photons = np.maximum(np.diff(before), 0.0)
         self.shift, self.part = bins_of(cell.system.dead_time_periods, bins)
         self.off, self.off_part = bins_of(electronics, bins)
         self.steps = self.off + self.shift + 4
         self.periods = (self.steps + bins) // bins + 2
-        if self.steps * bins > _MAX_NUMBERS:
+        if self.steps * bins > effort.numbers:
+            more = "" if effort == MOST_EFFORT else "use electronics_moments, which goes on for longer, or "
             raise ConvergenceError(
-                f"statistics of {cell.name(0)}, t_e = {electronics:g} periods: {bins} bins per period are not "
-                "enough, and more do not fit in 1 GiB; simulate it with engine 'exact'"
+                f"statistics of {cell.name(0)}, t_e = {electronics:g} periods: {bins} bins per period are not enough, "
+                f"and more take too long or do not fit in 1 GiB; {more}simulate it with engine 'exact'"
             )
         self.kernel, self.late = self._kernel()
         self.first, self.first_armed = self._first()

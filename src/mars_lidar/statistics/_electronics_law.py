@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.statistics._cells import Cells, FloatArray
-from mars_lidar.statistics._electronics_grid import RecordGrid, RecordRun, Rows
+from mars_lidar.statistics._electronics_grid import LAW_EFFORT, RecordGrid, RecordRun, Rows
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._pmf import Window, exact_windows
 from mars_lidar.statistics.electronics import refined, without_effect
@@ -24,7 +24,6 @@ ComplexArray = NDArray[np.complex128]
 _REACH, _MARGIN = 7.5, 6.0  # of a window: standard deviations, and counts beside them
 _EDGE = 1e-9  # probability at the ends of a window that holds all
 _POINTS = 64  # of the circle at a time
-_MAX_STEPS = 3e11  # multiplications for them: half a minute
 _SETTLED, _QUIET = 1e-11, 1e-17
 _LIKE_MOMENTS = 3.0  # times the tolerance by which the pmf's mean and variance may differ from those of the grid
 
@@ -43,15 +42,16 @@ def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Window]
 def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Window:
     if float(cell.total[0]) == 0.0:
         return Window(0, np.ones(1), 0.0)
-    mean, variance, _, bins = refined(cell, electronics_ns, tolerance)
+    mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW_EFFORT)
     electronics = electronics_ns / cell.system.period_ns
-    grids = [RecordGrid(cell, n, electronics) for n in (bins, bins // 2)]
+    grids = [RecordGrid(cell, n, electronics, LAW_EFFORT) for n in (bins, bins // 2)]
     most = math.floor(cell.system.cycles / electronics) + 1
     spread = math.sqrt(variance)
     half = math.ceil(_REACH * spread + _MARGIN)
+    left = [LAW_EFFORT.points]  # multiplications
     while True:
         first, last = max(math.floor(mean) - half, 0), min(math.ceil(mean) + half, most)
-        fine, coarse = (_folded(grid, first, last) for grid in grids)
+        fine, coarse = (_folded(grid, first, last, left) for grid in grids)
         pmf = fine + (fine - coarse) / 3.0  # the limit for fine grids
         ends = max(pmf[0] if first > 0 else 0.0, pmf[-1] if last < most else 0.0)
         if abs(ends) <= _EDGE:
@@ -74,22 +74,22 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Window:
     return Window(first, pmf / pmf.sum(), outside)
 
 
-def _folded(grid: RecordGrid, first: int, last: int) -> FloatArray:
-    """P(N = n) for n from `first` to `last`, by (23) of docs/theory_exposure.md."""
+def _folded(grid: RecordGrid, first: int, last: int, left: list[float]) -> FloatArray:
+    """P(N = n) for n from `first` to `last`, by (23) of docs/theory_exposure.md; takes its cost off `left`."""
     counts = last - first + 1
     size = counts + counts % 2
     angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
     value = np.zeros(angle.size, np.complex128)
     for start in range(0, angle.size, _POINTS):
         some = np.exp(1j * angle[start : start + _POINTS])
-        value[start : start + _POINTS] = _values(grid, some)
+        value[start : start + _POINTS] = _values(grid, some, left)
         if np.abs(value[start : start + _POINTS]).max() < _QUIET:  # a long exposure: nothing beyond
             break
     folded = np.fft.irfft(value.conj(), size)
     return np.asarray(folded[np.arange(first, last + 1) % size], dtype=np.float64)
 
 
-def _values(grid: RecordGrid, z: ComplexArray) -> ComplexArray:
+def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArray:
     """E z^N of the exposure at points z (points,) of the unit circle: records (12), each weighted with z (19)."""
 
     def weigh(now: Rows) -> Rows:
@@ -99,9 +99,10 @@ def _values(grid: RecordGrid, z: ComplexArray) -> ComplexArray:
     run = RecordRun(grid, np.ones_like(z), weigh)
     value, streak, ratio = np.ones_like(z), np.zeros(z.size, np.int64), np.zeros_like(z)
     before: ComplexArray = np.zeros((z.size, grid.bins + 2), np.complex128)
-    budget = max(10, int(_MAX_STEPS / (4.0 * z.size * grid.bins * (grid.shift + 64.0))))
+    a_period = 4.0 * grid.bins * (grid.shift + 64.0)  # multiplications of a point
     for period in range(grid.cycles):
         records, earlier = run.period(), value
+        left[0] -= a_period * index.size
         value = value + (z[index] - 1.0) * records.sum(-1)
         state = np.concatenate([records, run.armed[:, None], value[:, None]], axis=1)
         # as in native/exposure_characteristic.h: the state repeats but for a factor, by least squares
@@ -117,15 +118,15 @@ def _values(grid: RecordGrid, z: ComplexArray) -> ComplexArray:
             result[index[ends]] = _extrapolated(
                 value[ends], earlier[ends], best[ends], grid.cycles - 1 - period
             )
-            left = ~done
-            if not left.any():
+            rest = ~done
+            if not rest.any():
                 break
-            index, value, before, ratio, streak = index[left], value[left], before[left], ratio[left], streak[left]
-            run.keep(left, weigh)
-        if period >= budget:
+            index, value, before, ratio, streak = index[rest], value[rest], before[rest], ratio[rest], streak[rest]
+            run.keep(rest, weigh)
+        if left[0] < 0.0:
             raise ConvergenceError(
                 f"count law of {grid.cell.name(0)} behind electronics with a dead time: the state does not repeat "
-                f"within {budget} periods; electronics_moments has mean and variance, or simulate it with engine "
+                f"within {period + 1} periods; electronics_moments has mean and variance, or simulate it with engine "
                 "'exact'"
             )
     return result

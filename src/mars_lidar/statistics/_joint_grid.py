@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +54,8 @@ class FoldedGrid:
         dead = cells.system.dead_time_periods
         whole = int(np.floor(dead))
         position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
+        if cells.system.start == "armed":  # a dead time beyond the end of the exposure is as good as one up to it
+            whole = min(whole, cells.system.cycles)
         shift = int(np.floor(position))
         fraction = position - shift
         if fraction < 1e-9:
@@ -63,7 +65,8 @@ class FoldedGrid:
         if shift == bins:
             whole, shift = whole + 1, 0
         energy, row = cells.energies(bins)
-        photons = cells.signal[0] * energy[row[0]] + cells.background[0] / energy.shape[-1]
+        signal, background = cells.native_flux
+        photons = signal[0] * energy[row[0]] + background[0] / energy.shape[-1]
         response = np.empty((6, bins))
         _core.joint_response(photons, response)
         return cls(cells.system.cycles, cells.system.start == "stationary", whole, shift, fraction, response)
@@ -242,12 +245,36 @@ class FoldedGrid:
         """Sparse factors of (5.4) with the windows of worths as further unknowns: few entries in every row."""
         from scipy.sparse.linalg import splu
 
+        n, d = self.bins, self.shift
+        pa, qa = self.response[0], self.response[3]
+        # The window that the others follow from sums many bins: that one full row would fill the factors. So it is
+        # held at 0 in them, and put back as a change of rank one.
+        row, matrix = np.zeros(3 * n), self._matrix()
+        row[:d], row[n : n + d] = -pa[:d], -qa[:d]
+        order = np.arange(3 * n).reshape(3, n).T.reshape(-1)  # bin after bin: entries near the diagonal
         try:
-            return splu(self._matrix()).solve
+            factors: Any = splu(matrix[order][:, order])
         except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
             raise ConvergenceError(f"the feedback equation is singular: {error}") from None
 
+        def bare(right: FloatArray, trans: str) -> FloatArray:
+            out, ordered = np.empty_like(right), np.ascontiguousarray(right[order])
+            out[order] = factors.solve(ordered, trans=trans)
+            return out
+
+        one = np.zeros(3 * n)
+        one[2 * n] = 1.0
+        change = {"N": (bare(one, "N"), row), "T": (bare(row, "T"), one)}
+
+        def whole(right: FloatArray, trans: str = "N") -> FloatArray:
+            out, (step, weight) = bare(right, trans), change[trans]
+            share = weight @ out / (1.0 + weight @ step)
+            return np.asarray(out - (step[:, None] * share if out.ndim == 2 else step * share))
+
+        return whole
+
     def _matrix(self) -> csc_matrix:
+        """The equations without the sum over a window in row 2 n, the window before the first bin."""
         from scipy.sparse import csc_matrix
 
         pa, p0, p1, qa, q0, q1 = self.response
@@ -270,11 +297,9 @@ class FoldedGrid:
                 add(i + k * n, j, armed * pa[j] - part[0, k] * p0[j] - part[1, k] * p1[j])
                 add(i + k * n, j + n, armed * qa[j] - part[0, k] * q0[j] - part[1, k] * q1[j])
         add(i, i + 2 * n, np.ones(n))
-        first, rest = np.arange(d), i[1:]
+        rest = i[1:]
         add(i + 2 * n, (i - 1) % n + 2 * n, np.ones(n))  # row i: window after bin i - 1
         add(rest + 2 * n, rest + 2 * n, -np.ones(n - 1))
-        add(np.full(d, 2 * n), first, -pa[:d])
-        add(np.full(d, 2 * n), first + n, -qa[:d])
         for away, sign in ((0, -1.0), (d, 1.0)):
             j = (rest + away) % n
             add(rest + 2 * n, j, sign * pa[j])

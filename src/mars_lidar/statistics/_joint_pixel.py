@@ -12,8 +12,8 @@ from mars_lidar.statistics._joint_grid import FoldedGrid
 from mars_lidar.statistics._joint_window import SettledLaw, Windows
 
 _SETTLED = 1e-9  # distance from the stationary state (total variation) at which the start is forgotten
-_MAX_STEPS = 4_000_000_000  # bins x periods after which an exposure counts as not settling
-_MAX_RECURSION = 2**25  # bins x periods of an exposure that is run through for every window
+_MAX_STEPS = 200_000_000  # bins x periods after which an exposure counts as not settling: a second
+_MAX_RECURSION = 2**22  # bins x periods of an exposure that is run through for every window
 
 
 class Pixel:
@@ -41,7 +41,8 @@ class Pixel:
             if self.settled == -2 or bins * (grid.cycles + grid.whole) > _MAX_RECURSION:
                 raise ConvergenceError(
                     f"joint law of {cells.name(0)}: the pixel does not forget its start before the exposure ends, "
-                    f"and {bins} bins x {grid.cycles} periods are too many to run through"
+                    f"and {bins} bins x {grid.cycles} periods are too many to run through; use exposure_moments (count "
+                    "and mean histogram), or simulate it with engine 'exact'"
                 )
             fine = grid.cycles * grid.state[0] if grid.warm else total
         else:

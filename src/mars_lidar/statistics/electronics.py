@@ -18,7 +18,7 @@ from mars_lidar._brief import brief
 from mars_lidar.detector import Mode
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray
-from mars_lidar.statistics._electronics_grid import RecordGrid, RecordRun
+from mars_lidar.statistics._electronics_grid import MOST_EFFORT, Effort, RecordGrid, RecordRun
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._gate import photons_before
 from mars_lidar.statistics._timing import Timing, is_timed
@@ -26,7 +26,6 @@ from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.system import System
 
 ELECTRONICS_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")
-_MAX_STEPS = 3e10  # multiplications of an exposure
 _SETTLED = 1e-11
 
 
@@ -94,7 +93,7 @@ def electronics_moments(
     return moments(cells, tolerance)
 
 
-def moments(cells: Cells, tolerance: float) -> ElectronicsMoments:
+def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> ElectronicsMoments:
     """`electronics_moments` of checked cells."""
     tolerance = _validate.real("tolerance", tolerance, low=1e-6, high=0.1)
     out = cells.system
@@ -113,7 +112,9 @@ def moments(cells: Cells, tolerance: float) -> ElectronicsMoments:
     else:
         alone = replace(cells, system=system.replace(detector=system.detector.without("electronics_dead_time_ns")))
         for k in range(cells.size):
-            mean[k], variance[k], histogram[k], grid[k] = refined(alone.part(slice(k, k + 1)), slower, tolerance)
+            mean[k], variance[k], histogram[k], grid[k] = refined(
+                alone.part(slice(k, k + 1)), slower, tolerance, effort
+            )
     if timing is not None:
         histogram = timing.forward(histogram)
     shape = cells.shape
@@ -136,17 +137,25 @@ def without_effect(cells: Cells) -> tuple[Cells | None, float]:
     return replace(cells, system=cells.system.replace(detector=bare)), slower
 
 
-def refined(cell: Cells, electronics_ns: float, tolerance: float) -> tuple[float, float, FloatArray, int]:
+def coarsest_grid(cell: Cells) -> int:
+    """Bins of the first grid: a power of two, so that grids are parts of each other; the dead time spans a bin."""
+    bins = 1 << round(math.log2(cell.first_bins(2)))
+    while bins * cell.system.dead_time_periods < 2.0:
+        bins *= 2
+    return bins
+
+
+def refined(
+    cell: Cells, electronics_ns: float, tolerance: float, effort: Effort = MOST_EFFORT
+) -> tuple[float, float, FloatArray, int]:
     """Mean, variance, mean histogram and the bins that were needed, of one cell whose system has no electronics."""
     system = cell.system
     out, electronics = system.bins, electronics_ns / system.period_ns
-    bins = 2 ** round(math.log2(cell.first_bins(2)))  # powers of two: parts of each other
-    while bins * system.dead_time_periods < 2.0:  # the dead time must span a bin
-        bins *= 2
-    coarse, before = _Run(cell, bins, electronics), None
+    bins = coarsest_grid(cell)
+    coarse, before = _Run(cell, bins, electronics, effort), None
     while True:
         bins *= 2
-        fine = _Run(cell, bins, electronics)
+        fine = _Run(cell, bins, electronics, effort)
         # the grid errs by the square of its step: what doubling it moved tells the limit
         limit = np.array([fine.mean, fine.variance])
         limit += (limit - [coarse.mean, coarse.variance]) / 3.0
@@ -163,12 +172,12 @@ def refined(cell: Cells, electronics_ns: float, tolerance: float) -> tuple[float
             moved = min(moved, float(np.max(np.abs(limit - before) / scale)))
         if max(moved, shape) <= tolerance:
             mean, variance = float(limit[0]), max(float(limit[1]), 0.0)
-            histogram = _rebinned(cell, fine.rate, coarse.rate, out)
+            histogram = rebinned(cell, fine.rate, coarse.rate, out)
             return mean, variance, histogram * (mean / fine.mean if fine.mean > 0.0 else 1.0), bins
         coarse, before = fine, limit
 
 
-def _rebinned(cell: Cells, fine: FloatArray, coarse: FloatArray, out: int) -> FloatArray:
+def rebinned(cell: Cells, fine: FloatArray, coarse: FloatArray, out: int) -> FloatArray:
     """Records in `out` bins, from those on a grid and on one of half as many bins.
 
     The grid errs by the square of its step (times of re-arming are spread over a bin), so a third of what doubling it
@@ -193,17 +202,17 @@ def _rebinned(cell: Cells, fine: FloatArray, coarse: FloatArray, out: int) -> Fl
 class _Run:
     """One pixel on a grid of the period: the exposure run through, period by period."""
 
-    def __init__(self, cell: Cells, bins: int, electronics: float) -> None:
+    def __init__(self, cell: Cells, bins: int, electronics: float, effort: Effort) -> None:
         self.cycles = cell.system.cycles
         self.mean = self.variance = 0.0
         self.rate = np.zeros(bins)
         if float(cell.total[0]) > 0.0:
-            self._run(RecordGrid(cell, bins, electronics))
+            self._run(RecordGrid(cell, bins, electronics, effort))
 
     def _run(self, grid: RecordGrid) -> None:
         """Records period by period, and the number of those before each (12), (13)."""
         run = RecordRun(grid, np.array([1.0, 0.0]), lambda now: np.stack([now[0], now[0] + now[1]]))
-        budget = min(self.cycles, max(1000, int(_MAX_STEPS / (grid.bins * (grid.shift + 64.0)))))
+        budget = min(self.cycles, max(100, int(grid.effort.moments / (grid.bins * (grid.shift + 64.0)))))
         pairs, growth, steady, last = 0.0, 0.0, 0, np.zeros((2, grid.bins))
         for period in range(self.cycles):
             now = run.period()
@@ -220,9 +229,10 @@ class _Run:
                 pairs += left * float(weighted.sum()) + 0.5 * left * (left + 1.0) * growth
                 break
             if period >= budget:
+                more = "" if grid.effort == MOST_EFFORT else "use electronics_moments itself, which goes on, or "
                 raise ConvergenceError(
                     f"electronics_moments of {grid.cell.name(0)}: the state does not repeat within {budget} periods; "
-                    "simulate it with engine 'exact'"
+                    f"{more}simulate it with engine 'exact'"
                 )
         self.mean = float(self.rate.sum())
         self.variance = 2.0 * pairs + self.mean - self.mean**2  # E N (N - 1) is twice the pairs

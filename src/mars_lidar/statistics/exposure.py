@@ -10,6 +10,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +23,11 @@ from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._paralyzable_rate import registration_rates
 from mars_lidar.statistics._timing import Timing, is_timed
+from mars_lidar.statistics._warm import NOT_WARM, warm_history
 from mars_lidar.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar import _core
 
 Progress = Callable[[int, int], object]
 
@@ -144,41 +149,80 @@ def recorded_moments(
 
 
 def refined_moments(
-    cells: Cells, out_bins: int, *, tolerance: float, threads: int | None, progress: Progress | None = None
+    cells: Cells,
+    out_bins: int,
+    *,
+    tolerance: float,
+    threads: int | None,
+    progress: Progress | None = None,
+    steps: int | None = None,
 ) -> Exposure:
-    """`exposure_moments` of checked cells, histogram in `out_bins` bins; refines each cell as it needs."""
+    """`exposure_moments` of checked cells, histogram in `out_bins` bins; refines each cell as it needs.
+
+    A cell that would take more than some `steps` bins x periods on all its grids is refused.
+    """
     tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:
         return _poisson(cells, out_bins)
     result = _blank(cells, out_bins)
-    pending = np.arange(cells.size)
+    pending = np.flatnonzero(cells.total > 0.0)
     bins = cells.first_bins(out_bins)
+    if pending.size < cells.size:
+        _darkness(result, cells.total == 0.0, bins)
+        if not pending.size:
+            return _shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
-    coarse = _run(cells, bins // 2, shared, team, progress)
+    coarse = _run(cells.part(pending), bins // 2, shared, team, progress, steps)
+    last = spent = _spent(coarse, cells.system.cycles)
     while True:
-        fine = _run(cells.part(pending), bins, out_bins, team, progress)
+        _affordable(cells, pending, spent + 2.0 * last, steps)
+        fine = _run(cells.part(pending), bins, out_bins, team, progress, steps)
+        last = _spent(fine, cells.system.cycles)
+        spent = spent + last
         moved = _movement(coarse, fine)
         good = moved <= tolerance
         _put(result, pending[good], fine, good, bins, moved)
         if good.all():
             break
         pending, coarse = pending[~good], _take(fine, ~good)
+        last, spent = last[~good], spent[~good]
         bins *= 2
         if bins > max(MOST_BINS, 4 * out_bins):
             worst = int(np.argmax(moved[~good]))
             raise ConvergenceError(
                 f"exposure statistics of {cells.name(int(pending[worst]))}: with {bins // 2} bins per period "
-                f"they still move by {moved[~good][worst]:.2g} (tolerance {tolerance:g})"
+                f"they still move by {moved[~good][worst]:.2g} (tolerance {tolerance:g}); {cells.instead}"
             )
     negative = result.cumulants[:, 1] < -1e-9 * result.cumulants[:, 0]
     if negative.any():
         k = int(np.argmax(negative))
         raise ConvergenceError(
-            f"exposure statistics of {cells.name(k)}: variance {result.cumulants[k, 1]:.3g} < 0"
+            f"exposure statistics of {cells.name(k)}: variance {result.cumulants[k, 1]:.3g} < 0; {cells.instead}"
         )
     np.maximum(result.cumulants[:, 1], 0.0, out=result.cumulants[:, 1])  # rounding of a locked pixel
     return _shaped(result, cells.shape)
+
+
+def _spent(done: Exposure, cycles: int) -> FloatArray:
+    """Bins x periods (cells,) of one pass."""
+    return np.where(done.settled >= 0, done.settled, cycles) * done.bins.astype(np.float64)
+
+
+def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, steps: int | None) -> None:
+    """Refuse a cell before a pass that would take it beyond `steps`."""
+    beyond = after > (math.inf if steps is None else steps)
+    if beyond.any():
+        k = int(pending[int(np.argmax(beyond))])
+        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, steps)}")
+
+
+def _too_long(cells: Cells, steps: int | None) -> str:
+    more = "" if steps is None else "exposure_moments, which goes on for some minutes, or "
+    return (
+        "the state of the pixel does not repeat from period to period for so long that the exposure cannot be run to "
+        f"its end; use {more}{cells.instead.removeprefix('use ')}"
+    )
 
 
 def thread_count(threads: int | None) -> int:
@@ -189,6 +233,13 @@ def thread_count(threads: int | None) -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on this system
         return os.cpu_count() or 1
+
+
+def _darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
+    """Nothing is registered where nothing arrives."""
+    for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
+        array[which] = 0
+    result.bins[which] = bins
 
 
 def _blank(cells: Cells, out_bins: int) -> Exposure:
@@ -204,16 +255,20 @@ def _blank(cells: Cells, out_bins: int) -> Exposure:
     )
 
 
-def _run(cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None) -> Exposure:
+def _run(
+    cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, steps: int | None = None
+) -> Exposure:
     """One pass of the recursion over all cells on one grid."""
     from mars_lidar import _core
 
     cells.check_history(bins)
+    if steps is not None and min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) * bins > steps:
+        raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, steps)}")
     result = _blank(cells, out_bins)
     paralyzable = cells.system.detector.mode == "paralyzable"
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
-        grid = some.grid(bins, out_bins)
+        grid = some.grid(bins, out_bins, steps)
         into = {name: vars(result)[name][part] for name in _NATIVE}
         if paralyzable:
             rates = registration_rates(some, bins)
@@ -221,20 +276,40 @@ def _run(cells: Cells, bins: int, out_bins: int, threads: int, progress: Progres
                 grid=grid, photons=some.total, rates=rates, **into, threads=threads, level="", progress=progress
             )
             continue
-        energy, row = some.energies(bins)
-        signal, background = some.native_flux
-        _core.exposure_moments(
-            grid=grid, signal=signal, background=background, shape=row, shapes=energy, **into,
-            threads=threads, level="", progress=progress,
-        )  # fmt: skip
+        _moments(some, grid, bins, into, threads, progress)
+        cold = np.flatnonzero(into["settled"] == NOT_WARM)
+        if cold.size:
+            again = {name: np.ascontiguousarray(array[cold]) for name, array in into.items()}
+            history = warm_history(some, cold, bins)
+            _moments(some.part(cold), grid, bins, again, threads, progress, history)
+            for name, array in into.items():
+                array[cold] = again[name]
     lost = result.settled == UNSETTLED
     if lost.any():
-        raise ConvergenceError(
-            f"exposure statistics of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not "
-            "repeat from period to period for so long that the exposure cannot be run to its end"
-        )
+        k = int(np.argmax(lost))
+        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, steps)}")
     result.bins[:] = bins
     return result
+
+
+def _moments(
+    cells: Cells,
+    grid: _core.ExposureGrid,
+    bins: int,
+    into: dict[str, NDArray[Any]],
+    threads: int,
+    progress: Progress | None,
+    history: FloatArray | None = None,
+) -> None:
+    """One pass of the native recursion; `history` (cells, 2 bins + 2) is the warm state where it is known."""
+    from mars_lidar import _core
+
+    energy, row = cells.energies(bins)
+    signal, background = cells.native_flux
+    _core.exposure_moments(
+        grid=grid, signal=signal, background=background, shape=row, shapes=energy, **into,
+        threads=threads, level="", progress=progress, history=history,
+    )  # fmt: skip
 
 
 def _movement(coarse: Exposure, fine: Exposure) -> FloatArray:

@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike
 
 from mars_lidar.detector import MODES
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.statistics._cells import Cells, FloatArray
+from mars_lidar.statistics._cells import LAW_STEPS, Cells, FloatArray
+from mars_lidar.statistics._electronics_grid import LAW_EFFORT
 from mars_lidar.statistics._timing import recorded
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments
 from mars_lidar.statistics.exposure import refined_moments
@@ -53,7 +54,7 @@ def mean_histograms(cells: Cells, tolerance: float, threads: int | None) -> Floa
 def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | None) -> FloatArray:
     mode = cells.system.detector.mode
     if "electronics_dead_time_ns" in cells.system.detector.effects:
-        return moments(cells, max(tolerance, 1e-3)).histogram.reshape(cells.size, bins)
+        return moments(cells, max(tolerance, 1e-3), LAW_EFFORT).histogram.reshape(cells.size, bins)
     if mode == "synchronous":
         armed = first_arrivals(cells)
         seen = np.maximum(armed.sum(-1), np.finfo(float).tiny)
@@ -61,5 +62,5 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
         return np.asarray(armed * (mean / seen)[:, None], dtype=np.float64)
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)
-    exposure = refined_moments(cells, bins, tolerance=tolerance, threads=threads)
+    exposure = refined_moments(cells, bins, tolerance=tolerance, threads=threads, steps=LAW_STEPS)
     return exposure.histogram.reshape(cells.size, bins)

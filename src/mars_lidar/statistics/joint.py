@@ -60,7 +60,7 @@ def joint_law(
     ------
     ConvergenceError
         Naming the pixel, where no grid up to 2^20 bins meets the tolerance, or where the exposure does not
-        forget its start and is too long to be run through bin by bin (more than 2^25 bins x periods).
+        forget its start and is too long to be run through bin by bin (more than 2^22 bins x periods).
 
     Notes
     -----
@@ -103,7 +103,8 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
         if bins > max(_MAX_BINS, 4 * out):
             raise ConvergenceError(
                 f"joint law of {cells.name(0)}: with {bins // 2} bins per period it still moves by {moved:.2g} "
-                f"(tolerance {tolerance:g})"
+                f"(tolerance {tolerance:g}); use exposure_moments (count and mean histogram), or simulate it with "
+                "engine 'exact'"
             )
         coarse = fine
 

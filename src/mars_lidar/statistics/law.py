@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from mars_lidar import _validate
 from mars_lidar.detector import MODES, Mode
 from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics._cells import LAW_STEPS, Cells, FloatArray, IndexArray
 from mars_lidar.statistics._electronics_law import record_windows
 from mars_lidar.statistics._gate import PLAIN
 from mars_lidar.statistics._methods import check_model, neural_moments, pixel_of, rearm_of
@@ -195,7 +195,7 @@ def count_law(
         found = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
         return CountLaw(method, found, lambda: windows)
     if method == "exact":
-        exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team)
+        exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team, steps=LAW_STEPS)
         flat, bins = exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1)
         return CountLaw(method, exposure.cumulants, lambda: exact_windows(cells, flat, bins, team), exposure)
     if method == "poisson":

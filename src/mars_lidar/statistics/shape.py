@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 
 from mars_lidar import _validate
 from mars_lidar.detector import MODES
-from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.effects import LIGHT_EFFECTS
 from mars_lidar.statistics._cells import Cells, FloatArray
+from mars_lidar.statistics._electronics_shape import stationary_records
 from mars_lidar.statistics._gate import PLAIN
 from mars_lidar.statistics._methods import check_model, neural_moments, pixel_of, rearm_of
 from mars_lidar.statistics._timing import recorded
@@ -51,7 +52,8 @@ def registration_pdf(
         - ``"exposure"``: mean histogram of the finite exposure, which is what a measurement averages to,
         - ``"stationary"``: that of a pixel which has been running for long,
         - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500), for detectors
-          of mode ``"nonparalyzable"``; the first two are for every mode (docs/detectors.md),
+          of mode ``"nonparalyzable"``; the first two are for every mode (docs/detectors.md), and for dead time of the
+          electronics (to 1e-3 in total variation) with modes ``"nonparalyzable"`` and ``"gated"``,
         - ``"neural"``: a trained network's answer to the flux, in place of the chain's
           (`mars_lidar.engines.NeuralEngine`).
     rearm
@@ -83,9 +85,9 @@ def registration_pdf(
         warm = replace(cells, system=system.replace(start="stationary"))
         shape = mean_histograms(warm, tolerance, threads)
     else:
-        shape = recorded(
-            cells, lambda some, parts: stationary_histogram(some, parts, tolerance=tolerance, threads=threads)
-        )
+        slow = "electronics_dead_time_ns" in system.detector.effects
+        compute = stationary_records if slow else stationary_histogram
+        shape = recorded(cells, lambda some, parts: compute(some, parts, tolerance=tolerance, threads=threads))
     total = shape.sum(-1, keepdims=True)
     dark = total == 0.0
     shape = np.where(dark, 1.0 / system.bins, shape / np.where(dark, 1.0, total))
@@ -95,7 +97,7 @@ def registration_pdf(
 def _shape_effects(method: str, system: System) -> tuple[str, ...]:
     if method in _OF_CHAIN:
         return LIGHT_EFFECTS
-    return histogram_effects(system) if method == "exposure" else LIGHT_EFFECTS + TIMING_EFFECTS
+    return histogram_effects(system)
 
 
 def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:

@@ -9,6 +9,7 @@ import numpy as np
 from mars_lidar import _validate
 from mars_lidar.statistics._cells import Cells, FloatArray
 from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.statistics._warm import warm_history
 from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED, thread_count
 
 
@@ -33,7 +34,7 @@ def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threa
         if pending.size and bins > max(MOST_BINS, 4 * out_bins):
             raise ConvergenceError(
                 f"stationary histogram of {cells.name(int(pending[0]))}: with {bins // 2} bins per period it "
-                f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g})"
+                f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g}); {cells.instead}"
             )
     return result
 
@@ -58,7 +59,8 @@ def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatAr
             level="",
             progress=None,
         )
-    if (settled == UNSETTLED).any():
-        k = int(np.argmax(settled == UNSETTLED))
-        raise ConvergenceError(f"stationary state of {cells.name(k)}: not reached")
+    cold = np.flatnonzero(settled == UNSETTLED)
+    if cold.size:
+        known = warm_history(cells, cold, bins)[:, : 2 * bins : 2]
+        result[cold] = known.reshape(cold.size, out_bins, -1).sum(-1)
     return result

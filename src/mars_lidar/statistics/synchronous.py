@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar.statistics._cells import Cells, FloatArray
 from mars_lidar.statistics._feedback import ConvergenceError
@@ -19,7 +20,13 @@ from mars_lidar.statistics._pmf import Window
 _TAIL = 1e-13  # probability left out at either end of the support
 _SPREAD = 9.0  # standard deviations of the number of late registrations that are summed over
 _CHUNK = 1 << 20  # terms of (6) at a time
-_MAX_TERMS = 1 << 28  # of one cell: half a minute
+_SUMS = 6  # incomplete beta functions in a term of (6)
+_MAX_TERMS = 1 << 23  # of one cell: a second
+_MANY_TERMS, _MANY_COUNTS = 1 << 18, 20  # from which on the transform (21) is faster, and good
+_REACH = 11.0  # standard deviations, in each of which the law and its transform are taken to end
+_POINTS, _FAINT, _MAX_TRANSFORM = 32, 1e-15, 30_000_000
+_LOOSE_TAIL = 1e-10  # of a law by its transform
+_INSTEAD = "use fewer cycles, or simulate it with engine 'exact'"
 
 
 def first_arrivals(cells: Cells) -> FloatArray:
@@ -48,6 +55,12 @@ def cumulants_of(window: Window) -> FloatArray:
     return np.array([mean, m2, m3, m4 - 3.0 * m2**2])
 
 
+def _log1p(u: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """log(1 + u), real part accurate relative to itself: it is multiplied by 1e8 registrations."""
+    real = 0.5 * np.log1p(2.0 * u.real + u.real**2 + u.imag**2)
+    return np.asarray(real + 1j * np.arctan2(u.imag, 1.0 + u.real))
+
+
 class _Count:
     """The count of one pixel: `early` of its `total` photons a period come before 1 - f."""
 
@@ -71,7 +84,7 @@ class _Count:
     def at_least(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) (6)."""
         spread = self._spread(float(counts.max()))
-        rows = max(1, int(_CHUNK / (self.first.size * spread)))
+        rows = max(1, int(_CHUNK / (_SUMS * spread)))
         parts = [self._at_least(counts[k : k + rows], spread) for k in range(0, counts.size, rows)]
         return np.concatenate(parts)
 
@@ -91,32 +104,96 @@ class _Count:
             late = low[:, None] + np.arange(math.ceil(spread) + 1)
             weight = np.asarray(binom.pmf(late, (k - 1.0)[:, None], self.late), dtype=np.float64)
         empty = self.cycles - 1.0 - (k[:, None] - 1.0) * (self.whole + 1.0) - late  # periods that may be empty
-        found, step = np.zeros(k.size), max(1, int(_CHUNK / (k.size * spread)))
-        for r in range(0, self.first.size, step):
-            some = self.first[r : r + step]
-            left = empty[..., None] - (r + np.arange(some.size))
-            waited = betainc(k[:, None, None], np.maximum(left, 0.0) + 1.0, self.seen)
-            found += ((np.where(left >= 0.0, waited, 0.0) @ some) * weight).sum(-1)
-        return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(found, 1.0)), dtype=np.float64)
+        wanted = k[:, None]
+
+        def waited(left: FloatArray, more: float = 0.0) -> FloatArray:
+            """P(no more than `left` empty periods before registration k + `more`)."""
+            chance = betainc(wanted + more, np.maximum(left, 0.0) + 1.0, self.seen)
+            return np.asarray(np.where(left >= 0.0, chance, 0.0), dtype=np.float64)
+
+        def summed(left: FloatArray) -> FloatArray:
+            """Sum of `waited` from 0 up to `left`."""
+            mean = wanted * (1.0 - self.seen) / self.seen
+            return np.asarray(np.maximum((left + 1.0) * waited(left) - mean * waited(left - 1.0, 1.0), 0.0))
+
+        n = self.first.size
+        found = self.first[0] * waited(empty)
+        if n > 1:  # probabilities of the wait for the first armed period: all the same but for the first and the last
+            found += self.first[-1] * waited(empty - (n - 1.0))
+        if n > 2:
+            found += self.first[1] * np.maximum(summed(empty - 1.0) - summed(empty - (n - 1.0)), 0.0)
+        total = (found * weight).sum(-1)
+        return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(total, 1.0)), dtype=np.float64)
 
     def window(self) -> Window:
         most = math.ceil(self.cycles / (self.whole + 1))
         if self.seen == 0.0:
             return Window(0, np.ones(1), 0.0)
-        self._check(math.log2(most + 1.0) + 1.0, most)
-        low, high = self._last(1.0 - _TAIL, most), self._last(_TAIL, most)
-        self._check(high + 2.0 - low, high)
-        survival = self.at_least(np.arange(low, high + 2, dtype=np.float64))
-        survival[0] = 1.0
-        pmf = survival - np.append(survival[1:], 0.0)
-        return Window(low, np.maximum(pmf[:-1], 0.0), _TAIL * ((low > 0) + (high < most)))
+        low, high = self._reach(most)
+        if low >= _MANY_COUNTS and (high - low) * _SUMS * self._spread(float(most)) > _MANY_TERMS:
+            survival = self._transformed(np.arange(low, high + 2, dtype=np.float64))
+            tail = _LOOSE_TAIL
+            if not (survival[0] >= 1.0 - tail and survival[-1] <= tail):
+                raise ConvergenceError(f"count law of {self.name}: it does not end within {low} .. {high}; {_INSTEAD}")
+        else:
+            self._check((math.log2(most + 1.0) + 1.0) * 2.0, most)
+            # what the sums over the wait for the first armed period may lose to rounding
+            tail = _TAIL + (4.0 * np.finfo(float).eps * self.cycles / self.first.size if self.first.size > 2 else 0.0)
+            low, high = self._last(1.0 - tail, most), self._last(_TAIL, most)
+            self._check(high + 2.0 - low, high)
+            survival = self.at_least(np.arange(low, high + 2, dtype=np.float64))
+        survival[0], survival[-1] = 1.0, 0.0
+        pmf = np.maximum(-np.diff(np.minimum.accumulate(survival)), 0.0)
+        return Window(low, pmf, tail * ((low > 0) + (high < most)))
+
+    def _reach(self, most: int) -> tuple[int, int]:
+        """Counts between which the law is, from mean and variance of the time of a registration."""
+        lost = (1.0 - self.seen) / self.seen + self.late  # periods a registration loses beyond its dead time
+        each = self.whole + 1.0 + lost
+        mean = self.cycles / each
+        spread = math.sqrt(mean * ((1.0 - self.seen) / self.seen**2 + self.late * (1.0 - self.late))) / each
+        reach = _REACH * spread + 10.0 + self.first.size / each
+        return max(0, math.floor(mean - reach)), min(most, math.ceil(mean + reach))
+
+    def _transformed(self, counts: FloatArray) -> FloatArray:
+        """P(N >= counts) (n,) by the transform of the periods that k registrations lose, (21)."""
+        k, q, late, n = counts, self.seen, self.late, self.first.size
+        room = self.cycles - 1.0 - (k - 1.0) * (self.whole + 1.0)  # periods that may be lost
+        spread = math.sqrt(float(k.max()) * ((1.0 - q) / q**2 + late * (1.0 - late)))
+        away = float(np.abs(room - k * (1.0 - q) / q - (k - 1.0) * late).max())
+        half = math.ceil(away + _REACH * spread + n + 64.0 / q)
+        size, least = 2 * half + 2, float(k.min())
+        found = np.full(k.size, (half + 1.0) / size * float(self.first.sum()))
+        for start in range(1, half + 1, _POINTS):
+            angle = 2.0 * np.pi * np.arange(start, min(start + _POINTS, half + 1)) / size
+            away_from_one = 2.0 * np.sin(0.5 * angle) ** 2 - 1j * np.sin(angle)  # 1 - w
+            empty, delayed = -_log1p((1.0 - q) / q * away_from_one), _log1p(-late * away_from_one)
+            window = (1.0 - np.exp(1j * angle * (half + 1.0))) / away_from_one
+            first = self.first[0] * np.ones_like(window)
+            if n > 1:
+                first += self.first[-1] * np.exp(1j * angle * (n - 1.0))
+            if n > 2:
+                w = np.exp(1j * angle)
+                first += self.first[1] * (w - np.exp(1j * angle * (n - 1.0))) / away_from_one
+            weight = 2.0 / size * first * window
+            keep = np.abs(weight) * np.exp(least * empty.real + (least - 1.0) * delayed.real) > _FAINT
+            for c, a, b, t in zip(weight[keep], empty[keep], delayed[keep], angle[keep], strict=True):
+                found += (c * np.exp(k * a + (k - 1.0) * b - 1j * np.remainder(room * t, 2.0 * np.pi))).real
+            if not keep.any():  # the moduli of both factors fall all the way round the circle
+                return np.asarray(np.clip(found, 0.0, 1.0), dtype=np.float64)
+            if (start + _POINTS) * k.size > _MAX_TRANSFORM:
+                break
+        raise ConvergenceError(
+            f"count law of {self.name}: a dead time that reaches over period starts all but locks the count, whose "
+            f"transform does not end; {_INSTEAD}"
+        )
 
     def _check(self, counts: float, most: int) -> None:
-        terms = counts * self.first.size * self._spread(float(most))
+        terms = counts * _SUMS * self._spread(float(most))
         if terms > _MAX_TERMS:
             raise ConvergenceError(
                 f"count law of {self.name}: {terms:.2g} terms are too many for mode 'synchronous' with a dead time "
-                f"that reaches over period starts (at most {_MAX_TERMS:.2g}); use fewer cycles"
+                f"that reaches over period starts (at most {_MAX_TERMS:.2g}); {_INSTEAD}"
             )
 
     def _last(self, chance: float, most: int) -> int:

@@ -18,7 +18,7 @@ from mars_lidar.system import System
 from mars_lidar.table.axes import Grid, axis_values, describe
 from mars_lidar.table.cache import request_key
 from mars_lidar.table.entries import Entries, Progress, exposure_entries
-from mars_lidar.table.error import QuantisationError
+from mars_lidar.table.error import QuantisationError, long_error
 from mars_lidar.table.node_laws import NodeLaws, node_laws
 from mars_lidar.table.refine import refined_axes
 from mars_lidar.table.renewal_entries import renewal_entries
@@ -90,11 +90,13 @@ def build(
         error = table.quantisation_error(samples=_ERROR_SAMPLES, threads=recipe.threads)
     else:
         table, error = _refined(system, axes, recipe, goal, progress)
+    longest = long_error(table, _ERROR_SAMPLES, recipe.threads)
     law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
     table.provenance.update(
         key=request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
         refine=goal,
         error=error.to_dict(),
+        error_longest=None if longest is None else longest.to_dict(),
         law=law,
         build_s=time.perf_counter() - began,
     )

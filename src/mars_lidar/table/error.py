@@ -11,6 +11,7 @@ import numpy as np
 
 from mars_lidar import _validate
 from mars_lidar.statistics._cells import FloatArray
+from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics.exposure import exposure_moments, thread_count
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 # relative change of the variance
 _TV_MEAN, _TV_VARIANCE = 1.0 / math.sqrt(2.0 * math.pi), 1.0 / math.sqrt(2.0 * math.pi * math.e)
 _LEAST_SPREAD = 0.5  # below it a count is a lottery between two integers, and errors matter in counts
+MOST_CYCLES = 10**8  # of a System: the exposure at which errors of the mean are largest
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,9 @@ class QuantisationError:
 
     Errors of the cumulants are in units of powers of the standard deviation, at least 1/2 count. Those called
     `delayed` are at random delays, where an armed start gives another law; the others at the canonical t_r / 2.
+    All hold for exposures of `cycles` periods: an error of the mean count per period grows with the exposure, the
+    standard deviation with its root, so that errors of the mean in standard deviations grow as the root of the
+    exposure. Those of the variance and of the shape do not grow.
 
     Attributes
     ----------
@@ -69,9 +74,30 @@ class QuantisationError:
         """Total variation that the table may be off by: the larger of `law_max` and `shape_max`."""
         return max(self.law_max, self.shape_max)
 
+    def cycles_within(self, allowed: float = 0.05) -> int:
+        """Periods up to which the mean is within `allowed` standard deviations, from 1 to 1e8.
+
+        From the error measured at `cycles`, by its growth with the root of the exposure: most exact where measured at
+        1e8 cycles, since a standard deviation below half a count, for which short exposures are excused, is excused
+        no longer.
+        """
+        allowed = _validate.real("allowed", allowed, low=0.0, strict_low=True)
+        worst = max(self.mean_max, self.delayed_mean_max, 1e-300)
+        return max(1, int(min(self.cycles * (allowed / worst) ** 2, MOST_CYCLES)))
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""
         return dataclasses.asdict(self)
+
+
+def long_error(table: Table, samples: int, threads: int | None) -> QuantisationError | None:
+    """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
+    if table.system.cycles != MOST_CYCLES and not table.entries.serves(MOST_CYCLES).all():
+        return None
+    try:
+        return quantisation_error(table, "bilinear", samples, 0, MOST_CYCLES, threads)
+    except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
+        return None
 
 
 def quantisation_error(

@@ -1,0 +1,333 @@
+"""Laws anywhere in the declared domain: right, or a refusal that says what to use. What was found wrong, by name."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from benchmarks.law_map import disagreements, draw, laws
+from scipy import stats
+
+import mars_lidar as ml
+from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
+from mars_lidar.statistics import _cells as cells_module
+from mars_lidar.statistics import _joint_pixel as pixel_module
+from mars_lidar.statistics import _pmf as pmf_module
+from mars_lidar.statistics._cells import Cells
+from mars_lidar.statistics._joint_grid import FoldedGrid
+
+PERIOD_NS = 100.0
+
+
+def view(dead: float, cycles: int = 1000, sigma: float = 0.01, start: str = "armed", **changes: Any) -> ml.System:
+    """Times in periods."""
+    detector = ml.Detector(dead_time_ns=dead * PERIOD_NS)
+    made = ml.System(
+        period_ns=PERIOD_NS, cycles=cycles, bins=64, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        detector=detector, start=start,  # type: ignore[arg-type]
+    )  # fmt: skip
+    return made.replace(**changes)
+
+
+# A warmed-up clock: many background photons in a dead time
+
+
+@pytest.mark.parametrize(
+    ("background", "dead", "cycles"), [(1000.0, 1.9999, 1), (999.0, 0.9997, 1), (300.0, 4.98256, 3), (80.0, 2.5, 20)]
+)
+def test_warm_start_of_a_bright_clock(background: float, dead: float, cycles: int):
+    """The mean of a stationary renewal process is that of its rate; the first has raised."""
+    law = ml.count_law(0.0, background, view(dead, cycles, start="stationary"))
+    mean = background * cycles / (1.0 + background * dead)
+    assert law.mean == pytest.approx(mean, rel=1e-6)
+    assert law.pmf.sum() == pytest.approx(1.0, abs=1e-9)
+    assert law.pmf @ law.support == pytest.approx(mean, rel=1e-6)
+    if dead > cycles:  # one at most
+        assert law.variance == pytest.approx(mean * (1.0 - mean), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "detector"),
+    [
+        (2.0, 0.3, 0.6375, {}),
+        (10.0, 0.05, 1.97, {}),
+        (0.5, 4.0, 3.25, {}),
+        (3.0, 0.5, 0.002, {}),
+        (3.0, 0.5, 0.7, {"mode": "gated", "gate_start_ns": 30.0, "gate_width_ns": 40.0}),
+    ],
+)
+def test_warm_states_by_sweeps_and_by_the_equation(
+    monkeypatch: pytest.MonkeyPatch, signal: float, background: float, dead: float, detector: dict[str, Any]
+):
+    system = view(dead, 30, start="stationary")
+    system = system.replace(detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **detector))
+    swept = ml.count_law([signal, 0.1], background, system, delay_ns=47.0)
+    shape = ml.registration_pdf([signal, 0.1], background, system, "stationary", delay_ns=47.0)
+    assert swept.pmf.shape[0] == 2
+    monkeypatch.setattr(cells_module, "_WARM_PERIODS", 1)
+    solved = ml.count_law([signal, 0.1], background, system, delay_ns=47.0)
+    np.testing.assert_allclose(solved.cumulants, swept.cumulants, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(solved.pmf, swept.pmf, atol=1e-9)
+    again = ml.registration_pdf([signal, 0.1], background, system, "stationary", delay_ns=47.0)
+    np.testing.assert_allclose(again, shape, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "sigma"),
+    [(205.648, 6.66524, 0.999856070836575, 0.013763629840558421), (26.3463, 0.00914578, 4.988590445664314, 0.002),
+     (28.4588, 241.234, 1.99982, 0.177), (64.86, 0.45, 0.999978, 0.00446)],
+)  # fmt: skip
+def test_stationary_shapes_of_locked_pixels(signal: float, background: float, dead: float, sigma: float):
+    """Rate and shape: armed + blind = 1, each bin's registrations at least those of the pixel armed a dead time ago."""
+    system = view(dead, sigma=sigma, bins=32)
+    shape = ml.registration_pdf(signal, background, system, "stationary", delay_ns=30.0)
+    assert shape.sum() == pytest.approx(1.0, abs=1e-9)
+    assert shape.min() >= 0.0
+    other = ml.registration_pdf(signal, background, view(dead + 3.0, sigma=sigma, bins=32), "stationary", delay_ns=30.0)
+    np.testing.assert_allclose(other, shape, atol=1e-6)  # whole periods only wait
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "dead"), [(1.0, 0.5, 0.6375), (20.0, 0.1, 0.97), (0.2, 60.0, 0.81), (5.0, 1.0, 2.003)]
+)
+def test_factors_of_the_feedback_equation(signal: float, background: float, dead: float):
+    """The factors, whose full row is put back, and the sweeps solve the same equations, forward and transposed."""
+    cells = Cells.of(signal, background, view(dead), delay_ns=33.0)
+    swept, direct = FoldedGrid.of(cells, 512), FoldedGrid.of(cells, 512)
+    direct.direct = True
+    np.testing.assert_allclose(direct.state, swept.state, rtol=1e-7, atol=1e-12)
+    weights = np.random.default_rng(1).normal(size=(3, 512))
+    a, b = direct.adjoint(weights), swept.adjoint(weights)
+    np.testing.assert_allclose(a, b, atol=1e-7 * np.abs(b).max())
+    assert direct.residual < 1e-9
+
+
+# Wide laws
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "cycles", "start"),
+    [(1.0, 1.0, 0.6375, 100_000, "armed"), (0.01, 0.02, 1.3, 1_000_000, "stationary"), (3.0, 3.0, 0.01, 2000, "armed"),
+     (0.3, 30.0, 0.01, 400, "stationary"), (9.0, 0.1, 2.2, 300_000, "armed")],
+)  # fmt: skip
+def test_wide_laws_from_few_points(
+    monkeypatch: pytest.MonkeyPatch, signal: float, background: float, dead: float, cycles: int, start: str
+):
+    system = view(dead, cycles, start=start)
+    used = []
+    true_narrow = pmf_module._narrow
+
+    def told(*arguments: Any) -> Any:
+        used.append(true_narrow(*arguments))
+        return used[-1]
+
+    monkeypatch.setattr(pmf_module, "_narrow", told)
+    law = ml.count_law(signal, background, system)
+    assert law.pmf.size > 256
+    assert used[0] is not None
+    assert np.count_nonzero(used[0]) < 100
+    monkeypatch.setattr(pmf_module, "_ALL_POINTS", 10**9)
+    every = ml.count_law(signal, background, system)
+    assert every.pmf.size == law.pmf.size
+    np.testing.assert_allclose(law.pmf, every.pmf, atol=1e-12)
+
+
+def test_the_law_of_a_hundred_million_periods():
+    """125 s once: at t_d = t_r registrations are a renewal process of whole periods and the phase of one photon."""
+    law = ml.count_law(5.0, 1.0, view(1.0, 10**8, 0.00375))
+    assert law.mean == pytest.approx(6.0 * 1e8 / 7.0, abs=1.0)
+    assert law.variance == pytest.approx(float(law.cumulants[1]))
+    offset = law.support - law.mean
+    assert law.pmf.sum() == pytest.approx(1.0, abs=1e-6)
+    assert law.pmf @ offset == pytest.approx(0.0, abs=1e-3 * math.sqrt(law.variance))
+    assert law.pmf @ offset**2 == pytest.approx(float(law.variance), rel=1e-4)
+    normal = stats.norm.pdf(law.support, law.mean, math.sqrt(law.variance))
+    assert 0.5 * np.abs(law.pmf - normal).sum() < 1e-3
+
+
+@pytest.mark.parametrize(("lattice", "seen"), [(1, True), (2, False), (3, False)])
+def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, lattice: int, seen: bool):
+    """Counts that come in pairs have a second peak of the transform at -1, as narrow as the first."""
+    system = view(0.5, 10_000)
+
+    def transform(cells: Cells, re: np.ndarray, im: np.ndarray | None, *_: Any) -> tuple[np.ndarray, np.ndarray]:
+        assert im is not None
+        value = np.exp(0.3 * cells.system.cycles * ((re + 1j * im) ** lattice - 1.0))
+        return value.real, value.imag
+
+    monkeypatch.setattr(pmf_module, "_characteristic", transform)
+    variance = 0.3 * 10_000 * lattice**2
+    size = 2 * math.ceil(8 * math.sqrt(variance))
+    found = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.Purse())
+    assert (found is not None) == seen
+
+
+def test_locked_law_of_many_periods():
+    """A count that is all but certain: its pmf errs in probability, not in shares of its variance of 1e-4."""
+    pulse = ml.SampledPulse(np.random.default_rng(0).exponential(size=20), bin_ns=1.0)
+    system = view(0.807282, 333_063, start="stationary", pulse=pulse)
+    law = ml.count_law(137.457, 0.0353754, system, delay_ns=99.9)
+    assert law.pmf.sum() == pytest.approx(1.0, abs=1e-7)
+    assert law.pmf @ law.support == pytest.approx(float(law.mean), abs=1e-6)
+
+
+# Darkness, dead times beyond the exposure
+
+
+def test_darkness():
+    system = view(12127.27, 121_892, bins=24_393)
+    law = ml.count_law(None, 0.0, system, waveform=np.zeros(100))
+    assert law.mean == law.variance == 0.0
+    np.testing.assert_array_equal(law.pmf, [1.0])
+    assert mean_histogram(None, 0.0, system, waveform=np.zeros(100)).sum() == 0.0
+    some = ml.count_law([0.0, 1.0], [0.0, 0.5], view(0.6, 100))
+    np.testing.assert_allclose(some.cumulants[1], ml.count_law(1.0, 0.5, view(0.6, 100)).cumulants, rtol=1e-10)
+    np.testing.assert_array_equal(some.cumulants[0], 0.0)
+    assert some.pmf[0, 0] == 1.0
+
+
+@pytest.mark.parametrize(("cycles", "dead"), [(1, 1e6), (2, 925_385.5), (38, 147_009.02), (1000, 1000.5)])
+def test_one_registration_at_most(cycles: int, dead: float):
+    system = view(dead, cycles)
+    law, joint = ml.count_law(0.02, 0.001, system), ml.joint_law(0.02, 0.001, system)
+    chance = -math.expm1(-0.021 * cycles)
+    np.testing.assert_allclose(law.pmf[:2], [1.0 - chance, chance], atol=1e-9)
+    assert joint.count_mean == pytest.approx(chance, rel=1e-6)
+    assert joint.count_variance == pytest.approx(chance * (1.0 - chance), rel=1e-5)
+
+
+# The joint law of an exposure that forgets its start long before its end
+
+
+def test_joint_law_known_to_settle(monkeypatch: pytest.MonkeyPatch):
+    """Given up after some 50 of 300 periods, the fall of the distance so far tells when it is within the tolerance."""
+    system = view(2.04, 10**7)
+    law = ml.joint_law(4.0, 0.1, system)
+    monkeypatch.setattr(pixel_module, "_MAX_STEPS", 100_000)
+    early = ml.joint_law(4.0, 0.1, system)
+    assert early.settled == pytest.approx(law.settled, rel=0.1)
+    assert early.settled != law.settled
+    assert early.count_variance == pytest.approx(law.count_variance, rel=1e-9)
+    np.testing.assert_allclose(early.mean, law.mean, rtol=1e-9)
+    for cycles in (800, 10**5):  # not within a third of the exposure; a pixel that has told nothing yet
+        with pytest.raises(ConvergenceError, match="engine 'exact'"):
+            ml.joint_law(6.0, 0.05, view(1.97, cycles, bins=1024, sigma=0.002))
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("signal", "background", "dead", "cycles", "sigma", "start"),
+    [
+        (219.457, 208.209, 6.000022, 4_381_356, 0.05, "armed"),
+        (3.21, 24.75, 7.785, 14_893_667, 3.17e-4, "stationary"),
+        (1.7, 6.3, 367_230.6, 10**7, 0.001, "stationary"),
+    ],
+)
+def test_refusals_say_what_to_use(
+    signal: float, background: float, dead: float, cycles: int, sigma: float, start: str
+):
+    system = view(dead, cycles, sigma, start)
+    told = r"; use .*joint_law.*simulate it with engine 'exact'"
+    for law in (ml.count_law, mean_histogram, ml.registration_pdf):
+        with pytest.raises((ConvergenceError, MemoryError), match=told):
+            law(signal, background, system)
+
+
+def test_a_law_that_is_refused_is_to_be_had_elsewhere(monkeypatch: pytest.MonkeyPatch):
+    system = view(2.04, 20_000)
+    expected = exposure_moments(4.0, 0.1, system)
+    monkeypatch.setattr("mars_lidar.statistics.law.LAW_STEPS", 10_000)
+    with pytest.raises(ConvergenceError, match="exposure_moments, which goes on"):
+        ml.count_law(4.0, 0.1, system)
+    assert exposure_moments(4.0, 0.1, system).mean == expected.mean
+    assert ml.joint_law(4.0, 0.1, system).count_mean == pytest.approx(float(expected.mean), rel=1e-6)
+
+
+# Bad input
+
+
+@pytest.mark.parametrize("law", [ml.count_law, ml.registration_pdf, mean_histogram, exposure_moments, ml.joint_law])
+@pytest.mark.parametrize(
+    ("change", "error", "told"),
+    [
+        ({"signal": math.nan}, ValueError, "signal must lie in"),
+        ({"signal": -1e-9}, ValueError, "signal must lie in"),
+        ({"signal": math.inf}, ValueError, "signal must lie in"),
+        ({"signal": 1e7}, ValueError, "signal must lie in"),
+        ({"background": math.nan}, ValueError, "background must lie in"),
+        ({"background": -1.0}, ValueError, "background must lie in"),
+        ({"background": "1"}, TypeError, "background must be real numbers"),
+        ({"signal": 1j}, TypeError, "signal must be real numbers"),
+        ({"delay_ns": math.nan}, ValueError, "delay_ns must be finite"),
+        ({"delay_ns": -math.inf}, ValueError, "delay_ns must be finite"),
+        ({"signal": None, "waveform": [1.0, math.nan]}, ValueError, "waveform must lie in"),
+        ({"signal": None, "waveform": [-1.0, 1.0]}, ValueError, "waveform must lie in"),
+        ({"signal": None, "waveform": []}, ValueError, "waveform must"),
+        ({"tolerance": math.nan}, ValueError, "tolerance must be"),
+        ({"system": None}, TypeError, "system must be a System"),
+    ],
+)  # fmt: skip
+def test_bad_input(law: Any, change: dict[str, Any], error: type[Exception], told: str):
+    given: dict[str, Any] = {"signal": 1.0, "background": 0.1, "system": view(0.6)} | change
+    with pytest.raises(error, match=told):
+        law(given.pop("signal"), given.pop("background"), given.pop("system"), **given)
+
+
+@pytest.mark.parametrize("start", ["armed", "stationary"])
+@pytest.mark.parametrize("dead", [0.0, 1e-4, 0.5, 1.0, 1e6])
+@pytest.mark.parametrize(("signal", "background"), [(0.0, 0.0), (1000.0, 1000.0), (1e-6, 0.0), (0.0, 1e-6)])
+def test_corners(signal: float, background: float, dead: float, start: str):
+    """One period, two bins: no flux, much of it, no dead time, a million periods of it."""
+    system = view(dead, 1, start=start, bins=2)
+    total = signal + background
+    law = ml.count_law(signal, background, system)
+    if total == 0.0:
+        mean = 0.0
+    elif dead == 0.0:
+        mean = total
+    elif start == "armed" and dead >= 1.0:
+        mean = -math.expm1(-total)
+    elif start == "stationary" and dead in (1.0, 1e6):
+        mean = total / (1.0 + dead * total)
+    else:
+        mean = float(law.mean)
+    assert law.mean == pytest.approx(mean, rel=1e-5, abs=1e-300)
+    assert law.pmf.sum() == pytest.approx(1.0, abs=1e-8)
+    assert law.pmf.min() >= 0.0
+    histogram = mean_histogram(signal, background, system)
+    assert histogram.sum() == pytest.approx(mean, rel=1e-4, abs=1e-300)
+    if start == "stationary" and dead == 1e6 and total > 0.0:  # a million periods of history
+        with pytest.raises(ConvergenceError, match="use exposure_moments"):
+            ml.joint_law(signal, background, system)
+    else:
+        joint = ml.joint_law(signal, background, system)
+        assert joint.count_mean == pytest.approx(mean, rel=1e-3, abs=1e-300)
+    for method in ("exposure", "stationary"):
+        shape = ml.registration_pdf(signal, background, system, method)  # type: ignore[arg-type]
+        assert shape.sum() == pytest.approx(1.0, abs=1e-9)
+
+
+# A sweep: whatever is not refused agrees with all else
+
+
+@pytest.mark.parametrize("first", range(20_000, 20_032, 8))
+def test_random_systems(first: int):
+    for seed in range(first, first + 8):
+        drawn, values, unhelpful = draw(seed), {}, []
+        if drawn.electronics or drawn.dead > 300.0 or drawn.bins > 4096:  # right, but slow: `benchmarks.law_map`
+            continue
+        for name, law in laws(drawn).items():
+            try:
+                values |= law(values)
+            except KeyError:  # of a law that has been refused
+                continue
+            except (ConvergenceError, MemoryError) as refusal:
+                if not re.search("use |simulate it", str(refusal)):
+                    unhelpful.append(f"{name}: {refusal}")
+        assert not unhelpful, f"{drawn}: {unhelpful}"
+        assert not disagreements(drawn, values), f"{drawn}: {disagreements(drawn, values)}"

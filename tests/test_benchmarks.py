@@ -11,9 +11,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks are run from the checkout, not installed
 from benchmarks import __main__ as command
-from benchmarks import memory_child, numpy_loop, workload
+from benchmarks import memory_child, numpy_loop, rows, workload
 from benchmarks.config import Config
-from benchmarks.floor import LANES, operations
+from benchmarks.floor import LANES, Bandwidth, measured_clock, nominal_clock, operations
 from benchmarks.report import Goal, Section, table
 from benchmarks.timing import Timing, in_turn
 
@@ -125,6 +125,26 @@ def test_turns_are_paired_and_counted():
 
 def test_ratios_are_taken_within_a_turn():
     assert Timing((2.0, 8.0, 4.0), (1.0, 1.0, 1.0)).ratio(Timing((1.0, 2.0, 4.0), (1.0, 1.0, 1.0))) == 2.0
+
+
+def test_clock_is_that_of_dependent_additions(monkeypatch: pytest.MonkeyPatch):
+    """No compiler has taken the chain apart, and the floor is of that clock, not of the processor's description."""
+    assert _core.addition_chain(1000) == 16_000
+    hertz = measured_clock()
+    assert hertz is not None
+    assert 3e8 < hertz < 1e10
+    load = workload.canonical(TINY)
+    run = workload.EngineRun(load, level="scalar")
+    timing, bandwidth = Timing((1.0,), (1.0,)), Bandwidth(1.0, 1.0, 1.0, 1.0)
+    told = rows.engine_row("a", run, timing, bandwidth)["ops floor ns/reg"]
+    assert told == pytest.approx(1e9 * operations("scalar").seconds(hertz))
+    monkeypatch.setattr(_core, "addition_chain", None)
+    measured_clock.cache_clear()
+    assert measured_clock() is None
+    told = rows.engine_row("a", run, timing, bandwidth)["ops floor ns/reg"]
+    nominal = nominal_clock()
+    assert told == (None if nominal is None else pytest.approx(1e9 * operations("scalar").seconds(nominal)))
+    measured_clock.cache_clear()
 
 
 def test_wider_levels_need_fewer_operations():

@@ -176,6 +176,15 @@ def test_verify_fails_where_a_count_differs(tmp_path):
     done = run("info", "--verify", tmp_path / "a.zarr")
     assert done.exit_code == 1
     assert "NO: counts differ" in done.output
+    assert "made by" not in done.output
+    # of another version: it opens as ever, and a difference is told with the version that made the counts
+    store = zarr.open_group(tmp_path / "a.zarr")
+    store.attrs["version"] = "0.0.9"
+    with io.load(tmp_path / "a.zarr") as cube:
+        assert cube.version == "0.0.9"
+        assert cube.histogram[0, 0, 0, 0] == 9999
+    told = " ".join(run("info", "--verify", tmp_path / "a.zarr").output.split())
+    assert "NO: counts differ (made by mars-lidar 0.0.9, this is" in told
 
 
 def test_view_draws_a_cube(tmp_path):

@@ -1,3 +1,11 @@
 """Package version, the same as in pyproject.toml (a test compares them)."""
 
 __version__ = "0.1.0"
+
+
+def other_version(made_by: object) -> str:
+    """Of counts that differ: empty, or that another version made them, in brackets and with a space before them."""
+    if made_by in (None, "", __version__):
+        return ""
+    told = f"made by mars-lidar {made_by}, this is {__version__}"
+    return f" ({told}: another version may draw other counts of the same law; {made_by} makes these again)"

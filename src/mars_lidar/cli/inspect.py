@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mars_lidar._version import other_version
 from mars_lidar.cli.console import check_picture, reported, save_picture, table
 
 if TYPE_CHECKING:
@@ -49,7 +50,8 @@ def info(
                 raise ValueError(f"{file} is incomplete: there is nothing to verify")
             with progress_bar("verifying") as progress:
                 same = same_again(cube, progress=progress)
-            table([("verified", "simulated again, every count is the same" if same else "NO: counts differ")])
+            different = f"NO: counts differ{other_version(cube.version)}"
+            table([("verified", "simulated again, every count is the same" if same else different)])
             if not same:
                 raise typer.Exit(FAILED)
 

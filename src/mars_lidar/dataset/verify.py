@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mars_lidar import _validate
+from mars_lidar._version import other_version
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.store import open_dataset
 from mars_lidar.dataset.write import Maker
@@ -60,7 +61,6 @@ def verify(
     threads, progress
         As for `mars_lidar.generate`.
     """
-    from mars_lidar import __version__
     from mars_lidar.simulate import _default_threads
 
     dataset = open_dataset(path)
@@ -82,9 +82,7 @@ def verify(
         )
         wrong = _compare(maker, region)
         if wrong:
-            made_by = dataset.attrs.get("version")
-            older = "" if made_by == __version__ else f" (made by mars-lidar {made_by}, this is {__version__})"
-            different.append(f"{wrong}{older}")
+            different.append(wrong + other_version(dataset.attrs.get("version")))
         if progress is not None:
             progress(k + 1, number)
     return Verified(number, total, tuple(different))

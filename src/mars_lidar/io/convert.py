@@ -113,6 +113,7 @@ def photons(
         The photons do not have the stored counts (another version made the cube), or the engine draws
         histograms only.
     """
+    from mars_lidar import __version__
     from mars_lidar.simulate import simulate_timestamps
 
     k = _validate.integer("realization", realization, low=0, high=cube.shape[0] - 1)
@@ -130,7 +131,7 @@ def photons(
         if not np.array_equal(flat.reshape(times.shape[1], times.bins), np.asarray(cube.histogram[k, y])):
             raise ValueError(
                 f"the photons of row {y} do not have the counts of {cube.path}: it was made by mars-lidar "
-                f"{cube.version}, or changed since"
+                f"{cube.version} and this is {__version__}, or it was changed since"
             )
     return times
 

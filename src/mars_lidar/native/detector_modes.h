@@ -13,8 +13,10 @@ inline GateView gate_view(const Gate& gate) {
         const double lower = (periods * 0x1p32 - upper) * 0x1p32;
         return static_cast<uint64_t>(static_cast<uint32_t>(upper)) << 32 | static_cast<uint32_t>(lower);
     };
-    // a gate that is always open: 1 would not do, because a distance round the period may be rounded up to 1
-    const float width = gate.width < 1.0 ? static_cast<float>(gate.width) : 2.0f;
+    // Phases are multiples of 2^-24 or finer. As many of them are inside as the gate is wide: an edge between two.
+    // A gate that is always open: 1 would not do, because a distance round the period may be rounded up to 1.
+    const double places = static_cast<double>(static_cast<int32_t>(gate.width * 0x1p24 + 0.5));
+    const float width = gate.width < 1.0 ? static_cast<float>((places - 0.25) * 0x1p-24) : 2.0f;
     return {fixed_point(gate.start), fixed_point(gate.step), width, static_cast<uint32_t>(gate.cycles)};
 }
 
@@ -68,16 +70,16 @@ MARS_INLINE Mask advance(const SystemView& system, Time hit, Int cycle, Float ph
         const Mask shut = since_opening(phase, gate_positions(gate, cycle)) >= width;
         Time next = earlier(shut, hit, rearm(system, hit));
         // where the gate is shut at that time: to its next opening
-        const Float there = next.phase + delay;
-        const Int wrap = minus_if(one_if(there >= 1.0f), there < 0.0f);
-        const Int period = next.frame + wrap;
-        const Float x = there - to_float(wrap), position = gate_positions(gate, period);
+        const Time there = in_period(next, delay);
+        const Int period = there.frame;
+        const Float x = there.phase, position = gate_positions(gate, period);
         const Mask wait = since_opening(x, position) >= width, past = wait & (x >= position);
         const Int opens = plus_if(period, past);
         const Float opening = gate_positions(gate, opens);
         // a gate that wraps is open from the beginning of the period
         const Mask at_once = past & (opening + width > 1.0f);
-        const Time open = in_frames(opens, select(at_once, splat(0.0f), opening), delay);
+        Time open = in_frames(opens, select(at_once, splat(0.0f), opening), delay);
+        open.phase = open.phase - 0x1p-25f;  // what is rounded up to the first place inside
         armed = earlier(wait, open, next);
         // without a jump, and after whole periods, the pulse's energy here is that of the registration
         const Mask same = (since_opening(x, position) < width) & (splat(system.dead_fraction) == 0.0f);

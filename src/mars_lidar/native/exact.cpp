@@ -91,6 +91,22 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
     run_exact(job, pulse, block, threads, level, progress);
 }
 
+#if defined(__GNUC__)
+// `rounds` times 16 additions, each of which waits for the one before it: a cycle each. The number that is added comes from
+// a register, because some processors do additions of constants beside the others.
+uint64_t addition_chain(int64_t rounds) {
+    uint64_t sum = 0, step = 1;
+    for (int64_t k = 0; k < rounds; ++k) {
+#pragma GCC unroll 16
+        for (int addition = 0; addition < 16; ++addition) {
+            sum += step;
+            asm volatile("" : "+r"(sum), "+r"(step));  // one by one
+        }
+    }
+    return sum;
+}
+#endif
+
 }  // namespace
 
 void bind_exact(nb::module_& module) {
@@ -142,6 +158,10 @@ void bind_exact(nb::module_& module) {
         },
         nb::arg("c0"), nb::arg("c1"), nb::arg("k0"), nb::arg("k1"), nb::arg("rounds"),
         "Threefry-2x32, for the known-answer tests.");
+#if defined(__GNUC__)
+    module.def("addition_chain", &addition_chain, nb::arg("rounds"),
+               "16 dependent additions a round, a cycle each: the processor's clock, for the benchmarks.");
+#endif
 }
 
 }  // namespace mars

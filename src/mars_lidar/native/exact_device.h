@@ -164,7 +164,7 @@ struct DeviceWriter<DeviceSink::kTimestamps> { using Type = DeviceTimestamps; };
 
 MARS_INLINE Rate device_rate(double photons) {
     Rate flux;
-    plain_rate(photons, flux.rate, flux.inverse, flux.never);
+    plain_rate(photons, flux.rate, flux.inverse);
     return flux;
 }
 

@@ -24,13 +24,13 @@ constexpr int kPollEvery = 512;  // rounds between looks at `stop`
 
 // Plain memory behind the lanes, for changing single lanes.
 struct RateArray {
-    float rate[kLanes], inverse[kLanes], never[kLanes];
+    float rate[kLanes], inverse[kLanes];
 
-    void set(int lane, double photons) { plain_rate(photons, rate[lane], inverse[lane], never[lane]); }
+    void set(int lane, double photons) { plain_rate(photons, rate[lane], inverse[lane]); }
 };
 
 MARS_INLINE Rate load_rate(const RateArray& from) {
-    return {load<Float>(from.rate), load<Float>(from.inverse), load<Float>(from.never)};
+    return {load<Float>(from.rate), load<Float>(from.inverse)};
 }
 
 // `timed` runners can tell the times of registrations; those with a recorder always can.

@@ -85,7 +85,9 @@ public:
         int64_t k = 0;
         while (k + 1 < returns_ && photon >= until_[k]) ++k;
         const float energy = static_cast<float>(u < view_.split ? u : u - 1.0);
-        const double time = centre_[k] + (gaussian_ ? quantile<true>(view_, energy) : quantile<false>(view_, energy));
+        const float size = magnitude(energy);
+        const double time = centre_[k] + (gaussian_ ? quantile<true>(view_, energy, size)
+                                                    : quantile<false>(view_, energy, size));
         const double phase = time - std::floor(time);
         return phase < 1.0 ? phase : 0.0;
     }

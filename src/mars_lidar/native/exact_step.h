@@ -25,11 +25,9 @@ template <DetectorMode mode>
 MARS_INLINE Registration register_arrival(const SystemView& system, const Time& hit, Float delay, UInt event,
                                           Time& armed, Memory& memory, Mask& unseen) {
     if constexpr (mode == DetectorMode::kNonparalyzable) armed = rearm(system, hit);
-    // from the frames of the first return to laser periods
-    const Float shifted = hit.phase + delay;
-    const Int wrap = minus_if(one_if(shifted >= 1.0f), shifted < 0.0f);
-    const Int cycle = hit.frame + wrap;
-    const Float phase = shifted - to_float(wrap);
+    const Time seen = in_period(hit, delay);
+    const Int cycle = seen.frame;
+    const Float phase = seen.phase;
     // inside the exposure: 0 <= cycle < cycles, one unsigned comparison
     Mask outside = as_uint(cycle) >= static_cast<uint32_t>(system.cycles);
     if constexpr (mode != DetectorMode::kNonparalyzable) {
@@ -65,12 +63,11 @@ MARS_INLINE float offset_of(double delay, double first_delay) {
     return apart < 0.5f ? apart : apart - 1.0f;
 }
 
-MARS_INLINE void plain_rate(double photons, float& rate, float& inverse, float& never) {
+MARS_INLINE void plain_rate(double photons, float& rate, float& inverse) {
     const float r = static_cast<float>(photons);
-    const bool dark = !(r >= 1e-30f);
+    const bool dark = !(r >= 1.0f / kDarkInverse);
     rate = dark ? 0.0f : r;
-    inverse = dark ? 0.0f : 1.0f / r;
-    never = dark ? kForever : 0.0f;
+    inverse = dark ? kDarkInverse : 1.0f / r;
 }
 
 // A phase of period `cycle` in the frames of the first return.

@@ -51,6 +51,15 @@ MARS_INLINE void prefetch([[maybe_unused]] const void* at) {
 #endif
 }
 
+// A condition that is seldom true: compilers put what it guards out of the way.
+MARS_INLINE bool seldom(bool condition) {
+#if defined(__GNUC__) && !defined(__CUDACC__)
+    return __builtin_expect(condition, false);
+#else
+    return condition;
+#endif
+}
+
 }  // namespace MARS_LEVEL
 }  // namespace mars
 

@@ -39,6 +39,9 @@ MARS_INLINE Float from_bits(UInt u) {
 }
 
 MARS_INLINE bool any(Mask m) { return m; }
+// Whether any lane's number, or any lane's of two, reaches or falls short of a bound.
+MARS_INLINE bool any_reaches(Float a, Float b, float bound) { return a >= bound || b >= bound; }
+MARS_INLINE bool any_below(Float a, float bound) { return a < bound; }
 MARS_INLINE Mask except(Mask a, Mask b) { return a && !b; }
 template <class T>
 MARS_INLINE T select(Mask m, T yes, T no) {

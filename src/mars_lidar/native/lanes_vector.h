@@ -106,7 +106,7 @@ MARS_INLINE UInt bits(Float x) { return {(HardUInt)x.low, (HardUInt)x.high}; }
 MARS_INLINE Float from_bits(UInt x) { return {(HardFloat)x.low, (HardFloat)x.high}; }
 
 #if defined(MARS_LEVEL_avx512)
-MARS_INLINE bool any(Mask m) { return (m.low | m.high) != 0; }
+MARS_INLINE bool any(HardMask m) { return m != 0; }
 MARS_INLINE HardInt choose(HardMask m, HardInt yes, HardInt no) {
     return (HardInt)_mm512_mask_blend_epi32(m, (__m512i)no, (__m512i)yes);
 }
@@ -114,19 +114,19 @@ MARS_INLINE HardFloat choose(HardMask m, HardFloat yes, HardFloat no) {
     return (HardFloat)_mm512_mask_blend_ps(m, (__m512)no, (__m512)yes);
 }
 #else
-MARS_INLINE bool any(Mask m) {
-    const HardInt both = m.low | m.high;
+MARS_INLINE bool any(HardMask m) {
 #if defined(MARS_LEVEL_avx2)
-    return _mm256_movemask_ps((__m256)both) != 0;
+    return _mm256_movemask_ps((__m256)m) != 0;
 #elif defined(MARS_X86)
-    return _mm_movemask_ps((__m128)both) != 0;
+    return _mm_movemask_ps((__m128)m) != 0;
 #else
-    return (both[0] | both[1] | both[2] | both[3]) != 0;
+    return (m[0] | m[1] | m[2] | m[3]) != 0;
 #endif
 }
 MARS_INLINE HardInt choose(HardMask m, HardInt yes, HardInt no) { return m ? yes : no; }
 MARS_INLINE HardFloat choose(HardMask m, HardFloat yes, HardFloat no) { return m ? yes : no; }
 #endif
+MARS_INLINE bool any(Mask m) { return any((HardMask)(m.low | m.high)); }
 MARS_INLINE Int select(Mask m, Int yes, Int no) {
     return {choose(m.low, yes.low, no.low), choose(m.high, yes.high, no.high)};
 }
@@ -181,6 +181,14 @@ MARS_INLINE Float square_root(Float x) { return {square_root(x.low), square_root
 MARS_INLINE Float minimum(Float a, Float b) { return {least(a.low, b.low), least(a.high, b.high)}; }
 MARS_INLINE Float maximum(Float a, Float b) { return {most(a.low, b.low), most(a.high, b.high)}; }
 MARS_INLINE Int minimum(Int a, Int b) { return select(a < b, a, b); }
+
+// Whether any lane's number, or any lane's of two, reaches or falls short of a bound: one comparison for all.
+MARS_INLINE bool any_reaches(Float a, Float b, float bound) {
+    return any(compare_at_least(most(most(a.low, a.high), most(b.low, b.high)), HardFloat{} + bound));
+}
+MARS_INLINE bool any_below(Float a, float bound) {
+    return any(compare_less(least(a.low, a.high), HardFloat{} + bound));
+}
 
 // Lanes to and from memory.
 template <class Vector, class Scalar>

@@ -11,7 +11,7 @@
 namespace mars {
 namespace {
 
-constexpr double kGaussianReach = 8.5;    // half support in sigma: 1e-17 of the energy lies outside
+constexpr double kGaussianReach = 8.5;    // half support in sigma: 1e-17 = 2^-56.4 of the energy lies outside
 constexpr int kForwardCellsPerSigma = 256;
 
 }  // namespace
@@ -48,12 +48,12 @@ namespace {
 int32_t octave_cell(float p) {
     uint32_t word;
     std::memcpy(&word, &p, sizeof word);
-    return static_cast<int32_t>(word >> kOctaveShift) - kOctaveBase;
+    return static_cast<int32_t>(word >> kOctaveShift);
 }
 
 // Lower edge of a cell of the octave table, the inverse of octave_cell.
 float octave_edge(int32_t cell) {
-    const uint32_t word = static_cast<uint32_t>(cell + kOctaveBase) << kOctaveShift;
+    const uint32_t word = static_cast<uint32_t>(cell) << kOctaveShift;
     float p;
     std::memcpy(&p, &word, sizeof p);
     return p;
@@ -97,7 +97,7 @@ void build_gaussian(PulseTable& table) {
         late[2 * half_cells - k] = -energy;
     }
     table.centre = 0.0;
-    table.low = static_cast<float>(-half);
+    table.cell_of_centre = static_cast<float>(half_cells + 1);
     table.cells_per_period = static_cast<float>(1.0 / width);
     build_forward(table, early, late, half_cells);
 
@@ -124,10 +124,11 @@ void build_gaussian(PulseTable& table) {
         }
         return v;
     };
-    const int32_t last = octave_cell(0.5f);
+    const int32_t last = octave_cell(0.5f), first = octave_cell(std::ldexp(1.0f, -kOctaves));
     table.inverse.assign(2 * (last + 2), 0.0f);  // p = 1/2 and what rounds to a little more: the centre
-    double edge = octave_edge(0), position = quantile(edge, std::max(-0.5, -kGaussianReach * shape.sigma));
-    for (int32_t cell = 0; cell < last; ++cell) {
+    double edge = octave_edge(first), position = quantile(edge, std::max(-0.5, -kGaussianReach * shape.sigma));
+    for (int32_t cell = 0; cell < first; ++cell) table.inverse[2 * cell] = static_cast<float>(position);
+    for (int32_t cell = first; cell < last; ++cell) {
         const double next_edge = octave_edge(cell + 1), next_position = quantile(next_edge, position);
         const double slope = (next_position - position) / (next_edge - edge);
         table.inverse[2 * cell] = static_cast<float>(position - slope * edge);
@@ -137,17 +138,41 @@ void build_gaussian(PulseTable& table) {
     }
 }
 
+// The sample edge nearest the median.
+int median_edge(const std::vector<double>& knots) {
+    int nearest = 0;
+    for (int k = 0; k < static_cast<int>(knots.size()); ++k)
+        if (std::fabs(knots[k] - 0.5) < std::fabs(knots[nearest] - 0.5)) nearest = k;
+    return nearest;
+}
+
+// Every sample as two: the same density.
+std::vector<double> halved(const std::vector<double>& knots) {
+    std::vector<double> fine;
+    fine.reserve(2 * knots.size());
+    for (size_t k = 0; k + 1 < knots.size(); ++k) {
+        fine.push_back(knots[k]);
+        fine.push_back(0.5 * (knots[k] + knots[k + 1]));
+    }
+    fine.push_back(knots.back());
+    return fine;
+}
+
 void build_sampled(PulseTable& table) {
     const PulseShape& shape = table.shape;
-    const std::vector<double>& knots = shape.knots;
+    std::vector<double> knots = shape.knots;
+    double width = shape.width;
+    int split = median_edge(knots);
+    if (std::fabs(knots[split] - 0.5) > 0.25) {  // most of the energy in one sample: both halves need some for their tails
+        knots = halved(knots);
+        width *= 0.5;
+        split = median_edge(knots);
+    }
     const int cells = static_cast<int>(knots.size()) - 1;
-    int split = 0;  // the sample edge nearest the median
-    for (int k = 0; k <= cells; ++k)
-        if (std::fabs(knots[k] - 0.5) < std::fabs(knots[split] - 0.5)) split = k;
-    const double half = 0.5 * shape.width * cells;
+    const double half = 0.5 * width * cells;
     table.centre = shape.start + half;
-    table.low = static_cast<float>(-half);
-    table.cells_per_period = static_cast<float>(1.0 / shape.width);
+    table.cell_of_centre = static_cast<float>(0.5 * cells + 1.0);
+    table.cells_per_period = static_cast<float>(1.0 / width);
     std::vector<double> late(knots.size());
     for (size_t k = 0; k < knots.size(); ++k) late[k] = knots[k] - 1.0;
     build_forward(table, knots, late, split);
@@ -160,8 +185,8 @@ void build_sampled(PulseTable& table) {
         const float end = static_cast<float>(k < split ? knots[k + 1] : late[k + 1]);
         if (!(end > begin)) continue;
         table.upper.push_back(end);
-        table.end.push_back(static_cast<float>((k + 1) * shape.width - half));
-        table.periods_per_energy.push_back(static_cast<float>(shape.width / (knots[k + 1] - knots[k])));
+        table.end.push_back(static_cast<float>((k + 1) * width - half));
+        table.periods_per_energy.push_back(static_cast<float>(width / (knots[k + 1] - knots[k])));
         if (k < split) early_samples = static_cast<int32_t>(table.upper.size());
     }
     table.last_early = std::max(early_samples - 1, 0);
@@ -170,13 +195,14 @@ void build_sampled(PulseTable& table) {
     const int32_t guides = octave_cell(1.0f) + 2;  // |p| up to 1 and what rounds to a little more
     table.guide.resize(2 * guides);
     table.guides = guides;
-    for (int32_t cell = 0; cell < guides; ++cell) {
-        const float least_early = cell == 0 ? 0.0f : octave_edge(cell), least_late = -octave_edge(cell + 1);
-        int32_t k = 0;
-        while (k < table.last_early && !(table.upper[k] > least_early)) ++k;
+    for (int32_t cell = 0, k = 0; cell < guides; ++cell) {
+        const float least = cell == 0 ? 0.0f : octave_edge(cell);
+        while (k < table.last_early && !(table.upper[k] > least)) ++k;
         table.guide[cell] = k;
-        k = std::min(early_samples, table.last_late);
-        while (k < table.last_late && !(table.upper[k] > least_late)) ++k;
+    }
+    for (int32_t cell = guides - 1, k = std::min(early_samples, table.last_late); cell >= 0; --cell) {
+        const float least = -octave_edge(cell + 1);
+        while (k < table.last_late && !(table.upper[k] > least)) ++k;
         table.guide[guides + cell] = k;
     }
 }

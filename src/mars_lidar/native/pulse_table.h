@@ -12,13 +12,13 @@
 
 namespace mars {
 
-constexpr int kOctaveShift = 16;                                  // 2^7 cells an octave
-constexpr int32_t kOctaveBase = (127 - 34) << (23 - kOctaveShift);  // the smallest |p| is 2^-34
+constexpr int kOctaveShift = 16;  // 2^7 cells an octave
+constexpr int kOctaves = 56;      // below 2^-56, 8.5 sigma of a Gaussian, there is no energy
 
 struct PulseTable {
     PulseShape shape;
     double centre = 0.0;           // of the frame, relative to the delay
-    float low = 0.0f;              // first cell edge, relative to the centre; likewise below
+    float cell_of_centre = 0.0f;   // number of cells, with the guard, before the centre; a fraction for an odd number
     float cells_per_period = 0.0f;
     int32_t cells = 0;
     int32_t late_cell = 0;         // of `forward`: the late half begins with it ...

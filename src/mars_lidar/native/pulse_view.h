@@ -6,6 +6,8 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
+static_assert(kEnergyShift == kOctaveShift, "cells of the tables");
+
 inline PulseView pulse_view(const PulseTable& pulse) {
     PulseView view{};
     view.forward = pulse.forward.data();
@@ -14,7 +16,7 @@ inline PulseView pulse_view(const PulseTable& pulse) {
     view.upper = pulse.upper.data();
     view.end = pulse.end.data();
     view.periods_per_energy = pulse.periods_per_energy.data();
-    view.low = pulse.low;
+    view.cell_of_centre = pulse.cell_of_centre;
     view.cells_per_period = pulse.cells_per_period;
     view.split = pulse.split;
     view.last_cell = static_cast<float>(pulse.cells + 1);
@@ -22,8 +24,6 @@ inline PulseView pulse_view(const PulseTable& pulse) {
     view.late_cell = pulse.late_cell;
     view.last_early = pulse.last_early;
     view.last_late = pulse.last_late;
-    view.octave_shift = kOctaveShift;
-    view.octave_base = kOctaveBase;
     return view;
 }
 

@@ -64,17 +64,18 @@ MARS_INLINE Pair<uint32_t> stream_key(uint64_t seed, uint32_t realization, uint3
 // A uniform number on (0, 1), both ends open, 31 bits: relatively fine near 0.
 MARS_INLINE Float uniform(UInt x) { return (to_float(as_int(x >> 1)) + 0.5f) * 0x1p-31f; }
 
-// A standard exponential number, -log(u) with u uniform on a lattice of 31 bits; relatively fine at both
-// ends: down to 2^-32 (what registers in a pulse's early tail) and up to 22.
-MARS_INLINE Float exponential(UInt x) {
+// A standard exponential number, -log(u), u = (n + rest) 2^-31 with the upper 31 bits n of a word and `rest` in (0, 1);
+// relatively fine at both ends: what registers in a pulse's early tail, and up to 22. With a random rest, small ones have
+// no lattice.
+MARS_INLINE Float exponential(UInt x, Float rest) {
     const Int n = as_int(x >> 1);
-    const Float f = to_float(n) + 0.5f;
+    const Float f = to_float(n) + rest;
     // f = m 2^e with m in [sqrt(1/2), sqrt(2)); sqrt(1/2) has the bits 0x3f3504f3
     const UInt shifted = bits(f) - 0x3f3504f3u;
     const Int e = as_int(shifted) >> 23;
     Float t = from_bits((shifted & 0x007fffffu) + 0x3f3504f3u) - 1.0f;
     // u above sqrt(1/2): 1 - u comes from the integer, exactly
-    t = select(e == 31, (to_float(0x7fffffff - n) + 0.5f) * -0x1p-31f, t);
+    t = select(e == 31, (to_float(0x7fffffff - n) + rest) * -0x1p-31f, t);
     // log(1 + t) = t - t^2/2 + t^3 P(t), P minimax for the relative error (2.6e-7)
     Float p = splat(-0.10191701352596283f);
     p = p * t + 0.16024371981620789f;
@@ -82,10 +83,14 @@ MARS_INLINE Float exponential(UInt x) {
     p = p * t + 0.19924505054950714f;
     p = p * t - 0.24983267486095428f;
     p = p * t + 0.33334246277809143f;
-    const Float z = t * t;
-    const Float log1p = (t - 0.5f * z) + (z * t) * p;
+    p = p * t - 0.5f;
+    const Float log1p = t + (t * t) * p;
     return to_float(31 - e) * 0.693147182464599609375f - log1p;
 }
+MARS_INLINE Float exponential(UInt x) { return exponential(x, splat(0.5f)); }
+
+// The lower 16 bits of a word as a number in (0, 2^-15): an odd multiple of 2^-32.
+MARS_INLINE Float dither(UInt x) { return from_bits((x & 0xffffu) | 0x3b800000u) - (0x1p-8f - 0x1p-32f); }
 
 }  // namespace MARS_LEVEL
 }  // namespace mars

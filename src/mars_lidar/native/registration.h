@@ -20,10 +20,16 @@ constexpr uint32_t kStageStart = 2;       // arrivals before a stationary exposu
 constexpr uint32_t kStageJitter = 4;      // first word of the counter: half the number; + 1: tails
 constexpr uint32_t kStageReturns = 16;    // + 2 k: returns 2 k + 1 and 2 k + 2; + 2 k + 1: their fractions
 
-constexpr float kLongWait = 128.0f;        // periods; a float32 wait is coarser than 2^-16 period beyond
-constexpr float kForever = 134217728.0f;   // 2^27 periods: beyond every exposure
-
+constexpr uint32_t kStageTails = 64;         // + k: place of an arrival in the tails of return k
 constexpr uint32_t kStageTraps = 0x40000000;  // afterpulses, by the number of the avalanche that leaves carriers (+ k)
+
+constexpr float kLongWait = 256.0f;       // periods; `split_wait` resolves 2^-24 of one up to here
+constexpr float kForever = 134217728.0f;  // 2^27 periods: beyond every exposure
+constexpr float kDarkInverse = 1e30f;           // 1 / rate of a component without photons: every wait is kForever
+
+// Energies nearer to 0 than this are drawn afresh: between two numbers of the lattice of 2^-24 of energies near 1.
+constexpr float kTail = 0x1p-14f - 0x1p-25f;
+constexpr int kEnergyShift = 16;          // the leading bits of an energy name its cell in the tables
 
 // Tables of the pulse, see pulse_table.h.
 struct PulseView {
@@ -33,8 +39,8 @@ struct PulseView {
     const float* upper;
     const float* end;
     const float* periods_per_energy;
-    float low, cells_per_period, last_cell, split;
-    int32_t late_cell, guides, last_early, last_late, octave_shift, octave_base;
+    float cell_of_centre, cells_per_period, last_cell, split;
+    int32_t late_cell, guides, last_early, last_late;
 };
 
 // Positions of the gate in units of 2^-64 period, which add up and wrap exactly.
@@ -52,9 +58,9 @@ struct SystemView {
     float dead_fraction;  // ... and the rest
 };
 
-// Flux of one component at the lane's pixel. A component without photons has rate = inverse = 0 and never = 2^27.
+// Flux of one component at the lane's pixel. A component without photons has rate = 0 and inverse = kDarkInverse.
 struct Rate {
-    Float rate, inverse, never;
+    Float rate, inverse;
 };
 
 struct Return {
@@ -72,16 +78,17 @@ struct Wait {
     Float fraction;  // in [0, 1)
 };
 
-// Position in the frame of the energy p, signed as in pulse_table.h.
+MARS_INLINE Float magnitude(Float x) { return from_bits(bits(x) & 0x7fffffffu); }
+
+// Position in the frame of the energy p, signed as in pulse_table.h; `size` is its magnitude.
 template <bool gaussian>
-MARS_INLINE Float quantile(const PulseView& pulse, Float p) {
-    const UInt sign = bits(p) & 0x80000000u;  // late
-    const Float size = maximum(from_bits(bits(p) ^ sign), splat(0x1p-34f));
-    const Int cell = as_int(bits(size) >> pulse.octave_shift) - pulse.octave_base;
+MARS_INLINE Float quantile(const PulseView& pulse, Float p, Float size) {
+    const Int cell = as_int(bits(size) >> kEnergyShift);
     if constexpr (gaussian) {  // the early half, mirrored
+        const UInt late = bits(p) & 0x80000000u;
         Float intercept, slope;
         gather_pair(pulse.inverse, cell, intercept, slope);
-        return from_bits(bits(intercept + slope * size) ^ sign);
+        return from_bits(bits(intercept + slope * size) ^ late);
     } else {
         const Mask late = p < 0.0f;
         Int k = gather(pulse.guide, cell + select(late, splat(pulse.guides), splat(0)));
@@ -97,30 +104,71 @@ MARS_INLINE Float quantile(const PulseView& pulse, Float p) {
     }
 }
 
-// A long wait in float32 has a coarse fraction: replace it by a fresh one. Exact, since whole periods and
-// fraction of an exponential wait are independent; the fraction has the density ~ e^(-rate r) on [0, 1).
+// Whole periods and rest of a wait. A float32 knows waits of 64 periods to 2^-17 of one, and the random numbers that it
+// is made of have a lattice of their own. So only the 16 leading bits are kept. They name a cell of 2^-15 times the
+// power of two below the wait, in which its law is uniform but for a slope of 2^-15 times the exponential number; `place`,
+// uniform in (0, 2^-15) and independent of the wait, draws afresh where in the cell it ends.
+MARS_INLINE Wait split_wait(Float wait, Float place) {
+    const Float cell = from_bits(bits(wait) & 0xffffff00u), power = from_bits(bits(wait) & 0x7f800000u);
+    const Int whole = truncate(cell);
+    return {whole, (cell - to_float(whole)) + power * place};
+}
+
+// The fraction of a long wait afresh. Exact, since whole periods and fraction of an exponential wait are independent;
+// the fraction has the density ~ e^(-rate r) on [0, 1).
 MARS_INLINE void refresh(Wait& wait, Mask lanes, UInt word, Float rate) {
     const Float v = uniform(word);
     const Float bend = 0.5f * rate * v * (1.0f - v) * (1.0f - rate * (1.0f - 2.0f * v) * 0.33333334f);
     wait.fraction = select(lanes, v - bend, wait.fraction);
 }
 
-// Waits of two components, in periods (background) or pulse energies (returns).
+// Of waits beyond kLongWait, where cells grow longer than a period: whole periods of float32, fractions of their own.
+MARS_INLINE void refresh_long(Float wait_a, Float wait_b, const Rate& a, const Rate& b, UInt key0, UInt key1, UInt event,
+                              uint32_t stage, Wait& split_a, Wait& split_b) {
+    const Mask long_a = wait_a >= kLongWait, long_b = wait_b >= kLongWait;
+    split_a = {select(long_a, truncate(wait_a), split_a.whole), select(long_a, splat(0.5f), split_a.fraction)};
+    split_b = {select(long_b, truncate(wait_b), split_b.whole), select(long_b, splat(0.5f), split_b.fraction)};
+    const Mask fresh_a = long_a & (wait_a < kForever), fresh_b = long_b & (wait_b < kForever);
+    if (!any(fresh_a | fresh_b)) return;
+    const Pair<UInt> fine = threefry<13>(event, splat(stage + 1), key0, key1);
+    refresh(split_a, fresh_a, fine.first, a.rate);
+    refresh(split_b, fresh_b, fine.second, b.rate);
+}
+
+// Waits of two components, in periods (background) or pulse energies (returns). The place in their cells comes from the
+// low bits of the sum of their words: given either word it is uniform by the other.
 MARS_INLINE void draw_waits(UInt key0, UInt key1, UInt event, uint32_t stage, const Rate& a, const Rate& b,
                             Wait& wait_a, Wait& wait_b) {
     const Pair<UInt> words = threefry<13>(event, splat(stage), key0, key1);
-    const Float wa = minimum(exponential(words.first) * a.inverse + a.never, splat(kForever));
-    const Float wb = minimum(exponential(words.second) * b.inverse + b.never, splat(kForever));
-    wait_a.whole = truncate(wa);
-    wait_b.whole = truncate(wb);
-    wait_a.fraction = wa - to_float(wait_a.whole);
-    wait_b.fraction = wb - to_float(wait_b.whole);
-    const Mask long_a = wa >= kLongWait, long_b = wb >= kLongWait;
-    if (any(long_a | long_b)) {
-        const Pair<UInt> fine = threefry<13>(event, splat(stage + 1), key0, key1);
-        refresh(wait_a, long_a, fine.first, a.rate);
-        refresh(wait_b, long_b, fine.second, b.rate);
+    const Float place = dither(words.first + words.second), rest = place * 0x1p15f;
+    Float wa = exponential(words.first, rest) * a.inverse, wb = exponential(words.second, rest) * b.inverse;
+    const bool far = any_reaches(wa, wb, kLongWait);
+    if (far) {
+        wa = minimum(wa, splat(kForever));
+        wb = minimum(wb, splat(kForever));
     }
+    wait_a = split_wait(wa, place);
+    wait_b = split_wait(wb, place);
+    if (far) refresh_long(wa, wb, a, b, key0, key1, event, stage, wait_a, wait_b);
+}
+
+// One draw of a pixel's stream that is seldom needed.
+struct Source {
+    UInt key0, key1, event;
+    uint32_t stage;
+};
+
+// Energies p near 0 to a relative precision. What the sum of an energy and a wait leaves of them is a lattice of 2^-24;
+// but that an arrival from the energy `here` on is nearer to 0 than `reach` comes out right, and given that, p has the
+// density ~ e^(-rate p) in (-reach, reach) if all of that interval lies ahead: after a turn, or from far below. From
+// nearer by, the sum itself is relatively precise.
+MARS_INLINE Float resolve_tail(Float p, Float here, Int turns, const Rate& flux, const Source& source) {
+    const Float reach = minimum(flux.inverse * 0x1p-8f, splat(kTail));
+    const Mask coarse = (magnitude(p) < reach) & ((turns > 0) | (here < -2.0f * reach));
+    if (!any(coarse)) return p;
+    const UInt word = threefry<13>(source.event, splat(source.stage), source.key0, source.key1).first;
+    const Float v = (to_float(as_int(word)) + 0.5f) * 0x1p-31f;  // in (-1, 1), relatively fine near 0
+    return select(coarse, reach * (v - 0.5f * (flux.rate * reach) * (1.0f - v * v)), p);
 }
 
 // Next arrival of a return after `from`, both in frames of that return, its wait given in pulse energies. With
@@ -128,8 +176,9 @@ MARS_INLINE void draw_waits(UInt key0, UInt key1, UInt event, uint32_t stage, co
 // entry: a registration of this return that re-arms at the same phase takes no detour over the tables. On return
 // it holds the arrival's.
 template <bool gaussian, bool whole>
-MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask known, Float& energy) {
-    const Float x = minimum(maximum((from.phase - pulse.low) * pulse.cells_per_period + 1.0f, splat(0.0f)),
+MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask known, const Rate& flux,
+                             const Source& source, Float& energy) {
+    const Float x = minimum(maximum(from.phase * pulse.cells_per_period + pulse.cell_of_centre, splat(0.0f)),
                             splat(pulse.last_cell));
     const Int cell = truncate(x);
     Float here, slope;
@@ -143,11 +192,16 @@ MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask 
     }
     const Float sum = here + wait.fraction;
     const Mask over = sum >= pulse.split;
-    const Float p = minus_if(sum, over);
+    const Int turns = plus_if(wait.whole, over);
+    Float p = minus_if(sum, over), size = magnitude(p);
+    if (seldom(any_below(size, kTail))) {
+        p = resolve_tail(p, here, turns, flux, source);
+        size = magnitude(p);
+    }
     energy = p;
     // from the late half of a frame to an early half: one frame further
-    const Int frames = minus_if(plus_if(plus_if(wait.whole, over), late), p < 0.0f);
-    const Float arrival = quantile<gaussian>(pulse, p);
+    const Int frames = minus_if(plus_if(turns, late), p < 0.0f);
+    const Float arrival = quantile<gaussian>(pulse, p, size);
     // the tables' rounding must not turn time back
     return {from.frame + frames, select(frames == 0, maximum(arrival, from.phase), arrival)};
 }
@@ -163,6 +217,19 @@ MARS_INLINE Time later(Time time, Int frames, Float fraction) {
     const Float phase = time.phase + fraction;
     const Mask carry = phase >= 0.5f;
     return {plus_if(time.frame + frames, carry), minus_if(phase, carry)};
+}
+
+// The same without the lattice of 2^-23 that sums above 1 have.
+MARS_INLINE Time finely_later(Time time, Int frames, Float fraction) {
+    const Mask carry = time.phase + fraction >= 0.5f;
+    return {plus_if(time.frame + frames, carry), minus_if(time.phase, carry) + fraction};
+}
+
+// The same instant in the laser period that holds it, of frames around `delay` in [0, 1): phases in [0, 1].
+MARS_INLINE Time in_period(Time time, Float delay) {
+    const Float here = time.phase + delay, next = time.phase + (delay - 1.0f);  // no sum above 1: its lattice is coarser
+    const Mask before_it = here < 0.0f, after_it = next >= 0.0f;
+    return {minus_if(plus_if(time.frame, after_it), before_it), select(after_it, next, plus_if(here, before_it))};
 }
 
 // The same instant in the frames of a return `offset` later.
@@ -195,10 +262,10 @@ MARS_INLINE Draw draw(const Rate& background, const Rate& signal, UInt key0, UIn
 template <bool gaussian, bool whole>
 MARS_INLINE Time next_registration(const SystemView& system, const Return* returns, Time from, const Draw& drawn,
                                    UInt key0, UInt key1, UInt event, Memory& memory) {
-    Time first = later(from, drawn.background.whole, drawn.background.fraction);
+    Time first = finely_later(from, drawn.background.whole, drawn.background.fraction);
     Float energy = memory.energy;
-    const Time echo =
-        next_return<gaussian, whole>(system.pulse, from, drawn.signal, memory.known & (memory.source == 0), energy);
+    const Time echo = next_return<gaussian, whole>(system.pulse, from, drawn.signal, memory.known & (memory.source == 0),
+                                                   returns[0].flux, {key0, key1, event, kStageTails}, energy);
     const Mask wins = before(echo, first);
     first = earlier(wins, echo, first);
     Memory next = {wins, splat(0), energy};
@@ -210,10 +277,11 @@ MARS_INLINE Time next_registration(const SystemView& system, const Return* retur
                    returns[partner].flux, waits[0], waits[1]);
         for (int32_t i = k; i <= partner; ++i) {
             energy = memory.energy;
-            const Time other = shifted(next_return<gaussian, whole>(system.pulse, shifted(from, returns[i].offset),
-                                                                    waits[i - k],
-                                                                    memory.known & (memory.source == i), energy),
-                                       negative(returns[i].offset));
+            const Source source = {key0, key1, event, kStageTails + static_cast<uint32_t>(i)};
+            const Time frames = next_return<gaussian, whole>(system.pulse, shifted(from, returns[i].offset), waits[i - k],
+                                                             memory.known & (memory.source == i), returns[i].flux, source,
+                                                             energy);
+            const Time other = shifted(frames, negative(returns[i].offset));
             const Mask sooner = before(other, first);
             first = earlier(sooner, other, first);
             next.known = next.known | sooner;

@@ -122,20 +122,23 @@ private:
         const Mask in_time = lanes & (clock_.period(time) < last_);  // and not after the exposure
         const Mask one = words.second < splat(law_.one_below);
         const Float spread = minimum(to_float(as_int(words.second >> 1)) * law_.stretch, splat(2147483520.0f));
-        const UInt word = as_uint(truncate(spread)) << 1;
-        const Wait wait = law_.exponential() ? exponential_wait(in_time & one, word, key0, key1)
+        // spread in float32, which drops the low bits of the upper half: others in their place
+        const Int upper = truncate(spread), lower = as_int((words.first >> 16) & 127u);
+        const UInt word = as_uint(upper + select(upper >= (1 << 30), lower, splat(0))) << 1;
+        const Float place = dither(words.first + words.second);
+        const Wait wait = law_.exponential() ? exponential_wait(in_time & one, word, place, key0, key1)
                                              : sampled_wait(in_time & one, word);
         insert(in_time & one, time, wait, generation);
         const Mask several = except(in_time, one);
         if (any(several)) fill_several(several, time, generation, words.second, key0, key1);
     }
 
-    MARS_INLINE Wait exponential_wait(Mask lanes, UInt word, const UInt& key0, const UInt& key1) const {
-        const Float beyond = minimum(exponential(word) * law_.scale, splat(kForever));
-        Wait wait = {truncate(beyond), splat(0.0f)};
-        wait.fraction = beyond - to_float(wait.whole);
+    MARS_INLINE Wait exponential_wait(Mask lanes, UInt word, Float place, const UInt& key0, const UInt& key1) const {
+        const Float beyond = minimum(exponential(word, place * 0x1p15f) * law_.scale, splat(kForever));
+        Wait wait = split_wait(beyond, place);
         const Mask far = lanes & (beyond >= kLongWait);
         if (any(far)) {
+            wait.whole = select(far, truncate(beyond), wait.whole);
             const UInt fine =
                 threefry<13>(as_uint(number_), splat(kStageTraps + TrapLaw::kFine), key0, key1).first;
             refresh(wait, far, fine, splat(law_.rate));

@@ -1,6 +1,7 @@
 // From one time to the next arrival at a pixel with a waveform, one pixel per lane.
 #pragma once
 #include "registration.h"
+#include "standard.h"
 #include "waveform_gather.h"
 #include "waveform_table.h"
 
@@ -66,27 +67,38 @@ struct WaveRates {
     double total[kLanes], inverse[kLanes];
 };
 
+// `cell`, of which 16 bits are left, continued by a random word: a number in the cell, as in `split_wait` of registration.h.
+MARS_INLINE double continued(float cell, uint32_t word) {
+    return bits_double(double_bits(static_cast<double>(cell)) | static_cast<uint64_t>(word) << 5 | 16u);
+}
+
 // In double precision, because the energy beyond the whole periods has to be right to 2^-31 of a period's.
 MARS_INLINE WaveWait draw_wave(const WaveRates& rates, UInt key0, UInt key1, UInt event) {
-    alignas(64) float exponentials[kLanes];
+    alignas(64) float exponentials[kLanes], cells[kLanes];
     alignas(64) uint32_t fresh[kLanes];
     alignas(64) int32_t whole[kLanes], energy[kLanes];
     const Pair<UInt> words = threefry<13>(event, splat(kStageArrival), key0, key1);
-    store(exponentials, exponential(words.first));
+    const Float drawn = exponential(words.first);
+    store(cells, from_bits(bits(drawn) & 0xffffff00u));
+    store(fresh, words.second);
     for (int lane = 0; lane < kLanes; ++lane) {
-        const double wait = static_cast<double>(exponentials[lane]) * rates.inverse[lane];
+        const double wait = continued(cells[lane], fresh[lane]) * rates.inverse[lane];
         const double periods = wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever);
         whole[lane] = static_cast<int32_t>(periods);
         energy[lane] = static_cast<int32_t>((periods - static_cast<double>(whole[lane])) * 0x1p31);
     }
     const Int count = load<Int>(whole);
-    if (any(count >= static_cast<int32_t>(kLongWait))) {  // a fresh fraction: `refresh` of registration.h
-        store(fresh, words.second);
-        for (int lane = 0; lane < kLanes; ++lane) {
+    if (any(count >= static_cast<int32_t>(kLongWait))) {  // `refresh_long` of registration.h
+        store(exponentials, drawn);
+        for (int lane = 0; lane < kLanes; ++lane) {  // all of a cell or none of it
+            if (!(static_cast<double>(cells[lane]) * rates.inverse[lane] >= static_cast<double>(kLongWait))) continue;
+            const double wait = static_cast<double>(exponentials[lane]) * rates.inverse[lane];
+            whole[lane] = static_cast<int32_t>(wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever));
             const double v = (fresh[lane] + 0.5) * 0x1p-32, total = rates.total[lane];
             const double x = v - 0.5 * total * v * (1.0 - v) * (1.0 - total * (1.0 - 2.0 * v) * (1.0 / 3.0));
-            if (whole[lane] >= static_cast<int32_t>(kLongWait)) energy[lane] = static_cast<int32_t>(x * 0x1p31);
+            energy[lane] = static_cast<int32_t>(x * 0x1p31);
         }
+        return {load<Int>(whole), load<Int>(energy)};
     }
     return {count, load<Int>(energy)};
 }

@@ -99,7 +99,7 @@ def test_width_dead_time_and_edge_of_the_period():
     assert abs((found.delay_ns - 133.2 + 60) % PERIOD - 60) < 4 * errors["delay_ns"]
     assert abs(found.signal - 0.8) < 4 * errors["signal"]
     assert abs(found.background - 0.2) < 4 * errors["background"]
-    assert abs(found.dead_time_ns - 85.0) < 5 * found.dead_time_error_ns < 0.05
+    assert abs(found.dead_time_ns - 85.0) < 5 * found.dead_time_error_ns < 0.06  # with what a jitter may hide
     assert found.too_short == 0
 
 

@@ -87,12 +87,15 @@ def test_a_sharp_edge_is_called_blurred_as_often_as_it_should():
         stream = stream_of(times.pixel(0, k))
         ages = shortest(stream, min(float(dt.min()) for dt in stream.intervals()))
         rate = 0.8 * ml.GaussianPulse(sigma_ns=SIGMA).bin_energy(DELAY, PERIOD, 1024) + 0.1 / 1024
-        chances.append(is_sharp(ages, Underlying.of(rate, PERIOD, DEAD))[0])
+        phases = stream.histogram(1024).astype(float)
+        chances.append(is_sharp(ages, Underlying.of(rate, phases, PERIOD))[0])
         found = ml.calibrate(times.pixel(0, k))
         if found.dead_time_by == "smallest interval":
             assert found.jitter_ns == 0.0
-            assert found.jitter_limit_ns > 5.0 * found.dead_time_error_ns
-            z.append((found.dead_time_ns - DEAD) / found.dead_time_error_ns + 1.0)
+            known = ml.calibrate(times.pixel(0, k), jitter_ns=0.0)
+            assert found.dead_time_error_ns >= known.dead_time_error_ns
+            assert found.jitter_limit_ns > 0.1 * known.dead_time_error_ns
+            z.append((known.dead_time_ns - DEAD) / known.dead_time_error_ns + 1.0)
     below = int((np.array(chances) < 0.1).sum())
     outcomes = {"level": float(stats.binom.sf(below - 1, number, 0.1))}
     outcomes["excess"] = float(stats.kstest(z, "expon").pvalue)  # the smallest of n is exponential behind the edge

@@ -96,6 +96,7 @@ def inspect(
             how = "behind an edge that jitter blurs" if light.jitter_ns else "at once"
             told = f"{how}: the rate is that of the light from {found.recovery.dead_time_ns:.5g} to {ages:.4g} ns"
             rows.append(("recovery", told))
+        rows += [("not known", text) for text in found.unknown]
         rows += [("does not fit", text) for text in found.problems or ("nothing",)]
         if out is not None:
             from mars_lidar.plot.stream import stream_figure

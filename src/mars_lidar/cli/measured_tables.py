@@ -31,7 +31,7 @@ def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
     dead = f"{found.dead_time_ns:.6g} ns"
     if estimated:
         by = {"edge": "the middle of an edge that jitter blurs"}.get(found.dead_time_by, "the smallest interval")
-        dead += f" ± {found.dead_time_error_ns:.2g}, by {by}"
+        dead += f" ± {found.dead_time_error_ns:.2g}, by {by}" if found.edge_fits else ": not known"
     rows = [
         ("intervals", f"smallest {counted.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),
         ("dead time", dead),
@@ -40,10 +40,7 @@ def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
         error = f" ± {found.jitter_error_ns:.2g}, by that edge" if found.jitter_error_ns else ", given"
         rows.append(("jitter", f"sigma {found.jitter_ns:.4g} ns{error}; the recorded pulse holds it"))
     elif not found.edge_fits:
-        rows.append(
-            ("does not fit", "the edge of the recovery is neither sharp nor one that jitter makes: see `mars-lidar "
-             "inspect`, and give a dead time and a hold-off")
-        )  # fmt: skip
+        rows.append(("jitter", "not known"))
     elif found.jitter_limit_ns:
         rows.append(("jitter", f"none seen: the edge is sharp; one below {found.jitter_limit_ns:.2g} ns could hide"))
     return rows
@@ -54,7 +51,7 @@ def light_rows(found: Calibration, detector: Detector | None = None) -> list[tup
     from mars_lidar.estimate.detector_model import moves_records
     from mars_lidar.system import SPEED_OF_LIGHT_M_PER_NS
 
-    rows = interval_rows(found, found.dead_time_error_ns > 0)
+    rows = interval_rows(found, found.dead_time_error_ns != 0)
     if found.hold_off_ns > found.dead_time_ns + found.dead_time_error_ns:
         rows.append(("hold-off", f"{found.hold_off_ns:.5g} ns: {found.armed.left_out:,} photons not used"))
     if found.summary.same_time:
@@ -64,6 +61,7 @@ def light_rows(found: Calibration, detector: Detector | None = None) -> list[tup
         smallest = f"the smallest {found.summary.smallest_ns[0]:.5g} ns"
         told = f"{found.too_short:,} intervals shorter than the dead time, {smallest}"
         rows.append(("by jitter" if expected else "does not fit", told))
+    rows += [("not known", text) for text in found.unknown]
     errors = found.errors
     if found.waveform is not None:
         rows.append(("light", f"{found.total:.6g} ± {found.total_error:.2g} photons per period, any shape"))
@@ -75,7 +73,9 @@ def light_rows(found: Calibration, detector: Detector | None = None) -> list[tup
             depth = 0.5 * SPEED_OF_LIGHT_M_PER_NS * delay
             rows.append((f"signal S{which}", f"{signal:.6g} ± {errors[f'signal{tail}']:.2g} photons per period"))
             error = errors[f"delay_ns{tail}"]
-            told = f"{delay:.7g} ± {error:.2g} ns, {depth:.6g} m" if error == error else "none: no signal is seen"
+            told = f"{delay:.7g} ± {error:.2g} ns, {depth:.6g} m"
+            if error != error and (not found.unknown or any("no pulse" in text for text in found.unknown)):
+                told = "none: no signal is seen"
             rows.append((f"delay{which}", told))
         width = errors.get("sigma_ns", 0.0)
         if width == width:

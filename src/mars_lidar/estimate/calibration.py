@@ -14,6 +14,7 @@ from mars_lidar.estimate.detector_model import jitter_sigma, needs_simulation, r
 from mars_lidar.estimate.indirect import indirect
 from mars_lidar.estimate.intervals import Stream, stream_of
 from mars_lidar.estimate.stream_summary import summary_of
+from mars_lidar.estimate.telling import told as told_of
 from mars_lidar.pulse import Pulse
 from mars_lidar.system import System
 from mars_lidar.timestamps import Timestamps
@@ -77,6 +78,7 @@ def calibrate(
     Returns
     -------
     Calibration
+        An error of NaN stands for what the stream cannot tell: `Calibration.unknown` says why.
 
     Raises
     ------
@@ -106,18 +108,18 @@ def calibrate(
             "exactly the time of the one before"
         )
     if detector is None and dead is None:
-        return _bounded(Unknown(stream, counted, shape, hold, number, jitter).calibrated())
+        return told_of(_bounded(Unknown(stream, counted, shape, hold, number, jitter).calibrated()), edge=True)
     watch = _watch(detector, dead, hold, jitter)
 
     found = _bounded(fitted(stream, counted, shape, watch, number))
     if told is None or detector is None or not needs_simulation(detector):
-        return found
+        return told_of(found, edge=False)
     model = told.replace(period_ns=stream.period_ns, detector=detector)
 
     def once(seen: Stream) -> Calibration:
         return fitted(seen, summary_of(seen), shape, watch, number, found)
 
-    return indirect(found, model, once)
+    return told_of(indirect(found, model, once), edge=False)
 
 
 def _bounded(found: Calibration) -> Calibration:

@@ -19,6 +19,7 @@ from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
 _STEPS = 200
 _CONVERGED = 1e-8  # Newton decrement: twice what log L could still gain
 _DIGITS, _CORNERS = 1e-3, 0.5  # the same where no step gains: half a standard error, with corners
+_FEW = 20.0  # photons of the background
 _WIDTHS = 24  # pulse widths tried to begin with, where it is not known
 
 
@@ -71,7 +72,18 @@ def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
             converged = decrement < (_CORNERS if isinstance(light.pulse, SampledPulse) else _DIGITS)
             break
         theta, best = trial, found
-    return Fit(theta, information, best, converged)
+    return Fit(theta, _not_sure(seen, light, theta, information), best, converged)
+
+
+def _not_sure(seen: ArmedTime, light: Light, theta: FloatArray, information: FloatArray) -> FloatArray:
+    """The information with one photon more of a background that is made of few, or that of none would be infinite."""
+    one = 1.0 / max(float(seen.passes.mean()), 1e-300)
+    if theta[0] > _FEW * one:
+        return information
+    more = theta.copy()
+    more[0] += one
+    rate, slopes = light.jacobian(more)
+    return np.asarray(slopes.T @ ((seen.passes / np.maximum(rate, 1e-300))[:, None] * slopes) + light.known(more)[2])
 
 
 def _free(light: Light, theta: FloatArray, score: FloatArray, information: FloatArray) -> FloatArray:

@@ -18,7 +18,15 @@ from mars_lidar.estimate.phase_bins import SHAPE_BINS, fine_bins, free_bins
 from mars_lidar.estimate.stream_summary import Summary
 from mars_lidar.pulse import GaussianPulse, Pulse
 
+_SHORT = 1e-7  # false-alarm probability of intervals shorter than the dead time
 CERTAIN = 8.5  # jitters behind a dead time after which a pixel is armed for certain: 6 of a difference of two
+
+
+def _below(intervals: int) -> float:
+    """Jitters by which the shortest of so many intervals of the dead time is less than it, once in 10^7 streams."""
+    from scipy.special import ndtri
+
+    return math.sqrt(2.0) * float(-ndtri(_SHORT / max(intervals, 1)))
 
 
 @dataclass(frozen=True)
@@ -44,7 +52,7 @@ def fitted(
     """Light of the likelihood, without a bias taken off; `near`: another calibration, to begin with its light."""
     dead, hold = watch.dead_ns, watch.hold_ns
     slack = 1.5 * stream.unit_ns + 1e-6 * stream.period_ns  # two roundings of the clock; of the engines' phases
-    slack += 0.5 * CERTAIN * watch.jitter_ns
+    slack += _below(stream.registrations) * (watch.jitter_ns + 3.0 * watch.jitter_error_ns) + 4.0 * watch.dead_error_ns
     short = 0
     if counted.smallest_ns.size and counted.smallest_ns[0] < dead - slack:
         short = sum(int((dt < dead - slack).sum()) for dt in stream.intervals())

@@ -56,8 +56,8 @@ class Calibration:
         Sigma of the Gaussian jitter of each record, which `pulse` holds: as given (error 0), or by the edge of the
         recovery; 0 where there is none, or none is seen.
     jitter_limit_ns
-        Where none is seen: nine in ten jitters of this much would have been. One that hides moves `dead_time_ns` down,
-        by its own size or so. Else 0.
+        Where none is seen, or none fits: jitters up to this leave the shortest intervals as likely, to a factor of
+        e^4. What one that hides does to dead time and light is in their errors. Else 0.
     edge_fits
         False where the dead time was to be estimated from an edge that is neither sharp nor one that a Gaussian jitter
         makes: a slow quench, a second dead time, a clock too coarse.
@@ -67,6 +67,8 @@ class Calibration:
     simulated
         For a detector with effects: how many times longer than this one the simulated stream is by which the bias
         of the likelihood was taken off; else 0.
+    unknown
+        What the stream cannot tell, a sentence each; the errors of that are NaN.
     """
 
     background: float
@@ -90,6 +92,7 @@ class Calibration:
     jitter_limit_ns: float = 0.0
     edge_fits: bool = True
     simulated: float = 0.0
+    unknown: tuple[str, ...] = ()
 
     __repr__ = brief
 
@@ -120,10 +123,10 @@ class Calibration:
 
     @property
     def total_error(self) -> float:
-        """Standard error of Lambda."""
+        """Standard error of Lambda; NaN where a part of it is not known."""
         lights = [k for k, name in enumerate(self.names) if name.startswith(("signal", "background"))]
         part = self.covariance[np.ix_(lights, lights)]
-        return float(np.sqrt(np.nansum(part)))
+        return float(np.sqrt(max(float(part.sum()), 0.0))) if np.isfinite(part).all() else math.nan
 
     @property
     def disagreement(self) -> float:
@@ -134,7 +137,10 @@ class Calibration:
         rapp, mine = self.rapp.total_error, self.total_error
         if self.simulated or not (math.isfinite(self.rapp.total) and 0.0 < rapp < math.inf):
             return math.nan
-        return (self.rapp.total - self.total) / math.sqrt(max(rapp**2 - mine**2, 0.25 * rapp**2))
+        if math.isnan(mine):  # by the number of photons alone
+            mine = self.total / math.sqrt(max(self.armed.used, 1))
+        spread = max(rapp**2 - mine**2, 0.25 * rapp**2)
+        return (self.rapp.total - self.total) / math.sqrt(spread)
 
     @property
     def rate(self) -> FloatArray:
@@ -156,6 +162,10 @@ class Calibration:
         if self.waveform is not None:
             return self._even(self._sharp_waveform)
         return self._light.arriving(self._parameters)
+
+    def arriving_in(self, bins: int) -> FloatArray:
+        """`arriving` in so many equal parts of the period; not of a free shape."""
+        return replace(self._light, bins=bins).arriving(self._parameters)
 
     @property
     def parameters(self) -> FloatArray:

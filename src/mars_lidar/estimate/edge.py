@@ -10,19 +10,23 @@ about the edge. Neighbouring intervals share a J; the standard errors allow for 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from mars_lidar.estimate.intervals import FloatArray
 from mars_lidar.estimate.shortest import FEW, WIDEST, Ages, Underlying
 
+Law = Callable[[float], Underlying]
+"""What lies behind a stream whose edge is so wide, ns: the same records from a narrower pulse and a wider jitter."""
+
 _BELOW, _BEYOND = 6.0, 15.0  # the window that is fitted, in widths of the edge
+REACH = _BEYOND + 1.0  # widths beyond the dead time up to which intervals are needed
 _CELLS = 8  # of it per width
 _ROUNDS = 6
 _STEPS = 60
-_CONVERGED = 1e-7  # Newton decrement
+_CONVERGED = 1e-3  # Newton decrement
 _SAME = 0.02  # widths by which a last round may move the edge
 ORDINARY = 1e-4  # probability below which the edge is not that of a jitter
 
@@ -67,18 +71,19 @@ class Edge:
 
 
 def edge_of(
-    ages: Ages, behind: Underlying, dead_time_ns: float, width_ns: float, off: Sequence[Underlying] = ()
+    ages: Ages, behind: Law, dead_time_ns: float, width_ns: float, off: Sequence[Law] = ()
 ) -> Edge | None:
     """Dead time and jitter by maximum likelihood, from rough values of the dead time and of the edge's width.
 
-    `off`: what could lie behind the stream as well, a standard error away in one independent direction each; what
-    this moves is part of the covariance. None where there are too few intervals, or where what is there is wider than
-    an edge.
+    `behind` tells the avalanches of an edge of any width: what is known is the light as it is recorded, and the more
+    of its width is jitter, the less is the pulse's. `off`: what could lie behind the stream as well, a standard error
+    away in one independent direction each; what this moves is part of the covariance. None where there are too few
+    intervals, or where what is there is wider than an edge.
     """
     theta = np.array([dead_time_ns, math.log(width_ns), 0.0])
     for _ in range(_ROUNDS):
         width = math.exp(theta[1])
-        if width > WIDEST * behind.period_ns or theta[0] < _BELOW * width:
+        if width > WIDEST * behind(width).period_ns or theta[0] < _BELOW * width:
             return None
         fitted = _Window.about(ages, behind, float(theta[0]), width)
         found = fitted.maximum(theta) if fitted.counts.sum() >= FEW else None
@@ -88,7 +93,8 @@ def edge_of(
         theta = found
         if moved < _SAME:
             break
-    masses = [np.diff(other.count(fitted.dead_time_ns, fitted.cells_ns)) for other in off]
+    width = math.exp(theta[1])
+    masses = [np.diff(other(width).count(float(theta[0]), fitted.after_ns)) for other in off]
     return fitted.edge(theta, masses)
 
 
@@ -97,14 +103,14 @@ class _Window:
     """Counts of intervals about an edge, and what is expected of them; parameters t_d, log width, log amplitude."""
 
     ages: Ages
-    dead_time_ns: float
     edges_ns: FloatArray
     counts: FloatArray
-    cells_ns: FloatArray  # ages beyond the dead time, and the intervals between them without jitter
-    mass: FloatArray
+    after_ns: FloatArray  # ages beyond the dead time
+    behind: Law
+    masses: dict[tuple[float, float], FloatArray] = field(default_factory=dict)
 
     @classmethod
-    def about(cls, ages: Ages, behind: Underlying, dead_time_ns: float, width_ns: float) -> _Window:
+    def about(cls, ages: Ages, behind: Law, dead_time_ns: float, width_ns: float) -> _Window:
         """A window about the edge, with whole cells of the clock."""
         step = width_ns / _CELLS
         number = math.ceil((_BELOW + _BEYOND) * _CELLS)
@@ -114,22 +120,29 @@ class _Window:
         if unit > 0.0:
             step, begin = max(round(step / unit), 1) * unit, (math.floor(begin / unit) + 0.5) * unit
         edges = begin + step * np.arange(math.ceil((_BELOW + _BEYOND) * width_ns / step) + 1)
-        count = behind.count(dead_time_ns, after)
         counts = np.histogram(ages.interval_ns, edges)[0].astype(np.float64)
-        return cls(ages, dead_time_ns, edges.astype(np.float64), counts, after, np.diff(count))
+        return cls(ages, edges.astype(np.float64), counts, after, behind)
+
+    def mass(self, dead_time_ns: float, width_ns: float) -> FloatArray:
+        """Intervals between the ages behind that dead time, without jitter, where an edge of that width is seen."""
+        key = (dead_time_ns, width_ns)
+        if key not in self.masses:
+            self.masses[key] = np.diff(self.behind(width_ns).count(dead_time_ns, self.after_ns))
+        return self.masses[key]
 
     def expected(self, theta: FloatArray, mass: FloatArray | None = None) -> FloatArray:
         """Counts (m,) of each cell."""
         from scipy.special import ndtr
 
-        after = 0.5 * (self.cells_ns[1:] + self.cells_ns[:-1])
-        below = ndtr((self.edges_ns[:, None] - theta[0] - after) / math.exp(theta[1]))
-        below = below @ (self.mass if mass is None else mass)
+        dead, width = float(theta[0]), math.exp(theta[1])
+        after = 0.5 * (self.after_ns[1:] + self.after_ns[:-1])
+        below = ndtr((self.edges_ns[:, None] - dead - after) / width)
+        below = below @ (self.mass(dead, width) if mass is None else mass)
         return np.asarray(np.maximum(math.exp(theta[2]) * np.diff(below), 1e-12))
 
     def slopes(self, theta: FloatArray) -> FloatArray:
         """d log expected / d theta (m, 3)."""
-        step = np.array([1e-3 * math.exp(theta[1]), 1e-3, 0.0])
+        step = np.array([1e-2 * math.exp(theta[1]), 1e-2, 0.0])
         out = np.ones((self.counts.size, 3))
         for k in range(2):
             shift = np.zeros(3)

@@ -17,6 +17,7 @@ CHUNK = 2**19  # registrations at a time: some ten temporaries stay in the cache
 _DITHER_SEED = 1
 _OWN_UNITS = (2**15, 2**16)  # at most, in the period: our PTU and Photon-HDF5
 _PROBED = 1000
+_MOST_UNITS = 2**16  # of a period whose units are kept: finer ones are spread, which moves nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +140,8 @@ def _clock(times: Timestamps) -> tuple[float, int]:
         return (times.period_ns / units, units) if units else (0.0, 0)
     number = times.period_ns / unit
     whole = round(number)
-    return unit, whole if abs(number - whole) < 1e-4 and whole % times.bins == 0 else 0
+    kept = whole <= _MOST_UNITS and abs(number - whole) < 1e-4 and whole % times.bins == 0
+    return unit, whole if kept else 0
 
 
 def _own_units(times: Timestamps) -> int:

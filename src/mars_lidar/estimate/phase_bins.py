@@ -17,8 +17,8 @@ def fine_bins(stream: Stream, pulse: Pulse | None) -> int:
         wanted = _BINS_PER_SIGMA * stream.period_ns / pulse.sigma_ns
     elif isinstance(pulse, SampledPulse):
         wanted = 4.0 * stream.period_ns / pulse.bin_ns
-    bins = stream.bins
-    while bins < wanted and 2 * bins <= max(_MOST_BINS, stream.bins):
+    bins = stream.bins if stream.units or stream.bins <= _MOST_BINS else SHAPE_BINS
+    while bins < wanted and 2 * bins <= max(_MOST_BINS, stream.bins if stream.units else 0):
         if stream.units % (2 * bins) != 0:  # bins would hold different numbers of units
             break
         bins *= 2

@@ -8,6 +8,7 @@ fell on the pixel while it was a old.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +19,7 @@ from mars_lidar import _validate
 from mars_lidar._brief import brief
 from mars_lidar.estimate.ages import intervals_of, light_before
 from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
+from mars_lidar.estimate.same_phase import SamePhase
 from mars_lidar.timestamps import Timestamps
 
 _MOST = 250_000  # intervals looked at: more would show nothing new
@@ -38,6 +40,9 @@ class Recovery:
         (m,) registrations, and photons that arrived at that age.
     dead_time_ns, hold_off_ns
         What the light was calibrated with.
+    judged
+        The same against registrations at the same phases, by which `findings` are told where there is one: then no
+        error of the light is in them.
     """
 
     edges_ns: FloatArray
@@ -45,6 +50,7 @@ class Recovery:
     expected: FloatArray
     dead_time_ns: float
     hold_off_ns: float
+    judged: SamePhase | None = None
 
     __repr__ = brief
 
@@ -97,27 +103,35 @@ class Recovery:
 
     def findings(self) -> list[str]:
         """What is not as it should be, a sentence each."""
-        told = []
-        until = self.recovered_ns
-        if until > self.dead_time_ns:
+        begin, until, seen, expected, z = self._departure()
+        ratio = seen / max(expected, 1e-300)
+        if z < -_SIGNIFICANT:
+            return [
+                f"only {ratio:.3g} of the light's rate from {begin:.4g} to {until:.4g} ns after a "
+                f"registration ({z:.0f} standard deviations): a dead time of more than {self.dead_time_ns:.4g} ns, "
+                f"or a second one (electronics t_e = {self.dead_time_ns:.4g} ns, detector t_d about "
+                f"{until - self.dead_time_ns:.3g} ns), or a slow recovery, where the light itself fits; a "
+                f"hold-off of {until:.4g} ns keeps it out"
+            ]
+        if z > _SIGNIFICANT:
+            return [
+                f"{seen - expected:.0f} registrations too many ({ratio:.3g} of the light's rate, {z:.0f} standard "
+                f"deviations) from {begin:.4g} to {until:.4g} ns after a registration: "
+                f"afterpulses; a hold-off of {until:.4g} ns keeps them out"
+            ]
+        return []
+
+    def _departure(self) -> tuple[float, float, float, float, float]:
+        """First and last age, ns, of what is farthest from the light; registrations, those expected, their score."""
+        if self.judged is None:
+            until = self.recovered_ns
             seen, expected = self._part(self.dead_time_ns, until)
-            z = (seen - expected) / np.sqrt(max(expected, 1.0))
-            ratio = seen / max(expected, 1e-300)
-            if z < -_SIGNIFICANT:
-                told.append(
-                    f"only {ratio:.3g} of the light's rate from {self.dead_time_ns:.4g} to {until:.4g} ns after a "
-                    f"registration ({z:.0f} standard deviations): a dead time of more than {self.dead_time_ns:.4g} ns, "
-                    f"or a second one (electronics t_e = {self.dead_time_ns:.4g} ns, detector t_d about "
-                    f"{until - self.dead_time_ns:.3g} ns), or a slow recovery, where the light itself fits; a "
-                    f"hold-off of {until:.4g} ns keeps it out"
-                )
-            elif z > _SIGNIFICANT:
-                told.append(
-                    f"{seen - expected:.0f} registrations too many ({ratio:.3g} of the light's rate, {z:.0f} standard "
-                    f"deviations) from {self.dead_time_ns:.4g} to {until:.4g} ns after a registration: "
-                    f"afterpulses; a hold-off of {until:.4g} ns keeps them out"
-                )
-        return told
+            return self.dead_time_ns, until, seen, expected, (seen - expected) / math.sqrt(max(expected, 1.0))
+        scores, rates = self.judged.first()
+        k = int(np.argmax(np.abs(scores)))
+        seen = float(self.judged.observed[: k + 1].sum())
+        edges = self.judged.edges_ns
+        return float(edges[0]), float(edges[k + 1]), seen, seen / max(float(rates[k]), 1e-3), float(scores[k])
 
 
 def recovery_of(

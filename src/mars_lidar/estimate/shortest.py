@@ -16,12 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mars_lidar.estimate.intervals import FloatArray, Stream
-from mars_lidar.pulse import GaussianPulse
-from mars_lidar.statistics.law import registration_pdf
-from mars_lidar.system import Detector, System
 
 FEW = 20  # intervals about an edge that tell something of it
-WIDEST = 0.1  # periods: a wider edge is a slow recovery
+WIDEST = 0.2  # periods: a wider edge is a slow recovery
+_REACH = 0.2  # periods above the smallest in which an edge is judged to be sharp or not
+_SHARE = 16  # of the intervals a part of so many is judged: the light is known no better
 _MOST = 400_000  # intervals that are looked at
 
 
@@ -40,9 +39,9 @@ class Ages:
         return float(self.interval_ns.min())
 
 
-def shortest(stream: Stream, smallest_ns: float) -> Ages:
-    """The intervals up to a fifth of a period above the smallest, of so many records as are needed."""
-    limit = smallest_ns + 2.0 * WIDEST * stream.period_ns
+def shortest(stream: Stream, smallest_ns: float, reach_ns: float | None = None) -> Ages:
+    """The intervals up to `reach_ns` above the smallest (a fifth of a period), of so many records as are needed."""
+    limit = smallest_ns + (_REACH * stream.period_ns if reach_ns is None else reach_ns)
     found: list[FloatArray] = []
     place: list[FloatArray] = []
     passed, kept = 0, 0
@@ -70,14 +69,21 @@ class Underlying:
     period_ns: float
 
     @classmethod
-    def of(cls, rate: FloatArray, period_ns: float, dead_time_ns: float) -> Underlying:
-        """Light and the phases of registrations that it makes in the long run."""
-        system = System(
-            period_ns=period_ns, cycles=1, bins=rate.size, pulse=GaussianPulse(sigma_ns=0.01 * period_ns),
-            detector=Detector(dead_time_ns=dead_time_ns), start="stationary",
-        )  # fmt: skip
-        shape = registration_pdf(None, 0.0, system, "stationary", waveform=rate, threads=1)
-        return cls(rate, shape, period_ns)
+    def of(cls, rate: FloatArray, phases: FloatArray, period_ns: float) -> Underlying:
+        """Light and the phases of registrations, in any unit."""
+        return cls(rate, phases / max(float(phases.sum()), 1e-300), period_ns)
+
+    def fallen(self, age_ns: FloatArray) -> FloatArray:
+        """Photons (m,) that fall within ages (m,) >= 0 of a registration, in the mean."""
+        n = self.rate.size
+        spectrum = np.conj(np.fft.rfft(self.phases)) * np.fft.rfft(self.rate)
+        # photons in the bin so many bins later; half of those of its own bin come after it
+        later = np.maximum(np.fft.irfft(spectrum, n), 0.0)
+        total = float(self.rate.sum())
+        cumulative = np.concatenate([[0.0], np.cumsum(later)])
+        x = age_ns / self.period_ns + 0.5 / n
+        cycle = np.floor(x)
+        return np.asarray(np.interp((x - cycle) * n, np.arange(n + 1), cumulative) + cycle * total)
 
     def count(self, dead_time_ns: float, after_ns: FloatArray) -> FloatArray:
         """(1): intervals (m,) of less than the dead time and `after_ns` (m,) >= 0."""
@@ -99,12 +105,13 @@ class Underlying:
         return np.array([-float((self.phases * np.expm1(armed - light(dead_time_ns + u))).sum()) for u in after_ns])
 
 
-def is_sharp(ages: Ages, behind: Underlying) -> tuple[float, float]:
+def is_sharp(ages: Ages, behind: Underlying, of: int | None = None) -> tuple[float, float]:
     """Probability of intervals as these behind a sharp edge, and the reach, ns, over which they are farthest from it.
 
     Behind a sharp edge the values of (1) at the 2nd, 3rd, ... of the m smallest intervals over that at the m-th,
     with the smallest as the dead time, are ordered uniform numbers: whatever the rate and the dead time. A blurred
-    edge leaves the first of them too large. -sum log of them is a gamma variable; m is doubled from 20 on.
+    edge leaves the first of them too large. -sum log of them is a gamma variable; m is doubled from 20 on, up to a 16th
+    of all intervals, `of`: the light by which they are expected is known from as many.
     """
     from scipy.stats import gamma
 
@@ -113,8 +120,8 @@ def is_sharp(ages: Ages, behind: Underlying) -> tuple[float, float]:
     count = behind.count(float(y[0]), grid)
     level = np.interp(y - y[0], grid, count)
     best, reach, tried = 1.0, 0.0, 0
-    m = FEW
-    while m <= y.size:
+    m, most = FEW, max(y.size if of is None else of // _SHARE, _SHARE * FEW)
+    while m <= min(y.size, most):
         if level[m - 1] > 0.0:
             part = np.maximum(level[1 : m - 1] / level[m - 1], 1e-12)
             p = float(gamma.cdf(-np.log(part).sum(), m - 2))

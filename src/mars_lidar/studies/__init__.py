@@ -92,6 +92,10 @@ STUDIES: dict[str, tuple[str, Study]] = {
         "T6: streams calibrated and validated, faulty detectors; --stream adds a measured one",
         _study("hardware_report"),
     ),
+    "streams": (
+        "ideal streams over the whole range of light, jitter and clock: false alarms, and how well errors hold",
+        _study("streams_report"),
+    ),
     "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _study("runtime_report")),
     "reconstruction": (
         "bias and error of depth and signal over flux, every method, beside the bound",

@@ -11,10 +11,10 @@ from feedback_cases import GIVEN, Sampler, case, drawn
 from scipy import stats
 
 import mars_lidar as ml
-from harness import COUNTS, JOINT, SHAPE, Case, check, require, task_of
+from harness import COUNTS, JOINT, SHAPE, Case, check, require, task_of, waveform_flux
 from mars_lidar import _core
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines._feedback_grid import near_pulse
+from mars_lidar.engines._feedback_grid import cell_cuts, near_pulse
 from mars_lidar.engines._feedback_rule import Reason
 
 PERIOD_NS = 1e3 / 7.5
@@ -143,3 +143,34 @@ def test_reports_count_by_reason():
     assert report[f"{GIVEN}, locked, short exposure"] == 1
     assert report[f"{GIVEN}, slow sweeps"] == 1
     assert report["exposures drawn again by exact"] == 0
+
+
+# Light that is constant on parts
+
+
+def steps(
+    parts: int, lit: dict[int, float], background: float, dead: float, bins: int, cycles: int, items: int
+) -> Case:
+    photons = np.zeros(parts)
+    photons[list(lit)] = list(lit.values())
+    system = case(0.0, 0.0, dead, cycles, bins=bins).system
+    return Case(f"{parts} parts in {bins} bins", waveform_flux(photons, background), system, items)
+
+
+STEPS = {
+    "48 parts": steps(48, {3: 2.0, 20: 1.5}, 0.1, 0.457, 48, 1_000_000, 300),
+    "40 parts in 48 bins": steps(40, {3: 2.0, 20: 1.5}, 0.1, 0.457, 48, 100_000, 1500),
+    "7 parts in 2 bins": steps(7, {1: 0.5, 2: 0.2, 5: 0.17}, 0.1165, 2.88, 2, 1_000_000, 500),
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_edges_of_bright_parts(name: str):
+    """Cells were as wide as parts whatever the exposure: means of bins up to 50 standard deviations off."""
+    check(Sampler(), STEPS[name], ENGINES["exact"], {COUNTS, SHAPE, JOINT})
+
+
+def test_smooth_light_needs_no_cuts():
+    fog = np.exp(-np.arange(1024) / 300.0) * (1.0 - np.exp(-np.arange(1024) / 40.0))
+    request = Case("fog", waveform_flux(fog / fog.sum(), 0.1), case(0, 0, 0.6375, 10_000).system.replace(bins=1024), 1)
+    assert (cell_cuts(request.flux, request.system)[0] == 1).all()

@@ -19,6 +19,9 @@ _SIGMAS = 5.0  # of a pulse that counts as one that is met
 _TAIL = 1e-6  # energy of a pulse outside of what is cut finely
 
 
+Cuts = tuple[NDArray[np.int64], NDArray[np.int64]]
+
+
 class Echo(NamedTuple):
     """Pixels (H, W) that are armed again near a return, one dead time after the same or another one."""
 
@@ -47,7 +50,7 @@ def meets_echo(flux: Flux, system: System) -> Echo:
     return Echo(within, remembered, near)
 
 
-def cell_cuts(flux: Flux, system: System) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def cell_cuts(flux: Flux, system: System) -> Cuts:
     """Parts (H, W) that a bin of the histogram is cut into, and that these are cut into again near the pulse.
 
     The grid's error of a bin's mean is about c (width / sigma)^2 of its standard deviation for one period, and
@@ -67,7 +70,7 @@ def cell_cuts(flux: Flux, system: System) -> tuple[NDArray[np.int64], NDArray[np
         return ones, ones
     widest = np.full(flux.shape, min(1.0, 0.25 * system.dead_time_periods))
     if flux.waveform is not None:
-        return _cuts(np.minimum(widest, 1.0 / flux.waveform.shape[-1]), 1.0 / system.bins), ones
+        return _waveform_cuts(flux, system, widest), ones
     sigma = pulse_sigma(system) / system.period_ns
     echo = meets_echo(flux, system)
     periods = math.sqrt(system.cycles)
@@ -84,6 +87,36 @@ def cell_cuts(flux: Flux, system: System) -> tuple[NDArray[np.int64], NDArray[np
     base = np.where(flux.signal > 0, base, widest)
     merge = _cuts(base, 1.0 / system.bins)
     return merge, np.where(single, _cuts(finest, 1.0 / (system.bins * merge)), 1)
+
+
+def _waveform_cuts(flux: Flux, system: System, widest: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Parts (H, W) that a bin is cut into, for a rate that is constant on parts of the period.
+
+    Cells of width w are crossed by the edges of parts, and re-arm those of the part one dead time before, whose rate
+    falls within it as its photons are used up. Where the photons of parts differ by J, and one has l, this puts
+    J (1 + l) N_r / 8 (w / part)^2 exposures wrong at the edges of a cell one dead time on, where m photons a part see
+    them: an error of J (1 + l) sqrt(N_r m) / 8 standard deviations, for w as wide as a part, second order in w.
+    Smooth light needs no cuts. Edges of cells are those of
+    parts where bins and parts allow it within twice as many cells.
+    """
+    assert flux.waveform is not None
+    parts = flux.waveform.shape[-1]
+    later = system.dead_time_periods % 1.0 * parts
+    worst = np.empty(flux.shape)
+    for row, photons in enumerate(flux.waveform):  # a row of the image at a time: waveforms may be large
+        rate = photons + flux.background[row, :, None] / parts
+        step = np.abs(rate - np.roll(rate, 1, -1))
+        uneven = np.maximum(step, np.roll(step, -1, -1)) * (1.0 + rate)
+        seen = rate
+        for shift in range(math.floor(later) - 1, math.ceil(later) + 2):
+            seen = np.maximum(seen, np.roll(rate, -shift, -1))
+        worst[row] = (uneven * np.sqrt(seen)).max(-1)
+    worst *= math.sqrt(system.cycles) / 8.0
+    width = np.minimum(1.0, np.sqrt(_GOAL_ECHO / np.maximum(worst, 1e-30))) / parts
+    merge = _cuts(np.minimum(widest, width), 1.0 / system.bins)
+    aligned = parts // math.gcd(parts, system.bins)
+    rounded = -(-merge // aligned) * aligned
+    return np.where(rounded <= 2 * merge, rounded, merge)
 
 
 def _cuts(finest: NDArray[np.float64], width: float | NDArray[np.float64]) -> NDArray[np.int64]:
@@ -105,9 +138,9 @@ def near_pulse(system: System, merge: int) -> NDArray[np.uint8]:
     return found
 
 
-def internal_cells(flux: Flux, system: System) -> NDArray[np.int64]:
-    """Cells (H, W) of the period on which the sweeps run."""
-    merge, parts = cell_cuts(flux, system)
+def internal_cells(flux: Flux, system: System, cuts: Cuts | None = None) -> NDArray[np.int64]:
+    """Cells (H, W) of the period on which the sweeps run; `cuts` are those of `cell_cuts`."""
+    merge, parts = cell_cuts(flux, system) if cuts is None else cuts
     cells = merge * system.bins
     for factor in np.unique(merge[parts > 1]):
         if factor * system.bins <= MOST_CELLS:  # else refused whatever the pulse needs

@@ -95,23 +95,37 @@ class Rest:
             yield int(one), 1, np.sort(self.pixel[self.realization == one])
 
 
-def refusals(flux: Flux, system: System) -> NDArray[np.uint8]:
-    """Why the sweeps are not even tried on a pixel (H, W), or `Reason.DRAWN`."""
-    periods = math.ceil(system.dead_time_periods)
-    echo = meets_echo(flux, system)
-    fewest = np.where(echo.remembered, FEWEST_PERIODS_ECHO, FEWEST_PERIODS)
-    reasons = np.zeros(flux.shape, np.uint8)
-    reasons[internal_cells(flux, system) > MOST_CELLS] = Reason.CELLS
-    reasons[echo.remembered & (flux.signal > BRIGHTEST_ECHO)] = Reason.ECHO
-    reasons[system.cycles < fewest * periods] = Reason.SHORT
-    return reasons
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is known of the pixels (n,) of an image before their sweeps.
+
+    `merge` and `parts` are those of a `Grid`, `cells` its cells; `reason` why sweeps are not even tried, or DRAWN.
+    """
+
+    merge: IndexArray
+    parts: IndexArray
+    cells: IndexArray
+    reason: StatusArray
+
+    @classmethod
+    def of(cls, flux: Flux, system: System) -> Plan:
+        """For all pixels of an image."""
+        periods = math.ceil(system.dead_time_periods)
+        cuts = cell_cuts(flux, system)
+        cells = internal_cells(flux, system, cuts)
+        echo = meets_echo(flux, system)
+        fewest = np.where(echo.remembered, FEWEST_PERIODS_ECHO, FEWEST_PERIODS)
+        reason = np.zeros(flux.shape, np.uint8)
+        reason[cells > MOST_CELLS] = Reason.CELLS
+        reason[echo.remembered & (flux.signal > BRIGHTEST_ECHO)] = Reason.ECHO
+        reason[system.cycles < fewest * periods] = Reason.SHORT
+        return cls(cuts[0].reshape(-1), cuts[1].reshape(-1), cells.reshape(-1), reason.reshape(-1))
 
 
-def sweep_pixels(task: Task, pixels: IndexArray, sweep: Sweep) -> Rest:
+def sweep_pixels(task: Task, plan: Plan, pixels: IndexArray, sweep: Sweep) -> Rest:
     """Draw `pixels` (n,) group by group of one grid, those again that ask for laps, and return what is left."""
-    merge, parts = (cuts.reshape(-1)[pixels] for cuts in cell_cuts(task.flux, task.system))
-    cells = internal_cells(task.flux, task.system).reshape(-1)[pixels]
-    status = np.tile(refusals(task.flux, task.system).reshape(-1)[pixels], (task.realizations, 1))
+    merge, parts, cells = plan.merge[pixels], plan.parts[pixels], plan.cells[pixels]
+    status = np.tile(plan.reason[pixels], (task.realizations, 1))
     # lanes go through their sweeps together: neighbours in background need about as many
     able = np.flatnonzero(status[0] == Reason.DRAWN)
     able = able[np.argsort(task.flux.background.reshape(-1)[pixels[able]], kind="stable")]

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines._feedback_grid import internal_cells
-from mars_lidar.engines._feedback_rule import draw_rest
+from mars_lidar.engines._feedback_rule import Plan, draw_rest
 from mars_lidar.engines.base import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
@@ -31,7 +30,7 @@ class AutoEngine(Engine):
 
     Feedback costs the same whatever the exposure, exact the same for every registration. The rule knows the pixel
     and the system only, so that any part of an image has the bits of the whole: more than 4 expected registrations
-    for every internal cell (`internal_cells`) go to feedback, the rest, and what feedback refuses, to exact.
+    for every internal cell (`Plan.cells`) go to feedback, the rest, and what feedback refuses, to exact.
 
     Reports ``pixels drawn by exact`` and ``pixels drawn by feedback``, and what feedback reports. Draws histograms
     only: of its pixels' registrations the feedback engine knows the bins, not the times.
@@ -45,11 +44,11 @@ class AutoEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Feedback where it pays, exact for the rest."""
-        cost = BREAK_EVEN * internal_cells(task.flux, task.system)
-        many = (expected_registrations(task.flux, task.system) > cost).reshape(-1)
+        plan = Plan.of(task.flux, task.system)
+        many = expected_registrations(task.flux, task.system).reshape(-1) > BREAK_EVEN * plan.cells
         share = float(many.mean())
         first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))
-        refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many))
+        refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many), plan)
         rest = replace(refused, pixels=np.sort(np.concatenate([np.flatnonzero(~many), refused.pixels])))
         draw_rest(ExactEngine(self.level), second, out, rest)
         task.report["pixels drawn by exact"] = float(rest.pixels.size)

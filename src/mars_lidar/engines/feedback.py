@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.engines._feedback_grid import near_pulse
-from mars_lidar.engines._feedback_rule import Grid, Reason, Rest, draw_rest, refusals, sweep_pixels
+from mars_lidar.engines._feedback_rule import Grid, Plan, Reason, Rest, draw_rest, sweep_pixels
 from mars_lidar.engines.base import Engine, Progress, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.parts import draw_pixels, stage
@@ -84,14 +84,13 @@ class FeedbackEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Poisson numbers, feedback, or the exact engine, pixel by pixel."""
-        share = 1.0
-        if task.system.dead_time_periods > 0.0:
-            share = float((refusals(task.flux, task.system) == Reason.DRAWN).mean())
+        plan = Plan.of(task.flux, task.system)
+        share = float((plan.reason == Reason.DRAWN).mean()) if task.system.dead_time_periods > 0.0 else 1.0
         every = np.arange(task.pixel_index.size)
-        rest = self.sample(replace(task, progress=stage(task.progress, 0.0, share)), out, every)
+        rest = self.sample(replace(task, progress=stage(task.progress, 0.0, share)), out, every, plan)
         draw_rest(ExactEngine(self.level), replace(task, progress=stage(task.progress, share, 1.0)), out, rest)
 
-    def sample(self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64]) -> Rest:
+    def sample(self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64], plan: Plan | None = None) -> Rest:
         """Fill the rows of `pixels` (n,) and return those that this engine cannot do, whose rows are not filled."""
         if task.system.dead_time_periods == 0.0:
             draw_pixels(PoissonEngine(), task, out, pixels)
@@ -105,4 +104,4 @@ class FeedbackEngine(Engine):
             )  # fmt: skip
             return status
 
-        return sweep_pixels(task, pixels, sweep)
+        return sweep_pixels(task, plan or Plan.of(task.flux, task.system), pixels, sweep)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import _core
 from mars_lidar.engines._feedback_grid import near_pulse
-from mars_lidar.engines._feedback_rule import Grid, sweep_pixels
+from mars_lidar.engines._feedback_rule import Grid, Plan, sweep_pixels
 from mars_lidar.engines.base import Progress, Task
 from mars_lidar.engines.parts import part_of
 from mars_lidar.gpu.kernels import feedback_histograms, overflow
@@ -39,7 +39,8 @@ def feedback_histogram(
     def sweep(group: IndexArray, grid: Grid, progress: Progress | None) -> NDArray[np.uint8]:
         return _launch(task, out, group, grid, arrays, machine, warps)
 
-    rest = sweep_pixels(replace(task, progress=None), np.arange(task.pixel_index.size), sweep)
+    plan = Plan.of(task.flux, task.system)
+    rest = sweep_pixels(replace(task, progress=None), plan, np.arange(task.pixel_index.size), sweep)
     cube = out.reshape(task.realizations, task.pixel_index.size, task.system.bins)
     for first, number, pixels in rest.blocks(task.realizations):
         if pixels.size == task.pixel_index.size and number == task.realizations:

@@ -233,3 +233,17 @@ def test_faint_parts_of_a_dim_waveform(photons: float, faint: int, bright: int):
     outcomes["all"] = float(2 * stats.norm.sf(abs(hist.sum() - expected.sum()) / np.sqrt(expected.sum())))
     assert hist.sum() == hist[[faint, bright]].sum()
     require(outcomes, f"waveform of {photons:g} photons, parts {faint} and {bright}")
+
+
+def test_afterpulses_have_no_lattice():
+    """Releases some 100 periods after avalanches at one place: smooth over 30,000 bins, in runs of 30 of them."""
+    detector = ml.Detector(
+        dead_time_ns=30.0, afterpulsing=ml.Afterpulsing(probability=0.2, delay_ns=1e4, generations=1)
+    )
+    view = system(pulse=ml.GaussianPulse(sigma_ns=1e-4), bins=30_000, cycles=2_000_000, detector=detector)
+    hist = histogram(ml.Flux(np.full((1, 96), 0.5), 0.0, 10.003), view, seed=3)
+    runs = hist[15_000:29_700].reshape(-1, 30).astype(float)  # where no dead time ends and no pulse is
+    mean = runs.mean(1, keepdims=True)
+    assert mean.min() > 100
+    square = float(((runs - mean) ** 2 / mean).sum())
+    require({"phases": float(stats.chi2.sf(square, runs.size - len(runs)))}, "afterpulses")

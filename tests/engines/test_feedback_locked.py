@@ -101,6 +101,17 @@ def test_random_locked_systems_count_as_exact_does():
         assert abs(a.var() - b.var()) < 5 * spread, request.name
 
 
+AGAIN = {  # armed again within the pulse; cells were too wide for what it then does
+    "S 50, dead time 2.2 sigma": locked(50.0, 0.03, 0.034, 51_458, 0.0154, 128, start="stationary", items=2000),
+    "S 100, dead time 5 sigma": locked(100.0, 5.0, 0.25, 20_000, 0.05, 64, delay=0.42, items=2000),
+}
+
+
+@pytest.mark.parametrize("name", AGAIN)
+def test_bright_pulses_armed_again_within(name: str):
+    check(Sampler(), AGAIN[name], ENGINES["exact"], {COUNTS, SHAPE, JOINT})
+
+
 # The kernel's own word
 
 

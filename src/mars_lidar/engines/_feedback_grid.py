@@ -28,6 +28,7 @@ class Echo(NamedTuple):
     within: NDArray[np.bool_]  # within 5 sigma of it
     remembered: NDArray[np.bool_]  # these, but for dead times that end within the pulse that they began in
     near: NDArray[np.bool_]  # within the whole extent of the pulse
+    late: NDArray[np.bool_]  # the same, after the middle of the return
 
 
 def meets_echo(flux: Flux, system: System) -> Echo:
@@ -35,19 +36,21 @@ def meets_echo(flux: Flux, system: System) -> Echo:
 
     Where the dead time ends within the pulse that it began in, nothing is remembered from period to period.
     """
-    within, remembered, near = np.zeros((3, *flux.shape), dtype=np.bool_)
+    within, remembered, near, late = np.zeros((4, *flux.shape), dtype=np.bool_)
     reach = _SIGMAS * pulse_sigma(system) / system.period_ns
     low, high = _extent(system)
     lit = flux.returns_signal > 0
     delay = np.where(lit, flux.returns_delay_ns, 0.0) / system.period_ns
     for i, j in np.ndindex(len(lit), len(lit)):
         apart = delay[i] - delay[j] + system.dead_time_periods
-        distance = np.where(lit[i] & lit[j], np.abs(apart - np.rint(apart)), np.inf)
+        after = np.where(lit[i] & lit[j], apart - np.rint(apart), np.inf)
+        distance = np.abs(after)
         within |= distance < reach
         near |= distance < max(high - low, reach)
+        late |= (after >= 0.0) & (after < high - low)
         if i != j or round(system.dead_time_periods) > 0:
             remembered |= distance < reach
-    return Echo(within, remembered, near)
+    return Echo(within, remembered, near, late)
 
 
 def cell_cuts(flux: Flux, system: System) -> Cuts:
@@ -56,7 +59,8 @@ def cell_cuts(flux: Flux, system: System) -> Cuts:
     The grid's error of a bin's mean is about c (width / sigma)^2 of its standard deviation for one period, and
     grows as the root of the number of periods. c = 1.1e-3 S up to S = 4 (measured against 16 times finer grids); one
     dead time after the pulse 0.03 S sqrt(B / bins), where re-arming is interpolated within cells: an eighth of the
-    slope of the pulse, seen by a bin's background; 0.022 S where a pulse meets its own echo. Cells are narrow enough
+    slope of the pulse, seen by a bin's background; 0.022 S, of any S, where a pulse meets its own echo: a pixel that is
+    armed again within the pulse registers and re-arms within 1 / S of its width. Cells are narrow enough
     for 1/20 of a standard deviation (1/50 with an echo, which shifts many bins alike), at most 0.3 sigma wide, 0.15
     above 5 signal photons, and at most a quarter of the dead time.
 
@@ -75,8 +79,10 @@ def cell_cuts(flux: Flux, system: System) -> Cuts:
     echo = meets_echo(flux, system)
     periods = math.sqrt(system.cycles)
     after = np.maximum(_ERROR, _ERROR_AFTER * np.sqrt(flux.background / system.bins))
-    error = np.where(echo.within, _ERROR_ECHO, after) * np.clip(flux.signal, 1e-3, 4.0) * periods
-    goal = np.where(echo.within, _GOAL_ECHO, _GOAL)
+    signal = np.maximum(flux.signal, 1e-3)
+    within = echo.within | (echo.late & (signal > 4.0))  # bright pulses register in their early tail
+    error = np.where(within, _ERROR_ECHO * signal, after * np.minimum(signal, 4.0)) * periods
+    goal = np.where(within, _GOAL_ECHO, _GOAL)
     finest = np.minimum(widest, sigma * np.minimum(np.where(flux.signal > 5, 0.15, 0.3), np.sqrt(goal / error)))
     # goal = _ERROR_DARK B width sqrt(B / bins) (width / sigma)^2 sqrt(N_r) e^(S / 2)
     few_armed = np.exp(0.5 * np.minimum(flux.signal, 4.0))
@@ -96,8 +102,8 @@ def _waveform_cuts(flux: Flux, system: System, widest: NDArray[np.float64]) -> N
     falls within it as its photons are used up. Where the photons of parts differ by J, and one has l, this puts
     J (1 + l) N_r / 8 (w / part)^2 exposures wrong at the edges of a cell one dead time on, where m photons a part see
     them: an error of J (1 + l) sqrt(N_r m) / 8 standard deviations, for w as wide as a part, second order in w.
-    Smooth light needs no cuts. Edges of cells are those of
-    parts where bins and parts allow it within twice as many cells.
+    Smooth light needs no cuts. Edges of cells are those of parts where bins and parts allow it within twice as many
+    cells.
     """
     assert flux.waveform is not None
     parts = flux.waveform.shape[-1]

@@ -80,8 +80,8 @@ private:
                 work_.exact[static_cast<int64_t>(t) * kTeams] = law.rare(j, kFewArmed, kFewCounts, kLikely);
                 uint16_t* dither = work_.dither + row(t);
                 for (int i = 0; i < kTeam; ++i) dither[i] = static_cast<uint16_t>(other[i] >> 16);
-                follow_quantile(law.mean, law.variance, work_.rates.fire(j), work_.rates.refire(j), uniforms,
-                                work_.alpha + row(t), work_.beta + row(t));
+                follow_quantile(law.mean, law.variance, work_.rates.fire(j), work_.rates.refire(j), grid_.laps > 1,
+                                uniforms, work_.alpha + row(t), work_.beta + row(t));
             }
         }
         for (int i = 0; i < kTeam; ++i) {

@@ -113,49 +113,64 @@ MARS_INLINE bool any_few(const float* mean) {
 }
 
 // The steepest line that a count may follow: one exposure more armed (p of mu), or re-armed (q), adds at most one count.
-// Beyond it deviations could grow from sweep to sweep (docs/feedback.md).
-MARS_INLINE float steepest(float p, float q) {
-    const float most = p > q ? p : q;
-    return 1.0f / (most > 1e-30f ? most : 1e-30f);
+// Beyond it deviations could grow from sweep to sweep (docs/feedback.md). About (`mean`, `at`).
+MARS_NOINLINE void limit_slopes(const float* __restrict__ p, const float* __restrict__ q,
+                                const float* __restrict__ mean, const float* __restrict__ at,
+                                float* __restrict__ alpha, float* __restrict__ beta) {
+    for (int i = 0; i < kTeam; ++i) {
+        const float most = p[i] > q[i] ? p[i] : q[i], limit = 1.0f / (most > 1e-30f ? most : 1e-30f);
+        const bool over = alpha[i] > limit;
+        alpha[i] = over ? limit : alpha[i];
+        beta[i] = over ? at[i] - limit * mean[i] : beta[i];
+    }
 }
 
-// alpha and beta of a cell that fires with probability p, or q where it was re-armed within, for all lanes.
-MARS_INLINE void follow_quantile(const float* mean, const float* variance, const float* p, const float* q,
+// alpha and beta of a cell that fires with probability p, or q where it was re-armed within, for all lanes. `bursts`: its
+// mean may well be several times what it is expected to be, because few exposures are armed.
+MARS_INLINE void follow_quantile(const float* mean, const float* variance, const float* p, const float* q, bool bursts,
                                  const Uniforms& uniforms, float* alpha, float* beta) {
+    alignas(64) float about[kTeam], at[kTeam];  // a point of the line
+    int32_t steep = 0;
     for (int i = 0; i < kTeam; ++i) {
         const float mu = mean[i] > 1.0f ? mean[i] : 1.0f, least = mu * 1e-7f;
         const float var = variance[i] > least ? variance[i] : least;
         float growth;
-        const float more = excess(mu, var, uniforms.normal[i], growth);
-        const float slope = 1.0f + growth / mu, limit = steepest(p[i], q[i]);
-        alpha[i] = slope < limit ? slope : limit;
-        beta[i] = more - (alpha[i] - 1.0f) * mu;
+        const float more = excess(mu, var, uniforms.normal[i], growth), most = p[i] > q[i] ? p[i] : q[i];
+        alpha[i] = 1.0f + growth / mu;
+        beta[i] = more - growth;
+        about[i] = mu;
+        at[i] = mu + more;
+        steep |= alpha[i] * most > 1.0f ? 1 : 0;
     }
-    if (!any_few(mean)) return;
-    Terms terms;
-    terms.sum(mean, variance, uniforms.above);
-    for (int i = 0; i < kTeam; ++i) {
-        const bool none = terms.count[i] == 0.0f;
-        const float term = terms.term[i] > 1e-12f ? terms.term[i] : 1e-12f;
-        const float before = none ? 1.0f : (terms.before[i] > 1e-12f ? terms.before[i] : 1e-12f);
-        // How far the mean is below the next count's threshold, and above this one's: d P(H > k) / d mu = P(H = k), and
-        // its derivative P(H = k - 1) - P(H = k). Without the second order E H^2 would lack the variance of mu.
-        const float past = (uniforms.above[i] - terms.beyond[i]) / term, ratio = none ? 0.0f : before / term;
-        const float short_of = (terms.above[i] - uniforms.above[i]) / before, k = terms.count[i];
-        float up = past / (1.0f + 0.5f * (ratio - 1.0f) * past);
-        // Far below one count the mean may well be several times what it is expected to be, and P(H > 1) = mu^2 / 2 -
-        // mu^3 / 3 is not of second order about it.
-        const float far = root(2.0f * uniforms.above[i]), second = far + far * far * 0.33333334f - mean[i];
-        up = k == 1.0f && mean[i] < kFarBelowOne && second > up ? second : up;
-        up = up > 1e-6f ? (up < 1e3f ? up : 1e3f) : 1e-6f;
-        float down = short_of / (1.0f - 0.5f * ((k - 1.0f) / (mean[i] > 1e-3f ? mean[i] : 1e-3f) - 1.0f) * short_of);
-        down = down > 0.0f ? (down < 1e3f ? down : 1e3f) : 0.0f;
-        const float steps = none ? 1.0f : 1.0f / (up + down), limit = steepest(p[i], q[i]);
-        const float slope = steps < limit ? steps : limit;
-        const bool few = mean[i] < kInversionBelow;
-        alpha[i] = few ? slope : alpha[i];
-        beta[i] = few ? k - slope * (mean[i] + up) : beta[i];
+    if (any_few(mean)) {
+        Terms terms;
+        terms.sum(mean, variance, uniforms.above);
+        for (int i = 0; i < kTeam; ++i) {
+            const bool none = terms.count[i] == 0.0f;
+            const float term = terms.term[i] > 1e-12f ? terms.term[i] : 1e-12f;
+            const float before = none ? 1.0f : (terms.before[i] > 1e-12f ? terms.before[i] : 1e-12f);
+            // How far the mean is below the next count's threshold, and above this one's: d P(H > k) / d mu = P(H = k),
+            // and its derivative P(H = k - 1) - P(H = k). Without the second order E H^2 would lack the variance of mu.
+            const float past = (uniforms.above[i] - terms.beyond[i]) / term, ratio = none ? 0.0f : before / term;
+            const float short_of = (terms.above[i] - uniforms.above[i]) / before, k = terms.count[i];
+            float up = past / (1.0f + 0.5f * (ratio - 1.0f) * past);
+            if (bursts) {  // P(H > 1) = mu^2 / 2 - mu^3 / 3 is not of second order about a mean far below one count
+                const float far = root(2.0f * uniforms.above[i]), second = far + far * far * 0.33333334f - mean[i];
+                up = k == 1.0f && mean[i] < kFarBelowOne && second > up ? second : up;
+            }
+            up = up > 1e-6f ? (up < 1e3f ? up : 1e3f) : 1e-6f;
+            float down = short_of / (1.0f - 0.5f * ((k - 1.0f) / (mean[i] > 1e-3f ? mean[i] : 1e-3f) - 1.0f) * short_of);
+            down = down > 0.0f ? (down < 1e3f ? down : 1e3f) : 0.0f;
+            const float slope = none ? 1.0f : 1.0f / (up + down), most = p[i] > q[i] ? p[i] : q[i];
+            const bool few = mean[i] < kInversionBelow;
+            alpha[i] = few ? slope : alpha[i];
+            beta[i] = few ? k - slope * (mean[i] + up) : beta[i];
+            about[i] = few ? mean[i] + up : about[i];
+            at[i] = few ? k : at[i];
+            steep |= alpha[i] * most > 1.0f ? 1 : 0;
+        }
     }
+    if (steep) limit_slopes(p, q, about, at, alpha, beta);
 }
 
 // The count itself, for all lanes.

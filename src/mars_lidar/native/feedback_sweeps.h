@@ -207,8 +207,16 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
         const int32_t before = old[static_cast<int64_t>(exposure.edge[i]) * kRow + i];
         mark[i] = minus(minus(before, history.less[1][i]), exposure.rank[i]);
     }
+    int32_t until = 0;  // no lane's exposure begins before
     for (int32_t lap = 0, t = 0; lap < grid.laps; ++lap)
         for (int32_t j = 0; j < grid.cells; ++j, ++t) {
+            if (!periods && t == until) {
+                until = path;
+                for (int i = 0; i < kTeam; ++i) {
+                    mark[i] = t == exposure.edge[i] ? minus(c[i], exposure.rank[i]) : mark[i];
+                    if (exposure.edge[i] > t && exposure.edge[i] < until) until = exposure.edge[i];
+                }
+            }
             const FeedbackEdge& edge = grid.lap_edge[t + 1];
             const float *p = rates.fire(j), *q = rates.refire(j), part = edge.part;
             const auto back = history.at(edge);
@@ -229,7 +237,6 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
                 if constexpr (periods) {
                     extra += (phase[i] < exposure.end[i] ? 1 : 0) - (exposure.part[i] > turn ? 1 : 0);
                 } else {
-                    mark[i] = t == exposure.edge[i] ? minus(c[i], exposure.rank[i]) : mark[i];
                     const int32_t out = minus(re[i], mark[i]) < 0 ? 1 : 0;
                     extra += out;
                     in += (minus(next, mark[i]) < 0 ? 1 : 0) - out;

@@ -22,7 +22,7 @@ from mars_lidar.system import System
 PERIOD_NS = 100.0
 FluxRange = (1e-6, 1e3)
 FAMILIES = ("any", "locked", "dim", "waveform", "mode", "effects", "tails", "long", "ends")
-_SHARES = (0.22, 0.20, 0.10, 0.14, 0.12, 0.11, 0.03, 0.05, 0.03)
+_SHARES = (0.22, 0.20, 0.11, 0.14, 0.12, 0.11, 0.03, 0.03, 0.04)
 MOVING = "moving gate"
 Start = Literal["armed", "stationary"]
 
@@ -97,7 +97,8 @@ class Case:
         pulse = system.pulse
         return {
             "case": self.name, "family": self.family, "mode": self.mode, "start": system.start,
-            "S": self.strongest, "B": self.background, "delay": self.delay[0], "dead": system.dead_time_periods, "cycles": system.cycles,
+            "S": self.strongest, "B": self.background, "delay": self.delay[0],
+            "dead": system.dead_time_periods, "cycles": system.cycles,
             "bins": system.bins, "sigma": pulse.sigma_ns / PERIOD_NS if isinstance(pulse, GaussianPulse) else 0.0,
             "light": self.wave or (f"{len(self.signal)} returns" if len(self.signal) > 1 else "return"),
             "effects": " ".join(system.detector.effects),

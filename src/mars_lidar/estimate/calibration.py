@@ -7,7 +7,7 @@ from typing import Literal
 
 from mars_lidar import _validate
 from mars_lidar.detector import Detector
-from mars_lidar.estimate.calibration_once import CERTAIN, Watch, fitted
+from mars_lidar.estimate.calibration_once import CERTAIN, Watch, fitted, with_division
 from mars_lidar.estimate.calibration_result import Calibration
 from mars_lidar.estimate.dead_time import Unknown
 from mars_lidar.estimate.detector_model import jitter_sigma, needs_simulation, recorded_pulse, stream_detector, watched
@@ -108,7 +108,8 @@ def calibrate(
             "exactly the time of the one before"
         )
     if detector is None and dead is None:
-        return told_of(_bounded(Unknown(stream, counted, shape, hold, number, jitter).calibrated()), edge=True)
+        estimated = _bounded(Unknown(stream, counted, shape, hold, number, jitter).calibrated())
+        return told_of(with_division(stream, estimated), edge=True)
     watch = _watch(detector, dead, hold, jitter)
 
     found = _bounded(fitted(stream, counted, shape, watch, number))

@@ -13,11 +13,13 @@ from mars_lidar.estimate.calibration_fit import covariance, fit, initial
 from mars_lidar.estimate.calibration_light import Light
 from mars_lidar.estimate.calibration_rapp import split, total_of
 from mars_lidar.estimate.calibration_result import Calibration
+from mars_lidar.estimate.fine_light import fine_light
 from mars_lidar.estimate.intervals import FloatArray, Stream
 from mars_lidar.estimate.phase_bins import SHAPE_BINS, fine_bins, free_bins
 from mars_lidar.estimate.stream_summary import Summary
 from mars_lidar.pulse import GaussianPulse, Pulse
 
+_CROWDED, _FINER = 0.05, 64  # photons of a bin of a free shape above which light within it matters; parts of it
 _SHORT = 1e-7  # false-alarm probability of intervals shorter than the dead time
 CERTAIN = 8.5  # jitters behind a dead time after which a pixel is armed for certain: 6 of a difference of two
 
@@ -48,8 +50,13 @@ def fitted(
     watch: Watch,
     returns: int,
     near: Calibration | None = None,
+    *,
+    divided: bool = True,
 ) -> Calibration:
-    """Light of the likelihood, without a bias taken off; `near`: another calibration, to begin with its light."""
+    """Light of the likelihood, without a bias taken off; `near`: another calibration, to begin with its light.
+
+    `divided`: Rapp's total is divided by the shape of the histogram, which takes longer than all the rest.
+    """
     dead, hold = watch.dead_ns, watch.hold_ns
     slack = 1.5 * stream.unit_ns + 1e-6 * stream.period_ns  # two roundings of the clock; of the engines' phases
     slack += _below(stream.registrations) * (watch.jitter_ns + 3.0 * watch.jitter_error_ns) + 4.0 * watch.dead_error_ns
@@ -61,6 +68,11 @@ def fitted(
         bins = free_bins(stream.bins)
         seen = armed_time(stream, hold, bins)
         rate = seen.rate
+        finer = _FINER
+        while finer > 1 and 0 < stream.units < 4 * finer * bins:
+            finer //= 2
+        if (rate > _CROWDED).any() and finer > 1:  # a pulse within a bin, of which few passes see more than the start
+            rate = fine_light(stream, hold, finer * bins, bins).reshape(bins, finer).sum(1)
         # var of h / D is h / D^2; the bins are independent given the armed time
         some = seen.passes > 0
         spread = float((seen.registrations[some] / seen.passes[some] ** 2).sum())
@@ -88,13 +100,20 @@ def fitted(
     found = fit(seen, light, start)
     pulse, jitter = light.pulse_of(found.theta), light.jitter_of(found.theta)
     theta, matrix = _in_order(*light.recorded(found.theta, covariance(light, found)), returns, stream.period_ns)
-    if returns == 1:
-        rapp = split(stream, rapp, pulse, float(theta[2]), dead, min(SHAPE_BINS, stream.bins))
-    return Calibration(
+    found_light = Calibration(
         float(theta[0]), theta[1 : 1 + returns], theta[1 + returns : 1 + 2 * returns], pulse, None, dead,
         watch.dead_error_ns, hold, short, light.names, matrix, rapp, seen, counted, found.converged,
         jitter, math.sqrt(matrix[-1, -1]) if light.fit_jitter else watch.jitter_error_ns, watch.by,
     )  # fmt: skip
+    return with_division(stream, found_light) if divided else found_light
+
+
+def with_division(stream: Stream, found: Calibration) -> Calibration:
+    """With Rapp's total divided into signal and background, of a single return."""
+    if found.pulse is None or found.returns_signal.size != 1:
+        return found
+    bins = min(SHAPE_BINS, stream.bins)
+    return replace(found, rapp=split(stream, found.rapp, found.pulse, found.delay_ns, found.dead_time_ns, bins))
 
 
 def _in_order(theta: FloatArray, matrix: FloatArray, k: int, period_ns: float) -> tuple[FloatArray, FloatArray]:

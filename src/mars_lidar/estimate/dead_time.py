@@ -74,7 +74,7 @@ class Unknown:
         )
 
     def _pass(self, watch: Watch, near: Calibration | None = None) -> Calibration:
-        return fitted(self.stream, self.counted, self.shape, watch, self.returns, near)
+        return fitted(self.stream, self.counted, self.shape, watch, self.returns, near, divided=False)
 
     def _sharp(self, first: Calibration) -> Calibration:
         """The smallest of n intervals exceeds t_d by 1 / (sum of the rates at re-arming) in the mean.

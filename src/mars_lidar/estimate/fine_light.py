@@ -11,14 +11,16 @@ _COARSE = 1024
 _ENOUGH = 32  # registrations of a bin that is halved
 
 
-def fine_light(stream: Stream, hold_off_ns: float, bins: int) -> FloatArray:
-    """Photons per period (bins,) in a power of two of bins: h / D of bins that are halved where photons abound.
+def fine_light(stream: Stream, hold_off_ns: float, bins: int, coarse: int | None = None) -> FloatArray:
+    """Photons per period (bins,): h / D of `coarse` (1024) bins that are halved where photons abound.
+
+    `bins` are a power of two times `coarse`.
 
     A pulse much narrower than a bin of the coarsest grid is seen as it is, and faint light does not fall apart into
     single photons.
     """
     seen = armed_time(stream, hold_off_ns, bins)
-    number = min(_COARSE, bins)
+    number = min(_COARSE if coarse is None else coarse, bins)
     rate, photons = np.zeros(bins), np.full(number, np.inf)
     while True:
         each = bins // number

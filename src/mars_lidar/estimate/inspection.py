@@ -25,6 +25,7 @@ _LEAST = 10.0  # photons of a piece
 _GROUPS = 64  # of the period
 _INTERVAL_BINS = 400
 _MOST_CELLS = 2**16  # of the period, for photons that share a unit of the clock
+_TWICE = 2.0  # smallest intervals: a second dead time, of the detector, is at most that of its electronics
 _SAME_EDGE = 5.0  # standard errors within which a given dead time is that of the edge
 
 
@@ -154,8 +155,15 @@ def _problems(
         told.append(
             f"the rate is not constant: {parts.min():,} to {parts.max():,} photons in twentieths of the recording"
         )
-    told += found.findings()
-    return told, list(free.unknown)
+    unknown = list(free.unknown)
+    if found.departure_ends_ns > _TWICE * counted.smallest_ns[0]:
+        unknown.append(
+            f"the rate rises slowly up to {found.departure_ends_ns:.4g} ns after a registration, the shortest of which "
+            f"are {counted.smallest_ns[0]:.4g} ns apart: jitter of the size of the dead time, or a slow recovery"
+        )
+    else:
+        told += found.findings()
+    return told, unknown
 
 
 def _flat(free: Calibration) -> float:

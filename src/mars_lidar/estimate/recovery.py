@@ -121,6 +121,12 @@ class Recovery:
             ]
         return []
 
+    @property
+    def departure_ends_ns(self) -> float:
+        """Age at which a rate below the light's ends, ns, where there is one that `findings` tells; else 0."""
+        _, until, _, _, z = self._departure()
+        return until if z < -_SIGNIFICANT else 0.0
+
     def _departure(self) -> tuple[float, float, float, float, float]:
         """First and last age, ns, of what is farthest from the light; registrations, those expected, their score."""
         if self.judged is None:

@@ -15,6 +15,7 @@ from mars_lidar.pulse import GaussianPulse
 _MISFIT = 1e-5  # false-alarm probability of light that is told not to be that of the pulse
 _GROUPS, _EXPECTED = 128, 10.0  # of the bins at most, registrations in each at least
 _SEEN = 15.0  # gain of log likelihood by which returns of unknown width are seen: chance peaks gain less
+_HIDDEN = 5.0  # standard errors of a constant light that a pulse which is not seen may have
 _UNIT = 1.0  # units of the clock that a pulse must be wide
 _UNSEEN = 0.5  # passes below which the light of a bin is not known
 _BIASED = 0.5  # standard errors
@@ -40,6 +41,10 @@ def told(found: Calibration, *, edge: bool) -> Calibration:
     if found.pulse is None:
         reasons += _free(found, lost)
     else:
+        if "sigma_ns" in found.names and not _is_seen(found):
+            reasons.append("no pulse is seen: signal, delay and width are not known")
+            lost.update(name for name in found.names if name != "background" and name != "jitter_ns")
+            found = _dark(found)
         reasons += _pulse(found, lost, edge and found.edge_fits and found.converged)
     if not reasons:
         return found
@@ -69,10 +74,7 @@ def _pulse(found: Calibration, lost: set[str], edge: bool) -> list[str]:
     reasons = []
     places = [name for name in found.names if name.startswith(("delay", "sigma", "jitter"))]
     fitted = "sigma_ns" in found.names
-    if fitted and not _is_seen(found):
-        reasons.append("no pulse is seen: signal, delay and width are not known")
-        lost.update(places, (name for name in found.names if name.startswith("signal")))
-    elif isinstance(found.pulse, GaussianPulse) and found.pulse.sigma_ns < _UNIT * found.summary.unit_ns:
+    if isinstance(found.pulse, GaussianPulse) and found.pulse.sigma_ns < _UNIT * found.summary.unit_ns:
         unit = found.summary.unit_ns
         reasons.append(f"delay and width are not known: the pulse is no wider than the clock's unit of {unit:.4g} ns")
         lost.update(places)
@@ -86,6 +88,20 @@ def _pulse(found: Calibration, lost: set[str], edge: bool) -> list[str]:
         )
         lost.update(found.names)
     return reasons
+
+
+def _dark(found: Calibration) -> Calibration:
+    """Constant light, where no pulse is seen: what one may hide, too faint or too wide, is in the error."""
+    seen = found.armed
+    passes = float(seen.passes.mean())
+    total = float(seen.registrations.sum()) / max(passes, 1e-300)
+    error = math.sqrt(max(float(seen.registrations.sum()), 1.0)) / max(passes, 1e-300)
+    covariance = found.covariance.copy()
+    covariance[0, :] = covariance[:, 0] = 0.0
+    covariance[0, 0] = error**2 + min(found.signal, _HIDDEN * error) ** 2
+    return replace(
+        found, background=total, returns_signal=np.zeros_like(found.returns_signal), covariance=covariance
+    )
 
 
 def _is_seen(found: Calibration) -> bool:

@@ -76,7 +76,9 @@ private:
             const int32_t cuts = first_[static_cast<size_t>(b) + 1] - first;
             const int32_t s = std::max(0, static_cast<int32_t>(std::ceil(inside * cuts - 1e-9)) - 1);
             const double part = s + 1 - inside * cuts;
-            const FeedbackEdge edge{first + s + 1, first + s, turns, part > 1e-9 ? static_cast<float>(part) : 0.0f};
+            // below 1 by more than float32 rounds counts by: no more are taken back than were registered
+            const float share = part > 1e-9 ? static_cast<float>(std::min(part, 1.0 - 0x1p-22)) : 0.0f;
+            const FeedbackEdge edge{first + s + 1, first + s, turns, share};
             if (turns == 0 && edge.late >= e)
                 throw nb::value_error("merge must make the cells shorter than the dead time");
             if (turns > 0 && edge.early < grid.watch) grid.watch = edge.early;

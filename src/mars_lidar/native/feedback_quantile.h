@@ -113,15 +113,15 @@ MARS_INLINE bool any_few(const float* mean) {
 }
 
 // The steepest line that a count may follow: one exposure more armed (p of mu), or re-armed (q), adds at most one count.
-// Beyond it deviations could grow from sweep to sweep (docs/feedback.md). About (`mean`, `at`).
+// Beyond it deviations could grow from sweep to sweep (docs/feedback.md). The count at the mean stays.
 MARS_NOINLINE void limit_slopes(const float* __restrict__ p, const float* __restrict__ q,
-                                const float* __restrict__ mean, const float* __restrict__ at,
-                                float* __restrict__ alpha, float* __restrict__ beta) {
+                                const float* __restrict__ mean, float* __restrict__ alpha,
+                                float* __restrict__ beta) {
     for (int i = 0; i < kTeam; ++i) {
         const float most = p[i] > q[i] ? p[i] : q[i], limit = 1.0f / (most > 1e-30f ? most : 1e-30f);
-        const bool over = alpha[i] > limit;
-        alpha[i] = over ? limit : alpha[i];
-        beta[i] = over ? at[i] - limit * mean[i] : beta[i];
+        const float slope = alpha[i] < limit ? alpha[i] : limit;
+        beta[i] += (alpha[i] - slope) * mean[i];
+        alpha[i] = slope;
     }
 }
 
@@ -129,7 +129,6 @@ MARS_NOINLINE void limit_slopes(const float* __restrict__ p, const float* __rest
 // mean may well be several times what it is expected to be, because few exposures are armed.
 MARS_INLINE void follow_quantile(const float* mean, const float* variance, const float* p, const float* q, bool bursts,
                                  const Uniforms& uniforms, float* alpha, float* beta) {
-    alignas(64) float about[kTeam], at[kTeam];  // a point of the line
     int32_t steep = 0;
     for (int i = 0; i < kTeam; ++i) {
         const float mu = mean[i] > 1.0f ? mean[i] : 1.0f, least = mu * 1e-7f;
@@ -138,8 +137,6 @@ MARS_INLINE void follow_quantile(const float* mean, const float* variance, const
         const float more = excess(mu, var, uniforms.normal[i], growth), most = p[i] > q[i] ? p[i] : q[i];
         alpha[i] = 1.0f + growth / mu;
         beta[i] = more - growth;
-        about[i] = mu;
-        at[i] = mu + more;
         steep |= alpha[i] * most > 1.0f ? 1 : 0;
     }
     if (any_few(mean)) {
@@ -165,12 +162,10 @@ MARS_INLINE void follow_quantile(const float* mean, const float* variance, const
             const bool few = mean[i] < kInversionBelow;
             alpha[i] = few ? slope : alpha[i];
             beta[i] = few ? k - slope * (mean[i] + up) : beta[i];
-            about[i] = few ? mean[i] + up : about[i];
-            at[i] = few ? k : at[i];
             steep |= alpha[i] * most > 1.0f ? 1 : 0;
         }
     }
-    if (steep) limit_slopes(p, q, about, at, alpha, beta);
+    if (steep) limit_slopes(p, q, mean, alpha, beta);
 }
 
 // The count itself, for all lanes.

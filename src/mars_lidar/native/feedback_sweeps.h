@@ -175,7 +175,7 @@ MARS_NOINLINE void take_exactly(const Quantiles& quantiles, int32_t j, uint32_t 
 constexpr float kLargest = 2147483520.0f;  // the largest float that an integer holds
 
 // Integer sweep through all laps. `change` as above, in counts. `negative`: below 0 where fewer than no exposures were
-// armed in a cell.
+// armed in a cell; with K = 0 and an armed start, where exposures keep their order, that cannot be.
 //
 // The ends of the exposure, K = 0: all M exposures begin armed, so that the one that ends at the edge of the exposure,
 // blind by the registration of that rank before it, is taken out of the history: its re-arming does not count. (What
@@ -242,7 +242,7 @@ MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, c
                     in += (minus(next, mark[i]) < 0 ? 1 : 0) - out;
                 }
                 const int32_t left = plus(exposure.armed[i] + extra, minus(re[i], c[i]));
-                negative[i] |= left;
+                if constexpr (warm) negative[i] |= left;
                 armed[i] = left > 0 ? left : 0;
                 rearmed[i] = in > 0 ? in : 0;
                 re[i] = next;

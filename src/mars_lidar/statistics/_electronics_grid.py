@@ -34,7 +34,7 @@ class Effort:
 
 
 MOST_EFFORT = Effort(1 << 27, 3e10, 3e11)  # 1 GiB, and half a minute
-LAW_EFFORT = Effort(3 << 23, 3e9, 2e10)  # of the laws, which are to take 2 s at most
+LAW_EFFORT = Effort(1 << 24, 2e9, 2e10)  # of the laws, which are to take 2 s at most
 
 
 class RecordGrid:

@@ -356,3 +356,4 @@ def _check(cells: Cells, cell: int, window: Window, cumulants: FloatArray) -> No
             f"least {least:.2g}; mean, variance and cumulants are known; for the law {cells.instead}"
         )
     np.maximum(pmf, 0.0, out=pmf)
+    pmf /= pmf.sum()

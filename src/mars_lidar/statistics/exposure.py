@@ -345,21 +345,31 @@ def _shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
     return Exposure(**{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(flat).items()})
 
 
-def _poisson(cells: Cells, out_bins: int) -> Exposure:
-    """No dead time: Poisson exactly, in every bin and in all."""
+def recorded_light(cells: Cells, out_bins: int) -> FloatArray:
+    """Photons (cells, out_bins) of a period: all of them are registered where there is no dead time."""
     from mars_lidar import _core
 
-    result = _blank(cells, out_bins)
-    parts = int(_core.EXPOSURE_PARTS)
-    step = out_bins * math.ceil(512 / out_bins)
+    parts, step = int(_core.EXPOSURE_PARTS), _poisson_bins(out_bins)
+    rate = np.empty((cells.size, out_bins))
     for part in cells.chunks(step, out_bins):
         some = cells.part(part)
         energy, row = some.energies(step)
         energy = energy.reshape(energy.shape[0], out_bins, step // out_bins * parts).sum(-1)
         photons, flat = some.native_flux
-        result.histogram_rate[part] = photons[:, None] * energy[row] + flat[:, None] / out_bins
+        rate[part] = photons[:, None] * energy[row] + flat[:, None] / out_bins
+    return rate
+
+
+def _poisson_bins(out_bins: int) -> int:
+    return out_bins * math.ceil(512 / out_bins)
+
+
+def _poisson(cells: Cells, out_bins: int) -> Exposure:
+    """No dead time: Poisson exactly, in every bin and in all."""
+    result = _blank(cells, out_bins)
+    result.histogram_rate[:] = recorded_light(cells, out_bins)
     result.cumulant_rates[:] = cells.total[:, None]
     result.cumulants[:] = cells.system.cycles * result.cumulant_rates
     result.histogram[:] = cells.system.cycles * result.histogram_rate
-    result.settled[:], result.bins[:] = 0, step
+    result.settled[:], result.bins[:] = 0, _poisson_bins(out_bins)
     return _shaped(result, cells.shape)

@@ -25,7 +25,7 @@ from mars_lidar.statistics._joint_timed import TimedPixel
 from mars_lidar.statistics._timing import Timing, is_timed
 from mars_lidar.system import System
 
-_MAX_BINS = 2**20  # of the grid, unless the histogram itself has more
+_MAX_BINS = 2**17  # of the grid, unless the histogram itself has more: a second or two
 _BLOCK = 64  # windows solved at a time
 
 
@@ -59,7 +59,7 @@ def joint_law(
     Raises
     ------
     ConvergenceError
-        Naming the pixel, where no grid up to 2^20 bins meets the tolerance, or where the exposure does not
+        Naming the pixel, where no grid up to 2^17 bins meets the tolerance, or where the exposure does not
         forget its start and is too long to be run through bin by bin (more than 2^22 bins x periods).
 
     Notes

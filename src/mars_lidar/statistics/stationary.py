@@ -10,13 +10,15 @@ from mars_lidar import _validate
 from mars_lidar.statistics._cells import Cells, FloatArray
 from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics._warm import warm_history
-from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED, thread_count
+from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED, recorded_light, thread_count
 
 
 def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
     """Registrations per period and bin (cells, out_bins) of a pixel that has been running for long (18)."""
     tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
+    if cells.system.dead_time_periods == 0.0:  # the light itself
+        return recorded_light(cells, out_bins)
     result = np.empty((cells.size, out_bins))
     pending = np.arange(cells.size)
     bins = cells.first_bins(out_bins)

@@ -112,8 +112,9 @@ def stream_of(ideal: Ideal) -> Timestamps:
 def recorded(ideal: Ideal, avalanches_ns: NDArray[np.float64], cycles: int) -> Timestamps:
     """Avalanches as a laboratory has them: each with a jitter of its own, in whole units of the clock, sorted."""
     random = np.random.default_rng([ideal.seed, 1])
-    times = avalanches_ns + ideal.jitter_ns * random.standard_normal(avalanches_ns.size)
-    times = np.sort(times % (cycles * ideal.period_ns))
+    # the recording begins a period before the light: no record is earlier
+    times = avalanches_ns + ideal.jitter_ns * random.standard_normal(avalanches_ns.size) + ideal.period_ns
+    times = np.sort(times)
     times = (np.floor(times / ideal.unit_ns) + 0.5) * ideal.unit_ns
     bins = min(max(1, round(ideal.period_ns / ideal.unit_ns)), _MOST_BINS)
     cycle = np.floor(times / ideal.period_ns)
@@ -121,7 +122,7 @@ def recorded(ideal: Ideal, avalanches_ns: NDArray[np.float64], cycles: int) -> T
     offsets = np.array([0, times.size], np.int64)
     return Timestamps(
         times, cycle.astype(np.int32), place.astype(np.int32), offsets, (1, 1), bins, np.dtype(np.uint32),
-        ideal.period_ns, max(cycles, int(cycle[-1]) + 1), {"unit_ns": ideal.unit_ns},
+        ideal.period_ns, max(cycles + 1, int(cycle[-1]) + 1), {"unit_ns": ideal.unit_ns},
     )  # fmt: skip
 
 

@@ -53,6 +53,12 @@ class Case:
         return (light + self.background) * detector.detection_efficiency + dark
 
     @property
+    def number(self) -> int:
+        """Its number in the sweep; 0 for one made by hand."""
+        last = self.name.rpartition("/")[2]
+        return int(last) if last.isdigit() else 0
+
+    @property
     def strongest(self) -> float:
         """Signal photons per period, summed over the returns or the waveform."""
         return float(sum(self.signal) if self.waveform is None else self.waveform.sum())

@@ -33,7 +33,7 @@ from harness import (
 from harness.pvalues import variance_score
 from mars_lidar.engines import ENGINES
 from mars_lidar.studies.domain import simulator
-from mars_lidar.studies.domain.systems import Case as Pixel
+from mars_lidar.studies.domain.case import Case as Pixel
 
 
 def _system(dead: float, sigma: float, bins: int, cycles: int, start: str = "armed") -> ml.System:

@@ -15,12 +15,13 @@ from mars_lidar.statistics import ConvergenceError
 from mars_lidar.studies.__main__ import main
 from mars_lidar.studies.domain import judge as judging
 from mars_lidar.studies.domain import verdict, watch
+from mars_lidar.studies.domain.case import MOVING, PERIOD_NS, Case
 from mars_lidar.studies.domain.checks import Check, merge, two_samples
 from mars_lidar.studies.domain.closed_forms import known
 from mars_lidar.studies.domain.judge import Budget, judge
 from mars_lidar.studies.domain.samples import Windows, simulated
 from mars_lidar.studies.domain.sweep import Settings, judge_case
-from mars_lidar.studies.domain.systems import FAMILIES, MOVING, PERIOD_NS, Case, draw
+from mars_lidar.studies.domain.systems import FAMILIES, draw
 from mars_lidar.studies.domain.watch import Watched
 from mars_lidar.studies.report import MAX_FIGURE_BYTES
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.simulate import simulate
 from mars_lidar.studies.domain import simulator
+from mars_lidar.studies.domain.case import Case
 from mars_lidar.studies.domain.checks import (
     Check,
     against_law,
@@ -23,7 +24,6 @@ from mars_lidar.studies.domain.checks import (
 from mars_lidar.studies.domain.predictions import TOLERANCE, Predictions
 from mars_lidar.studies.domain.records import recorded
 from mars_lidar.studies.domain.samples import Sample, Windows, handed, own, simulated
-from mars_lidar.studies.domain.systems import Case
 from mars_lidar.studies.domain.verdict import FAILED, HANDED, LAWS, REFUSED, SLOW, UNJUDGED, VERIFIED, Outcome, refusal
 
 FloatArray = NDArray[np.float64]

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from mars_lidar.estimate import cramer_rao
 from mars_lidar.statistics import CountLaw, JointLaw, count_law, joint_law, mean_histogram, registration_pdf
+from mars_lidar.studies.domain.case import Case
 from mars_lidar.studies.domain.checks import Check
 from mars_lidar.studies.domain.closed_forms import known
 from mars_lidar.studies.domain.samples import Windows
-from mars_lidar.studies.domain.systems import Case
 
 FloatArray = NDArray[np.float64]
 TOLERANCE = 1e-4  # of `count_law` and `mean_histogram`: their default

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mars_lidar.simulate import simulate, simulate_timestamps
+from mars_lidar.studies.domain.case import PERIOD_NS, Case
 from mars_lidar.studies.domain.checks import Check
-from mars_lidar.studies.domain.systems import PERIOD_NS, Case
 
 _MOST = 3e5  # registrations that are looked at one by one
 _LATTICE = 17  # bits of a period behind which phases are still to be even

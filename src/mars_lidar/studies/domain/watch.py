@@ -11,8 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from mars_lidar.studies.domain.case import Case
 from mars_lidar.studies.domain.judge import Budget, judge
-from mars_lidar.studies.domain.systems import Case
 from mars_lidar.studies.domain.verdict import FAILED, SLOW, Outcome
 
 PATIENCE = 2.1  # seconds of processor time of one step before it is stopped

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,23 @@ from scipy import special, stats
 
 import mars_lidar as ml
 from harness import (
-    COUNTS, JOINT, PERIOD_NS, SHAPE, Case, JointLaw, Law, check, counts_against_law, flux_of, require,
+    COUNTS,
+    JOINT,
+    PERIOD_NS,
+    SHAPE,
+    Case,
+    JointLaw,
+    Law,
+    check,
+    counts_against_law,
+    flux_of,
+    require,
     waveform_flux,
 )  # fmt: skip
 from harness.pvalues import variance_score
 from mars_lidar.engines import ENGINES
 from mars_lidar.studies.domain import simulator
-from mars_lidar.studies.domain.systems import Case as Pixel
+from mars_lidar.studies.domain.case import Case as Pixel
 
 
 def _system(dead: float, sigma: float, bins: int, cycles: int, start: str = "armed") -> ml.System:
@@ -34,7 +45,7 @@ def _system(dead: float, sigma: float, bins: int, cycles: int, start: str = "arm
 
 @dataclasses.dataclass(frozen=True)
 class Locked:
-    """A pixel that locks to the laser within a period: S, B, t_d, sigma (periods), bins, cycles, start, delay, items."""
+    """A pixel that locks to the laser within a period; times in periods, `items` exposures."""
 
     signal: float
     background: float
@@ -64,7 +75,9 @@ LOCKED = {
     "S 69, t_d 0.73": Locked(69.0758, 1.52576, 0.72702975, 0.004044, 256, 142, "stationary"),
     "S 193, t_d 0.74": Locked(192.828, 0.705439, 0.74010765, 0.0003535, 8, 128, "stationary"),
     "S 234, t_d 0.81": Locked(234.492, 1.3631, 0.81079273, 0.0006246, 4, 160_475, items=100),
-    "S 40, t_d 0.90, 344,109 cycles": Locked(40.5466, 1.10649, 0.90280658, 0.0002292, 128, 344_109, delay=0.627, items=80),
+    "S 40, t_d 0.90, 344,109 cycles": Locked(
+        40.5466, 1.10649, 0.90280658, 0.0002292, 128, 344_109, delay=0.627, items=80
+    ),
     "more than 3 background photons a dead time": Locked(1.0, 5.0, 0.7, 0.01, 64, 300, items=4000),
 }
 
@@ -111,7 +124,8 @@ WAVEFORMS: dict[str, tuple[np.ndarray, float, float, int, int, str]] = {
     "two spikes, a million cycles": (_spikes(48, {3: 2.0, 20: 1.5}), 0.1, 0.457, 48, 1_000_000, "armed"),
     "40 parts in 48 bins": (_spikes(40, {3: 2.0, 20: 1.5}), 0.1, 0.457, 48, 100_000, "armed"),
     "7 parts in 2 bins": (
-        0.758 * np.array([0.02, 0.4, 0.01, 0.3, 0.17, 0.0, 0.1]), 0.11653829, 5.880561209937386, 2, 3_000_000, "stationary",
+        0.758 * np.array([0.02, 0.4, 0.01, 0.3, 0.17, 0.0, 0.1]), 0.11653829, 5.880561209937386, 2, 3_000_000,
+        "stationary",
     ),
 }  # fmt: skip
 
@@ -155,7 +169,7 @@ def test_dim_tails(signal: float) -> None:
     """Photons beyond 4.5 to 6 sigma of a dim Gaussian pulse: as many as belong there."""
     sigma, registrations = 0.004, 1.2e7
     at = [4.5, 5.0, 5.5, 6.0, 8.0]
-    edges = [(a * sigma, b * sigma) for a, b in zip(at[:-1], at[1:], strict=True)]
+    edges = [(a * sigma, b * sigma) for a, b in pairwise(at)]
     edges += [(-b, -a) for a, b in edges]
     pixels = max(1, round(registrations / (signal * 50_000_000)))
     drawn = pixels * 50_000_000 * signal / (1 + 0.3 * signal)
@@ -211,7 +225,7 @@ def test_a_narrow_gate_in_dim_light() -> None:
 LAWS: dict[str, tuple[float, float, float, float, int, int, str]] = {
     "stationary, S = 0, B = 1000, one cycle": (0.0, 1000.0, 1.9999, 0.01, 64, 1, "stationary"),
     "1e8 cycles": (5.0, 1.0, 1.0, 0.01, 64, 100_000_000, "armed"),
-    "locked, S 206, just below a period": (205.648, 6.66524, 0.999856070836575, 0.013763629840558421, 32, 464_361, "armed"),
+    "locked, S 206, just below a period": (205.648, 6.66524, 0.999856071, 0.01376363, 32, 464_361, "armed"),
     "locked, S 40, 344,109 cycles": (40.5466, 1.10649, 0.90280658, 0.0002292, 128, 344_109, "armed"),
     "darkness, dead for 12,127 periods": (0.0, 0.0, 12127.273, 0.02, 24_393, 121_892, "armed"),
     "dead for a million periods": (1e-6, 1000.0, 1e6, 1.0, 2, 1000, "armed"),
@@ -233,10 +247,13 @@ def test_laws_answer_or_say_what_to_use(name: str, prediction: str) -> None:
         "stationary": lambda: ml.registration_pdf(signal, background, system, "stationary", **light),
         "joint_law": lambda: ml.joint_law(signal, background, system, **light).count_variance,
     }
+    words = ""
     try:
-        assert np.isfinite(asked[prediction]()).all()
+        found = np.asarray(asked[prediction]())
     except (ValueError, MemoryError, ml.statistics.ConvergenceError) as error:
-        assert any(word in str(error) for word in ("use ", "simulat", "engine", "tolerance=")), error
+        words, found = str(error), np.zeros(1)
+    assert np.isfinite(found).all()
+    assert not words or any(word in words for word in ("use ", "simulat", "engine", "tolerance=")), words
 
 
 def test_bound_of_two_bins() -> None:

@@ -14,6 +14,8 @@ from mars_lidar.estimate.method import FloatArray
 from mars_lidar.estimate.recording import core_ns, open_bins, relative_width
 from mars_lidar.system import System
 
+_SINGULAR = 1e-11  # of the largest eigenvalue, all of size 1 to 3: rounding of the sums over the bins is 1e-15 of it
+
 
 @dataclass(frozen=True, eq=False)
 class HistogramBound:
@@ -65,7 +67,7 @@ def cramer_rao(
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     MaximumLikelihood().check(system)
-    require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, lambda _: ", and neither do the estimators")
+    require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, _simulate_instead)
     mean = mean_histogram(signal, background, system, delay_ns=delay_ns, threads=threads)  # checks the arguments
     s, b, tau = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (signal, background, delay_ns)))
     if not (b > 0).all():
@@ -134,12 +136,30 @@ def _pulse_bins(system: System, delay_ns: FloatArray) -> tuple[FloatArray, Float
     return np.maximum(energy_at(delay_ns), 0.0), slope, (high - low) * system.bins
 
 
+def _simulate_instead(_: str) -> str:
+    return ", and neither do the estimators: reconstruct simulated cubes (engine 'exact') to see their errors"
+
+
 def _inverse_diagonal(information: FloatArray) -> FloatArray:
-    """Diagonal of the inverse (..., 3); what nothing is known of is inf and left out of the rest."""
+    """Diagonal of the inverse (..., 3); what nothing is known of is inf and left out of the rest.
+
+    So is what cannot be told from something else: the signal from the background, say, in a single bin.
+    """
     flat = information.reshape(-1, 3, 3)
     out = np.full((len(flat), 3), np.inf)
     for row, matrix in zip(out, flat, strict=True):
         known = np.diag(matrix) > 0
         if known.any():
-            row[known] = np.diag(np.linalg.inv(matrix[np.ix_(known, known)]))
+            row[known] = _variances(matrix[np.ix_(known, known)])
     return out.reshape(*information.shape[:-1])
+
+
+def _variances(information: FloatArray) -> FloatArray:
+    """Diagonal of the inverse of a matrix of positive diagonal, inf where a direction without information reaches."""
+    size = np.sqrt(np.diag(information))
+    value, vector = np.linalg.eigh(information / np.outer(size, size))
+    blank = value <= _SINGULAR * value[-1]
+    if not blank.any():
+        return np.asarray(np.diag(np.linalg.inv(information)))
+    seen = (vector[:, ~blank] ** 2 / value[~blank]).sum(-1) / size**2
+    return np.asarray(np.where((vector[:, blank] ** 2).sum(-1) > _SINGULAR, np.inf, seen))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from mars_lidar.studies.domain.systems import PERIOD_NS, Case
+from mars_lidar.studies.domain.case import PERIOD_NS, Case
 
 _LIGHT = {"detection_efficiency", "dark_count_hz", "jitter", "code_density"}
 _MOST = 20_000  # counts of a law that is written out

@@ -7,17 +7,17 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mars_lidar.simulate import simulate, simulate_timestamps
+from mars_lidar.studies.domain.case import PERIOD_NS, Case
 from mars_lidar.studies.domain.checks import Check
-from mars_lidar.studies.domain.systems import PERIOD_NS, Case
 
-_MOST = 1e6  # registrations that are looked at one by one
+_MOST = 3e5  # registrations that are looked at one by one
 _LATTICE = 17  # bits of a period behind which phases are still to be even
 _CELLS = 16
 
 
 def recorded(case: Case, seed: int, budget: float) -> list[Check]:
     """Checks of `simulate_timestamps` with the exact engine: order, dead time, exposure, histogram, fine phases."""
-    if case.registrations() > _MOST or (case.mode == "paralyzable" and case.photons * case.system.cycles > 20 * _MOST):
+    if case.registrations() > _MOST or (case.mode == "paralyzable" and case.photons * case.system.cycles > 5 * _MOST):
         return []
     pixels = int(np.clip(min(budget / max(case.registrations(), 1e-6), 2**22 / case.system.bins), 1, 64))
     flux, system = case.flux(pixels), case.system

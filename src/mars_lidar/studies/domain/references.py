@@ -14,8 +14,8 @@ from mars_lidar.detector import Detector
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate
 from mars_lidar.statistics import count_law, joint_law, mean_histogram
+from mars_lidar.studies.domain.case import PERIOD_NS, Case
 from mars_lidar.studies.domain.checks import Check, merge
-from mars_lidar.studies.domain.systems import PERIOD_NS, Case
 from mars_lidar.system import System
 
 _EXPOSURES = 4000

@@ -18,8 +18,8 @@ from mars_lidar.studies.domain.verdict import SUBJECTS
 from mars_lidar.studies.report import save_csv
 
 SEED = 20_261_122
-FULL = Settings(2000, SEED, Budget(), 100_000)
-QUICK = Settings(60, SEED, Budget(1e6, 1e7, 600, 1e5), 3_000)
+FULL = Settings(2000, SEED, Budget(4e5, 4e6, 800, 6e4), 100_000)
+QUICK = Settings(60, SEED, Budget(4e5, 4e6, 800, 6e4), 3_000)
 REFERENCE_LEVEL = 1e-6
 
 

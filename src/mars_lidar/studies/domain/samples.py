@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.simulate import simulate
-from mars_lidar.studies.domain.systems import PERIOD_NS, Case
+from mars_lidar.studies.domain.case import PERIOD_NS, Case
 
 _PIXELS = 32
 _BLOCK_BYTES = 2**24

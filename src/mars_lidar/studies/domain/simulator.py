@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.pulse import GaussianPulse
-from mars_lidar.studies.domain.systems import PERIOD_NS, Case
+from mars_lidar.studies.domain.case import PERIOD_NS, Case
 
 ABLE = {
     "detection_efficiency", "dark_count_hz", "electronics_dead_time_ns", "max_events_per_period",

@@ -13,9 +13,10 @@ from threading import Thread
 from typing import Any
 
 from mars_lidar.studies import Tell
+from mars_lidar.studies.domain.case import Case
 from mars_lidar.studies.domain.checks import Check
 from mars_lidar.studies.domain.judge import Budget
-from mars_lidar.studies.domain.systems import Case, draw
+from mars_lidar.studies.domain.systems import draw
 from mars_lidar.studies.domain.verdict import (
     FAILED,
     FIRST_LEVEL,

@@ -11,11 +11,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from mars_lidar.studies.domain.case import Case
 from mars_lidar.studies.domain.judge import Budget, judge
-from mars_lidar.studies.domain.systems import Case
 from mars_lidar.studies.domain.verdict import FAILED, SLOW, Outcome
 
-PATIENCE = 2.5  # seconds of processor time of one step before it is stopped
+PATIENCE = 2.1  # seconds of processor time of one step before it is stopped
 _WALL = 8.0  # the same on the clock, for what sleeps or machines that are busy, in units of the patience
 
 

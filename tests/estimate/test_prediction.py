@@ -129,7 +129,7 @@ def test_options_of_the_detector(tmp_path):
 
     detector = DETECTORS["electronics"]
     system = PLAIN.replace(detector=detector)
-    recorded(detector, seed=36).save(tmp_path / "lab.npz")
+    recorded(detector, seed=37).save(tmp_path / "lab.npz")
     system.save(tmp_path / "lab.yaml")
     PLAIN.save(tmp_path / "plain.yaml")
     shape = ("--pulse-sigma-ns", 1.0)
@@ -141,7 +141,7 @@ def test_options_of_the_detector(tmp_path):
     assert ml.System.load(tmp_path / "out.yaml").detector == detector
     told = rows("validate", "--cycles", 500, "--simulated", 500, *single, *shape)
     assert "by 512 simulated realizations" in told["prediction"]
-    whole = ml.simulate_timestamps(LIGHT, system, seed=36)
+    whole = ml.simulate_timestamps(LIGHT, system, seed=37)
     assert ml.validate(whole, cycles=500).system.detector == detector
     for arguments, message in (
         (("--electronics-dead-time-ns", 65), "needs its dead time: give --dead-time-ns or --system"),

@@ -107,7 +107,7 @@ def test_an_edge_that_is_neither_sharp_nor_gaussian():
     assert not found.edge_fits
     assert math.isnan(found.dead_time_error_ns)
     assert all(math.isnan(error) for error in found.errors.values())
-    assert "neither at once" in found.unknown[0]
+    assert "rises neither at once" in found.unknown[0]
 
 
 def test_what_the_command_says(tmp_path):

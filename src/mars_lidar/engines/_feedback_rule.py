@@ -39,6 +39,7 @@ class Reason(IntEnum):
     SHORT = 16
     ECHO = 17
     CELLS = 18
+    DEAR = 19
     LAPS = 64  # and more: of a pixel that needs that many laps less 64
 
     @property
@@ -51,6 +52,7 @@ _WORDS = {
     Reason.SLOW: "slow sweeps", Reason.LOCKED: "narrow count law", Reason.FEW: "locked, short exposure",
     Reason.UNSETTLED: "unsettled", Reason.NEGATIVE: "negative armed", Reason.UNLIKELY: "unlikely count",
     Reason.SHORT: "short exposure", Reason.ECHO: "bright echo", Reason.CELLS: "too many cells",
+    Reason.DEAR: "quicker exactly",
 }  # fmt: skip
 
 
@@ -122,8 +124,13 @@ class Plan:
         return cls(cuts[0].reshape(-1), cuts[1].reshape(-1), cells.reshape(-1), reason.reshape(-1))
 
 
-def sweep_pixels(task: Task, plan: Plan, pixels: IndexArray, sweep: Sweep) -> Rest:
-    """Draw `pixels` (n,) group by group of one grid, those again that ask for laps, and return what is left."""
+def sweep_pixels(
+    task: Task, plan: Plan, pixels: IndexArray, sweep: Sweep, worth: NDArray[np.float64] | None = None
+) -> Rest:
+    """Draw `pixels` (n,) group by group of one grid, those again that ask for laps, and return what is left.
+
+    `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
+    """
     merge, parts, cells = plan.merge[pixels], plan.parts[pixels], plan.cells[pixels]
     status = np.tile(plan.reason[pixels], (task.realizations, 1))
     # lanes go through their sweeps together: neighbours in background need about as many
@@ -143,8 +150,10 @@ def sweep_pixels(task: Task, plan: Plan, pixels: IndexArray, sweep: Sweep) -> Re
     slow = able[status[0, able] >= Reason.LAPS]
     laps = status[0, slow].astype(np.int64) - Reason.LAPS
     large = cells[slow] * laps > MOST_LAP_CELLS
+    dear = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
+    status[:, slow[dear]] = Reason.DEAR
     status[:, slow[large]] = Reason.CELLS
-    draw(slow[~large], laps[~large])
+    draw(slow[~large & ~dear], laps[~large & ~dear])
     return Rest.of(task, pixels, status)
 
 

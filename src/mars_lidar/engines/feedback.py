@@ -90,8 +90,14 @@ class FeedbackEngine(Engine):
         rest = self.sample(replace(task, progress=stage(task.progress, 0.0, share)), out, every, plan)
         draw_rest(ExactEngine(self.level), replace(task, progress=stage(task.progress, share, 1.0)), out, rest)
 
-    def sample(self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64], plan: Plan | None = None) -> Rest:
-        """Fill the rows of `pixels` (n,) and return those that this engine cannot do, whose rows are not filled."""
+    def sample(
+        self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64], plan: Plan | None = None,
+        worth: NDArray[np.float64] | None = None,
+    ) -> Rest:  # fmt: skip
+        """Fill the rows of `pixels` (n,) and return those that this engine cannot do, whose rows are not filled.
+
+        `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
+        """
         if task.system.dead_time_periods == 0.0:
             draw_pixels(PoissonEngine(), task, out, pixels)
             return Rest.of(task, pixels[:0], np.zeros((task.realizations, 0), np.uint8))
@@ -104,4 +110,4 @@ class FeedbackEngine(Engine):
             )  # fmt: skip
             return status
 
-        return sweep_pixels(task, plan or Plan.of(task.flux, task.system), pixels, sweep)
+        return sweep_pixels(task, plan or Plan.of(task.flux, task.system), pixels, sweep, worth)

@@ -10,6 +10,7 @@ import numpy as np
 
 from mars_lidar.estimate.calibration_once import CERTAIN, Watch, fitted
 from mars_lidar.estimate.calibration_result import Calibration, nearest
+from mars_lidar.estimate.departure import SIGNIFICANT, departure_of, too_coarse
 from mars_lidar.estimate.edge import ORDINARY, REACH, Edge, Law, edge_of
 from mars_lidar.estimate.fine_light import fine_light
 from mars_lidar.estimate.hidden import hidden
@@ -17,6 +18,7 @@ from mars_lidar.estimate.intervals import FloatArray, Stream
 from mars_lidar.estimate.jittered import normal_kernel, unblurred
 from mars_lidar.estimate.shortest import FEW, Ages, Underlying, extrapolated, is_sharp, shortest
 from mars_lidar.estimate.stream_summary import Summary
+from mars_lidar.estimate.telling import is_seen
 from mars_lidar.pulse import GaussianPulse, Pulse
 from mars_lidar.statistics import ConvergenceError
 from mars_lidar.statistics.law import registration_pdf
@@ -40,6 +42,7 @@ _HIDES = (
 _PARTS = (0.6, 1.0)  # of it that are tried
 _ALL = 0.98  # of the pulse that may be jitter
 _WIDEST = 0.1  # periods that a jitter may be wide where no pulse limits it
+_OUT_OF_ORDER = 0.3  # of the intervals within the reach of a jitter that may hide
 _STEPS = 30  # of Richardson and Lucy
 
 
@@ -66,12 +69,20 @@ class Unknown:
         first = self._pass(Watch(smallest, max(least, hold or 0.0), told, by="smallest interval"))
         if smallest == 0.0 or self.jitter_ns == 0.0:
             return self._sharp(first)
-        sharp, found = self._blurred(first)
-        if found is not None:
+        sharp, blurred = self._blurred(first)
+        if blurred is not None:
+            return self._checked(blurred)
+        found = self._sharp(first)
+        return self._checked(found) if sharp else replace(found, edge_fits=False, dead_time_error_ns=math.nan)
+
+    def _checked(self, found: Calibration) -> Calibration:
+        """Without an edge where the rate beyond it is not that of the light: it was none, or is not all there is."""
+        if self.jitter_ns is not None or too_coarse(self.stream, found.armed.rate):
             return found
-        return self._sharp(first) if sharp else replace(
-            self._sharp(first), edge_fits=False, dead_time_error_ns=math.nan
-        )
+        scores, _ = departure_of(self.stream, found).first()
+        if np.abs(scores).max(initial=0.0) <= SIGNIFICANT:
+            return found
+        return replace(found, edge_fits=False, dead_time_error_ns=math.nan)
 
     def _pass(self, watch: Watch, near: Calibration | None = None) -> Calibration:
         return fitted(self.stream, self.counted, self.shape, watch, self.returns, near, divided=False)
@@ -84,7 +95,7 @@ class Unknown:
         stream, smallest = self.stream, first.dead_time_ns
         excess = stream.period_ns / max(stream.registrations * _rate_after(stream, first), 1e-300)
         told = self.jitter_ns is not None
-        sigma = first.pulse.sigma_ns if isinstance(first.pulse, GaussianPulse) else _WIDEST * stream.period_ns
+        sigma = min(_width(first), _WIDEST * stream.period_ns)
         dead = max(smallest - excess, 0.0)
         left = hidden(
             self._ages(), self._any_width(first), stream.registrations, dead, 0.0 if told else _ALL * sigma
@@ -95,6 +106,11 @@ class Unknown:
             first, dead_time_ns=dead, dead_time_error_ns=math.hypot(error, stream.unit_ns, first.jitter_ns),
             jitter_limit_ns=0.0 if smallest < limit else limit,
         )  # fmt: skip
+        if not told and CERTAIN * left.jitter_ns > smallest:
+            # a jitter as large as the dead time puts records out of order: with many of them within its reach
+            near = sum(int((dt < CERTAIN * left.jitter_ns).sum()) for dt in stream.intervals())
+            if near > _OUT_OF_ORDER * stream.registrations:
+                return replace(found, edge_fits=False, dead_time_error_ns=math.nan)
         return self._with_hidden(found, min(limit, _ALL * sigma))
 
     def _with_hidden(self, found: Calibration, jitter: float) -> Calibration:
@@ -163,7 +179,7 @@ class Unknown:
         tried: list[tuple[float, float]] = []
         found = first
         for _ in range(_ROUNDS):
-            sigma = found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) else math.inf
+            sigma = _width(found)
             jitter = min(jitter, _ALL * sigma)
             if not (dead > 0.0 and jitter < 1.5 * _WIDEST * period):
                 return None
@@ -186,6 +202,8 @@ class Unknown:
         if edge is None or not _within_pulse(edge, found):
             return None
         found = self._pass(self._watch(edge), found)
+        if found.too_short:
+            return None
         edge = self._edge(ages, found, dead, width, self._uncertain(found, width, ages.clock_ns))
         if edge is None or not edge.fits > ORDINARY:
             return None
@@ -206,6 +224,8 @@ class Unknown:
         if not edge.fits > ORDINARY:
             return None
         found = self._pass(Watch(edge.dead_time_ns, max(edge.dead_time_ns + 2.0 * unit, self.hold_off_ns or 0.0)))
+        if found.too_short:
+            return None
         found = replace(
             found, dead_time_error_ns=math.hypot(edge.dead_time_error_ns, unit), dead_time_by="edge",
             jitter_limit_ns=max(edge.jitter_ns + 2.0 * edge.jitter_error_ns, ages.clock_ns),
@@ -325,8 +345,12 @@ def _is_clock(edge: Edge, ages: Ages) -> bool:
 
 def _within_pulse(edge: Edge, found: Calibration) -> bool:
     """Whether the edge is no wider than the pulse, which holds the jitter."""
-    sigma = found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) else math.inf
-    return edge.jitter_ns - 3.0 * edge.jitter_error_ns < sigma
+    return edge.jitter_ns - 3.0 * edge.jitter_error_ns < _width(found)
+
+
+def _width(found: Calibration) -> float:
+    """Sigma of a Gaussian pulse that is seen, else inf."""
+    return found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) and is_seen(found) else math.inf
 
 
 def _rate_after(stream: Stream, found: Calibration) -> float:

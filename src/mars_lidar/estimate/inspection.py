@@ -11,10 +11,10 @@ from mars_lidar._brief import brief
 from mars_lidar.estimate.armed_time import armed_time
 from mars_lidar.estimate.calibration import Calibration, calibrate
 from mars_lidar.estimate.calibration_once import CERTAIN, Watch, fitted
+from mars_lidar.estimate.departure import departure_of, too_coarse
 from mars_lidar.estimate.intervals import FloatArray, Stream, stream_of
 from mars_lidar.estimate.periodicity import other_period
 from mars_lidar.estimate.recovery import Recovery, recovery_of
-from mars_lidar.estimate.same_phase import same_phase
 from mars_lidar.timestamps import Timestamps
 
 _SURE = 1e-6  # false-alarm probability of what is told
@@ -26,6 +26,7 @@ _GROUPS = 64  # of the period
 _INTERVAL_BINS = 400
 _MOST_CELLS = 2**16  # of the period, for photons that share a unit of the clock
 _TWICE = 2.0  # smallest intervals: a second dead time, of the detector, is at most that of its electronics
+_NARROW = 0.1  # of the dead time: what a jitter that hides may explain
 _SAME_EDGE = 5.0  # standard errors within which a given dead time is that of the edge
 
 
@@ -86,8 +87,8 @@ def inspect(times: Timestamps, *, dead_time_ns: float | None = None) -> Inspecti
     # an edge that jitter has blurred is no recovery: ages are judged from where it is over
     edge = free.dead_time_ns if free.jitter_ns == 0.0 else free.hold_off_ns
     found = recovery_of(stream, kept.rate, edge, max(kept.hold_off_ns, edge))
-    begin = _certain(free)
-    found = replace(found, judged=same_phase(stream, begin, max(float(found.edges_ns[-1]), 2.0 * begin)))
+    judged = None if too_coarse(stream, kept.rate) else departure_of(stream, free)
+    found = replace(found, judged=judged)
     assert free.waveform is not None
     histogram = stream.histogram(free.waveform.size).astype(np.float64)
     reach = max(4.3 * stream.period_ns, free.dead_time_ns + 3.3 * stream.period_ns)
@@ -106,18 +107,15 @@ def _with_jitter(times: Timestamps, stream: Stream, free: Calibration) -> Calibr
     """With the jitter of an edge whose middle is the given dead time, where that is what makes intervals shorter."""
     edge = calibrate(_bare(times), pulse="free")
     off = abs(edge.dead_time_ns - free.dead_time_ns)
-    if edge.jitter_ns == 0.0 or not off < _SAME_EDGE * edge.dead_time_error_ns + stream.unit_ns:
+    if not off < _SAME_EDGE * edge.dead_time_error_ns + stream.unit_ns:
         return free
+    if edge.jitter_ns == 0.0:  # one that hides makes some intervals shorter too
+        reach = CERTAIN * edge.jitter_limit_ns
+        explained = reach < _NARROW * free.dead_time_ns and edge.summary.smallest_ns[0] > free.dead_time_ns - reach
+        return replace(free, too_short=0) if explained else free
     hold = free.dead_time_ns + CERTAIN * edge.jitter_ns
     watch = Watch(free.dead_time_ns, hold, edge.jitter_ns, edge.jitter_error_ns)
     return fitted(stream, free.summary, "free", watch, 1)
-
-
-def _certain(free: Calibration) -> float:
-    """Age, ns, from which on the rate of an ideal pixel depends on the phase alone, with any jitter seen or hidden."""
-    jitter = free.jitter_ns + 2.0 * free.jitter_error_ns if free.jitter_ns else free.jitter_limit_ns
-    first = free.summary.smallest_ns[0] if free.dead_time_by == "smallest interval" else free.dead_time_ns
-    return float(max(free.hold_off_ns, first + CERTAIN * jitter) + 2.0 * free.summary.unit_ns)
 
 
 def _bare(times: Timestamps) -> Timestamps:
@@ -156,7 +154,9 @@ def _problems(
             f"the rate is not constant: {parts.min():,} to {parts.max():,} photons in twentieths of the recording"
         )
     unknown = list(free.unknown)
-    if found.departure_ends_ns > _TWICE * counted.smallest_ns[0]:
+    if found.judged is None:
+        unknown.append("the recovery is not judged: light of a unit of the clock, which runs free, is too bright")
+    elif found.departure_ends_ns > _TWICE * counted.smallest_ns[0]:
         unknown.append(
             f"the rate rises slowly up to {found.departure_ends_ns:.4g} ns after a registration, the shortest of which "
             f"are {counted.smallest_ns[0]:.4g} ns apart: jitter of the size of the dead time, or a slow recovery"
@@ -175,10 +175,10 @@ def _flat(free: Calibration) -> float:
     starts = np.linspace(0, seen.passes.size, groups + 1).astype(int)[:-1]
     observed, passes = np.add.reduceat(seen.registrations, starts), np.add.reduceat(seen.passes, starts)
     expected = passes * (observed.sum() / max(float(passes.sum()), 1e-300))
-    judged = expected >= 5.0
+    judged = (expected >= 5.0) | (observed >= 10.0)
     if int(judged.sum()) < 2:
-        return 1.0
-    square = float(((observed - expected)[judged] ** 2 / expected[judged]).sum())
+        return 0.0
+    square = float(((observed - expected)[judged] ** 2 / np.maximum(expected[judged], 1e-300)).sum())
     return float(chi2.sf(square, int(judged.sum()) - 1))
 
 

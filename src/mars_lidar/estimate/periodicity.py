@@ -14,6 +14,7 @@ _SLOWEST = 0.3  # of the laser's frequency
 _STRONG = 40.0  # times the power of light without a period: one of 2^20 lines by chance at e^-40
 _CLEAR = 4.0  # times as strong as the line at the given period
 _SEED = 2
+_HARMONIC = 1e-3  # probability of lines as strong by chance
 _TRIED = 5000  # lines
 _AROUND = 64  # lines on either side, whose median tells what a dead time makes of light without a period
 
@@ -47,10 +48,22 @@ def other_period(stream: Stream) -> float | None:
     if first is None:
         return None
     first += int(np.argmax(power[first : first + 3]))
-    if abs(first - given) < 1.5:
+    if abs(first - given) < 1.5 or _is_harmonic(power, first, given):
         return None
     around = power[first - 1 : first + 2]
     return float(length * cell / (first + (around[2] - around[0]) / around.sum()))
+
+
+def _is_harmonic(power: FloatArray, line: int, given: float) -> bool:
+    """Whether a line is a multiple of the given frequency, of which there are others: a dead time may weaken those."""
+    from scipy.stats import gamma
+
+    number = round(line / given)
+    if number < 2 or abs(line - number * given) > 1.5:
+        return False
+    lower = [_strongest(power, k * given) / _neighbours(power, round(k * given)) for k in range(1, number)]
+    # the strongest of three lines each
+    return bool(gamma.sf(sum(lower), number - 1) * 3.0 ** (number - 1) < _HARMONIC)
 
 
 def _strongest(power: FloatArray, line: float) -> float:

@@ -33,15 +33,15 @@ def told(found: Calibration, *, edge: bool) -> Calibration:
         lost.update(found.names)
     if not found.edge_fits:
         reasons.append(
-            "dead time, jitter and light are not known: the rate after a registration rises neither at once nor as "
-            "Gaussian jitter makes it rise, of up to an eighth of the dead time and a tenth of the period; give a dead "
-            "time and a hold-off"
+            "dead time, jitter and light are not known: the rate after a registration rises neither at once, for good, "
+            "nor as Gaussian jitter makes it rise, of up to an eighth of the dead time and a tenth of the period; give "
+            "a dead time and a hold-off"
         )
         lost.update(found.names)
     if found.pulse is None:
         reasons += _free(found, lost)
     else:
-        if "sigma_ns" in found.names and not _is_seen(found):
+        if "sigma_ns" in found.names and not is_seen(found):
             reasons.append("no pulse is seen: signal, delay and width are not known")
             lost.update(name for name in found.names if name != "background" and name != "jitter_ns")
             found = _dark(found)
@@ -104,7 +104,7 @@ def _dark(found: Calibration) -> Calibration:
     )
 
 
-def _is_seen(found: Calibration) -> bool:
+def is_seen(found: Calibration) -> bool:
     """Whether the returns are seen, beside a constant light."""
     seen = found.armed
     flat = np.full(seen.passes.size, seen.registrations.sum() / max(float(seen.passes.sum()), 1e-300))

@@ -34,7 +34,7 @@ public:
             }
             if (!some) continue;
             draw_numbers(draw);
-            if (draw == 0) {
+            if (draw == 0) {  // the numbers came with the means, and these with the fewest exposures armed
                 choose_laps(fewest_);
                 for (int i = 0; i < kTeam; ++i) {
                     if (drawing_[i]) status(i, draw) = refused_[i];

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from mars_lidar.estimate import Calibration, Inspection, calibrate, inspect
 from mars_lidar.flux import Flux
 from mars_lidar.pulse import GaussianPulse
 from mars_lidar.simulate import simulate_timestamps
+from mars_lidar.statistics.exposure import thread_count
 from mars_lidar.studies import Tell
 from mars_lidar.system import System
 from mars_lidar.timestamps import Timestamps
@@ -65,7 +67,11 @@ class Ideal:
     def cycles(self) -> int:
         """Laser periods for about so many photons."""
         total = self.signal + self.background
-        rate = total / (1.0 + total * self.dead_ns / self.period_ns)
+        share = self.dead_ns / self.period_ns
+        rate = total / (1.0 + total * share)
+        # of a pulse shorter than the dead time the first photon alone
+        seen = (1.0 - math.exp(-self.signal)) * (1.0 + 4.0 * self.sigma_ns / self.dead_ns)
+        rate = min(rate, seen + self.background / (1.0 + self.background * share))
         return int(min(max(self.photons / rate, 50.0), _MOST_CYCLES))
 
     @property
@@ -208,13 +214,15 @@ def _pulls(ideal: Ideal, seen: Inspection | None, light: Calibration | None) -> 
 
 
 def outcomes(settings: Settings, tell: Tell) -> list[Outcome]:
-    """Of all streams."""
-    found = []
-    for number, ideal in enumerate(drawn(settings.streams, settings.seed, settings.photons)):
-        found.append(outcome(ideal))
-        if number % 20 == 19:
-            alarmed = sum(bool(one.alarms) for one in found)
-            tell(f"streams: {number + 1} of {settings.streams}, {alarmed} false alarms")
+    """Of all streams, one on each processor at a time."""
+    found: list[Outcome] = []
+    every = drawn(settings.streams, settings.seed, settings.photons)
+    with ProcessPoolExecutor(thread_count(None)) as pool:
+        for number, one in enumerate(pool.map(outcome, every, chunksize=2)):
+            found.append(one)
+            if number % 20 == 19:
+                alarmed = sum(bool(one.alarms) for one in found)
+                tell(f"streams: {number + 1} of {settings.streams}, {alarmed} false alarms")
     return found
 
 

@@ -27,7 +27,7 @@ def run(request: Request) -> list[Path]:
     findings = _findings(found, covered)
     for line in findings:
         request.tell(line)
-    spent = time.process_time() - began
+    spent = time.process_time() - began + sum(one.seconds for one in found)
     text = save_text(request.out / "streams.md", _text(settings, found, covered, findings, request.quick, spent))
     return [text, save_csv(request.out / "streams.csv", [_csv_row(one) for one in found])]
 

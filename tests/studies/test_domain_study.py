@@ -211,5 +211,5 @@ def test_quick_form(tmp_path, capsys) -> None:
     assert len(rows) == 60
     assert {row["exact"] for row in rows} <= set(verdict.STATES)
     assert sum(row["exact"] == verdict.VERIFIED for row in rows) > 40
-    for name in ("engines", "laws", "modes"):
+    for name in ("engines", "engines_exposure", "laws", "laws_exposure", "modes"):
         assert 0 < (tmp_path / f"domain_{name}.png").stat().st_size <= MAX_FIGURE_BYTES

@@ -33,35 +33,31 @@ _TITLE = {
 def maps(rows: Sequence[dict[str, Any]], out: Path) -> list[Path]:
     """`rows`: a case each, with a state by subject. Writes the figures; returns their paths."""
     return [
-        _map(rows, ENGINES, ("S", "dead"), out / "domain_engines.png", ("B", "cycles")),
-        _map(rows, LAWS[:5], ("S", "dead"), out / "domain_laws.png", ("cycles", "bins")),
+        _map(rows, ENGINES, "S", "dead", out / "domain_engines.png"),
+        _map(rows, ENGINES, "B", "cycles", out / "domain_engines_exposure.png"),
+        _map(rows, LAWS[:5], "S", "dead", out / "domain_laws.png"),
+        _map(rows, LAWS[:5], "cycles", "bins", out / "domain_laws_exposure.png"),
         _modes(rows, out / "domain_modes.png"),
     ]
 
 
-def _map(
-    rows: Sequence[dict[str, Any]], subjects: Sequence[str], first: tuple[str, str], path: Path, second: tuple[str, str]
-) -> Path:
-    """Two scatter plots for each subject: one row over `first`, one over `second`."""
-    figure, axes = panels(3.9, 2, len(subjects))
-    for column, subject in enumerate(subjects):
-        for line, (x, y) in enumerate((first, second)):
-            ax = axes[line, column]
-            for state in _INK:
-                some = [row for row in rows if row.get(subject) == state]
-                if some:
-                    at = [[max(float(row[key]), _LEAST.get(key, 1.0)) for row in some] for key in (x, y)]
-                    bad = state == FAILED
-                    ax.scatter(*at, s=14 if bad else 2.5, marker="x" if bad else "o", c=_INK[state],
-                               lw=0.9 if bad else 0,
-                               zorder=3 if bad else 1 + (state == SLOW), rasterized=True)  # fmt: skip
-            ax.set(xscale="log", yscale="log", xlabel=_TITLE[x])
-            ax.tick_params(labelsize=6, which="both")
-            ax.xaxis.label.set_size(7)
-            if column == 0:
-                ax.set_ylabel(_TITLE[y], fontsize=7)
-            if line == 0:
-                ax.set_title(subject, fontsize=8)
+def _map(rows: Sequence[dict[str, Any]], subjects: Sequence[str], x: str, y: str, path: Path) -> Path:
+    """A scatter plot for each subject, over two quantities."""
+    figure, axes = panels(2.3, 1, len(subjects))
+    for ax, subject in zip(axes[0], subjects, strict=True):
+        for state, ink in _INK.items():
+            some = [row for row in rows if row.get(subject) == state]
+            if some:
+                at = [[max(float(row[key]), _LEAST.get(key, 1.0)) for row in some] for key in (x, y)]
+                if state == FAILED:
+                    ax.scatter(*at, s=14, marker="x", c=ink, lw=0.9, zorder=3)
+                else:
+                    ax.scatter(*at, s=2.5, marker="o", c=ink, lw=0, zorder=1 + (state == SLOW))
+        ax.set(xscale="log", yscale="log")
+        ax.set_xlabel(_TITLE[x], fontsize=7)
+        ax.set_title(subject, fontsize=8)
+        ax.tick_params(labelsize=6, which="both")
+    axes[0, 0].set_ylabel(_TITLE[y], fontsize=7)
     _legend(figure)
     return save_figure(path, figure)
 

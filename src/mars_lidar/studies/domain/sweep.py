@@ -105,6 +105,9 @@ def judge_case(case: Case, settings: Settings, watched: Watched, seed: int) -> J
         level = second_level(settings.checks)
         seen = {(c.a, c.b, c.what): c for outcome in again for c in outcome.checks}
         for check in suspects:
+            if check.a == check.b:  # what must hold of every registration: no chance is in it
+                failing.append(check)
+                continue
             found = seen.get((check.a, check.b, check.what))
             if found is None:  # not made a second time: kept only where no chance is in it
                 failing += [check] if check.p == 0.0 else []

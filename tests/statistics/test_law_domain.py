@@ -376,5 +376,5 @@ def test_pulses_narrower_than_the_grids_resolve_are_refused(delay_ns: float) -> 
     count = 1000 / 2 + 1 / 8  # one photon in a dead time of one period, from an armed start
     assert mean == pytest.approx([count / 2, count / 2] if delay_ns == 0.0 else [count, 0.0], rel=1e-3, abs=1e-3)
     narrow = system.replace(pulse=ml.GaussianPulse(sigma_ns=1e-4))
-    with pytest.raises(ValueError, match="sigma_ns must be at least 1e-05 of the period.*engine 'exact'"):
+    with pytest.raises(ValueError, match=r"sigma_ns must be at least 1e-05 of the period.*engine 'exact'"):
         ml.statistics.mean_histogram(1.0, 1e-6, narrow, delay_ns=delay_ns)

@@ -101,7 +101,8 @@ class Cells:
         if isinstance(pulse, GaussianPulse) and pulse.sigma_ns < NARROWEST * system.period_ns and (total > 0).any():
             raise ValueError(
                 f"the pulse's sigma_ns must be at least {NARROWEST:g} of the period ({NARROWEST * system.period_ns:g} "
-                f"ns) for {what}, got {pulse.sigma_ns:g}: give a pulse of that width, or simulate it with engine 'exact'"
+                f"ns) for {what}, got {pulse.sigma_ns:g}; give a pulse of that width, or simulate it with engine "
+                "'exact'"
             )
         given = _reals("delay_ns", 0.5 * system.period_ns if delay_ns is None else delay_ns)
         total, back, delay = _broadcast(("signal", "background", "delay_ns"), total, back, given)

@@ -258,7 +258,7 @@ def test_laws_answer_or_say_what_to_use(name: str, prediction: str) -> None:
 
 
 def test_shape_of_the_narrowest_pulse_on_an_edge() -> None:
-    """sigma of a millionth of a period, on a bin's edge: the shape was 5 % off; refused, and right at ten millionths."""
+    """sigma of a millionth of a period, on a bin's edge: 5 % off before; refused, and right from ten millionths on."""
     with pytest.raises(ValueError, match=r"sigma_ns must be at least 1e-05 of the period"):
         ml.registration_pdf(1.0, 1e-6, _system(1.0, 1e-6, 2, 1000), "stationary", delay_ns=0.0)
     shape = ml.registration_pdf(1.0, 1e-6, _system(1.0, 1e-5, 2, 1000), "stationary", delay_ns=0.0)

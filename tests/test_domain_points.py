@@ -274,7 +274,6 @@ def test_sum_of_a_paralyzable_histogram_with_steps() -> None:
     assert total == pytest.approx(float(law.mean), rel=5e-6)
 
 
-@pytest.mark.xfail(strict=True, reason="a phase within 2^-25 of the end of a period rounds to it")
 def test_no_time_at_the_end_of_the_exposure() -> None:
     """Half of the narrowest pulse comes just before the end of a period: its times are still below it."""
     system = _system(1e-6, 1e-6, 2, 1)

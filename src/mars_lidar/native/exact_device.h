@@ -135,7 +135,7 @@ public:
         : task_(task), next_(task.offsets[item]) {}
     MARS_INLINE void take(const Registration& r, int32_t bin) {
         if (r.lost) return;
-        task_.times[next_] = static_cast<double>(r.cycle) + static_cast<double>(r.phase);
+        task_.times[next_] = registration_time(r.cycle, r.phase);
         task_.cycles[next_] = r.cycle;
         task_.bins[next_] = bin;
         ++next_;

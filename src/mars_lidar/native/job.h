@@ -61,4 +61,11 @@ struct Job {
     int64_t pixel(int64_t item) const { return item % pixels; }
 };
 
+// Time of a registration, in periods. A phase within 2^-25 of the end of its period is rounded to 1 in float32; it is
+// below.
+inline double registration_time(int32_t cycle, float phase) {
+    const double exact = static_cast<double>(phase);
+    return static_cast<double>(cycle) + (exact < 1.0 ? exact : 1.0 - 0x1p-25);
+}
+
 }  // namespace mars

@@ -127,7 +127,7 @@ private:
             if (bin_[k][lane] < 0) continue;
             const int64_t record = next_[lane]++;
             const int32_t cycle = round_exposure(cycle_[k][lane], cycles_);
-            output_.times[record] = static_cast<double>(cycle) + static_cast<double>(phase_[k][lane]);
+            output_.times[record] = registration_time(cycle, phase_[k][lane]);
             output_.cycles[record] = cycle;
             output_.bins[record] = bin_[k][lane];
         }

@@ -35,7 +35,7 @@ _SETTLED = 1e-12  # relative change of the state per period (20)
 
 
 NARROWEST = 1e-5
-"""Width of a Gaussian pulse, in periods, below which the laws' grids do not resolve it; right from there on."""
+"""Width of a Gaussian pulse, in periods, below which the grids of laws under dead time do not resolve it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,8 @@ class Cells:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
         total = _photons("signal", signal) * share
         pulse = system.pulse
-        if isinstance(pulse, GaussianPulse) and pulse.sigma_ns < NARROWEST * system.period_ns and (total > 0).any():
+        blind = system.dead_time_periods > 0.0
+        if blind and isinstance(pulse, GaussianPulse) and pulse.sigma_ns < NARROWEST * system.period_ns and total.any():
             raise ValueError(
                 f"the pulse's sigma_ns must be at least {NARROWEST:g} of the period ({NARROWEST * system.period_ns:g} "
                 f"ns) for {what}, got {pulse.sigma_ns:g}; give a pulse of that width, or simulate it with engine "

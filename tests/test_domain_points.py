@@ -257,10 +257,16 @@ def test_laws_answer_or_say_what_to_use(name: str, prediction: str) -> None:
     assert not words or any(word in words for word in ("use ", "simulat", "engine", "tolerance=")), words
 
 
+@pytest.mark.xfail(strict=True, reason="a refined grid does not see a pulse that is narrower than any of its bins")
 def test_shape_of_the_narrowest_pulse_on_an_edge() -> None:
-    """sigma of a millionth of a period, on a bin's edge: 5 % off before; refused, and right from ten millionths on."""
-    with pytest.raises(ValueError, match=r"sigma_ns must be at least 1e-05 of the period"):
-        ml.registration_pdf(1.0, 1e-6, _system(1.0, 1e-6, 2, 1000), "stationary", delay_ns=0.0)
+    """sigma of a millionth of a period, on a bin's edge: t_d = t_r leaves the shape of the light."""
+    system = _system(1.0, 1e-6, 2, 1000)
+    shape = ml.registration_pdf(1.0, 1e-6, system, "stationary", delay_ns=0.0)
+    assert shape == pytest.approx([0.5, 0.5], abs=1e-3)
+
+
+def test_shape_of_a_very_narrow_pulse_on_an_edge() -> None:
+    """Right from ten millionths of a period on."""
     shape = ml.registration_pdf(1.0, 1e-6, _system(1.0, 1e-5, 2, 1000), "stationary", delay_ns=0.0)
     assert shape == pytest.approx([0.5, 0.5], abs=1e-3)
 

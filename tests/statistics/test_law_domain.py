@@ -363,18 +363,3 @@ def test_random_systems(first: int):
                     unhelpful.append(f"{name}: {refusal}")
         assert not unhelpful, f"{drawn}: {unhelpful}"
         assert not disagreements(drawn, values), f"{drawn}: {disagreements(drawn, values)}"
-
-
-@pytest.mark.parametrize("delay_ns", [0.0, 25.0, 30.0])
-def test_pulses_narrower_than_the_grids_resolve_are_refused(delay_ns: float) -> None:
-    """Right at 1e-5 of a period; at 1e-6 the mean histogram was 10 % off without a word."""
-    system = ml.System(
-        period_ns=100.0, cycles=1000, bins=2, pulse=ml.GaussianPulse(sigma_ns=1e-3),
-        detector=ml.Detector(dead_time_ns=100.0),
-    )  # fmt: skip
-    mean = ml.statistics.mean_histogram(1.0, 1e-6, system, delay_ns=delay_ns)
-    count = 1000 / 2 + 1 / 8  # one photon in a dead time of one period, from an armed start
-    assert mean == pytest.approx([count / 2, count / 2] if delay_ns == 0.0 else [count, 0.0], rel=1e-3, abs=1e-3)
-    narrow = system.replace(pulse=ml.GaussianPulse(sigma_ns=1e-4))
-    with pytest.raises(ValueError, match=r"sigma_ns must be at least 1e-05 of the period.*engine 'exact'"):
-        ml.statistics.mean_histogram(1.0, 1e-6, narrow, delay_ns=delay_ns)

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar.detector import Mode
 from mars_lidar.effects import LIGHT_EFFECTS
-from mars_lidar.pulse import GaussianPulse
 from mars_lidar.statistics._gate import PLAIN, photons_before, require_mode
 from mars_lidar.system import System
 
@@ -32,10 +31,6 @@ _WARM_PERIODS = 400  # sweeps for a warm state; beyond, an equation is solved (_
 _CHUNK_BYTES = 64 << 20
 _MAX_HISTORY_BYTES = 1 << 30  # for each thread
 _SETTLED = 1e-12  # relative change of the state per period (20)
-
-
-NARROWEST = 1e-5
-"""Width of a Gaussian pulse, in periods, below which the grids of laws under dead time do not resolve it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +92,6 @@ class Cells:
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
         total = _photons("signal", signal) * share
-        pulse = system.pulse
-        blind = system.dead_time_periods > 0.0
-        if blind and isinstance(pulse, GaussianPulse) and pulse.sigma_ns < NARROWEST * system.period_ns and total.any():
-            raise ValueError(
-                f"the pulse's sigma_ns must be at least {NARROWEST:g} of the period ({NARROWEST * system.period_ns:g} "
-                f"ns) for {what}, got {pulse.sigma_ns:g}; give a pulse of that width, or simulate it with engine "
-                "'exact'"
-            )
         given = _reals("delay_ns", 0.5 * system.period_ns if delay_ns is None else delay_ns)
         total, back, delay = _broadcast(("signal", "background", "delay_ns"), total, back, given)
         bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (total == 0))

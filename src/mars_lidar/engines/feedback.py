@@ -35,7 +35,7 @@ class FeedbackEngine(Engine):
     Pixels that it cannot do are given to the exact engine, by a rule on the pixel and the system alone: exposures
     below 100 dead times, sweeps that contract too slowly (about eight or more background photons per dead time),
     counts that hardly vary under a dead time of more than a period, pulses that meet their own echo after whole
-    periods (bright, or below 1000 dead times), locked pixels below 1e5 periods, more than 65,536 internal cells.
+    periods (bright, or below 1000 dead times), locked pixels below 1e4 periods, more than 65,536 internal cells.
     Every drawn exposure is checked before it is written: its history must agree with itself, arm no negative number
     of exposures, and have a count that its law allows; else that exposure is drawn by the exact engine. Without dead
     time the bins are independent Poisson numbers.

@@ -66,4 +66,3 @@ def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[n
         rows = np.empty((part.items, task.system.bins), out.dtype)
         engine.histogram(part, rows)
         cube[first : first + number, some] = rows.reshape(number, some.size, task.system.bins)
-

@@ -303,7 +303,7 @@ def _characteristic(
     else:
         energy, row = cells.energies(bins)
         photons, flat = cells.native_flux
-        arrays = {"signal": photons, "background": flat, "shape": row}
+        arrays: dict[str, Any] = {"signal": photons, "background": flat, "shape": row}
         _core.exposure_characteristic(grid=grid, shapes=energy, **arrays, **points)
         cold = np.flatnonzero((settled == NOT_WARM).any(-1))
         if cold.size:

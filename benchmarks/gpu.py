@@ -15,10 +15,10 @@ import numpy as np
 
 import mars_lidar as ml
 from benchmarks.gpu_resources import MEMORY_BYTES_PER_S
+from mars_lidar.cuda.exact import exact_histogram
+from mars_lidar.cuda.machine import cupy_with_device
 from mars_lidar.engines import Engine, find_engine
-from mars_lidar.engines.base import Task
-from mars_lidar.gpu.exact import exact_histogram
-from mars_lidar.gpu.machine import cupy_with_device
+from mars_lidar.engines.engine import Task
 from mars_lidar.simulate import _task
 from mars_lidar.table import Table
 

@@ -1,4 +1,4 @@
-"""What the kernels of `mars_lidar.gpu` take, from compiling them without a GPU: `python -m benchmarks.gpu_resources`.
+"""What the kernels of `mars_lidar.cuda` take, from compiling them without a GPU: `python -m benchmarks.gpu_resources`.
 
 Writes benchmarks/results/gpu-resources.md.
 """
@@ -10,9 +10,7 @@ from pathlib import Path
 
 from benchmarks.nvrtc import Resources, compiled, compiled_code, version
 from mars_lidar import _core
-from mars_lidar.detector import Detector
-from mars_lidar.engines._alignment import pulse_frame
-from mars_lidar.gpu.kernels import (
+from mars_lidar.cuda.kernels import (
     AHEAD,
     MARS_LAWS,
     Kernel,
@@ -23,9 +21,11 @@ from mars_lidar.gpu.kernels import (
     mars_histograms,
     source,
 )
-from mars_lidar.gpu.mars import LANES
-from mars_lidar.pulse import GaussianPulse
-from mars_lidar.system import System
+from mars_lidar.cuda.mars import LANES
+from mars_lidar.engines.alignment import pulse_frame
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import System
 
 RESULT = Path(__file__).parent / "results" / "gpu-resources.md"
 MODES = ("non-paralyzable", "paralyzable", "synchronous", "gated")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import mars_lidar as ml
 from benchmarks.config import Config
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.base import Task
+from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 
 PERIOD_NS = 1e3 / 7.5

@@ -8,10 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
-from typer.testing import CliRunner
-
-import mars_lidar as ml
 from harness import (
     COUNTS,
     INTERVALS,
@@ -27,12 +23,16 @@ from harness import (
     two_mean_vectors,
     waveform_flux,
 )
+from scipy import stats
+from test_reproducibility import image
+from typer.testing import CliRunner
+
+import mars_lidar as ml
 from mars_lidar import _core, io, statistics
 from mars_lidar.cli import app
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.statistics import constant_light_rate
-from test_reproducibility import image
 
 EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
 BOTH = ["exact", "sequential"]

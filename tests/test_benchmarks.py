@@ -16,7 +16,6 @@ from benchmarks.config import Config
 from benchmarks.floor import LANES, Bandwidth, measured_clock, nominal_clock, operations
 from benchmarks.report import Goal, Section, table
 from benchmarks.timing import Timing, in_turn
-
 from mars_lidar import _core
 
 TINY = Config(

@@ -360,10 +360,6 @@ def test_help_flows(monkeypatch):
     assert "opens a .zarr with named dimensions and units" in run("simulate", "--help").output
 
 
-def test_the_studies_help_names_the_command():
-    assert "usage: mars-lidar study" in CliRunner().invoke(app, ["study", "--help"]).output
-
-
 def test_a_pipe_without_unicode_gets_plain_text(tmp_path):
     out = tmp_path / "a.zarr"
     assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0

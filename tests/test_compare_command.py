@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from mars_lidar.cli import app
 from mars_lidar.cli.compare_tables import cell, with_error
-from mars_lidar.studies.compare_sample import Estimate
+from mars_lidar.compare.sample import Estimate
 
 SMALL = ["--scene", "room", "--size", "12", "--cycles", "50", "--bins", "64"]
 SMALL += ["--realizations", "300", "--budget-s", "600"]

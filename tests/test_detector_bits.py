@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_reproducibility import SHAPE, drawn, image
 from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import _core, io
 from mars_lidar.cli import app
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.base import Engine, Task
+from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.plot.data import predicted_counts
-from test_reproducibility import SHAPE, drawn, image
 
 GATE = {"mode": "gated", "gate_start_ns": 83.0, "gate_width_ns": 31.0}
 MOVING = GATE | {"gate_step_ns": -7.3, "gate_cycles": 3}

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
-
 from harness import (
     COUNTS,
     INTERVALS,
@@ -24,9 +22,11 @@ from harness import (
     two_lobes,
     waveform_flux,
 )
+from scipy import stats
+
 from mars_lidar import Detector, GaussianPulse, SampledPulse, System
-from mars_lidar.detector import MODES
 from mars_lidar.engines import ENGINES
+from mars_lidar.instrument.detector import MODES
 from mars_lidar.statistics import count_law, exposure_moments
 
 EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}

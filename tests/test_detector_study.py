@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 
+from harness import require
 from scipy import stats
 
-from harness import require
-from mars_lidar.studies import detectors
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.report import MAX_FIGURE_BYTES
+from studies import detectors
+from studies.__main__ import main
+from studies.report import MAX_FIGURE_BYTES
 
 
 def test_quick(tmp_path):

@@ -1,6 +1,6 @@
 """Points of the declared domain where numbers were once wrong, or an exception told nobody what to do; by name.
 
-Found by the study "domain" (`mars_lidar.studies.domain`) and by hand. Each stays here with the engine or the prediction
+Found by the study "domain" (`studies.domain`) and by hand. Each stays here with the engine or the prediction
 that failed, whatever became of it since: right numbers, or pixels given to another engine.
 """
 
@@ -13,9 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import special, stats
-
-import mars_lidar as ml
 from harness import (
     COUNTS,
     JOINT,
@@ -31,10 +28,13 @@ from harness import (
     waveform_flux,
 )  # fmt: skip
 from harness.pvalues import variance_score
+from scipy import special, stats
+
+import mars_lidar as ml
 from mars_lidar.engines import ENGINES
-from mars_lidar.studies.domain import simulator
-from mars_lidar.studies.domain.case import Case as Pixel
-from mars_lidar.studies.domain.systems import draw
+from studies.domain import simulator
+from studies.domain.case import Case as Pixel
+from studies.domain.systems import draw
 
 
 def _system(dead: float, sigma: float, bins: int, cycles: int, start: str = "armed") -> ml.System:

@@ -8,9 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
-
-import mars_lidar as ml
 from harness import (
     COUNTS,
     INTERVALS,
@@ -27,9 +24,12 @@ from harness import (
     task_of,
     waveform_flux,
 )
+from scipy import stats
+
+import mars_lidar as ml
 from mars_lidar import Detector, GaussianPulse, Jitter, SampledJitter, System, _core
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.base import Records
+from mars_lidar.engines.engine import Records
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.statistics import electronics_moments, mean_histogram
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from mars_lidar.studies import effects
-from mars_lidar.studies.__main__ import main
+from studies import effects
+from studies.__main__ import main
 
 
 def test_quick_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

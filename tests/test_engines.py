@@ -9,8 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import stats
-
 from harness import (
     COUNTS,
     INTERVALS,
@@ -36,6 +34,8 @@ from harness import (
     two_mean_vectors,
     waveform_flux,
 )
+from scipy import stats
+
 from mars_lidar import Detector, GaussianPulse, SampledPulse, System
 from mars_lidar.engines import ANY_SYSTEM, ENGINES
 

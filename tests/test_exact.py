@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
-
-import mars_lidar as ml
 from harness import (
     COUNTS,
     INTERVALS,
@@ -21,9 +18,12 @@ from harness import (
     require,
     two_lobes,
 )
+from scipy import stats
+
+import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.engines import ENGINES
-from mars_lidar.system import _MAX_CYCLES
+from mars_lidar.instrument.system import _MAX_CYCLES
 
 GAUSSIAN = ml.GaussianPulse(sigma_ns=1.0)
 EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import first_arrival, goodness, require
 from numpy.typing import NDArray
 from scipy import special, stats
 
 import mars_lidar as ml
-from harness import first_arrival, goodness, require
 
 PERIOD = 100.0
 DELAY = 50.003  # ns; see test_exact_tails.py

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import special, stats
-
-import mars_lidar as ml
 from harness import (
     COUNTS,
     INTERVALS,
@@ -22,6 +19,9 @@ from harness import (
     same_law,
     two_lobes,
 )  # fmt: skip
+from scipy import special, stats
+
+import mars_lidar as ml
 from mars_lidar.engines import ENGINES
 
 EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}

@@ -9,7 +9,7 @@ import pytest
 from scipy import integrate, special
 
 import mars_lidar as ml
-from mars_lidar.studies.__main__ import main
+from studies.__main__ import main
 
 C = 0.299792458
 SYSTEM = ml.System(

@@ -11,9 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy import stats
-
 from harness import (
     COUNTS,
     INTERVALS,
@@ -40,9 +37,12 @@ from harness import (
 )
 from harness.pvalues import merge, variance_score
 from harness.sample import draw
+from numpy.typing import NDArray
+from scipy import stats
+
 from mars_lidar import Detector, Flux, GaussianPulse, System, count_law
 from mars_lidar.engines import ENGINES, Engine
-from mars_lidar.engines.base import Records, Task
+from mars_lidar.engines.engine import Records, Task
 
 EXACT = ENGINES["exact"]
 EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of
 
 import mars_lidar as ml
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import count_law, exposure_moments
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from native_jobs import Case, chi_square, gaussian_energy, z_to_p
 from scipy import stats
 
 from mars_lidar import _core
-from native_jobs import Case, chi_square, gaussian_energy, z_to_p
 
 ALPHA = 8e-7
 IMAGE = Case(signal=[0.0, 0.3, 2.0, 900.0], background=[0.2, 0.0, 1.0, 1000.0], delay=[0.1, -3.4, 0.999, 7.5])

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from native_jobs import Case, chi_square, gaussian_energy, z_to_p
 from scipy import integrate, special, stats
 
 from mars_lidar import _core
-from native_jobs import Case, chi_square, gaussian_energy, z_to_p
 
 ALPHA = 5e-8
 REFERENCE = Path(__file__).parents[2] / "shared" / "reference"

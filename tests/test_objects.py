@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar import estimate, io, statistics
-from mars_lidar._brief import brief
+from mars_lidar import io, statistics
+from mars_lidar._base.brief import brief
+from mars_lidar.calibrate import inspect
 from mars_lidar.engines import MarsEngine
+from mars_lidar.reconstruct import HistogramBound
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=200, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=40.0)
@@ -52,7 +54,7 @@ def objects(tmp_path_factory) -> dict[str, Any]:
         "reconstruction": ml.reconstruct(cube, SYSTEM),
         "calibration": light,
         "validation": ml.validate(times, light, cycles=200),
-        "inspection": estimate.inspect(times),
+        "inspection": inspect(times),
         "table": table,
         "lookup": table.lookup(np.array([0.5]), np.array([0.5])),
         "engine": MarsEngine(table=table, count="matched"),
@@ -73,7 +75,7 @@ def test_only_what_was_set_is_shown():
     assert repr(ml.Detector(dead_time_ns=40.0)) == "Detector(dead_time_ns=40.0)"
     assert repr(ml.Detector(dead_time_ns=40.0, dark_count_hz=5.0)) == "Detector(dead_time_ns=40.0, dark_count_hz=5.0)"
     assert eval(repr(SYSTEM), vars(ml)) == SYSTEM  # a system can be copied from a notebook
-    bound = estimate.HistogramBound(np.zeros((3, 3)), np.float64(1.0), np.ones(2), np.ones(5), np.ones(0))
+    bound = HistogramBound(np.zeros((3, 3)), np.float64(1.0), np.ones(2), np.ones(5), np.ones(0))
     assert brief(bound) == (
         "HistogramBound(information=<float64 (3, 3)>, signal=1.0, background=[1., 1.], "
         "delay_ns=<float64 (5,)>, depth_m=[])"

@@ -8,11 +8,11 @@ import sys
 import matplotlib as mpl
 import numpy as np
 import pytest
+from harness.ledger import rejected, require
+from harness.pvalues import mean_vector
 from matplotlib.figure import Figure
 
 import mars_lidar as ml
-from harness.ledger import rejected, require
-from harness.pvalues import mean_vector
 from mars_lidar import io, plot
 from mars_lidar.plot import data
 

@@ -6,11 +6,11 @@ import pickle
 
 import numpy as np
 import pytest
+from harness import measured_pulse, two_lobes
 from scipy import integrate, stats
 
 import mars_lidar as ml
-from harness import measured_pulse, two_lobes
-from mars_lidar.pulse import pulse_from_dict
+from mars_lidar.instrument.pulse import pulse_from_dict
 
 RECORD = np.array([0.0, 3.0, 9.0, 4.0, 0.0, 0.0, 1.0, 2.0, 0.0])
 PULSES = {

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from mars_lidar.raycast import Box, Camera, Sphere, cast
-from mars_lidar.scene import Scene
+from mars_lidar.scene.raycast import Box, Camera, Sphere, cast
+from mars_lidar.scene.scene import Scene
 
 
 def white(u, v):

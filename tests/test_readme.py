@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from benchmarks import readme
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -13,14 +13,14 @@ from typer.testing import CliRunner
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.cli import app
-from mars_lidar.estimate import METHODS
-from mars_lidar.estimate import stored as stored_module
-from mars_lidar.estimate.quality import map_error
-from mars_lidar.estimate.stored import reconstruct_stored
 from mars_lidar.io import recipe as recipes
 from mars_lidar.io.maps import load_maps
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.report import MAX_FIGURE_BYTES
+from mars_lidar.reconstruct import METHODS
+from mars_lidar.reconstruct import stored as stored_module
+from mars_lidar.reconstruct.quality import map_error
+from mars_lidar.reconstruct.stored import reconstruct_stored
+from studies.__main__ import main
+from studies.report import MAX_FIGURE_BYTES
 
 SMALL = ("--size", 12, "--cycles", 300, "--bins", 256, "--signal", 2)
 

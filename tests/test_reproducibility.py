@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.engines import ANY_SYSTEM
-from mars_lidar.engines.base import Records, Task
+from mars_lidar.engines.engine import Records, Task
 from mars_lidar.engines.exact import ExactEngine
 
 SHAPE = (6, 11)  # not a multiple of any number of lanes

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mars_lidar.pulse import GaussianPulse
-from mars_lidar.scene import Scene
-from mars_lidar.system import SPEED_OF_LIGHT_M_PER_NS, Detector, System
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, Detector, System
+from mars_lidar.scene.scene import Scene
 
 NAN = math.nan
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar import _memory
+from mars_lidar._base import memory as _memory
 from mars_lidar.engines import ANY_SYSTEM, ENGINES
-from mars_lidar.engines.base import Task
+from mars_lidar.engines.engine import Task
 
 
 @pytest.mark.parametrize("engine", ANY_SYSTEM)

@@ -12,10 +12,10 @@ from scipy import stats
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, count_law
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.studies import STUDIES, Request, covariance, covariance_findings, law, law_report, modes
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.distance import Pmf, g_test, sampling_floor, total_variation, variance_score
-from mars_lidar.studies.report import MAX_FIGURE_BYTES, table
+from mars_lidar.statistics.distance import Pmf, g_test, sampling_floor, total_variation, variance_score
+from studies import STUDIES, Request, covariance, covariance_findings, law, law_report, modes
+from studies.__main__ import main
+from studies.report import MAX_FIGURE_BYTES, table
 
 
 def read_csv(path):

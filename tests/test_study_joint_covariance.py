@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 
 import pytest
+from harness import require
 from scipy import stats
 
-from harness import require
-from mars_lidar.studies import joint_covariance_report
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.joint_covariance import QUICK, random_systems
-from mars_lidar.studies.report import MAX_FIGURE_BYTES
+from studies import joint_covariance_report
+from studies.__main__ import main
+from studies.joint_covariance import QUICK, random_systems
+from studies.report import MAX_FIGURE_BYTES
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,11 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from harness import ledger
 
 import mars_lidar as ml
-from harness import ledger
 from mars_lidar import io
-from mars_lidar.transient import Transient
+from mars_lidar.light.transient import Transient
 
 C = 0.299792458
 SYSTEM = ml.System(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from harness import COUNTS, SHAPE, Case, Law, check, first_arrival, require, waveform_flux
 from scipy import stats
 
 import mars_lidar as ml
-from harness import COUNTS, SHAPE, Case, Law, check, first_arrival, require, waveform_flux
 from mars_lidar import _core
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines.base import Records, Task
+from mars_lidar.engines.engine import Records, Task
 from mars_lidar.engines.exact import ExactEngine
 
 

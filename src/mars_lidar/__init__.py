@@ -3,14 +3,17 @@
 from typing import TYPE_CHECKING
 
 from mars_lidar._version import __version__
-from mars_lidar.avalanches import Afterpulsing, Crosstalk
-from mars_lidar.dark_counts import dark_count_map
+from mars_lidar.calibrate import Calibration, Validation, calibrate, validate
 from mars_lidar.dataset.run import Generated, generate
-from mars_lidar.effects import Jitter, SampledJitter
-from mars_lidar.estimate import Calibration, Reconstruction, Validation, calibrate, cramer_rao, reconstruct, validate
-from mars_lidar.flux import Flux
-from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
-from mars_lidar.scene import Scene
+from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
+from mars_lidar.instrument.dark_counts import dark_count_map
+from mars_lidar.instrument.effects import Jitter, SampledJitter
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
+from mars_lidar.instrument.system import Detector, System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.timestamps import Timestamps
+from mars_lidar.reconstruct import Reconstruction, cramer_rao, reconstruct
+from mars_lidar.scene.scene import Scene
 from mars_lidar.simulate import simulate, simulate_timestamps
 from mars_lidar.statistics import (
     CountLaw,
@@ -20,9 +23,7 @@ from mars_lidar.statistics import (
     joint_law,
     registration_pdf,
 )
-from mars_lidar.system import Detector, System
 from mars_lidar.table import Lookup, QuantisationError, Table
-from mars_lidar.timestamps import Timestamps
 
 __all__ = [
     "Afterpulsing",

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._memory import check_memory
+from mars_lidar._base import checks
+from mars_lidar._base.memory import check_memory
 from mars_lidar.engines import Engine, find_engine
-from mars_lidar.engines.base import Progress, Records, Task
-from mars_lidar.flux import Flux
-from mars_lidar.stored_flux import StoredFlux
-from mars_lidar.system import System
-from mars_lidar.timestamps import Timestamps
+from mars_lidar.engines.engine import Progress, Records, Task
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.timestamps import Timestamps
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -107,7 +107,7 @@ def simulate(
         flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress
     )
     shape = (task.realizations, *flux.shape, system.bins)
-    if _validate.choice("device", device, ("cpu", "cuda")) == "cuda":
+    if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
         there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
         if report is not None:
             report.update(task.report)
@@ -150,9 +150,9 @@ def simulate_timestamps(
     task = _task(
         flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization"
     )
-    if _validate.choice("device", device, ("cpu", "cuda")) == "cuda":
+    if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
         drawn_by.check_device(device, task.flux, task.system)
-        from mars_lidar.gpu import exact_records
+        from mars_lidar.cuda import exact_records
 
         records = exact_records(task)
     else:
@@ -178,7 +178,7 @@ def simulate_timestamps(
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:
     engine.check_device("cuda", task.flux, task.system)
-    from mars_lidar.gpu.machine import cupy_with_device
+    from mars_lidar.cuda.machine import cupy_with_device
 
     cupy = cupy_with_device()
     dtype = task.system.histogram_dtype
@@ -212,10 +212,10 @@ def _task(
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     if isinstance(flux, StoredFlux):
         flux = flux[:]  # whole, or a MemoryError that says so
-    first = _validate.integer(first_name, first_realization, low=0, high=2**32 - 1)
-    number = _validate.integer("realizations", realizations, low=1, high=2**32 - first)
-    _validate.integer("seed", seed, low=0, high=2**64 - 1)
-    team = _default_threads() if threads is None else _validate.integer("threads", threads, low=1, high=1024)
+    first = checks.integer(first_name, first_realization, low=0, high=2**32 - 1)
+    number = checks.integer("realizations", realizations, low=1, high=2**32 - first)
+    checks.integer("seed", seed, low=0, high=2**64 - 1)
+    team = _default_threads() if threads is None else checks.integer("threads", threads, low=1, high=1024)
     if progress is not None and not callable(progress):
         raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
     if len(flux.returns_signal) > 16:

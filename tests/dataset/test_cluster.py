@@ -8,9 +8,9 @@ import warnings
 
 import distributed
 import pytest
+from dataset.conftest import files
 
 import mars_lidar as ml
-from dataset.conftest import files
 from mars_lidar import io
 
 pytestmark = pytest.mark.filterwarnings("default")  # what dask warns of when its workers die is its own

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from dataset.conftest import SYSTEM, files
 from typer.testing import CliRunner
 
 import mars_lidar as ml
-from dataset.conftest import SYSTEM, files
 from mars_lidar import io
 from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, read_sparse, verify

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import scipy.io
 import xarray
+from dataset.conftest import SYSTEM, files
+from dataset.test_stopped import stopped
 from typer.testing import CliRunner
 
 import mars_lidar as ml
-from dataset.conftest import SYSTEM, files
-from dataset.test_stopped import stopped
 from mars_lidar import io
 from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, estimate, open_dataset, verify
-from mars_lidar.layers import LayeredScene
+from mars_lidar.scene.layers import LayeredScene
 
 SHAPE = (12, 10)
 FOGS = [

@@ -6,8 +6,8 @@ import math
 
 import pytest
 import yaml
-
 from dataset.conftest import SYSTEM
+
 from mars_lidar.dataset import DatasetRecipe
 from mars_lidar.dataset.samples import count_samples, fitting, sample_parts
 

@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from dataset.conftest import files
 
 import mars_lidar as ml
-from dataset.conftest import files
 from mars_lidar import io
 from mars_lidar.dataset import DatasetRecipe, open_dataset
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from harness import PERIOD_NS, Case, flux_of, task_of, two_lobes
 from numpy.typing import NDArray
 
-from harness import PERIOD_NS, Case, flux_of, task_of, two_lobes
 from mars_lidar import Detector, GaussianPulse, SampledPulse, System
-from mars_lidar.engines.base import Task
+from mars_lidar.engines.engine import Task
 from mars_lidar.engines.feedback import FeedbackEngine
 
 GIVEN = "pixels given to exact"

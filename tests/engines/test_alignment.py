@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-import mars_lidar as ml
 from harness import require, two_lobes
 from harness.pvalues import goodness
+
+import mars_lidar as ml
 from mars_lidar import _core
-from mars_lidar.engines._alignment import Alignment
-from mars_lidar.engines._count_shape import normalised
+from mars_lidar.engines.alignment import Alignment
+from mars_lidar.engines.count_shape import normalised
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 

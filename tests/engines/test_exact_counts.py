@@ -6,14 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from harness import Case, counts_against_law, require, task_of
 
 import mars_lidar as ml
-from harness import Case, counts_against_law, require, task_of
 from mars_lidar.engines import MarsEngine
-from mars_lidar.engines._counts import Matched, Mended, Streams, Tabulated
-from mars_lidar.engines._synthesis import Run
-from mars_lidar.engines._table import Entries
-from mars_lidar.statistics._pmf import Window
+from mars_lidar.engines.counts import Matched, Mended, Streams, Tabulated
+from mars_lidar.engines.synthesis import Run
+from mars_lidar.engines.table_reader import Entries
+from mars_lidar.statistics.pmf import Window
 from mars_lidar.table import Table
 from mars_lidar.table.law import distance
 
@@ -156,8 +156,9 @@ def test_usual_pixels_are_drawn_as_before():
 
 
 def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import _count_shape, _synthesis
-    from mars_lidar.statistics import _pmf
+    from mars_lidar.engines import count_shape as _count_shape
+    from mars_lidar.engines import synthesis as _synthesis
+    from mars_lidar.statistics import pmf as _pmf
 
     flux = doubted(pixels=160)
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=2)

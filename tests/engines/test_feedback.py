@@ -5,9 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from feedback_cases import SAMPLED, Sampler, case, drawn
-from numpy.typing import NDArray
-from scipy import stats
-
 from harness import (
     COUNTS,
     JOINT,
@@ -24,9 +21,12 @@ from harness import (
     require,
     waveform_flux,
 )
+from numpy.typing import NDArray
+from scipy import stats
+
 from mars_lidar import joint_law
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines._feedback_grid import cell_cuts
+from mars_lidar.engines.feedback_grid import cell_cuts
 
 CLAIMS = {COUNTS, SHAPE, JOINT}
 FloatArray = NDArray[np.float64]

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from feedback_cases import GIVEN, Sampler, case, drawn
+from harness import COUNTS, JOINT, SHAPE, Case, check, require, task_of, waveform_flux
 from scipy import stats
 
 import mars_lidar as ml
-from harness import COUNTS, JOINT, SHAPE, Case, check, require, task_of, waveform_flux
 from mars_lidar import _core
 from mars_lidar.engines import ENGINES
-from mars_lidar.engines._feedback_grid import cell_cuts, near_pulse
-from mars_lidar.engines._feedback_rule import Reason
+from mars_lidar.engines.feedback_grid import cell_cuts, near_pulse
+from mars_lidar.engines.feedback_rule import Reason
 
 PERIOD_NS = 1e3 / 7.5
 

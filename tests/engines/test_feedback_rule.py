@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 from feedback_cases import GIVEN, SAMPLED, Sampler, case, drawn
+from harness import PERIOD_NS, Case, flux_of, require, task_of, two_lobes
 from numpy.typing import NDArray
 from scipy import stats
 
 import mars_lidar as ml
-from harness import PERIOD_NS, Case, flux_of, require, task_of, two_lobes
 from mars_lidar import Detector, System, _core
-from mars_lidar.engines._feedback_grid import MOST_CELLS, cell_cuts, internal_cells, near_pulse
 from mars_lidar.engines.auto import AutoEngine, expected_registrations
-from mars_lidar.engines.base import Task
+from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
+from mars_lidar.engines.feedback_grid import MOST_CELLS, cell_cuts, internal_cells, near_pulse
 
 # What is given to other engines
 

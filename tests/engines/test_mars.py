@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-
-import mars_lidar as ml
 from harness import Law, check, counts_against_law, require
 from harness.cases import Case
 from harness.check import COUNTS, SHAPE
+
+import mars_lidar as ml
 from mars_lidar.engines import MarsEngine
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
@@ -107,7 +107,8 @@ def test_any_part_alone_on_any_threads(with_table: bool):
 
 
 def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):
-    from mars_lidar.engines import _count_shape, _synthesis
+    from mars_lidar.engines import count_shape as _count_shape
+    from mars_lidar.engines import synthesis as _synthesis
 
     whole = ml.simulate(image(), SYSTEM, engine="mars", table=table(), realizations=5)
     monkeypatch.setattr(_synthesis, "_BATCH", 4)

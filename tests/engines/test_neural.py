@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import mean_vector, require
 from typer.testing import CliRunner
 
 import mars_lidar as ml
-from harness import mean_vector, require
 from mars_lidar.cli import app
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM as SYSTEM
 from mars_lidar.engines import NeuralEngine, find_engine

@@ -6,14 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from harness import goodness, require
+from harness.pvalues import bonferroni, variance_score
 from scipy import stats
 
 import mars_lidar as ml
-from harness import goodness, require
-from harness.pvalues import bonferroni, variance_score
 from mars_lidar import _core
-from mars_lidar.engines._alignment import Alignment
-from mars_lidar.engines._count_shape import normalised
+from mars_lidar.engines.alignment import Alignment
+from mars_lidar.engines.count_shape import normalised
 from mars_lidar.statistics import exposure_moments
 
 BINS = 200

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from harness import counts_against_law, require
+from harness.pvalues import goodness
 from scipy import stats
 
 import mars_lidar as ml
-from harness import counts_against_law, require
-from harness.pvalues import goodness
 from mars_lidar.statistics import exposure_moments, renewal_moments
 from mars_lidar.table import Table
 

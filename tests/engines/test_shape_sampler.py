@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
-
 from harness import goodness, require
 from harness.pvalues import bonferroni, mean_vector, variance_score
+from scipy import stats
+
 from mars_lidar import _core
 
 BINS = 200

@@ -8,11 +8,11 @@ import math
 
 import numpy as np
 import pytest
+from harness import ledger
 from scipy import stats
 
 import mars_lidar as ml
-from harness import ledger
-from mars_lidar.estimate import calibration_bound, rapp_total, recovery
+from mars_lidar.calibrate import calibration_bound, rapp_total, recovery
 
 PERIOD = 1e3 / 7.5
 DELAY = 40.0

@@ -9,13 +9,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from harness import ledger
 from scipy import stats
 
 import mars_lidar as ml
-from harness import ledger
-from mars_lidar.estimate.response import responses
+from mars_lidar.calibrate.response import responses
 from mars_lidar.statistics import mean_histogram
-from mars_lidar.studies.distance import Pmf, g_test
+from mars_lidar.statistics.distance import Pmf, g_test
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=20_000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),

@@ -11,14 +11,14 @@ import math
 
 import numpy as np
 import pytest
+from harness import ledger
 from scipy import stats
 
 import mars_lidar as ml
-from harness import ledger
-from mars_lidar.estimate import inspect
-from mars_lidar.estimate.intervals import stream_of
-from mars_lidar.estimate.same_phase import _passes, same_phase
-from mars_lidar.studies import streams
+from mars_lidar.calibrate import inspect
+from mars_lidar.calibrate.intervals import stream_of
+from mars_lidar.calibrate.same_phase import _passes, same_phase
+from studies import streams
 
 
 def recorded(

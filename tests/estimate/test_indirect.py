@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 import pytest
+from harness import ledger
 from scipy import stats
 
 import mars_lidar as ml
-from harness import ledger
 
 PERIOD, BINS, SIGMA, NUMBER = 1e3 / 7.5, 512, 0.5, 4
 DETECTORS = {

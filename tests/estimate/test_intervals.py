@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar.estimate import summary
-from mars_lidar.estimate.armed_time import ArmedTime, armed_time
-from mars_lidar.estimate.calibration_fit import log_likelihood
-from mars_lidar.estimate.intervals import stream_of
+from mars_lidar.calibrate import summary
+from mars_lidar.calibrate.armed_time import ArmedTime, armed_time
+from mars_lidar.calibrate.calibration_fit import log_likelihood
+from mars_lidar.calibrate.intervals import stream_of
 
 PULSE = ml.GaussianPulse(sigma_ns=4.0)
 

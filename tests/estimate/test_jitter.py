@@ -7,14 +7,14 @@ import math
 
 import numpy as np
 import pytest
+from harness import ledger
 from scipy import stats
 
 import mars_lidar as ml
-from harness import ledger
-from mars_lidar.estimate.dead_time import HIDDEN, SHARP
-from mars_lidar.estimate.intervals import stream_of
-from mars_lidar.estimate.jittered import Records, after_blur, normal_kernel, unblurred
-from mars_lidar.estimate.shortest import Ages, Underlying, is_sharp, shortest
+from mars_lidar.calibrate.dead_time import HIDDEN, SHARP
+from mars_lidar.calibrate.intervals import stream_of
+from mars_lidar.calibrate.jittered import Records, after_blur, normal_kernel, unblurred
+from mars_lidar.calibrate.shortest_intervals import Ages, Underlying, is_sharp, shortest
 
 PERIOD, DELAY, DEAD, SIGMA = 1e3 / 7.5, 40.0, 85.0, 0.5
 

@@ -7,12 +7,13 @@ import math
 
 import numpy as np
 import pytest
+from harness import require
 from scipy import stats
 
 import mars_lidar as ml
-from harness import require
-from mars_lidar import _core, estimate
-from mars_lidar.estimate.recording import recording_of
+from mars_lidar import _core
+from mars_lidar.reconstruct import METHODS, Flags, MaximumLikelihood, log_likelihood, window_error, window_weights
+from mars_lidar.reconstruct.histogram_record import recording_of
 
 PERIOD = 100.0
 PLAIN = ml.System(
@@ -86,7 +87,7 @@ def test_bias_is_taken_off(system, signal, bias):
     cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), signal, delay), system, seed=12)[0, 0]
     bound = float(ml.cramer_rao(signal, signal, system, delay_ns=delay).signal)
     errors = {
-        less: (ml.reconstruct(cube, system, estimate.MaximumLikelihood(less_bias=less)).signal - signal) / bound
+        less: (ml.reconstruct(cube, system, MaximumLikelihood(less_bias=less)).signal - signal) / bound
         for less in (False, True)
     }
     assert errors[False].mean() > bias
@@ -138,16 +139,16 @@ def test_derivatives(name):
     cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), background, delay), system, seed=11)[0, 0]
     at = np.array([1.1 * signal, 0.9 * background, delay + 0.07])
     h = cube[0]
-    _, gradient, _ = estimate.log_likelihood(h, system, *at)
+    _, gradient, _ = log_likelihood(h, system, *at)
     for k, step in enumerate(1e-4 * np.array([signal, background, system.bin_ns])):
         move = np.eye(3)[k] * step
-        values = [estimate.log_likelihood(h, system, *(at + sign * move))[0] for sign in (1, -1)]
+        values = [log_likelihood(h, system, *(at + sign * move))[0] for sign in (1, -1)]
         slope = (values[0] - values[1]) / (2 * step)
-        scale = np.sqrt(estimate.log_likelihood(h, system, *at)[2][k, k])
+        scale = np.sqrt(log_likelihood(h, system, *at)[2][k, k])
         assert slope == pytest.approx(gradient[k], abs=2e-3 * scale, rel=1e-5)
-    scores = np.array([estimate.log_likelihood(h, system, signal, background, delay)[1] for h in cube])
+    scores = np.array([log_likelihood(h, system, signal, background, delay)[1] for h in cube])
     information = np.mean(
-        [estimate.log_likelihood(h, system, signal, background, delay)[2] for h in cube[:100]], axis=0
+        [log_likelihood(h, system, signal, background, delay)[2] for h in cube[:100]], axis=0
     )
     unit = np.sqrt(np.diag(information))
     whitened = np.linalg.solve(np.linalg.cholesky(information / np.outer(unit, unit)), (scores / unit).T)
@@ -192,7 +193,7 @@ def test_pixels_without_signal_are_flagged():
     flux = ml.Flux(np.zeros((1, 4000)), 0.5, 0.0)
     cube = ml.simulate(flux, PLAIN.replace(cycles=400), seed=5)[0, 0]
     found = ml.reconstruct(cube, PLAIN.replace(cycles=400))
-    missed = int((found.flags & estimate.Flags.NO_SIGNAL == 0).sum())
+    missed = int((found.flags & Flags.NO_SIGNAL == 0).sum())
     require({"false alarms": float(stats.binom.sf(missed - 1, 4000, 0.015))}, "signal seen where there is none")
     assert (found.signal + found.background).mean() == pytest.approx(0.5, rel=0.01)  # the pulse takes what it can
 
@@ -204,7 +205,7 @@ def test_empty_saturated_and_impossible_pixels():
     cube[2, 300] = 100  # fired in every period
     cube[3] = 50_000  # no pixel with this dead time can
     found = ml.reconstruct(cube, system)
-    flags = estimate.Flags
+    flags = Flags
     assert found.flags[0] == flags.EMPTY
     assert np.isnan(found.depth_m[0])
     assert found.signal[0] == 0.0
@@ -220,7 +221,7 @@ def test_empty_saturated_and_impossible_pixels():
 def test_threads_and_types_do_not_matter():
     flux = ml.Flux(np.geomspace(0.01, 10, 300)[None], 1.0, 50.0)
     cube = ml.simulate(flux, PLAIN, seed=1)[0]
-    for method in estimate.METHODS.values():
+    for method in METHODS.values():
         if PLAIN.detector.mode not in method.modes:
             continue
         one = ml.reconstruct(cube, PLAIN, method, threads=1)
@@ -237,8 +238,8 @@ def test_window_error_is_that_of_the_raw_estimate():
     """The joint law gives mean and spread of the window estimate that `peak` and `matched_filter` make."""
     system = PLAIN.replace(cycles=1000)
     cube = ml.simulate(ml.Flux(np.full((1, 4000), 1.0), 1.0, 37.0), system, seed=9)[0, 0]
-    weights = estimate.window_weights(system, 37.0)
-    mean, deviation = estimate.window_error(weights, 1.0, 1.0, system, delay_ns=37.0)
+    weights = window_weights(system, 37.0)
+    mean, deviation = window_error(weights, 1.0, 1.0, system, delay_ns=37.0)
     sample = cube @ weights
     z = (sample.mean() - mean) / deviation * np.sqrt(4000)
     square = sample.var() / deviation**2 * 4000

@@ -6,13 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from harness import ledger
 from scipy import stats
 from typer.testing import CliRunner
 
 import mars_lidar as ml
-from harness import ledger
 from mars_lidar.cli import app
-from mars_lidar.studies.distance import Pmf, two_sample_g_test
+from mars_lidar.statistics.distance import Pmf, two_sample_g_test
 
 PLAIN = ml.System(
     period_ns=100.0, cycles=100_000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),

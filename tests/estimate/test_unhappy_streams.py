@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 import mars_lidar as ml
+from mars_lidar.calibrate import inspect
 from mars_lidar.cli import app
-from mars_lidar.estimate import inspect
 
 PERIOD = 1e3 / 7.5
 SYSTEM = ml.System(

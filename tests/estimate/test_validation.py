@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 import yaml
+from harness import ledger
 from typer.testing import CliRunner
 
 import mars_lidar as ml
-from harness import ledger
+from mars_lidar.calibrate import inspect
 from mars_lidar.cli import app
-from mars_lidar.estimate import inspect
-from mars_lidar.studies.distance import Pmf
+from mars_lidar.statistics.distance import Pmf
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=60_000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),

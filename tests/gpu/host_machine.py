@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _core
-from mars_lidar.gpu.kernels import Kernel
+from mars_lidar.cuda.kernels import Kernel
 
 _RUNS: dict[str, Callable[..., None]] = {
     "mars_device.h": _core.mars_on_host,

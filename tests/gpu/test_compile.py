@@ -5,9 +5,9 @@ from __future__ import annotations
 from itertools import product
 
 import pytest
-from benchmarks.nvrtc import NotFound, compiled, library
 
-from mars_lidar.gpu.kernels import MARS_LAWS, Kernel, Sink, Variant, feedback_histograms, mars_histograms
+from benchmarks.nvrtc import NotFound, compiled, library
+from mars_lidar.cuda.kernels import MARS_LAWS, Kernel, Sink, Variant, feedback_histograms, mars_histograms
 
 try:
     library()

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 import mars_lidar as ml
 from mars_lidar import _core
-from mars_lidar.engines.base import Records, Task
+from mars_lidar.cuda.exact import host_arrays
+from mars_lidar.cuda.kernels import Sink
+from mars_lidar.engines.engine import Records, Task
 from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.gpu.exact import host_arrays
-from mars_lidar.gpu.kernels import Sink
 
 MODES: dict[str, dict[str, Any]] = {
     "nonparalyzable": {},

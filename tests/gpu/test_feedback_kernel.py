@@ -9,10 +9,10 @@ import pytest
 from host_machine import Host
 
 import mars_lidar as ml
-from mars_lidar.engines.base import Task
+from mars_lidar.cuda.feedback import feedback_histogram
+from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.gpu.feedback import feedback_histogram
 
 BASE = ml.System(
     period_ns=100.0, cycles=3000, bins=128, pulse=ml.GaussianPulse(sigma_ns=1.0),

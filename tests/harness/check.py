@@ -23,7 +23,7 @@ from harness.pvalues import (
 )
 from harness.reference import Reference
 from harness.sample import Sample, draw, task_of
-from mars_lidar.engines.base import Engine
+from mars_lidar.engines.engine import Engine
 
 COUNTS = "counts"  # the law of the number of registrations
 SHAPE = "shape"  # the mean histogram

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.cases import Case
-from mars_lidar.engines.base import Engine, Records, Task
-from mars_lidar.system import System
+from mars_lidar.engines.engine import Engine, Records, Task
+from mars_lidar.instrument.system import System
 
 
 @dataclass(frozen=True, eq=False)

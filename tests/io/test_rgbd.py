@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mars_lidar.io.rgbd import read_rgbd
-from mars_lidar.scene import Scene
+from mars_lidar.scene.scene import Scene
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "rgbd"
 NAN = np.nan

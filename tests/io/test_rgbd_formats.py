@@ -15,7 +15,7 @@ from mars_lidar import io
 from mars_lidar.cli import app
 from mars_lidar.io.rgbd import read_rgbd
 from mars_lidar.io.rgbd.pfm import read_pfm
-from mars_lidar.scene import Scene
+from mars_lidar.scene.scene import Scene
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 NAN, INF = np.nan, np.inf

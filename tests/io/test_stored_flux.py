@@ -12,10 +12,11 @@ from scipy.io import savemat
 from typer.testing import CliRunner
 
 import mars_lidar as ml
-from mars_lidar import io, stored_flux
+from mars_lidar import io
 from mars_lidar.cli import app
 from mars_lidar.io import layout
-from mars_lidar.stored_flux import StoredFlux
+from mars_lidar.light import stored_flux
+from mars_lidar.light.stored_flux import StoredFlux
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=200, bins=200, pulse=ml.GaussianPulse(sigma_ns=0.8),

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import mars_lidar as ml
-from mars_lidar.estimate.maximum_likelihood import log_likelihood
 from mars_lidar.learn import armed_periods, bin_photons, expected_histogram, histogram_log_likelihood
+from mars_lidar.reconstruct.maximum_likelihood import log_likelihood
 
 PULSES = (ml.GaussianPulse(sigma_ns=3.0), ml.SampledPulse([1, 4, 9, 7, 3, 1, 0.5], bin_ns=2.7))
 

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader
 
 import mars_lidar as ml
 from mars_lidar.learn import Choice, CubeStream, LogUniform, SystemRange, Uniform
-from mars_lidar.learn.shared import SharedScenes
+from mars_lidar.learn.scene_cache import SharedScenes
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=60, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)

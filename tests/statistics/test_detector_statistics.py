@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, first_arrival, flux_of, mean_vector, require, two_lobes
+from harness import waveform_flux as flux_of_waveform
 from scipy import stats
 
 import mars_lidar as ml
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, first_arrival, flux_of, mean_vector, require, two_lobes
-from harness import waveform_flux as flux_of_waveform
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import (
     ConvergenceError,

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, two_lobes, waveform_flux
 
 import mars_lidar as ml
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, two_lobes, waveform_flux
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import electronics_moments, mean_histogram
 

@@ -10,9 +10,9 @@ import pytest
 import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.statistics import ConvergenceError, PhaseChain
-from mars_lidar.statistics import _cells as cells_module
+from mars_lidar.statistics import cells as cells_module
 from mars_lidar.statistics import exposure as exposure_module
-from mars_lidar.statistics._cells import Cells
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import exposure_moments
 from mars_lidar.statistics.stationary import stationary_histogram
 

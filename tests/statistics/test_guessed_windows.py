@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar.statistics import _pmf
-from mars_lidar.statistics._cells import Cells
-from mars_lidar.statistics._pmf import exact_windows, guessed_windows
+from mars_lidar.statistics import pmf as _pmf
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
+from mars_lidar.statistics.pmf import exact_windows, guessed_windows
 from mars_lidar.table.law import distance
 
 SYSTEM = ml.System(

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from harness import Reference, constant_rate_moments, require
+from harness.reference import REFERENCE_NAMES
 from scipy import stats
 
 import mars_lidar as ml
-from harness import Reference, constant_rate_moments, require
-from harness.reference import REFERENCE_NAMES
 from mars_lidar.statistics import exposure_moments, joint_law
 
 PERIOD = 100.0

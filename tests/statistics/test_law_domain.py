@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.law_map import disagreements, draw, laws
 from scipy import stats
 
 import mars_lidar as ml
+from benchmarks.law_map import disagreements, draw, laws
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
-from mars_lidar.statistics import _cells as cells_module
-from mars_lidar.statistics import _joint_pixel as pixel_module
-from mars_lidar.statistics import _pmf as pmf_module
-from mars_lidar.statistics._cells import Cells
-from mars_lidar.statistics._joint_grid import FoldedGrid
+from mars_lidar.statistics import cells as cells_module
+from mars_lidar.statistics import joint_pixel as pixel_module
+from mars_lidar.statistics import pmf as pmf_module
+from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.joint_grid import FoldedGrid
 
 PERIOD_NS = 100.0
 

@@ -4,16 +4,16 @@ import csv
 
 import numpy as np
 import pytest
+from harness import goodness, require
 from scipy import stats
 
 import mars_lidar as ml
-from harness import goodness, require
-from mars_lidar.statistics._pmf import Window
+from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.statistics.matched import matched_counts, matched_pmf, trusted
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.distance import Pmf, total_variation
-from mars_lidar.studies.matched import QUICK
-from mars_lidar.studies.report import MAX_FIGURE_BYTES
+from mars_lidar.statistics.pmf import Window
+from studies.__main__ import main
+from studies.matched import QUICK
+from studies.report import MAX_FIGURE_BYTES
 
 PERIOD_NS = 1e3 / 7.5
 AIM = 0.002

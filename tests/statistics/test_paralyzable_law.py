@@ -6,10 +6,10 @@ from math import comb, factorial
 
 import numpy as np
 import pytest
+from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, random_cases, two_lobes, waveform_flux
 from scipy.integrate import quad
 
 import mars_lidar as ml
-from harness import COUNTS, PERIOD_NS, SHAPE, Case, Law, check, flux_of, random_cases, two_lobes, waveform_flux
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import exposure_moments, paralyzable_moments
 

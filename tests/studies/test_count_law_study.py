@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from harness.ledger import require
 from scipy import stats
 
-from harness.ledger import require
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.poisson import PoissonEngine
-from mars_lidar.studies import count_law, count_law_report, simulators
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.count_law_shape import shape_sweep
-from mars_lidar.studies.distance import KL_FLOOR, Pmf, kl_divergence, wasserstein
-from mars_lidar.studies.report import MAX_FIGURE_BYTES
-from mars_lidar.studies.sample import draw
+from mars_lidar.statistics.distance import KL_FLOOR, Pmf, kl_divergence, wasserstein
+from studies import count_law, count_law_report, simulators
+from studies.__main__ import main
+from studies.count_law_shape import shape_sweep
+from studies.report import MAX_FIGURE_BYTES
+from studies.sample import draw
 
 
 @pytest.fixture(scope="module")

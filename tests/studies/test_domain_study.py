@@ -10,20 +10,20 @@ import pytest
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.estimate.histogram_bound import _variances
+from mars_lidar.reconstruct.histogram_bound import _variances
 from mars_lidar.statistics import ConvergenceError
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.domain import judge as judging
-from mars_lidar.studies.domain import verdict, watch
-from mars_lidar.studies.domain.case import MOVING, PERIOD_NS, Case
-from mars_lidar.studies.domain.checks import Check, merge, two_samples
-from mars_lidar.studies.domain.closed_forms import known
-from mars_lidar.studies.domain.judge import Budget, judge
-from mars_lidar.studies.domain.samples import Windows, simulated
-from mars_lidar.studies.domain.sweep import Settings, judge_case
-from mars_lidar.studies.domain.systems import FAMILIES, draw
-from mars_lidar.studies.domain.watch import Watched
-from mars_lidar.studies.report import MAX_FIGURE_BYTES
+from studies.__main__ import main
+from studies.domain import judge as judging
+from studies.domain import verdict, watch
+from studies.domain.case import MOVING, PERIOD_NS, Case
+from studies.domain.checks import Check, merge, two_samples
+from studies.domain.closed_forms import known
+from studies.domain.judge import Budget, judge
+from studies.domain.samples import Windows, simulated
+from studies.domain.sweep import Settings, judge_case
+from studies.domain.systems import FAMILIES, draw
+from studies.domain.watch import Watched
+from studies.report import MAX_FIGURE_BYTES
 
 
 def pixel(signal: float = 1.0, background: float = 0.5, dead: float = 0.4, cycles: int = 100, **more: object) -> Case:

@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 import mars_lidar as ml
 from mars_lidar.cli import app
 from mars_lidar.statistics import exposure_moments
-from mars_lidar.studies import Request, downstream, downstream_data
-from mars_lidar.studies.downstream_counts import count_bias
-from mars_lidar.studies.downstream_report import spread
+from studies import Request, downstream, downstream_data
+from studies.downstream_counts import count_bias
+from studies.downstream_report import spread
 
 TINY = downstream_data.CONFIGS["tiny"]
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.hardware import joined, system_of
-from mars_lidar.studies.report import MAX_FIGURE_BYTES
+from studies.__main__ import main
+from studies.hardware import joined, system_of
+from studies.report import MAX_FIGURE_BYTES
 
 
 def test_quick(tmp_path):

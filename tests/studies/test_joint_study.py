@@ -7,12 +7,12 @@ import sys
 
 import numpy as np
 import pytest
+from harness import require
 from scipy import stats
 
-from harness import require
-from mars_lidar.studies import classifiers, joint, joint_report
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.report import MAX_FIGURE_BYTES
+from studies import classifiers, joint, joint_report
+from studies.__main__ import main
+from studies.report import MAX_FIGURE_BYTES
 
 
 def test_auc_and_its_error():

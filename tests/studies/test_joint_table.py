@@ -4,12 +4,12 @@ import csv
 
 import numpy as np
 import pytest
+from harness.ledger import require
 from scipy import stats
 
-from harness.ledger import require
 from mars_lidar.engines import ANY_SYSTEM
-from mars_lidar.studies import joint_table as joint
-from mars_lidar.studies.__main__ import main
+from studies import joint_table as joint
+from studies.__main__ import main
 
 POISSON = joint.Case("no dead time", 0.5, 0.5, 0.0, cycles=300)
 

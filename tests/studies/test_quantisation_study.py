@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mars_lidar.statistics import exposure_moments
-from mars_lidar.studies import quantisation
-from mars_lidar.studies.__main__ import main
 from mars_lidar.table import Table
+from studies import quantisation
+from studies.__main__ import main
 
 
 def test_files(tmp_path):

@@ -4,14 +4,14 @@ import csv
 
 import numpy as np
 import pytest
+from harness.ledger import require
 from scipy import stats
 
 import mars_lidar as ml
-from harness.ledger import require
 from mars_lidar.engines import ANY_SYSTEM
-from mars_lidar.studies import contenders, runtime
-from mars_lidar.studies.__main__ import main
-from mars_lidar.studies.numpy_pipeline import STAGES, NumpyTable, Stages, synthesize
+from studies import contenders, runtime
+from studies.__main__ import main
+from studies.numpy_pipeline import STAGES, NumpyTable, Stages, synthesize
 
 
 @pytest.fixture(scope="module")

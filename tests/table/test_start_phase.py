@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
+from harness.ledger import require
 from scipy.stats import norm
+from table.cases import make_system, small_table
 
 import mars_lidar as ml
-from harness.ledger import require
 from mars_lidar import _core
 from mars_lidar.statistics import exposure_moments
-from mars_lidar.statistics._cells import Cells
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.table.start_phase import start_phases
-from table.cases import make_system, small_table
 
 PHASES = np.array([0, 60, 200, 240, 256, 262, 300, 400, 512])
 GRID = 512

@@ -3,13 +3,13 @@
 import h5py
 import numpy as np
 import pytest
+from table.cases import make_system, small_table
 from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar.cli import app
 from mars_lidar.table import cache, storage
 from mars_lidar.table.axes import axis_values
-from table.cases import make_system, small_table
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import csv
 
 import pytest
 
-from mars_lidar.studies import STUDIES, Request
+from studies import STUDIES, Request
 
 
 def test_the_study_writes_its_report(tmp_path):

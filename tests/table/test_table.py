@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from table.cases import make_system, small_table
 
 import mars_lidar as ml
 from mars_lidar.statistics import exposure_moments, mars_moments
 from mars_lidar.table.axes import axis_values, thinned
-from table.cases import make_system, small_table
 
 
 def off_grid(rng, number):

@@ -15,14 +15,12 @@ import typer
 from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
 from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
+from mars_lidar.cli.info import info, view
 from mars_lidar.cli.init import init
-from mars_lidar.cli.inspect import info, view
 from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
 from mars_lidar.cli.neural import app as neural_app
 from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
 from mars_lidar.cli.simulate import EPILOG, simulate
-from mars_lidar.cli.study import SETTINGS as STUDY_SETTINGS
-from mars_lidar.cli.study import study
 from mars_lidar.cli.table import app as table_app
 
 app = typer.Typer(
@@ -56,7 +54,6 @@ for _command, _epilog in (
     (reconstruct, RECONSTRUCT_EPILOG),
 ):
     _add(_command, _epilog, no_args_is_help=True)
-_add(study, context_settings=STUDY_SETTINGS)
 _add(init)
 app.add_typer(table_app, name="table")
 app.add_typer(neural_app, name="neural")

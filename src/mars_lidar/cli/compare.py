@@ -11,13 +11,13 @@ from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, save_picture, table
 from mars_lidar.cli.effect_options import Effects
 from mars_lidar.cli.groups import grouped
-from mars_lidar.cli.inspect import parsed_pixel
+from mars_lidar.cli.info import parsed_pixel
 from mars_lidar.cli.options import _OUTPUT, _RUN, _option
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions, seen
 from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
-    from mars_lidar.studies.compare import Comparison
+    from mars_lidar.compare.comparison import Comparison
 
 COMPARE_EPILOG = "\n\n".join(
     (
@@ -119,7 +119,7 @@ def compare(
         system = instrument.build(effects)
         view = seen(scene, light, system)
         from mars_lidar.cli.compare_tables import as_data, show
-        from mars_lidar.studies.compare import compare as run
+        from mars_lidar.compare.comparison import compare as run
 
         with progress_bar("comparing") as progress:
             found = run(
@@ -145,12 +145,12 @@ def compare(
 
 
 def _names(engines: str | None) -> list[str]:
-    from mars_lidar import _validate
+    from mars_lidar._base import checks
     from mars_lidar.engines import ENGINES
 
     if engines is None:
         return []
-    return [_validate.choice("--engines", name.strip(), tuple(ENGINES)) for name in engines.split(",")]
+    return [checks.choice("--engines", name.strip(), tuple(ENGINES)) for name in engines.split(",")]
 
 
 def _draw(found: Comparison, out: Path) -> None:

@@ -7,14 +7,14 @@ import math
 import sys
 from typing import TYPE_CHECKING, Any
 
-from mars_lidar.studies.compare_sample import SIGNIFICANT, Distance, Estimate, Moments
+from mars_lidar.compare.sample import SIGNIFICANT, Distance, Estimate, Moments
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from mars_lidar.studies.compare import Comparison
-    from mars_lidar.studies.compare_pixel import PixelStatistics
+    from mars_lidar.compare.comparison import Comparison
+    from mars_lidar.compare.pixel import PixelStatistics
 
 _PIPE = 160  # columns where nobody is watching: nothing is folded
 _MARK = "!"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from mars_lidar.cli.options import _option
-from mars_lidar.effects import FIELDS
+from mars_lidar.instrument.effects import FIELDS
 
 _EFFECTS = "Effects of the detector (off by default)"
 

@@ -203,7 +203,7 @@ def _recipe(
     source: Path | None, replaced: dict[str, Any], scene_seeds: int | None, rgbd: dict[str, Any], resume: bool
 ) -> DatasetRecipe | None:
     from mars_lidar.dataset.recipe import DatasetRecipe
-    from mars_lidar.scene import Scene
+    from mars_lidar.scene.scene import Scene
 
     if source is None:
         if not resume:

@@ -82,7 +82,7 @@ def inspect(
     """
     with reported():
         check_picture(out, overwrite)
-        from mars_lidar.estimate import inspect as look
+        from mars_lidar.calibrate import inspect as look
 
         times, rows = source.load(stream)
         found = look(times, dead_time_ns=dead_time_ns)
@@ -123,7 +123,7 @@ def calibrate(
         found, detector = light.calibrate(times, effects)
         table(rows + clock_rows(found) + light_rows(found, detector))
         if out is not None:
-            from mars_lidar.estimate.prediction import system_of
+            from mars_lidar.calibrate.prediction import system_of
 
             bins = times.bins if times.bins <= 2**20 else 1024
             system_of(found, detector, max(times.cycles, 1), bins).replace(start="armed").save(out)
@@ -148,7 +148,7 @@ def validate(
     """
     with reported():
         check_picture(out, overwrite)
-        from mars_lidar.estimate import validate as compared
+        from mars_lidar.calibrate import validate as compared
 
         times, rows = source.load(stream)
         calibrated, detector = light.calibrate(times, effects)

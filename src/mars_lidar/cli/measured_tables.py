@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mars_lidar.detector import Detector
-    from mars_lidar.estimate import Calibration
+    from mars_lidar.calibrate import Calibration
+    from mars_lidar.instrument.detector import Detector
 
 
 _APART = 5.0  # standard errors
@@ -48,8 +48,8 @@ def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
 
 def light_rows(found: Calibration, detector: Detector | None = None) -> list[tuple[str, str]]:
     """What was calibrated; `detector` is told, with its effects."""
-    from mars_lidar.estimate.detector_model import moves_records
-    from mars_lidar.system import SPEED_OF_LIGHT_M_PER_NS
+    from mars_lidar.calibrate.detector_model import moves_records
+    from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 
     rows = interval_rows(found, found.dead_time_error_ns != 0)
     if found.hold_off_ns > found.dead_time_ns + found.dead_time_error_ns:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mars_lidar.presets import PRESETS
+from mars_lidar.instrument.presets import PRESETS
 
 _SYSTEM, _RUN, _OUTPUT = "System", "Simulation", "Output"
 

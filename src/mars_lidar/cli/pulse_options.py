@@ -8,7 +8,7 @@ from typing import Annotated
 
 from mars_lidar.cli.effect_options import read_array
 from mars_lidar.cli.options import _SYSTEM, _option
-from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 
 Sigma = Annotated[
     float | None,

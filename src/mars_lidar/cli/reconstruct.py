@@ -13,9 +13,9 @@ import typer
 from mars_lidar.cli.console import progress_bar, reported, save_picture, say, table
 
 if TYPE_CHECKING:
-    from mars_lidar.estimate import Reconstruction
-    from mars_lidar.estimate.stored import Timed
     from mars_lidar.io import Cube
+    from mars_lidar.reconstruct import Reconstruction
+    from mars_lidar.reconstruct.stored import Timed
 
 RECONSTRUCT_EPILOG = "\n\n".join(
     (
@@ -70,11 +70,11 @@ def reconstruct(
     """
     with reported():
         began = time.perf_counter()
-        from mars_lidar import _validate
-        from mars_lidar.estimate.reconstruct import ATTENUATIONS
-        from mars_lidar.estimate.stored import reconstruct_stored
+        from mars_lidar._base import checks
         from mars_lidar.io import load
         from mars_lidar.io.maps import check_maps_output, save_maps
+        from mars_lidar.reconstruct.reconstruction import ATTENUATIONS
+        from mars_lidar.reconstruct.stored import reconstruct_stored
 
         png = out.with_suffix(".png")
         check_maps_output(out, overwrite=overwrite)
@@ -83,7 +83,7 @@ def reconstruct(
         if out.resolve() == cube.resolve():
             raise ValueError(f"--out must not be the cube itself, got {str(out)!r}")
         if attenuation is not None:
-            _validate.choice("--attenuation", attenuation, ATTENUATIONS)
+            checks.choice("--attenuation", attenuation, ATTENUATIONS)
         with load(cube) as stored:
             names = _methods(method, stored)
             with progress_bar("reconstructing") as progress:
@@ -101,8 +101,8 @@ def reconstruct(
 
 
 def _methods(text: str, cube: Cube) -> list[str]:
-    from mars_lidar import _validate
-    from mars_lidar.estimate import METHODS
+    from mars_lidar._base import checks
+    from mars_lidar.reconstruct import METHODS
 
     if text == "all":
         names = []
@@ -117,7 +117,7 @@ def _methods(text: str, cube: Cube) -> list[str]:
         if not names:
             raise ValueError("--method all: no method suits this detector; see docs/reconstruction.md")
         return names
-    asked = [_validate.choice("--method", part.strip(), (*METHODS, "all")) for part in text.split(",")]
+    asked = [checks.choice("--method", part.strip(), (*METHODS, "all")) for part in text.split(",")]
     if "all" in asked:
         raise ValueError("--method must be all alone, or names of methods")
     return list(dict.fromkeys(asked))
@@ -125,8 +125,8 @@ def _methods(text: str, cube: Cube) -> list[str]:
 
 def _show(cube: Cube, found: dict[str, Timed]) -> None:
     """One line a method on standard output."""
-    from mars_lidar.estimate import Flags
-    from mars_lidar.estimate.quality import MissingExtraError, errors_against
+    from mars_lidar.reconstruct import Flags
+    from mars_lidar.reconstruct.quality import MissingExtraError, errors_against
 
     realizations, height, width, _ = cube.shape
     head = ["method", "seconds", "seen %", "saturated %"]

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions
-from mars_lidar.dataset.lines import Key, RecipeError, line_of, read_yaml
+from mars_lidar.dataset.yaml_lines import Key, RecipeError, line_of, read_yaml
 
 Check = Callable[[str, Any, Path], Any]
 
@@ -30,15 +30,15 @@ def _number(name: str, value: Any, folder: Path) -> float:
         number = float(value) if isinstance(value, str) else value  # YAML 1.1 takes 1e-3 and inf for texts
     except ValueError:
         number = value
-    return math.inf if number == math.inf else _validate.real(name, number)
+    return math.inf if number == math.inf else checks.real(name, number)
 
 
 def _whole(name: str, value: Any, folder: Path) -> int:
-    return _validate.integer(name, value, low=0, high=2**63)
+    return checks.integer(name, value, low=0, high=2**63)
 
 
 def _size(name: str, value: Any, folder: Path) -> int:
-    return _validate.integer(name, value, low=1, high=2**20)
+    return checks.integer(name, value, low=1, high=2**20)
 
 
 def _flag(name: str, value: Any, folder: Path) -> bool:
@@ -99,13 +99,13 @@ def _read(data: Any, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         got = " and ".join(kinds) or "none of them"
         raise RecipeError((), f"a scene file must give one of {', '.join(_KINDS)}, got {got}")
     known = _KINDS[kinds[0]]
-    given = _checked((), _validate.known_keys, "a scene file", data, (*known, "light"))
+    given = _checked((), checks.known_keys, "a scene file", data, (*known, "light"))
     told: dict[str, Any] = {}
     for key, value in given.items():
         if key != "light" and value is not None:
             name, check = known[key]
             told[name] = _checked((key,), check, key, value, folder)
-    light = _checked(("light",), _validate.known_keys, "light", given.get("light") or {}, tuple(_LIGHT))
+    light = _checked(("light",), checks.known_keys, "light", given.get("light") or {}, tuple(_LIGHT))
     if "signal" in light and "photons_per_unit" in light:
         raise RecipeError(("light", "photons_per_unit"), "light must give one of signal and photons_per_unit, got both")
     shining = {key: _checked(("light", key), _LIGHT[key], key, value, folder) for key, value in light.items()}

@@ -11,9 +11,9 @@ from mars_lidar.cli.options import _option
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mars_lidar.flux import Flux
-    from mars_lidar.scene import Scene
-    from mars_lidar.system import System
+    from mars_lidar.instrument.system import System
+    from mars_lidar.light.flux import Flux
+    from mars_lidar.scene.scene import Scene
 
 _SCENE, _LIGHT = "Scene (one of --scene, --depth and --transient)", "Light"
 _TRANSIENT = "Rendered transient (with --transient)"
@@ -204,7 +204,7 @@ def _refuse(given: object, names: tuple[str, ...], what: str, absent: bool) -> N
 
 
 def _scene(given: SceneOptions) -> tuple[Scene, str]:
-    from mars_lidar.scene import Scene
+    from mars_lidar.scene.scene import Scene
 
     if given.depth is None:
         name, size, seed = given.scene or "", given.size or 128, given.scene_seed or 0

@@ -15,8 +15,8 @@ from mars_lidar.cli.scene_options import LightOptions, SceneOptions, seen
 from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
+    from mars_lidar.instrument.system import System
     from mars_lidar.io import Written
-    from mars_lidar.system import System
     from mars_lidar.table import Table
 
 EPILOG = "\n\n".join(

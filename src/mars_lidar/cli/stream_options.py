@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from mars_lidar.cli import options
 from mars_lidar.cli.console import say
 from mars_lidar.cli.effect_options import StreamEffects
-from mars_lidar.cli.inspect import parsed_pixel
+from mars_lidar.cli.info import parsed_pixel
 from mars_lidar.cli.options import _SYSTEM, _option
 from mars_lidar.cli.pulse_options import FittedPulseOptions
 
 if TYPE_CHECKING:
-    from mars_lidar.detector import Detector
-    from mars_lidar.estimate import Calibration
-    from mars_lidar.pulse import Pulse
-    from mars_lidar.system import System as SystemObject
-    from mars_lidar.timestamps import Timestamps
+    from mars_lidar.calibrate import Calibration
+    from mars_lidar.instrument.detector import Detector
+    from mars_lidar.instrument.pulse import Pulse
+    from mars_lidar.instrument.system import System as SystemObject
+    from mars_lidar.light.timestamps import Timestamps
 
 STREAM = "Stream"
 
@@ -88,7 +88,7 @@ class StreamOptions:
         """The pixel, and the rows that say what was read."""
         import numpy as np
 
-        from mars_lidar.timestamps import Timestamps as Times
+        from mars_lidar.light.timestamps import Timestamps as Times
 
         asked = None if self.pixel is None else parsed_pixel(self.pixel)
         times = Times.load(
@@ -127,11 +127,11 @@ class FitOptions:
 
         `given`: fields of the detector, of the options. A jitter alone tells none: the dead time is found beside it.
         """
+        from mars_lidar.calibrate.detector_model import stream_detector
         from mars_lidar.cli.system_options import with_given
-        from mars_lidar.detector import Detector
-        from mars_lidar.estimate.detector_model import stream_detector
-        from mars_lidar.pulse import GaussianPulse
-        from mars_lidar.system import System as SystemOf
+        from mars_lidar.instrument.detector import Detector
+        from mars_lidar.instrument.pulse import GaussianPulse
+        from mars_lidar.instrument.system import System as SystemOf
 
         known = times.system if self.system is None else SystemOf.load(self.system)
         dead = self.dead_time_ns
@@ -156,10 +156,10 @@ class FitOptions:
 
     def calibrate(self, times: Timestamps, effects: StreamEffects) -> tuple[Calibration, Detector | None]:
         """The light of the stream by maximum likelihood, and the detector where it is more than a dead time."""
+        from mars_lidar.calibrate import calibrate as fitted
+        from mars_lidar.calibrate.detector_model import is_plain, jitter_sigma
         from mars_lidar.cli.system_options import with_given
-        from mars_lidar.detector import Detector
-        from mars_lidar.estimate import calibrate as fitted
-        from mars_lidar.estimate.detector_model import is_plain, jitter_sigma
+        from mars_lidar.instrument.detector import Detector
 
         if self.mode not in (None, "nonparalyzable", "paralyzable"):
             raise ValueError(f"--mode must be nonparalyzable or paralyzable for a running stream, got {self.mode!r}")

@@ -9,8 +9,8 @@ from typing import Any
 from mars_lidar.cli import options
 from mars_lidar.cli.effect_options import Effects
 from mars_lidar.cli.pulse_options import PulseOptions
-from mars_lidar.pulse import GaussianPulse
-from mars_lidar.system import Detector, System
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import Detector, System
 
 DEFAULT_SYSTEM = System(
     period_ns=1e3 / 7.5,

@@ -15,7 +15,7 @@ from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
-    from mars_lidar.system import System
+    from mars_lidar.instrument.system import System
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Lookup tables over (S, B).")
 

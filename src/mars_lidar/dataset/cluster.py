@@ -13,7 +13,7 @@ import uuid
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base.optional import MissingLibraryError
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.store import Dataset, Item

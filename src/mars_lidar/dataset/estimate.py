@@ -15,7 +15,7 @@ from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import MAPS, histogram_array, histogram_blocks
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
-from mars_lidar.dataset.shown import Rendered, Shown
+from mars_lidar.dataset.sample_content import Rendered, Shown
 from mars_lidar.dataset.sources import Candidate, Named, candidates, scenes
 from mars_lidar.io.scan import Problem
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mars_lidar.dataset import values
-from mars_lidar.dataset.lines import Key, RecipeError
+from mars_lidar.dataset.yaml_lines import Key, RecipeError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.dataset.store import Dataset, open_dataset
 
 
@@ -35,8 +35,8 @@ def read_sparse(
     source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     array = source.histogram
     number, realizations, height, width, bins = array.shape
-    sample = _validate.integer("sample", sample, low=0, high=number - 1)
-    realization = _validate.integer("realization", realization, low=0, high=realizations - 1)
+    sample = checks.integer("sample", sample, low=0, high=number - 1)
+    realization = checks.integer("realization", realization, low=0, high=realizations - 1)
     if source.recipe.layout == "dense":
         counts = np.asarray(array[sample, realization]).reshape(height * width, bins)
         row, column = np.nonzero(counts)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from mars_lidar.dataset import values
-from mars_lidar.dataset.entries import read_scenes
 from mars_lidar.dataset.light import Light, read_light, refuse_for_transients
-from mars_lidar.dataset.lines import Key, RecipeError, line_of, read_yaml
-from mars_lidar.system import System
+from mars_lidar.dataset.scene_entries import read_scenes
+from mars_lidar.dataset.yaml_lines import Key, RecipeError, line_of, read_yaml
+from mars_lidar.instrument.system import System
 
 LAYOUTS = ("sparse", "dense")
 _ROOT = ("seed", "scenes", "size", "crop", "systems", "light", "engine", "realizations", "store")

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mars_lidar.dataset.shown import Rendered, unknown
+from mars_lidar.dataset.sample_content import Rendered, unknown
 from mars_lidar.io.transient import SUFFIXES, read_transient
 from mars_lidar.io.transient_truth import read_truth
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.recipe import DatasetRecipe
@@ -117,7 +117,7 @@ def generate(
         raise ValueError("workers start a cluster and scheduler joins one: give one of them")
     for name, value in (("threads", threads), ("workers", workers)):
         if value is not None:
-            _validate.integer(name, value, low=1, high=1024)
+            checks.integer(name, value, low=1, high=1024)
     wanted, folder = read_recipe(recipe)
     there = target.exists() and resume
     if there:

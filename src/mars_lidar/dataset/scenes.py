@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import blosc, create_list, create_maps
-from mars_lidar.dataset.shown import Rendered, Shown, Surfaces
-from mars_lidar.fog import Fog
-from mars_lidar.layers import MOST, LayeredScene
-from mars_lidar.scene import Scene
-from mars_lidar.system import System
-from mars_lidar.transient import Transient
+from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
+from mars_lidar.instrument.system import System
+from mars_lidar.light.fog import Fog
+from mars_lidar.light.transient import Transient
+from mars_lidar.scene.layers import MOST, LayeredScene
+from mars_lidar.scene.scene import Scene
 
 _DOUBLE = np.dtype(np.float64)
 _READ_BYTES = 4 << 20  # of one map: scenes are read this many at once, each read costs a millisecond

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mars_lidar import _validate
-from mars_lidar.dataset.lines import Key, RecipeError
+from mars_lidar._base import checks
+from mars_lidar.dataset.yaml_lines import Key, RecipeError
 
 
 def mapping(key: Key, data: Any, allowed: tuple[str, ...], needed: tuple[str, ...] = ()) -> dict[str, Any]:
     """A mapping of known keys."""
     name = key_name(key) or "the recipe"
-    known: dict[str, Any] = checked(key, _validate.known_keys, name, data, allowed)
+    known: dict[str, Any] = checked(key, checks.known_keys, name, data, allowed)
     for one in needed:
         if one not in known:
             raise RecipeError(key, f"{name} must give {one}")
@@ -24,7 +24,7 @@ def level(key: Key, name: str, value: Any) -> float:
     given = number(value)
     if name == "sbr" and isinstance(given, float) and math.isinf(given) and given > 0:
         return given
-    return float(checked(key, lambda: _validate.real(name, given, low=0.0, strict_low=True)))
+    return float(checked(key, lambda: checks.real(name, given, low=0.0, strict_low=True)))
 
 
 def size(key: Key, value: Any) -> int | tuple[int, int] | None:
@@ -81,18 +81,18 @@ def number(value: Any) -> Any:
 
 
 def real(key: Key, value: Any, **limits: Any) -> float:
-    """A number; `limits` as for `_validate.real`."""
-    return float(checked(key, lambda: _validate.real(key_name(key), number(value), **limits)))
+    """A number; `limits` as for `checks.real`."""
+    return float(checked(key, lambda: checks.real(key_name(key), number(value), **limits)))
 
 
 def integer(key: Key, value: Any, *, name: str | None = None, **limits: Any) -> int:
-    """An integer; `limits` as for `_validate.integer`."""
-    return int(checked(key, lambda: _validate.integer(name or key_name(key), value, **limits)))
+    """An integer; `limits` as for `checks.integer`."""
+    return int(checked(key, lambda: checks.integer(name or key_name(key), value, **limits)))
 
 
 def choice(key: Key, value: Any, allowed: tuple[str, ...]) -> str:
     """One of some words."""
-    return str(checked(key, _validate.choice, key_name(key), value, allowed))
+    return str(checked(key, checks.choice, key_name(key), value, allowed))
 
 
 def text(key: Key, value: Any) -> str:

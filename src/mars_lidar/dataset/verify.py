@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar._version import other_version
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.store import open_dataset
@@ -67,10 +67,10 @@ def verify(
     array = dataset.histogram
     grid = tuple(math.ceil(n / step) for n, step in zip(array.shape, array.chunks, strict=True))
     total = math.prod(grid)
-    number = total if chunks is None else min(total, _validate.integer("chunks", chunks, low=1, high=2**62))
+    number = total if chunks is None else min(total, checks.integer("chunks", chunks, low=1, high=2**62))
     if threads is not None:
-        _validate.integer("threads", threads, low=1, high=1024)
-    random = np.random.default_rng(_validate.integer("seed", seed, low=0, high=2**64 - 1))
+        checks.integer("threads", threads, low=1, high=1024)
+    random = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     chosen = np.arange(total) if number == total else np.sort(random.choice(total, number, replace=False))
     maker = Maker(dataset, threads or _default_threads())
     different = []

@@ -14,11 +14,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.dataset.sample_content import Shown
 from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.shard import chunks_of, packer, write_shard
-from mars_lidar.dataset.shown import Shown
 from mars_lidar.dataset.store import Dataset, Item
-from mars_lidar.flux import Flux
+from mars_lidar.light.flux import Flux
 
 _T = TypeVar("_T")
 _KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them

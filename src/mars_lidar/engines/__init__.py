@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.engines.auto import AutoEngine
-from mars_lidar.engines.base import Engine
+from mars_lidar.engines.engine import Engine
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
@@ -33,7 +33,7 @@ def find_engine(engine: str | Engine, **options: Any) -> Engine:
             name = next(iter(given))
             raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {given[name]!r}")
         return found
-    found = ENGINES[_validate.choice("engine", engine, tuple(ENGINES))]
+    found = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
     for name in given:
         if name not in found.options:
             takes = ", ".join(found.options) if found.options else "none"

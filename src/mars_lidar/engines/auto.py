@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines._feedback_rule import Plan, draw_rest
-from mars_lidar.engines.base import Engine, Task
+from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
+from mars_lidar.engines.feedback_rule import Plan, draw_rest
 from mars_lidar.engines.parts import stage
-from mars_lidar.flux import Flux
-from mars_lidar.system import System
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 BREAK_EVEN = 4.0
 """Registrations per internal cell above which feedback is the faster engine.

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _core
-from mars_lidar.detector import MODES
-from mars_lidar.effects import EFFECTS, LIGHT_EFFECTS, require_effects
-from mars_lidar.engines.base import Engine, Records, Task
-from mars_lidar.flux import Flux
-from mars_lidar.system import System
+from mars_lidar.engines.engine import Engine, Records, Task
+from mars_lidar.instrument.detector import MODES
+from mars_lidar.instrument.effects import EFFECTS, LIGHT_EFFECTS, require_effects
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 
 class ExactEngine(Engine):
@@ -44,7 +44,7 @@ class ExactEngine(Engine):
 
     def histogram_on_cuda(self, task: Task, out: Any) -> None:
         """One exposure a thread."""
-        from mars_lidar.gpu import exact_histogram
+        from mars_lidar.cuda import exact_histogram
 
         exact_histogram(task, out)
 

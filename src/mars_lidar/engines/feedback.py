@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _core
-from mars_lidar.engines._feedback_grid import near_pulse
-from mars_lidar.engines._feedback_rule import Grid, Plan, Reason, Rest, draw_rest, sweep_pixels
-from mars_lidar.engines.base import Engine, Progress, Task
+from mars_lidar.engines.engine import Engine, Progress, Task
 from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.feedback_grid import near_pulse
+from mars_lidar.engines.feedback_rule import Grid, Plan, Reason, Rest, draw_rest, sweep_pixels
 from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.engines.poisson import PoissonEngine
-from mars_lidar.flux import Flux
-from mars_lidar.system import System
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 
 class FeedbackEngine(Engine):
@@ -67,8 +67,8 @@ class FeedbackEngine(Engine):
 
     def histogram_on_cuda(self, task: Task, out: Any) -> None:
         """One pixel a thread; what the sweeps refuse is drawn by the exact engine, there or, a waveform, here."""
-        from mars_lidar.gpu.feedback import feedback_histogram
-        from mars_lidar.gpu.machine import Cuda
+        from mars_lidar.cuda.feedback import feedback_histogram
+        from mars_lidar.cuda.machine import Cuda
 
         machine = Cuda()
 

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _validate
-from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.engines._count_shape import CountTimesShape, normalised
-from mars_lidar.engines._counts import CountLaws, Matched, Mended, Poisson, RoundedGaussian, Tabulated
-from mars_lidar.engines._pixels import Group, groups
-from mars_lidar.engines._synthesis import Batch, Run
-from mars_lidar.engines._table import Entries, TableReader
-from mars_lidar.engines._table_laws import exact_laws, untrusted
-from mars_lidar.engines.base import Task
-from mars_lidar.flux import Flux
-from mars_lidar.system import System
+from mars_lidar._base import checks
+from mars_lidar.engines.count_shape import CountTimesShape, normalised
+from mars_lidar.engines.counts import CountLaws, Matched, Mended, Poisson, RoundedGaussian, Tabulated
+from mars_lidar.engines.engine import Task
+from mars_lidar.engines.pixels import Group, groups
+from mars_lidar.engines.synthesis import Batch, Run
+from mars_lidar.engines.table_laws import exact_laws, untrusted
+from mars_lidar.engines.table_reader import Entries, TableReader
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
@@ -80,7 +80,7 @@ class MarsEngine(CountTimesShape):
         outside: Literal["error", "exact"] | None = None,
         level: str = "",
     ) -> None:
-        self.count = _validate.choice("count", count, _COUNTS)
+        self.count = checks.choice("count", count, _COUNTS)
         super().__init__(table, interpolation, outside, level)
 
     @property
@@ -98,14 +98,14 @@ class MarsEngine(CountTimesShape):
                 f"table must be given for engine 'mars' on device {device!r}: without one every pixel is evaluated by "
                 "the processor; build a mars_lidar.Table, or use device 'cpu'"
             )
-        from mars_lidar.gpu.mars import check_mars
+        from mars_lidar.cuda.mars import check_mars
 
         check_mars(float(flux.total.max()), system.cycles, system.dead_time_periods)
 
     def histogram_on_cuda(self, task: Task, out: Any) -> None:
         """A table's pixels there, one a block; what lies beyond the table is evaluated here."""
-        from mars_lidar.gpu.machine import Cuda
-        from mars_lidar.gpu.mars import mars_histogram
+        from mars_lidar.cuda.machine import Cuda
+        from mars_lidar.cuda.mars import mars_histogram
 
         mars_histogram(self, task, out, Cuda())
 
@@ -118,8 +118,8 @@ class MarsEngine(CountTimesShape):
             run.draw(batch)
 
     def _evaluated(self, run: Run, group: Group) -> Batch:
-        from mars_lidar.statistics._pmf import exact_windows
         from mars_lidar.statistics.exposure import recorded_moments
+        from mars_lidar.statistics.pmf import exact_windows
 
         task = run.task
         exposure = recorded_moments(group.cells, tolerance=1e-4, threads=task.threads, progress=run.waiting)

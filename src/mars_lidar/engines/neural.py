@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines._alignment import Alignment
-from mars_lidar.engines._count_shape import normalised
-from mars_lidar.engines._counts import RoundedGaussian
-from mars_lidar.engines._pixels import Group, groups, single_return
-from mars_lidar.engines._synthesis import Batch, Run
-from mars_lidar.engines.base import Engine, Task
-from mars_lidar.flux import Flux
-from mars_lidar.system import System
+from mars_lidar.engines.alignment import Alignment
+from mars_lidar.engines.count_shape import normalised
+from mars_lidar.engines.counts import RoundedGaussian
+from mars_lidar.engines.engine import Engine, Task
+from mars_lidar.engines.pixels import Group, groups, single_return
+from mars_lidar.engines.synthesis import Batch, Run
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
     from mars_lidar.learn.neural import NeuralMap
-    from mars_lidar.statistics._cells import Cells
+    from mars_lidar.statistics.cells import Cells
 
 FloatArray = NDArray[np.float64]
 
@@ -92,8 +92,8 @@ class NeuralEngine(Engine):
 
     def of_cells(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
         """PDFs (cells, bins), means and variances (cells,): uniform, 0 and 0 where there is no light."""
-        from mars_lidar.statistics._methods import pixel_of
         from mars_lidar.statistics.grid import photons_per_bin
+        from mars_lidar.statistics.methods import pixel_of
 
         system, model = cells.system, self.model
         model.check(system)

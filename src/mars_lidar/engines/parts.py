@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines.base import Engine, Progress, Task
-from mars_lidar.flux import Flux
+from mars_lidar.engines.engine import Engine, Progress, Task
+from mars_lidar.light.flux import Flux
 
 _TICKS = 1000
 _BUFFER_BYTES = 64 << 20  # of histograms drawn aside before they are put in place

@@ -7,10 +7,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from mars_lidar import _core
-from mars_lidar.detector import MODES
-from mars_lidar.engines.base import Engine, Task
-from mars_lidar.flux import Flux
-from mars_lidar.system import System
+from mars_lidar.engines.engine import Engine, Task
+from mars_lidar.instrument.detector import MODES
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 
 class PoissonEngine(Engine):

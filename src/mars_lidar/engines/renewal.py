@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines._alignment import Alignment
-from mars_lidar.engines._count_shape import CountTimesShape, normalised
-from mars_lidar.engines._counts import CountLaws, RoundedGaussian
-from mars_lidar.engines._pixels import Group, groups, single_return
-from mars_lidar.engines._synthesis import Batch, Run
-from mars_lidar.engines._table import Entries, TableReader
-from mars_lidar.system import System
+from mars_lidar.engines.alignment import Alignment
+from mars_lidar.engines.count_shape import CountTimesShape, normalised
+from mars_lidar.engines.counts import CountLaws, RoundedGaussian
+from mars_lidar.engines.pixels import Group, groups, single_return
+from mars_lidar.engines.synthesis import Batch, Run
+from mars_lidar.engines.table_reader import Entries, TableReader
+from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
@@ -84,8 +84,8 @@ def _laws(system: System, signal: FloatArray, background: FloatArray) -> CountLa
 
 def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:
     """Shapes (cells, bins) and registrations per period (cells,)."""
-    from mars_lidar.statistics._methods import pixel_of
     from mars_lidar.statistics.chain import PhaseChain
+    from mars_lidar.statistics.methods import pixel_of
 
     cells, system = group.cells, run.task.system
     shapes, rates = np.zeros((cells.size, system.bins)), np.zeros(cells.size)

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import _core
-from mars_lidar.detector import MODES
-from mars_lidar.effects import EFFECTS
-from mars_lidar.engines.base import Engine, Records, Task
+from mars_lidar.engines.engine import Engine, Records, Task
+from mars_lidar.instrument.detector import MODES
+from mars_lidar.instrument.effects import EFFECTS
 
 
 class SequentialEngine(Engine):

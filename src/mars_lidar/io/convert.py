@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save
-from mars_lidar.io.streams import STREAM_SUFFIXES, is_stream
-from mars_lidar.timestamps import Timestamps
+from mars_lidar.io.photons.streams import STREAM_SUFFIXES, is_stream
+from mars_lidar.light.timestamps import Timestamps
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def photons(
     from mars_lidar import __version__
     from mars_lidar.simulate import simulate_timestamps
 
-    k = _validate.integer("realization", realization, low=0, high=cube.shape[0] - 1)
+    k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
     arguments = cube.recipe.part(slice(k, k + 1), slice(0, cube.shape[1]))
     del arguments["realizations"]
     arguments["realization"] = arguments.pop("first_realization")
@@ -144,7 +144,7 @@ def _cube(cube: Cube, old: Path, new: Path, realization: int | None, overwrite: 
     lost = []
     if realization is not None:
         count = cube.shape[0]
-        k = _validate.integer("realization", realization, low=0, high=count - 1)
+        k = checks.integer("realization", realization, low=0, high=count - 1)
         recipe = cube.recipe.replace(realizations=1, first_realization=cube.recipe.first_realization + k)
         cube = Cube(histogram=np.asarray(cube.histogram[k : k + 1]), recipe=recipe, version=cube.version)
         if count > 1:
@@ -176,7 +176,7 @@ def resolution_ns(path: Path, times: Timestamps) -> float:
     """Unit of the times that the format of `path` stores, ns; 0 for .npz, which holds them as they are."""
     if path.suffix == ".npz":
         return 0.0
-    from mars_lidar.io import photon_hdf5, ptu_stream
+    from mars_lidar.io.photons import photon_hdf5, ptu_stream
 
     module = ptu_stream if path.suffix == ".ptu" else photon_hdf5
     return float(times.period_ns / (times.bins * module.units_per_bin(times.bins)))

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._brief import brief
-from mars_lidar._memory import check_memory
-from mars_lidar.flux import Flux
+from mars_lidar._base.brief import brief
+from mars_lidar._base.memory import check_memory
+from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.store import (
@@ -25,7 +25,7 @@ from mars_lidar.io.store import (
     check_target,
     reason,
 )
-from mars_lidar.system import System
+from mars_lidar.light.flux import Flux
 
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz", ".mat", ".ptu")
 
@@ -249,7 +249,7 @@ def _format(path: Path, argument: str) -> Any:
     elif path.suffix == ".mat":
         from mars_lidar.io import mat as module
     elif path.suffix == ".ptu":
-        from mars_lidar.io import ptu as module
+        from mars_lidar.io.photons import ptu as module
     else:
         raise ValueError(f"{argument} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
     return module

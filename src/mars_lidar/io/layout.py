@@ -35,10 +35,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.flux import Flux
+from mars_lidar.instrument.system import System
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.stored_flux import BAND_BYTES, StoredFlux, Waveforms
-from mars_lidar.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.stored_flux import BAND_BYTES, StoredFlux, Waveforms
 
 FORMAT = "mars-lidar cube"
 _OTHERS = {  # attribute `format` of what is no cube, `kind` of a table: what it is, what reads it

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mars_lidar.io.store import TemporarySibling, check_target
 
 if TYPE_CHECKING:
-    from mars_lidar.estimate import Reconstruction
+    from mars_lidar.reconstruct import Reconstruction
 
 FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")

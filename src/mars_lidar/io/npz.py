@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._memory import check_memory
+from mars_lidar._base.memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
 from mars_lidar.io.store import (

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.flux import Flux
-from mars_lidar.stored_flux import StoredFlux
-from mars_lidar.system import System
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.stored_flux import StoredFlux
 
 BLOCK_BYTES = 64 * 2**20  # one call of the simulator: enough work for every core, little beside the output
 
@@ -68,7 +68,7 @@ class Recipe:
             ("realizations", 1, 2**32),
             ("first_realization", 0, 2**32 - 1),
         ):
-            number = _validate.integer(name, getattr(self, name), low=low, high=high)
+            number = checks.integer(name, getattr(self, name), low=low, high=high)
             object.__setattr__(self, name, number)
         if not isinstance(self.engine, str):
             raise TypeError(f"engine must be the name of an engine, got {self.engine!r}")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from mars_lidar.scene import Scene
+from mars_lidar.scene.scene import Scene
 
 MANIFEST = "manifest.csv"
 _COLUMNS = ("depth", "image", "index", "depth_unit_m", "focal_px")

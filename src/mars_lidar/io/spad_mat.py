@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._memory import check_memory
+from mars_lidar._base import checks
+from mars_lidar._base.memory import check_memory
 from mars_lidar.io import mat
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.store import check_target
@@ -115,7 +115,7 @@ def save_mat(
     target = Path(path)
     if target.suffix != ".mat":
         raise ValueError(f"path must end in .mat, got {str(path)!r}")
-    k = _validate.integer("realization", realization, low=0, high=cube.shape[0] - 1)
+    k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
     recipe = cube.recipe.replace(realizations=1, first_realization=cube.recipe.first_realization + k)
     fine = None
     if depth_hr_m is not None:

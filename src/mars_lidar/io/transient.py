@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._memory import check_memory
-from mars_lidar.system import SPEED_OF_LIGHT_M_PER_NS
-from mars_lidar.transient import Transient
+from mars_lidar._base.memory import check_memory
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
+from mars_lidar.light.transient import Transient
 
 SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _NAME = "transient"

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mars_lidar import _validate
-from mars_lidar._memory import check_memory
+from mars_lidar._base import checks
+from mars_lidar._base.memory import check_memory
 from mars_lidar.engines import Engine
+from mars_lidar.instrument.system import System
 from mars_lidar.learn.passing import ABLE, Slot, Slots
 from mars_lidar.learn.sample import Sample
 from mars_lidar.simulate import simulate
-from mars_lidar.system import System
 
 _UNSIGNED = {np.dtype(np.uint16): torch.uint16, np.dtype(np.uint32): torch.uint32}
 
@@ -32,8 +32,8 @@ class CubeMaker:
             engine.check_mode(system)
             engine.check_effects(system)
         self._engine = engine
-        self._layout = _validate.choice("layout", layout, ("dense", "sparse"))
-        self._axes = _validate.choice("axes", axes, ("THW", "HWT"))
+        self._layout = checks.choice("layout", layout, ("dense", "sparse"))
+        self._axes = checks.choice("axes", axes, ("THW", "HWT"))
         if dtype is not None and not isinstance(dtype, torch.dtype):
             raise TypeError(f"dtype must be a torch.dtype, or None for the counts as they are, got {dtype!r}")
         self._counts = max((system.histogram_dtype for system in systems), key=lambda dtype: dtype.itemsize)

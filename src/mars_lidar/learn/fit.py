@@ -17,7 +17,7 @@ import yaml
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 
 RECORD, LOG, LAST, BEST = "run.yaml", "log.csv", "last.pt", "best.pt"
 _COLUMNS = ("step", "seconds", "rate", "loss", "validation")
@@ -56,15 +56,15 @@ class FitPlan:
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "every", "patience"):
-            _validate.integer(name, getattr(self, name), low=1, high=10**9)
+            checks.integer(name, getattr(self, name), low=1, high=10**9)
         for name in ("rate", "scale"):
-            object.__setattr__(self, name, _validate.real(name, getattr(self, name), low=0.0, strict_low=True))
-        _validate.integer("seed", self.seed, low=0, high=2**63 - 1)
+            object.__setattr__(self, name, checks.real(name, getattr(self, name), low=0.0, strict_low=True))
+        checks.integer("seed", self.seed, low=0, high=2**63 - 1)
 
     @classmethod
     def from_dict(cls, data: Any) -> FitPlan:
         """From plain data; an unknown key is an error."""
-        return cls(**_validate.known_keys("fit", data, tuple(field.name for field in fields(cls))))
+        return cls(**checks.known_keys("fit", data, tuple(field.name for field in fields(cls))))
 
 
 @dataclass(frozen=True, eq=False)

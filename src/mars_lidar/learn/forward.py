@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
 except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
-from mars_lidar import _validate
-from mars_lidar.learn.circle import TOLERANCE, Delay, fired, registered
+from mars_lidar._base import checks
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import System
+from mars_lidar.learn.cyclic_solver import TOLERANCE, Delay, fired, registered
 from mars_lidar.learn.light import bin_photons, check_detector, detected, inputs
-from mars_lidar.pulse import GaussianPulse
-from mars_lidar.system import System
 
 _FINE = 4.0  # parts of a sigma of the pulse
 _BLOCK = 2**22  # pixels x bins of photons that are held at a time
@@ -58,8 +58,8 @@ def expected_histogram(
 
     Notes
     -----
-    O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.circle`). At less cost and to the
-    accuracy of a table: `HistogramTable`.
+    O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.cyclic_solver`). At less cost and to
+    the accuracy of a table: `HistogramTable`.
     """
     check_detector(system, light=True)
     given = inputs(signal, background, delay_ns)
@@ -69,7 +69,7 @@ def expected_histogram(
     if refine is None:
         pulse = system.pulse
         refine = max(1, math.ceil(_FINE * system.bin_ns / pulse.sigma_ns)) if isinstance(pulse, GaussianPulse) else 1
-    parts = _validate.integer("refine", refine, low=1, high=2**16)
+    parts = checks.integer("refine", refine, low=1, high=2**16)
     flat = [one.reshape(-1) for one in given]
     out: torch.Tensor = _Expected.apply(*flat, system, parts)  # type: ignore[no-untyped-call]
     return out.reshape(*given[0].shape, system.bins)

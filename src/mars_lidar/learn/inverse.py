@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
@@ -14,15 +14,15 @@ except ImportError as _error:
         f"mars_lidar.learn.LidarPhysics needs PyTorch and deepinv: pip install 'mars-lidar[learn]' deepinv ({_error})"
     ) from _error
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.engines import Engine, find_engine
-from mars_lidar.estimate.reconstruct import reconstruct
-from mars_lidar.flux import Flux
+from mars_lidar.instrument.system import System
 from mars_lidar.learn.forward import expected_histogram
 from mars_lidar.learn.light import check_detector
 from mars_lidar.learn.tabulated import HistogramTable
+from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruct.reconstruction import reconstruct
 from mars_lidar.simulate import simulate
-from mars_lidar.system import System
 from mars_lidar.table import Table
 
 
@@ -61,7 +61,7 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
             raise ValueError(f"table must be of this system, got one of {table.system}")
         self.system, self._engine, self._threads = system, find_engine(engine), threads
         self._table = None if table is None else HistogramTable(table, cycles=system.cycles)
-        self._seed = _validate.integer("seed", seed, low=0, high=2**63 - 1)
+        self._seed = checks.integer("seed", seed, low=0, high=2**63 - 1)
 
     def A(self, x: torch.Tensor, **kwargs: Any) -> torch.Tensor:
         """Expected histograms."""

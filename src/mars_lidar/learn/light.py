@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
 except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
-from mars_lidar import _validate
-from mars_lidar.effects import LIGHT_EFFECTS
-from mars_lidar.pulse import GaussianPulse, Pulse, SampledPulse
-from mars_lidar.system import System
+from mars_lidar._base import checks
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
+from mars_lidar.instrument.system import System
 
 
 def bin_photons(
@@ -30,7 +30,7 @@ def bin_photons(
         Parts that each bin is cut into.
     """
     signal, background, delay_ns = inputs(signal, background, delay_ns)
-    bins = system.bins * _validate.integer("refine", refine, low=1, high=2**16)
+    bins = system.bins * checks.integer("refine", refine, low=1, high=2**16)
     edges = torch.arange(bins + 1, dtype=signal.dtype, device=signal.device) * (system.period_ns / bins)
     time = edges - torch.remainder(delay_ns, system.period_ns).unsqueeze(-1)
     energy = wrapped_energy(system, time)

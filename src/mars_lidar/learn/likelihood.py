@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
 except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
-from mars_lidar.learn.circle import Delay
+from mars_lidar.instrument.system import System
+from mars_lidar.learn.cyclic_solver import Delay
 from mars_lidar.learn.light import bin_photons, check_detector, detected, inputs
-from mars_lidar.system import System
 
 
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:

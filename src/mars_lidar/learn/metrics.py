@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 
 
 def psnr(found: ArrayLike, true: ArrayLike, data_range: float) -> float:
     """Peak signal-to-noise ratio, dB: 20 log10(`data_range` / RMSE); `data_range` is stated, not the data's."""
-    peak = _validate.real("data_range", data_range, low=0.0, strict_low=True)
+    peak = checks.real("data_range", data_range, low=0.0, strict_low=True)
     error = rmse(found, true)
     return math.inf if error == 0.0 else 20.0 * math.log10(peak / error)
 
@@ -29,7 +29,7 @@ def rmse(found: ArrayLike, true: ArrayLike) -> float:
 
 def ssim(found: ArrayLike, true: ArrayLike, data_range: float) -> float:
     """Structural similarity (Wang et al. 2004) of two images (H, W), Gaussian window of 1.5 pixels; scikit-image's."""
-    peak = _validate.real("data_range", data_range, low=0.0, strict_low=True)
+    peak = checks.real("data_range", data_range, low=0.0, strict_low=True)
     try:
         from skimage.metrics import structural_similarity
     except ImportError as error:

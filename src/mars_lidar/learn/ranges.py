@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.pulse import GaussianPulse
-from mars_lidar.system import System
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import System
 
 
 @dataclass(frozen=True)
@@ -199,11 +199,11 @@ def as_systems(value: System | Sequence[System] | SystemRange) -> SystemRange | 
 
 def _ordered(given: Uniform | LogUniform, positive: bool = False) -> None:
     for name in ("low", "high"):
-        number = _validate.real(name, getattr(given, name), low=0.0 if positive else -math.inf, strict_low=positive)
+        number = checks.real(name, getattr(given, name), low=0.0 if positive else -math.inf, strict_low=positive)
         object.__setattr__(given, name, number)
     if given.low > given.high:
         raise ValueError(f"low must be at most high, got {given.low:g} and {given.high:g}")
 
 
 def _number(name: str, value: Any) -> float:
-    return math.inf if value == math.inf else _validate.real(name, value)
+    return math.inf if value == math.inf else checks.real(name, value)

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar.flux import Flux
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import System
 from mars_lidar.learn.ranges import Range, SystemList, SystemRange
 from mars_lidar.learn.scenes import SceneSource, generator
-from mars_lidar.pulse import GaussianPulse
-from mars_lidar.scene import Scene
-from mars_lidar.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.scene.scene import Scene
 
 _TRIES = 20  # places tried for a crop with a return in it
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from torch.utils.data import get_worker_info
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.io.scan import SceneFile, scan
-from mars_lidar.learn.shared import SharedScenes
-from mars_lidar.scene import Scene
+from mars_lidar.learn.scene_cache import SharedScenes
+from mars_lidar.scene.scene import Scene
 
 POOL = 16  # ray-cast scenes that are in use at a time
 _MARGIN = 1.5  # they are cast larger than what is cropped from them
@@ -171,7 +171,7 @@ class Arrays(Given):
 
 def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSource:
     """What `CubeStream` takes as scenes."""
-    _validate.integer("reuse", reuse, low=1, high=2**31)
+    checks.integer("reuse", reuse, low=1, high=2**31)
     if isinstance(scenes, str) and scenes in Scene.example_names():
         return RayCast(scenes, (64, 64) if size is None else size, reuse)
     if isinstance(scenes, str | Path):

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _validate
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base import checks
+from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
@@ -22,7 +22,7 @@ except ImportError as _error:
 
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.store import Dataset, open_dataset
-from mars_lidar.learn.places import rank_of, worker_of
+from mars_lidar.learn.distributed import rank_of, worker_of
 
 _NUMBERS = ("sample", "realization", "scene", "system", "signal_level", "sbr", "seed")
 
@@ -89,10 +89,10 @@ class StoredDataset(IterableDataset[dict[str, Any]]):
         number = dataset.histogram.shape[0]
         self._samples = np.arange(number) if samples is None else _numbers(samples, number)
         self._shuffle = bool(shuffle)
-        self._pool = _validate.integer("pool", pool, low=1, high=2**31)
-        self._seed = _validate.integer("seed", seed, low=0, high=2**63 - 1)
-        self._maps = tuple(_validate.choice("maps", name, tuple(MAPS)) for name in maps)
-        self._axes = _validate.choice("axes", axes, ("THW", "HWT"))
+        self._pool = checks.integer("pool", pool, low=1, high=2**31)
+        self._seed = checks.integer("seed", seed, low=0, high=2**63 - 1)
+        self._maps = tuple(checks.choice("maps", name, tuple(MAPS)) for name in maps)
+        self._axes = checks.choice("axes", axes, ("THW", "HWT"))
         if not isinstance(dtype, torch.dtype):
             raise TypeError(f"dtype must be a torch.dtype, got {dtype!r}")
         self._dtype = dtype
@@ -113,7 +113,7 @@ class StoredDataset(IterableDataset[dict[str, Any]]):
 
         A loader without workers goes on by itself; the workers of others are copies, which would repeat an order.
         """
-        self._epoch = _validate.integer("epoch", epoch, low=0, high=2**62)
+        self._epoch = checks.integer("epoch", epoch, low=0, high=2**62)
 
     def __len__(self) -> int:
         """Examples of one pass on this rank, all workers together."""

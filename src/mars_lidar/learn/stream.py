@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mars_lidar import _validate
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base import checks
+from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
@@ -19,17 +19,17 @@ try:
 except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
+from mars_lidar._base.resample import image_size
 from mars_lidar.engines import Engine, find_engine
+from mars_lidar.instrument.system import System
 from mars_lidar.io.scan import SceneFile
 from mars_lidar.learn.cubes import CubeMaker
+from mars_lidar.learn.distributed import rank_of, worker_of
 from mars_lidar.learn.passing import forget, passed
-from mars_lidar.learn.places import rank_of, worker_of
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.sample import Recipe, Sample, maps_of, numbers_of
 from mars_lidar.learn.scenes import as_source
-from mars_lidar.resample import image_size
-from mars_lidar.scene import Scene
-from mars_lidar.system import System
+from mars_lidar.scene.scene import Scene
 
 _LAST = 2**62
 
@@ -137,19 +137,19 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         if shape is None and isinstance(scenes, str) and scenes in Scene.example_names():
             shape = (64, 64)
         drawn = as_systems(systems)
-        _validate.choice("attenuation", attenuation, ("none", "inverse_square"))
+        checks.choice("attenuation", attenuation, ("none", "inverse_square"))
         if ambient is not None:
-            _validate.choice("ambient", ambient, ("uniform", "reflectivity", "map"))
+            checks.choice("ambient", ambient, ("uniform", "reflectivity", "map"))
         self._recipe = Recipe(
             source=as_source(scenes, shape, reuse), systems=drawn, size=shape, flips=bool(flips),
             signal=as_range("signal", signal), sbr=as_range("sbr", sbr, infinite=True),
             depth_scale=as_range("depth_scale", depth_scale), attenuation=attenuation, ambient=ambient,
-            dark_counts_per_s=_validate.real("dark_counts_per_s", dark_counts_per_s, low=0.0),
-            seed=_validate.integer("seed", seed, low=0, high=2**63 - 1),
+            dark_counts_per_s=checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0),
+            seed=checks.integer("seed", seed, low=0, high=2**63 - 1),
         )  # fmt: skip
-        self._size = None if epoch_size is None else _validate.integer("epoch_size", epoch_size, low=1, high=_LAST)
-        self._batch = None if batch_size is None else _validate.integer("batch_size", batch_size, low=1, high=2**20)
-        self._threads = None if threads is None else _validate.integer("threads", threads, low=1, high=1024)
+        self._size = None if epoch_size is None else checks.integer("epoch_size", epoch_size, low=1, high=_LAST)
+        self._batch = None if batch_size is None else checks.integer("batch_size", batch_size, low=1, high=2**20)
+        self._threads = None if threads is None else checks.integer("threads", threads, low=1, high=1024)
         self._maker = CubeMaker(find_engine(engine), drawn.corners(), device, layout, axes, dtype)
         self._transform = transform
         self._rank, self._world = rank_of(rank, world_size)
@@ -169,9 +169,9 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         Without it each pass gives the same epoch again. After n batches a loader has given samples up to
         ``n * batch_size * world_size``; from there the batches of the rest are those of a run that did not stop.
         """
-        number = _validate.integer("epoch", epoch, low=0, high=_LAST)
+        number = checks.integer("epoch", epoch, low=0, high=_LAST)
         most = _LAST if self._size is None else self._size
-        self._state[1] = _validate.integer("start", start, low=0, high=most)
+        self._state[1] = checks.integer("start", start, low=0, high=most)
         self._state[0], self._given = number, 0
 
     @property
@@ -188,7 +188,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
             Examples taken from a loader with workers, since the last `set_epoch` or `load_state_dict`: only the
             caller knows that number. None: counted here, right without workers.
         """
-        given = self._given if batches is None else _validate.integer("batches", batches, low=0, high=_LAST)
+        given = self._given if batches is None else checks.integer("batches", batches, low=0, high=_LAST)
         start = int(self._state[1]) + given * (self._batch or 1) * self._world
         if self._size is not None:
             start = min(start, self._size)
@@ -203,7 +203,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
     def sample(self, index: int) -> Sample:
         """Scene, Flux, System and seed of a sample of this epoch, not simulated."""
         most = _LAST if self._size is None else self._size - 1
-        return self._recipe.sample(self.epoch, _validate.integer("index", index, low=0, high=most))
+        return self._recipe.sample(self.epoch, checks.integer("index", index, low=0, high=most))
 
     def __len__(self) -> int:
         """Examples of one pass on this rank, all workers together."""

@@ -6,14 +6,14 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
 except ImportError as _error:
     raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
-from mars_lidar.learn.circle import Delay
+from mars_lidar.learn.cyclic_solver import Delay
 from mars_lidar.learn.light import check_detector, inputs, wrapped_energy
 from mars_lidar.table import Table
 

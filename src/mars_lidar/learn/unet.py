@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from mars_lidar import _validate
-from mars_lidar.io.optional import MissingLibraryError
+from mars_lidar._base import checks
+from mars_lidar._base.optional import MissingLibraryError
 
 try:
     import torch
@@ -44,14 +44,14 @@ class CubeUNet(nn.Module):
         self, bins: int, target: Target, *, stem: int = 64, widths: Sequence[int] = (32, 64, 96), blocks: int = 1
     ) -> None:
         super().__init__()
-        _validate.choice("target", target, TARGETS)
-        _validate.integer("bins", bins, low=1, high=2**20)
-        _validate.integer("stem", stem, low=1, high=4096)
-        _validate.integer("blocks", blocks, low=1, high=16)
+        checks.choice("target", target, TARGETS)
+        checks.integer("bins", bins, low=1, high=2**20)
+        checks.integer("stem", stem, low=1, high=4096)
+        checks.integer("blocks", blocks, low=1, high=16)
         if not widths:
             raise ValueError("widths must have at least one level, got none")
         for width in widths:
-            if _validate.integer("widths", width, low=8, high=4096) % 8:
+            if checks.integer("widths", width, low=8, high=4096) % 8:
                 raise ValueError(f"widths must be multiples of 8, got {width}")
         self.target: Target = target
         self.multiple = 2 ** (len(widths) - 1)

@@ -9,7 +9,7 @@
 
 namespace mars {
 
-// What is to be said of a pixel; `mars_lidar.estimate.Flags`.
+// What is to be said of a pixel; `mars_lidar.reconstruct.Flags`.
 enum Flag : uint8_t { kEmpty = 1, kNoSignal = 2, kSaturated = 4, kUnconverged = 8 };
 
 struct ReconstructionJob {

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mars_lidar.studies.compare import Comparison
+    from mars_lidar.compare.comparison import Comparison
 
 _WIDTH = 13.0  # inches
 _ACROSS = 5  # maps in a row

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.flux import Flux
-from mars_lidar.system import System
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.instrument.system import System
 from mars_lidar.plot.data import incident_rate, predicted_counts
 from mars_lidar.plot.style import INK, MUTED
-from mars_lidar.system import System
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,8 +14,8 @@ from mars_lidar.plot.style import DPI, style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from mars_lidar.estimate import Reconstruction
     from mars_lidar.io import Cube
+    from mars_lidar.reconstruct import Reconstruction
 
 _MAP_INCHES = 2.35
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mars_lidar.estimate import Inspection, Recovery, Validation
+    from mars_lidar.calibrate import Inspection, Recovery, Validation
 
 _SHOWN_RATIO = 4.0
 

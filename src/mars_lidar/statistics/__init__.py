@@ -1,6 +1,5 @@
 """Analytic count laws and histogram shapes of one pixel: no scene, no sampling."""
 
-from mars_lidar.statistics._feedback import ConvergenceError
 from mars_lidar.statistics.baselines import poisson_moments, poisson_pmf, renewal_moments, renewal_pmf
 from mars_lidar.statistics.chain import PhaseChain, Stationary
 from mars_lidar.statistics.constant_light import constant_light_rate
@@ -11,6 +10,7 @@ from mars_lidar.statistics.histogram import mean_histogram
 from mars_lidar.statistics.joint import JointLaw, joint_law
 from mars_lidar.statistics.law import CountLaw, count_law, registration_pdf
 from mars_lidar.statistics.paralyzable import ParalyzableMoments, paralyzable_moments
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.renewal import (
     HoldingTimes,
     MomentMatrices,

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar.detector import MODES
-from mars_lidar.statistics._gate import require_mode
-from mars_lidar.system import System
+from mars_lidar.instrument.detector import MODES
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.gate import require_mode
 
 FloatArray = NDArray[np.float64]
 

@@ -16,12 +16,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.statistics._feedback import ConvergenceError, Feedback, Solution, cyclic_recursion
-from mars_lidar.statistics._gate import require_mode
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.grid import cell_name, photons_per_bin
-from mars_lidar.system import System
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError, Feedback, Solution, cyclic_recursion
 
 FloatArray = NDArray[np.float64]
 Rearm = Literal["centre", "edge"]
@@ -122,8 +122,8 @@ class PhaseChain:
         total = float(photons.sum())
         if not total > 0:
             raise ValueError("photons must not all be 0: without flux there is no registration and no chain")
-        dead = _validate.real("dead_time", self.dead_time, low=0.0)
-        _validate.choice("rearm", self.rearm, _REARMS)
+        dead = checks.real("dead_time", self.dead_time, low=0.0)
+        checks.choice("rearm", self.rearm, _REARMS)
         photons.flags.writeable = False
         n = photons.size
         # whole periods apart first: t_d of 200.9 periods must not cost digits of its fraction (2.2)
@@ -205,7 +205,7 @@ class PhaseChain:
         ``"shift"``: rows of the first-arrival matrix, shifted cyclically by the dead time (2.3).
         ``"rapp"``: element by element from the integrated flux between re-arming and arrival (2.1).
         """
-        _validate.choice("form", form, ("shift", "rapp"))
+        checks.choice("form", form, ("shift", "rapp"))
         return self._dense_shift() if form == "shift" else self._dense_rapp()
 
     def _dense_shift(self) -> FloatArray:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _validate
-from mars_lidar.detector import Detector
-from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS, require_effects
+from mars_lidar._base import checks
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS, require_effects
 
 _EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", *TIMING_EFFECTS)
 _TOLERANCE = 1e-12
@@ -38,7 +38,7 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
         Of mode ``"nonparalyzable"``, without crosstalk or a longer dead time of the electronics, and afterpulses of all
         generations.
     """
-    light = _validate.real("rate_hz", rate_hz, low=0.0, high=_MAX_RATE_HZ)
+    light = checks.real("rate_hz", rate_hz, low=0.0, high=_MAX_RATE_HZ)
     require_effects("constant_light_rate", detector, _EFFECTS, lambda _: "; simulate it with engine 'sequential'")
     if detector.mode != "nonparalyzable":
         raise ValueError(f"constant_light_rate treats mode 'nonparalyzable' only, got {detector.mode!r}")

@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.detector import Mode
-from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.statistics._cells import Cells, FloatArray
-from mars_lidar.statistics._electronics_grid import MOST_EFFORT, Effort, RecordGrid, RecordRun
-from mars_lidar.statistics._feedback import ConvergenceError
-from mars_lidar.statistics._gate import photons_before
-from mars_lidar.statistics._timing import Timing, is_timed
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.electronics_grid import MOST_EFFORT, Effort, RecordGrid, RecordRun
 from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.system import System
+from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.timing import Timing, is_timed
 
 ELECTRONICS_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")
 _SETTLED = 1e-11
@@ -95,7 +95,7 @@ def electronics_moments(
 
 def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> ElectronicsMoments:
     """`electronics_moments` of checked cells."""
-    tolerance = _validate.real("tolerance", tolerance, low=1e-6, high=0.1)
+    tolerance = checks.real("tolerance", tolerance, low=1e-6, high=0.1)
     out = cells.system
     timing = Timing(out, cells.finest) if is_timed(out) else None
     if timing is not None:

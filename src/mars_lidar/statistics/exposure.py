@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.detector import Mode
-from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
-from mars_lidar.statistics._feedback import ConvergenceError
-from mars_lidar.statistics._paralyzable_rate import registration_rates
-from mars_lidar.statistics._timing import Timing, is_timed
-from mars_lidar.statistics._warm import NOT_WARM, warm_history
-from mars_lidar.system import System
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics.paralyzable_rate import registration_rates
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.timing import Timing, is_timed
+from mars_lidar.statistics.warm import NOT_WARM, warm_history
 
 if TYPE_CHECKING:
     from mars_lidar import _core
@@ -161,7 +161,7 @@ def refined_moments(
 
     A cell that would take more than some `steps` bins x periods on all its grids is refused.
     """
-    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:
         return _poisson(cells, out_bins)
@@ -228,7 +228,7 @@ def _too_long(cells: Cells, steps: int | None) -> str:
 def thread_count(threads: int | None) -> int:
     """Threads asked for, or all processors that this process may use."""
     if threads is not None:
-        return _validate.integer("threads", threads, low=1, high=1024)
+        return checks.integer("threads", threads, low=1, high=1024)
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on this system

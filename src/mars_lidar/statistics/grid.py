@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar.system import System
+from mars_lidar._base import checks
+from mars_lidar.instrument.system import System
 
 FloatArray = NDArray[np.float64]
 
@@ -47,9 +47,9 @@ def photons_per_bin(
     NDArray
         (bins,).
     """
-    back = _validate.real("background", background, low=0.0, high=_MAX_PHOTONS)
+    back = checks.real("background", background, low=0.0, high=_MAX_PHOTONS)
     if bins is not None:
-        bins = _validate.integer("bins", bins, low=1, high=_MAX_BINS)
+        bins = checks.integer("bins", bins, low=1, high=_MAX_BINS)
     if waveform is not None:
         if signal is not None or delay_ns is not None:
             raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
@@ -61,8 +61,8 @@ def photons_per_bin(
         return _detected(np.maximum(energy, 0.0) + back / n, system)
     if signal is None:
         raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-    total = _validate.real("signal", signal, low=0.0, high=_MAX_PHOTONS)
-    delay = 0.5 * system.period_ns if delay_ns is None else _validate.real("delay_ns", delay_ns)
+    total = checks.real("signal", signal, low=0.0, high=_MAX_PHOTONS)
+    delay = 0.5 * system.period_ns if delay_ns is None else checks.real("delay_ns", delay_ns)
     n = bins or default_bins(system)
     energy = system.pulse.bin_energy(delay, system.period_ns, n)
     return _detected(total * np.maximum(energy, 0.0) + back / n, system)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mars_lidar.detector import MODES
-from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.statistics._cells import LAW_STEPS, Cells, FloatArray
-from mars_lidar.statistics._electronics_grid import LAW_EFFORT
-from mars_lidar.statistics._timing import recorded
+from mars_lidar.instrument.detector import MODES
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import LAW_STEPS, Cells, FloatArray
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments
+from mars_lidar.statistics.electronics_grid import LAW_EFFORT
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
-from mars_lidar.system import System
+from mars_lidar.statistics.timing import recorded
 
 
 def mean_histogram(

@@ -14,16 +14,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar._memory import check_memory
-from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.statistics._cells import Cells, FloatArray
-from mars_lidar.statistics._feedback import ConvergenceError
-from mars_lidar.statistics._joint_pixel import Pixel, movement
-from mars_lidar.statistics._joint_timed import TimedPixel
-from mars_lidar.statistics._timing import Timing, is_timed
-from mars_lidar.system import System
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar._base.memory import check_memory
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.joint_pixel import Pixel, movement
+from mars_lidar.statistics.joint_timed import TimedPixel
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.timing import Timing, is_timed
 
 _MAX_BINS = 2**17  # of the grid, unless the histogram itself has more: a second or two
 _BLOCK = 64  # windows solved at a time
@@ -68,7 +68,7 @@ def joint_law(
     the exposure is too short to forget its start (`settled` is -1) every window is carried through all periods,
     which is exact too but costs O(bins x cycles) a window instead of O(bins).
     """
-    tolerance = _validate.real("tolerance", tolerance, low=1e-7, high=0.1)
+    tolerance = checks.real("tolerance", tolerance, low=1e-7, high=0.1)
     for name, value in (("signal", signal), ("background", background), ("delay_ns", delay_ns)):
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be a scalar (one pixel), got shape {np.shape(value)}")
@@ -203,7 +203,7 @@ class JointLaw:
     def lag(self, lag: int = 1) -> FloatArray:
         """(bins,) covariances of bin j with bin j + lag, round the period; lag 0 gives the variances."""
         n = self.mean.size
-        lag = _validate.integer("lag", lag, low=-n, high=n)
+        lag = checks.integer("lag", lag, low=-n, high=n)
         if self._pixel is None:
             return self.mean.copy() if lag % n == 0 else np.zeros(n)
         if self._covariance is not None:

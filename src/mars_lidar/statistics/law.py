@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mars_lidar import _validate
-from mars_lidar.detector import MODES, Mode
-from mars_lidar.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.statistics._cells import LAW_STEPS, Cells, FloatArray, IndexArray
-from mars_lidar.statistics._electronics_law import record_windows
-from mars_lidar.statistics._gate import PLAIN
-from mars_lidar.statistics._methods import check_model, neural_moments, pixel_of, rearm_of
-from mars_lidar.statistics._pmf import Window, exact_windows, gaussian_window, poisson_window
+from mars_lidar._base import checks
+from mars_lidar.instrument.detector import MODES, Mode
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import LAW_STEPS, Cells, FloatArray, IndexArray
+from mars_lidar.statistics.electronics_law import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments, thread_count
+from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects
+from mars_lidar.statistics.methods import check_model, neural_moments, pixel_of, rearm_of
+from mars_lidar.statistics.pmf import Window, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics.shape import registration_pdf as registration_pdf
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
-from mars_lidar.system import System
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -178,7 +178,7 @@ def count_law(
     CountLaw
         For cells of shape (...).
     """
-    _validate.choice("method", method, _METHODS)
+    checks.choice("method", method, _METHODS)
     edge = rearm_of(rearm, method == "mars", f"method {method!r}")
     check_model(model, method)
     cells = Cells.of(

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar.statistics._cells import FloatArray, IndexArray
-from mars_lidar.statistics._pmf import Window
+from mars_lidar.statistics.cells import FloatArray, IndexArray
+from mars_lidar.statistics.pmf import Window
 
 _MAX_COUNTS = 2**24
 _MAX_MEAN = 1e15

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.statistics._cells import Cells, FloatArray
-from mars_lidar.statistics._feedback import ConvergenceError
-from mars_lidar.statistics._gate import photons_before
-from mars_lidar.system import System
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 _MAX_BINS = 2**20
 _MAX_WHOLE = 20_000  # whole periods of a dead time: each is a step of the variance's start-up
@@ -95,7 +95,7 @@ def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
 
 
 def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> ParalyzableMoments:
-    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     system = cells.system
     mean, variance, bins = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size)
     histogram = np.empty((cells.size, system.bins))

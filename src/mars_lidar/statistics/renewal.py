@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.statistics._feedback import cyclic_recursion
-from mars_lidar.statistics._gate import require_mode
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
+from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.grid import cell_name, default_bins, photons_per_bin
-from mars_lidar.system import System
+from mars_lidar.statistics.phase_chain_operator import cyclic_recursion
 
 FloatArray = NDArray[np.float64]
 
@@ -230,7 +230,7 @@ def mars_moments(
         mean, variance: arrays of the broadcast shape (0-d for scalars); 0, 0 where there is no flux.
     """
     require_mode("mars_moments", system)
-    _validate.choice("rearm", rearm, ("centre", "edge"))
+    checks.choice("rearm", rearm, ("centre", "edge"))
     given = np.asarray(np.nan if signal is None else signal, dtype=np.float64)
     s, b = np.broadcast_arrays(given, np.asarray(background, dtype=np.float64))
     mean, variance = np.zeros(s.shape), np.zeros(s.shape)

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mars_lidar import _validate
-from mars_lidar.detector import MODES
-from mars_lidar.effects import LIGHT_EFFECTS
-from mars_lidar.statistics._cells import Cells, FloatArray
-from mars_lidar.statistics._electronics_shape import stationary_records
-from mars_lidar.statistics._gate import PLAIN
-from mars_lidar.statistics._methods import check_model, neural_moments, pixel_of, rearm_of
-from mars_lidar.statistics._timing import recorded
+from mars_lidar._base import checks
+from mars_lidar.instrument.detector import MODES
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.electronics_shape import stationary_records
+from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects, mean_histograms
+from mars_lidar.statistics.methods import check_model, neural_moments, pixel_of, rearm_of
 from mars_lidar.statistics.stationary import stationary_histogram
-from mars_lidar.system import System
+from mars_lidar.statistics.timing import recorded
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -67,7 +67,7 @@ def registration_pdf(
         (..., bins), non-negative; sums to 1 over the last axis. A cell without any flux has the uniform
         shape, the limit of little background.
     """
-    _validate.choice("method", method, _SHAPES)
+    checks.choice("method", method, _SHAPES)
     edge = rearm_of(rearm, method == "chain", f"method {method!r}")
     check_model(model, method)
     cells = Cells.of(

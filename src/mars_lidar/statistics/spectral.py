@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.statistics._gate import require_mode
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import PhaseChain, Rearm
+from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covariances, weighted_waits
-from mars_lidar.system import System
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -70,7 +70,7 @@ class HoldingTimeCovariance:
 
     def cutoff_sum(self, cutoff: int) -> float:
         """gamma_1 + ... + gamma_cutoff: the fixed cut-off (4.1); 0 for a cut-off of 0."""
-        cutoff = _validate.integer("cutoff", cutoff, low=0, high=_MAX_LAGS)
+        cutoff = checks.integer("cutoff", cutoff, low=0, high=_MAX_LAGS)
         if cutoff <= self.gamma.size:
             return float(self.gamma[:cutoff].sum())
         return float(lag_covariances(self._chain, self._times, cutoff).sum()) * self._unit
@@ -86,8 +86,8 @@ class HoldingTimeCovariance:
         A conjugate pair is never split: one more mode is taken where `modes` would. The paper's rule is
         L = 6, p = 5.
         """
-        lags = _validate.integer("lags", lags, low=0, high=_MAX_LAGS)
-        modes = _validate.integer("modes", modes, low=1, high=self._chain.bins)
+        lags = checks.integer("lags", lags, low=0, high=_MAX_LAGS)
+        modes = checks.integer("modes", modes, low=1, high=self._chain.bins)
         values, weights = self._modes
         count = self._whole_pairs(modes)
         kept, weight = values[1:count], weights[1:count]
@@ -101,7 +101,7 @@ class HoldingTimeCovariance:
         at least like |lambda_(p+1)|^l. The bound is rigorous for a normal P; P is not, so the first lags, in
         which non-normality shows, are summed exactly: at least six.
         """
-        tolerance = _validate.real("tolerance", tolerance, low=0.0, high=1.0, strict_low=True)
+        tolerance = checks.real("tolerance", tolerance, low=0.0, high=1.0, strict_low=True)
         size = np.abs(self.eigenvalues)
         best: tuple[int, int] | None = None
         for modes in range(1, min(_MOST_MODES, size.size - 1) + 1):
@@ -190,7 +190,7 @@ def holding_time_covariance(
         Where a solution did not converge; the message names the cell.
     """
     require_mode("holding_time_covariance", system)
-    lags = _validate.integer("lags", lags, low=0, high=_MAX_LAGS)
+    lags = checks.integer("lags", lags, low=0, high=_MAX_LAGS)
     chain = PhaseChain.from_flux(
         signal, background, system, rearm=rearm, bins=bins, delay_ns=delay_ns, waveform=waveform
     )

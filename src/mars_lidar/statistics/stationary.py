@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 
-from mars_lidar import _validate
-from mars_lidar.statistics._cells import Cells, FloatArray
-from mars_lidar.statistics._feedback import ConvergenceError
-from mars_lidar.statistics._warm import warm_history
+from mars_lidar._base import checks
+from mars_lidar.statistics.cells import Cells, FloatArray
 from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED, recorded_light, thread_count
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.warm import warm_history
 
 
 def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
     """Registrations per period and bin (cells, out_bins) of a pixel that has been running for long (18)."""
-    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:  # the light itself
         return recorded_light(cells, out_bins)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 
 FloatArray = NDArray[np.float64]
 Grid = tuple[float, float, int] | ArrayLike
@@ -37,9 +37,9 @@ def axis_values(name: str, grid: Grid) -> FloatArray:
     if isinstance(grid, tuple):
         if len(grid) != 3:
             raise ValueError(f"{name} must be (low, high, points) or an array of values, got {grid!r}")
-        low = _validate.real(f"{name}[0]", grid[0], low=0.0, high=_MAX_PHOTONS, strict_low=True)
-        high = _validate.real(f"{name}[1]", grid[1], low=0.0, high=_MAX_PHOTONS, strict_low=True)
-        points = _validate.integer(f"{name}[2]", grid[2], low=2, high=MAX_POINTS)
+        low = checks.real(f"{name}[0]", grid[0], low=0.0, high=_MAX_PHOTONS, strict_low=True)
+        high = checks.real(f"{name}[1]", grid[1], low=0.0, high=_MAX_PHOTONS, strict_low=True)
+        points = checks.integer(f"{name}[2]", grid[2], low=2, high=MAX_POINTS)
         if not high > low:
             raise ValueError(f"{name} must be (low, high, points) with high > low, got {grid!r}")
         return np.concatenate([[0.0], np.geomspace(low, high, points)])

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar import _validate
-from mars_lidar._memory import check_memory
+from mars_lidar._base import checks
+from mars_lidar._base.memory import check_memory
 from mars_lidar._version import __version__
-from mars_lidar.statistics._cells import FloatArray
-from mars_lidar.statistics._gate import require_mode
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.exposure import thread_count
-from mars_lidar.system import System
+from mars_lidar.statistics.gate import require_mode
 from mars_lidar.table.axes import Grid, axis_values, describe
 from mars_lidar.table.cache import request_key
 from mars_lidar.table.entries import Entries, Progress, exposure_entries
@@ -73,12 +73,12 @@ def build(
     require_mode("a table", system)
     system = system.detected()  # its axes are detected photons
     axes = axis_values("signal", signal), axis_values("background", background)
-    _validate.choice("method", method, _METHODS)
-    _validate.choice("rearm", rearm, _REARMS)
+    checks.choice("method", method, _METHODS)
+    checks.choice("rearm", rearm, _REARMS)
     if rearm != "centre" and method != "mars":
         raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
-    goal = None if refine is None else _validate.real("refine", refine, low=1e-5, high=0.1)
-    tolerance = _validate.real("tolerance", tolerance, low=1e-9, high=0.1)
+    goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
+    tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     if not isinstance(check_law, bool):
         raise TypeError(f"check_law must be True or False, got {check_law!r}")
     if progress is not None and not callable(progress):

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mars_lidar._version import __version__
+from mars_lidar.instrument.system import System
 from mars_lidar.io.store import reason
-from mars_lidar.statistics._cells import FloatArray
-from mars_lidar.system import System
+from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.table.axes import Grid, axis_values
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.system import System
 
 Progress = Callable[[int, int], object]
 Shapes = NDArray[np.float32]

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar import _validate
-from mars_lidar.statistics._cells import FloatArray
-from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar._base import checks
+from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.exposure import exposure_moments, thread_count
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 if TYPE_CHECKING:
     from mars_lidar.table.table import Interpolation, Table
@@ -81,7 +81,7 @@ class QuantisationError:
         1e8 cycles, since a standard deviation below half a count, for which short exposures are excused, is excused
         no longer.
         """
-        allowed = _validate.real("allowed", allowed, low=0.0, strict_low=True)
+        allowed = checks.real("allowed", allowed, low=0.0, strict_low=True)
         worst = max(self.mean_max, self.delayed_mean_max, 1e-300)
         return max(1, int(min(self.cycles * (allowed / worst) ** 2, MOST_CYCLES)))
 
@@ -106,9 +106,9 @@ def quantisation_error(
     """See `Table.quantisation_error`."""
     from mars_lidar.table.build import Recipe
 
-    samples = _validate.integer("samples", samples, low=1, high=1_000_000)
-    rng = np.random.default_rng(_validate.integer("seed", seed, low=0, high=2**64 - 1))
-    periods = table.system.cycles if cycles is None else _validate.integer("cycles", cycles, low=1, high=10**8)
+    samples = checks.integer("samples", samples, low=1, high=1_000_000)
+    rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
+    periods = table.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
     system = table.system.replace(cycles=periods)
     below = interpolation == "bilinear"  # the nearest entry knows nothing between 0 and the lowest value
     signal, background = (random_pixels(rng, axis, samples, below) for axis in (table.signal, table.background))

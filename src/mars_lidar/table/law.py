@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar import _validate
-from mars_lidar.statistics._pmf import Window
+from mars_lidar._base import checks
+from mars_lidar.statistics.pmf import Window
 from mars_lidar.table.error import random_pixels
 
 if TYPE_CHECKING:
@@ -59,8 +59,8 @@ def law_error(table: Table, samples: int, seed: int, cycles: int | None, threads
     from mars_lidar.statistics.law import count_law
     from mars_lidar.statistics.matched import matched_pmf
 
-    samples = _validate.integer("samples", samples, low=1, high=100_000)
-    rng = np.random.default_rng(_validate.integer("seed", seed, low=0, high=2**64 - 1))
+    samples = checks.integer("samples", samples, low=1, high=100_000)
+    rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     system = table.system if cycles is None else table.system.replace(cycles=cycles)
     signal, background = (random_pixels(rng, axis, samples, True) for axis in (table.signal, table.background))
     delay = rng.uniform(0.0, system.period_ns, samples)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar.statistics._cells import FloatArray, IndexArray, _broadcast, _reals
+from mars_lidar.statistics.cells import FloatArray, IndexArray, _broadcast, _reals
 from mars_lidar.table.start_phase import StartPhases
 
 

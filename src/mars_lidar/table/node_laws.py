@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
-from mars_lidar.statistics._pmf import Window, guessed_windows
-from mars_lidar.system import System
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics.pmf import Window, guessed_windows
 from mars_lidar.table.entries import Entries, Progress
 
 

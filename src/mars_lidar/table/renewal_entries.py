@@ -6,11 +6,11 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 
 import numpy as np
 
-from mars_lidar.statistics._cells import FloatArray
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.grid import cell_name, default_bins
 from mars_lidar.statistics.renewal import holding_times
-from mars_lidar.system import System
 from mars_lidar.table.entries import Entries, Progress
 
 _BLOCK = 32

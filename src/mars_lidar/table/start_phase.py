@@ -14,10 +14,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.statistics._cells import Cells, FloatArray, IndexArray
-from mars_lidar.statistics._feedback import ConvergenceError
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
 from mars_lidar.statistics.exposure import _run
-from mars_lidar.system import System
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.table.axes import thinned
 
 Progress = Callable[[int, int], object]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.instrument.system import System
 from mars_lidar.io.store import TemporarySibling, check_target
-from mars_lidar.system import System
 from mars_lidar.table.cache import FORMAT
 from mars_lidar.table.entries import Entries
 from mars_lidar.table.node_laws import NodeLaws

@@ -14,12 +14,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar import _validate
-from mars_lidar._brief import brief
-from mars_lidar.statistics._cells import FloatArray
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.exposure import thread_count
-from mars_lidar.system import System
 from mars_lidar.table.axes import PAPER_GRID, Grid
 from mars_lidar.table.entries import Entries, Progress
 from mars_lidar.table.error import QuantisationError, quantisation_error
@@ -158,8 +158,8 @@ class Table:
         ValueError
             Naming the range that lies outside of the table; or the entry that does not hold for `cycles`.
         """
-        _validate.choice("interpolation", interpolation, _INTERPOLATIONS)
-        _validate.choice("outside", outside, _OUTSIDE)
+        checks.choice("interpolation", interpolation, _INTERPOLATIONS)
+        checks.choice("outside", outside, _OUTSIDE)
         periods = self._cycles(cycles)
         team = thread_count(threads)
         s, b, phase, beyond = read_pixels(
@@ -209,7 +209,7 @@ class Table:
             Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
             and the lowest value, where the axis has a 0.
         """
-        _validate.choice("interpolation", interpolation, _INTERPOLATIONS)
+        checks.choice("interpolation", interpolation, _INTERPOLATIONS)
         return quantisation_error(self, interpolation, samples, seed, cycles, threads)
 
     def law_error(
@@ -271,7 +271,7 @@ class Table:
         )  # fmt: skip
 
     def _cycles(self, cycles: int | None) -> int:
-        return self.system.cycles if cycles is None else _validate.integer("cycles", cycles, low=1, high=10**8)
+        return self.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
 
     def _refuse(self, cycles: int) -> None:
         """Raise, naming the entry that holds for the fewest numbers of cycles."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.io.rgbd import pixels
 from mars_lidar.io.rgbd.pixels import FloatArray
 
@@ -102,7 +102,7 @@ def read_rgbd(
 
 
 def _positive(name: str, value: float | None) -> float | None:
-    return None if value is None else _validate.real(name, value, low=0.0, strict_low=True)
+    return None if value is None else checks.real(name, value, low=0.0, strict_low=True)
 
 
 def _stored(path: Path, suffix: str) -> NDArray[Any]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.io.optional import needed
+from mars_lidar._base.optional import needed
 from mars_lidar.io.rgbd.pixels import reason
 
 _CHANNELS = ("Z", "Y", "R")  # depth, luminance; red where a grey image was written in colour

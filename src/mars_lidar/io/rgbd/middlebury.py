@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.io.rgbd import pixels
 from mars_lidar.io.rgbd.pfm import read_pfm
 from mars_lidar.io.rgbd.pixels import FloatArray
@@ -53,7 +53,7 @@ def read(folder: Path) -> tuple[FloatArray, Path]:
 def _depth_2005(folder: Path) -> FloatArray:
     text = (folder / "dmin.txt").read_text(errors="replace").strip()
     try:
-        offset = _validate.real("dmin", float(text), low=0.0)
+        offset = checks.real("dmin", float(text), low=0.0)
     except ValueError as error:
         raise ValueError(f"{folder / 'dmin.txt'}: must hold one number >= 0, got {text[:40]!r}") from error
     stored = pixels.array(folder / "disp1.png")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.io.rgbd.pixels import describe, reason
 
 
@@ -29,7 +29,7 @@ def read_frame(path: Path, index: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     """Depth (H, W), m, and colours (H, W, 3), uint8, of a frame; only this frame is read."""
     with _opened(path) as file:
         depths, images = file["depths"], file["images"]
-        k = _validate.integer("index", index, low=0, high=int(depths.shape[0]) - 1)
+        k = checks.integer("index", index, low=0, high=int(depths.shape[0]) - 1)
         try:
             depth, image = np.asarray(depths[k]), np.asarray(images[k])
         except OSError as error:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _validate
-from mars_lidar.engines.base import Progress
+from mars_lidar._base import checks
+from mars_lidar.engines.engine import Progress
+from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
-from mars_lidar.system import System
 
 FloatArray = NDArray[np.float64]
 
@@ -41,10 +41,10 @@ class FluxRange:
             pair = getattr(self, name)
             if not isinstance(pair, tuple | list) or len(pair) != 2:
                 raise TypeError(f"{name} must be (low, high) photons per period, got {pair!r}")
-            low = _validate.real(name, pair[0], low=_SMALLEST, high=1e3)
-            high = _validate.real(name, pair[1], low=low, high=1e3, strict_low=True)
+            low = checks.real(name, pair[0], low=_SMALLEST, high=1e3)
+            high = checks.real(name, pair[1], low=low, high=1e3, strict_low=True)
             object.__setattr__(self, name, (low, high))
-        _validate.integer("returns", self.returns, low=1, high=2)
+        checks.integer("returns", self.returns, low=1, high=2)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from mars_lidar import _validate
+from mars_lidar._base import checks
 from mars_lidar.learn.neural.pairs import FluxRange
 
 
@@ -45,5 +45,5 @@ class Training:
             ("pairs", 10**7), ("held_out", 10**6), ("steps", 10**7), ("batch", 10**5), ("every", 10**7),
             ("width", 256), ("code", 4096),
         ):  # fmt: skip
-            _validate.integer(name, getattr(self, name), low=1, high=most)
-        _validate.integer("seed", self.seed, low=0, high=2**63 - 1)
+            checks.integer(name, getattr(self, name), low=1, high=most)
+        checks.integer("seed", self.seed, low=0, high=2**63 - 1)

@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mars_lidar import _validate
-from mars_lidar.engines.base import Progress
+from mars_lidar._base import checks
+from mars_lidar.engines.engine import Progress
+from mars_lidar.instrument.system import System
 from mars_lidar.learn.neural.model import NeuralMap
 from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, one_thread, rolled
 from mars_lidar.learn.neural.pairs import Pairs
 from mars_lidar.learn.neural.plan import Training
-from mars_lidar.statistics._gate import require_mode
-from mars_lidar.system import System
+from mars_lidar.statistics.gate import require_mode
 
 _RATE, _WARM_UP, _CLIP = 4e-3, 0.1, 1.0
 _MIN_BINS = 128
@@ -88,7 +88,7 @@ def train(
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     require_mode("the neural map", system)
     system = system.detected()
-    _validate.integer("bins of the neural map", system.bins, low=_MIN_BINS, high=2**16)
+    checks.integer("bins of the neural map", system.bins, low=_MIN_BINS, high=2**16)
     with one_thread():
         return _train(system, chosen, progress, tell)
 

@@ -1,0 +1,28 @@
+"""Calibration: what a stream of photons says about its instrument, and whether the model describes the stream."""
+
+from mars_lidar.calibrate.calibration import Calibration, calibrate
+from mars_lidar.calibrate.calibration_bound import Bound, calibration_bound
+from mars_lidar.calibrate.calibration_rapp import RappEstimate, rapp_total
+from mars_lidar.calibrate.fit_tests import Check
+from mars_lidar.calibrate.inspection import Inspection, inspect
+from mars_lidar.calibrate.recovery import Recovery, recovery
+from mars_lidar.calibrate.stream_summary import Summary, summary
+from mars_lidar.calibrate.validation import Validation, validate
+
+__all__ = [
+    "Bound",
+    "Calibration",
+    "Check",
+    "Inspection",
+    "RappEstimate",
+    "Recovery",
+    "Summary",
+    "Validation",
+    "calibrate",
+    "calibration_bound",
+    "inspect",
+    "rapp_total",
+    "recovery",
+    "summary",
+    "validate",
+]

@@ -1,0 +1,126 @@
+"""One pass of a calibration: the light by maximum likelihood, for a dead time, a hold-off and a jitter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from mars_lidar.calibrate.armed_time import armed_time
+from mars_lidar.calibrate.calibration_fit import covariance, fit, initial
+from mars_lidar.calibrate.calibration_light import Light
+from mars_lidar.calibrate.calibration_rapp import split, total_of
+from mars_lidar.calibrate.calibration_result import Calibration
+from mars_lidar.calibrate.fine_light import fine_light
+from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar.calibrate.phase_bins import SHAPE_BINS, fine_bins, free_bins
+from mars_lidar.calibrate.stream_summary import Summary
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+
+_CROWDED, _FINER = 0.05, 64  # photons of a bin of a free shape above which light within it matters; parts of it
+_SHORT = 1e-7  # false-alarm probability of intervals shorter than the dead time
+CERTAIN = 8.5  # jitters behind a dead time after which a pixel is armed for certain: 6 of a difference of two
+
+
+def _below(intervals: int) -> float:
+    """Jitters by which the shortest of so many intervals of the dead time is less than it, once in 10^7 streams."""
+    from scipy.special import ndtri
+
+    return math.sqrt(2.0) * float(-ndtri(_SHORT / max(intervals, 1)))
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What a calibration takes the detector for: dead time, hold-off, jitter, ns; errors are 0 of what is given."""
+
+    dead_ns: float
+    hold_ns: float
+    jitter_ns: float = 0.0
+    jitter_error_ns: float = 0.0
+    dead_error_ns: float = 0.0
+    by: Literal["given", "smallest interval", "edge"] = "given"
+
+
+def fitted(
+    stream: Stream,
+    counted: Summary,
+    shape: Pulse | Literal["gaussian", "free"],
+    watch: Watch,
+    returns: int,
+    near: Calibration | None = None,
+    *,
+    divided: bool = True,
+) -> Calibration:
+    """Light of the likelihood, without a bias taken off; `near`: another calibration, to begin with its light.
+
+    `divided`: Rapp's total is divided by the shape of the histogram, which takes longer than all the rest.
+    """
+    dead, hold = watch.dead_ns, watch.hold_ns
+    slack = 1.5 * stream.unit_ns + 1e-6 * stream.period_ns  # two roundings of the clock; of the engines' phases
+    slack += _below(stream.registrations) * (watch.jitter_ns + 3.0 * watch.jitter_error_ns) + 4.0 * watch.dead_error_ns
+    short = 0
+    if counted.smallest_ns.size and counted.smallest_ns[0] < dead - slack:
+        short = sum(int((dt < dead - slack).sum()) for dt in stream.intervals())
+    rapp = total_of(stream, hold)
+    if shape == "free":
+        bins = free_bins(stream.bins)
+        seen = armed_time(stream, hold, bins)
+        rate = seen.rate
+        finer = _FINER
+        while finer > 1 and 0 < stream.units < 4 * finer * bins:
+            finer //= 2
+        if (rate > _CROWDED).any() and finer > 1:  # a pulse within a bin, of which few passes see more than the start
+            rate = fine_light(stream, hold, finer * bins, bins).reshape(bins, finer).sum(1)
+        # var of h / D is h / D^2; the bins are independent given the armed time
+        some = seen.passes > 0
+        spread = float((seen.registrations[some] / seen.passes[some] ** 2).sum())
+        return Calibration(
+            0.0, np.empty(0), np.empty(0), None, rate, dead, watch.dead_error_ns, hold, short, ("signal",),
+            np.array([[spread]]), rapp, seen, counted, True, watch.jitter_ns, watch.jitter_error_ns, watch.by,
+        )  # fmt: skip
+    free_width = shape == "gaussian"
+    pulse = GaussianPulse(sigma_ns=0.01 * stream.period_ns) if isinstance(shape, str) else shape
+    known = pulse if near is None or near.pulse is None else near.pulse
+    bins = fine_bins(stream, None if free_width and near is None else known)
+    seen = armed_time(stream, hold, bins)
+    joint = watch.jitter_error_ns if isinstance(pulse, GaussianPulse) else 0.0
+    light = Light(stream.period_ns, bins, pulse, returns, free_width, watch.jitter_ns, joint)
+    if near is not None:
+        start = light.before(near.parameters, near.jitter_ns or watch.jitter_ns)
+    else:
+        start = initial(seen, light)
+        if free_width:  # the width tells how fine the grid must be
+            start = fit(seen, light, start).theta
+            finer = fine_bins(stream, light.pulse_of(start))
+            if finer > bins:
+                seen = armed_time(stream, hold, finer)
+                light = replace(light, bins=finer)
+    found = fit(seen, light, start)
+    pulse, jitter = light.pulse_of(found.theta), light.jitter_of(found.theta)
+    theta, matrix = _in_order(*light.recorded(found.theta, covariance(light, found)), returns, stream.period_ns)
+    found_light = Calibration(
+        float(theta[0]), theta[1 : 1 + returns], theta[1 + returns : 1 + 2 * returns], pulse, None, dead,
+        watch.dead_error_ns, hold, short, light.names, matrix, rapp, seen, counted, found.converged,
+        jitter, math.sqrt(matrix[-1, -1]) if light.fit_jitter else watch.jitter_error_ns, watch.by,
+    )  # fmt: skip
+    return with_division(stream, found_light) if divided else found_light
+
+
+def with_division(stream: Stream, found: Calibration) -> Calibration:
+    """With Rapp's total divided into signal and background, of a single return."""
+    if found.pulse is None or found.returns_signal.size != 1:
+        return found
+    bins = min(SHAPE_BINS, stream.bins)
+    return replace(found, rapp=split(stream, found.rapp, found.pulse, found.delay_ns, found.dead_time_ns, bins))
+
+
+def _in_order(theta: FloatArray, matrix: FloatArray, k: int, period_ns: float) -> tuple[FloatArray, FloatArray]:
+    """Delays within the period, the earliest return first."""
+    theta = theta.copy()
+    theta[1 + k : 1 + 2 * k] %= period_ns
+    theta[: 1 + k][theta[: 1 + k] <= 2e-9] = 0.0  # the fit's floor stands for none
+    order = np.argsort(theta[1 + k : 1 + 2 * k])
+    place = np.concatenate([[0], 1 + order, 1 + k + order, np.arange(1 + 2 * k, theta.size)])
+    return theta[place], matrix[np.ix_(place, place)]

@@ -1,0 +1,365 @@
+"""The dead time of a stream, and its jitter: by the smallest interval, or by the middle of a blurred edge."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch, fitted
+from mars_lidar.calibrate.calibration_result import Calibration, nearest
+from mars_lidar.calibrate.departure import SIGNIFICANT, departure_of, too_coarse
+from mars_lidar.calibrate.fine_light import fine_light
+from mars_lidar.calibrate.hidden_dead_time import hidden
+from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar.calibrate.jittered import normal_kernel, unblurred
+from mars_lidar.calibrate.recovery_edge import ORDINARY, REACH, Edge, Law, edge_of
+from mars_lidar.calibrate.shortest_intervals import FEW, Ages, Underlying, extrapolated, is_sharp, shortest
+from mars_lidar.calibrate.stream_summary import Summary
+from mars_lidar.calibrate.unknowns import is_seen
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+from mars_lidar.instrument.system import Detector, System
+from mars_lidar.statistics import ConvergenceError
+from mars_lidar.statistics.law import registration_pdf
+
+SHARP = 0.01  # false-alarm probability of a blurred edge
+HIDDEN = 14.0  # of a jitter this many mean excesses of the smallest interval wide nine in ten are seen
+_ROUNDS = 12
+_BINS_PER_WIDTH = 3
+_LEAST_BINS, _MOST_BINS = 2**10, 2**15  # of the light behind an edge
+_STARTS = (0.15, 0.06, 0.4, 1.0)  # widths tried, in parts of the reach over which the edge is not sharp
+_SAME = 0.05  # standard errors by which a last round may move the edge
+_AGREE = 4.0  # standard errors between the jitter by the edge and that by the shape of the pulse
+_MATTERS = 0.15  # of the pulse: a jitter that may hide and is wider moves the light of more than ...
+_BRIGHT = 0.02  # ... so many photons of signal
+_SHUT = 4.0  # photons of signal of which the pixel sees the first alone
+_HIDES = (
+    "signal, delay and width are not known: the pulse is bright, only its first photons are seen, and how much of its "
+    "width is jitter is not"
+)
+_PARTS = (0.6, 1.0)  # of it that are tried
+_ALL = 0.98  # of the pulse that may be jitter
+_WIDEST = 0.1  # periods that a jitter may be wide where no pulse limits it
+_OUT_OF_ORDER = 0.3  # of the intervals within the reach of a jitter that may hide
+_STEPS = 30  # of Richardson and Lucy
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """A calibration whose dead time is estimated too, and the jitter where `jitter_ns` is None."""
+
+    stream: Stream
+    counted: Summary
+    shape: Pulse | Literal["gaussian", "free"]
+    hold_off_ns: float | None
+    returns: int
+    jitter_ns: float | None
+    _seen: dict[float, Ages] = field(default_factory=dict)
+
+    def calibrated(self) -> Calibration:
+        """By the smallest interval where the edge is sharp, else with edge and light fitted in turn."""
+        if self.counted.smallest_ns.size == 0:
+            raise ValueError("dead_time_ns must be given where no recording in times holds two registrations")
+        smallest, hold, told = float(self.counted.smallest_ns[0]), self.hold_off_ns, self.jitter_ns or 0.0
+        if hold is not None and hold < smallest:
+            raise ValueError(f"hold_off_ns must be at least the dead time of {smallest:g} ns, got {hold:g}")
+        least = smallest + CERTAIN * told
+        first = self._pass(Watch(smallest, max(least, hold or 0.0), told, by="smallest interval"))
+        if smallest == 0.0 or self.jitter_ns == 0.0:
+            return self._sharp(first)
+        sharp, blurred = self._blurred(first)
+        if blurred is not None:
+            return self._checked(blurred)
+        found = self._sharp(first)
+        return self._checked(found) if sharp else replace(found, edge_fits=False, dead_time_error_ns=math.nan)
+
+    def _checked(self, found: Calibration) -> Calibration:
+        """Without an edge where the rate beyond it is not that of the light: it was none, or is not all there is."""
+        if self.jitter_ns is not None or too_coarse(self.stream, found.armed.rate):
+            return found
+        scores, _ = departure_of(self.stream, found).first()
+        if np.abs(scores).max(initial=0.0) <= SIGNIFICANT:
+            return found
+        return replace(found, edge_fits=False, dead_time_error_ns=math.nan)
+
+    def _pass(self, watch: Watch, near: Calibration | None = None) -> Calibration:
+        return fitted(self.stream, self.counted, self.shape, watch, self.returns, near, divided=False)
+
+    def _sharp(self, first: Calibration) -> Calibration:
+        """The smallest of n intervals exceeds t_d by 1 / (sum of the rates at re-arming) in the mean.
+
+        What a dead time may be below it for want of light, or above it with a jitter that hides, is in the error.
+        """
+        stream, smallest = self.stream, first.dead_time_ns
+        excess = stream.period_ns / max(stream.registrations * _rate_after(stream, first), 1e-300)
+        told = self.jitter_ns is not None
+        sigma = min(_width(first), _WIDEST * stream.period_ns)
+        dead = max(smallest - excess, 0.0)
+        left = hidden(
+            self._ages(), self._any_width(first), stream.registrations, dead, 0.0 if told else _ALL * sigma
+        )
+        error = max(excess, left.below_ns, 0.0 if told else left.above_ns)
+        limit = 0.0 if told else math.hypot(max(left.jitter_ns, 0.0), stream.unit_ns)
+        found = replace(
+            first, dead_time_ns=dead, dead_time_error_ns=math.hypot(error, stream.unit_ns, first.jitter_ns),
+            jitter_limit_ns=0.0 if smallest < limit else limit,
+        )  # fmt: skip
+        if not told and CERTAIN * left.jitter_ns > smallest:
+            # a jitter as large as the dead time puts records out of order: with many of them within its reach
+            near = sum(int((dt < CERTAIN * left.jitter_ns).sum()) for dt in stream.intervals())
+            if near > _OUT_OF_ORDER * stream.registrations:
+                return replace(found, edge_fits=False, dead_time_error_ns=math.nan)
+        return self._with_hidden(found, min(limit, _ALL * sigma))
+
+    def _with_hidden(self, found: Calibration, jitter: float) -> Calibration:
+        """With the light that a jitter that may hide would make, in the covariance: of a bright pulse it moves it."""
+        if not isinstance(found.pulse, GaussianPulse) or jitter < _MATTERS * found.pulse.sigma_ns:
+            return found
+        if found.signal < _BRIGHT or isinstance(self.shape, Pulse):
+            return found
+        if found.signal > _SHUT:
+            lost = np.array([name.startswith(("signal", "delay", "sigma")) for name in found.names])
+            covariance = np.where(lost | lost[:, None], math.nan, found.covariance)
+            return replace(found, covariance=covariance, unknown=(*found.unknown, _HIDES))
+        hold, covariance = found.armed.hold_off_ns, found.covariance
+        for part in _PARTS:
+            watch = Watch(hold, hold, part * jitter, by=found.dead_time_by)
+            moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
+            covariance = covariance + np.outer(moved, moved)
+        return replace(found, covariance=covariance)
+
+    def _ages(self, reach_ns: float = 0.0) -> Ages:
+        """The shortest intervals, up to at least `reach_ns` above the smallest."""
+        smallest = float(self.counted.smallest_ns[0])
+        known = max(self._seen, default=-1.0)
+        if known < reach_ns or known < 0.0:
+            self._seen[max(reach_ns, 0.0)] = shortest(self.stream, smallest, reach_ns or None)
+        return self._seen[max(self._seen)]
+
+    def _blurred(self, first: Calibration) -> tuple[bool, Calibration | None]:
+        """Whether the edge is sharp; and by the edge, None where that is sharp or no Gaussian jitter makes it."""
+        ages = self._ages()
+        if ages.interval_ns.size < FEW:
+            return True, None
+        sharp = self._any_width(first)(0.0)
+        if self.jitter_ns is None:
+            chance, reach = is_sharp(ages, sharp, self.stream.registrations)
+            if chance > SHARP:
+                return True, None
+            if self.shape == "free" and (by_a_pulse := self._by_a_pulse()) is not None:
+                return False, by_a_pulse
+            widths = [reach * part for part in _STARTS]
+        else:
+            widths = [math.sqrt(2.0) * self.jitter_ns]
+        found = (self._from(first, self._rough(sharp, width), width) for width in widths)
+        return False, next((one for one in found if one is not None), None)
+
+    def _by_a_pulse(self) -> Calibration | None:
+        """The edge as the model of a Gaussian pulse has it, which tells pulse and jitter apart; None without one."""
+        model = replace(self, shape="gaussian", _seen=dict(self._seen))
+        found = model.calibrated()
+        if found.dead_time_by != "edge" or not found.converged:
+            return None
+        hold = max(found.hold_off_ns, self.hold_off_ns or 0.0)
+        watch = Watch(
+            found.dead_time_ns, hold, found.jitter_ns, found.jitter_error_ns, found.dead_time_error_ns, "edge"
+        )
+        return replace(self._pass(watch), jitter_limit_ns=found.jitter_limit_ns)
+
+    def _rough(self, sharp: Underlying, width: float) -> float:
+        """A rough dead time, for an edge of that width."""
+        return extrapolated(self._ages(8.0 * width), sharp, width)
+
+    def _from(self, first: Calibration, dead: float, width: float) -> Calibration | None:
+        """The edge and the light, from a rough edge: the light of a jitter leads to an edge of that jitter."""
+        period, ages = self.stream.period_ns, self._ages()
+        jitter = width / math.sqrt(2.0) if self.jitter_ns is None else self.jitter_ns
+        tried: list[tuple[float, float]] = []
+        found = first
+        for _ in range(_ROUNDS):
+            sigma = _width(found)
+            jitter = min(jitter, _ALL * sigma)
+            if not (dead > 0.0 and jitter < 1.5 * _WIDEST * period):
+                return None
+            hold = max(dead + CERTAIN * jitter, self.hold_off_ns or 0.0)
+            found = self._pass(Watch(dead, hold, jitter), None if found is first else found)
+            if found.armed.used < FEW:
+                return None
+            edge = self._edge(ages, found, dead, width)
+            if edge is None:
+                return None
+            if _is_clock(edge, ages):
+                return self._clocked(first, edge, ages)
+            shift = abs(edge.dead_time_ns - dead) / edge.dead_time_error_ns
+            tried.append((jitter, edge.jitter_ns))
+            dead, width = edge.dead_time_ns, math.hypot(math.sqrt(2.0) * edge.jitter_ns, ages.clock_ns)
+            off = abs(edge.jitter_ns - jitter)
+            if shift < _SAME and off <= _SAME * edge.jitter_error_ns:
+                break
+            jitter = _nearer(tried)
+        if edge is None or not _within_pulse(edge, found):
+            return None
+        found = self._pass(self._watch(edge), found)
+        if found.too_short:
+            return None
+        edge = self._edge(ages, found, dead, width, self._uncertain(found, width, ages.clock_ns))
+        if edge is None or not edge.fits > ORDINARY:
+            return None
+        if abs(found.jitter_ns - edge.jitter_ns) > _AGREE * edge.jitter_error_ns > 0.0:  # the pulse is no Gaussian
+            found = self._pass(replace(self._watch(edge), jitter_error_ns=0.0), found)
+            found = replace(found, jitter_error_ns=edge.jitter_error_ns)
+        elif "jitter_ns" in found.names:
+            edge = edge.known(found.jitter_ns, found.jitter_error_ns)
+        elif found.pulse is not None and edge.jitter_error_ns > 0.0:  # a measured pulse: the light with another jitter
+            watch = replace(self._watch(edge), jitter_ns=edge.jitter_ns + edge.jitter_error_ns)
+            moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
+            found = replace(found, covariance=found.covariance + np.outer(moved, moved))
+        return replace(found, dead_time_ns=edge.dead_time_ns, dead_time_error_ns=edge.dead_time_error_ns)
+
+    def _clocked(self, first: Calibration, edge: Edge, ages: Ages) -> Calibration | None:
+        """The middle of an edge that the clock alone blurs; a jitter less than its unit may hide."""
+        unit = self.stream.unit_ns
+        if not edge.fits > ORDINARY:
+            return None
+        found = self._pass(Watch(edge.dead_time_ns, max(edge.dead_time_ns + 2.0 * unit, self.hold_off_ns or 0.0)))
+        if found.too_short:
+            return None
+        found = replace(
+            found, dead_time_error_ns=math.hypot(edge.dead_time_error_ns, unit), dead_time_by="edge",
+            jitter_limit_ns=max(edge.jitter_ns + 2.0 * edge.jitter_error_ns, ages.clock_ns),
+        )  # fmt: skip
+        sigma = found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) else 0.0
+        return self._with_hidden(found, min(found.jitter_limit_ns, _ALL * sigma))
+
+    def _edge(
+        self, ages: Ages, found: Calibration, dead: float, width: float, off: tuple[Law, ...] = ()
+    ) -> Edge | None:
+        ages = self._ages(dead + REACH * width - ages.smallest_ns)
+        edge = edge_of(ages, self._law(found, width, ages.clock_ns), dead, width, off)
+        return edge if edge is None or self.jitter_ns is None else edge.known(self.jitter_ns, 0.0)
+
+    def _bins(self, width_ns: float) -> int:
+        """Bins that are narrow beside the edge."""
+        bins = _MOST_BINS
+        while bins > _LEAST_BINS and bins * width_ns > 2.0 * _BINS_PER_WIDTH * self.stream.period_ns:
+            bins //= 2
+        return bins
+
+    def _law(self, found: Calibration, about_ns: float, clock_ns: float) -> Law:
+        """What lies behind edges of about that width, as a function of it."""
+        bins = self._bins(about_ns)
+        if not isinstance(found.pulse, GaussianPulse):
+            same = self._behind(found, bins)
+            return lambda width_ns: same
+
+        known: dict[float, Underlying] = {}
+
+        def behind(width_ns: float) -> Underlying:
+            if width_ns not in known:
+                jitter = math.sqrt(0.5 * max(width_ns**2 - clock_ns**2, 0.0))
+                known[width_ns] = self._behind(replace(found, jitter_ns=jitter), bins)
+            return known[width_ns]
+
+        return behind
+
+    def _any_width(self, found: Calibration) -> Law:
+        """What lies behind edges of any width; jitters that are small beside the pulse are none."""
+        known: dict[float, Underlying] = {}
+        sigma = found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) else math.inf
+        bins = self._bins(sigma) if math.isfinite(sigma) else _MOST_BINS // 4
+
+        def behind(width_ns: float) -> Underlying:
+            jitter = width_ns / math.sqrt(2.0)
+            jitter = jitter if jitter > _MATTERS * sigma else 0.0
+            if jitter not in known:
+                known[jitter] = self._behind(replace(found, jitter_ns=jitter), bins)
+            return known[jitter]
+
+        return behind
+
+    def _behind(self, found: Calibration, bins: int) -> Underlying:
+        """Light and phases of avalanches."""
+        period, jitter = self.stream.period_ns, found.jitter_ns
+        if found.pulse is None:
+            rate = fine_light(self.stream, found.hold_off_ns, bins)
+        else:
+            rate = found.arriving_in(bins)
+        if jitter == 0.0:
+            phases = self.stream.histogram(bins).astype(np.float64)
+        elif found.pulse is not None:
+            phases = self._in_the_long_run(rate, found)
+        else:
+            kernel = normal_kernel(jitter, period, bins)
+            rate = unblurred(rate, kernel, _STEPS)
+            phases = unblurred(self.stream.histogram(bins).astype(np.float64), kernel, _STEPS)
+        return Underlying.of(rate, phases, period)
+
+    def _in_the_long_run(self, rate: FloatArray, found: Calibration) -> FloatArray:
+        """Phases (n,) of avalanches in light (n,), which the jitter of the records hides."""
+        system = System(
+            period_ns=self.stream.period_ns, cycles=1, bins=rate.size, start="stationary",
+            pulse=GaussianPulse(sigma_ns=0.01 * self.stream.period_ns),
+            detector=Detector(dead_time_ns=found.dead_time_ns),
+        )  # fmt: skip
+        try:
+            return registration_pdf(None, 0.0, system, "stationary", waveform=rate, threads=1)
+        except (ConvergenceError, ValueError):  # locked to the laser, or far more light than the laws do
+            kernel = normal_kernel(found.jitter_ns, self.stream.period_ns, rate.size)
+            return unblurred(self.stream.histogram(rate.size).astype(np.float64), kernel, _STEPS)
+
+    def _uncertain(self, found: Calibration, width_ns: float, clock_ns: float) -> tuple[Law, ...]:
+        """The light, a standard error away in each independent direction of its parameters but the jitter."""
+        if found.pulse is None:
+            return ()
+        told = np.isfinite(np.diag(found.covariance)) & np.array([name != "jitter_ns" for name in found.names])
+        values, vectors = np.linalg.eigh(found.covariance[np.ix_(told, told)])
+        lights = []
+        for value, vector in zip(values, vectors.T, strict=True):
+            step: FloatArray = np.zeros(told.size)
+            step[told] = math.sqrt(max(value, 0.0)) * vector
+            lights.append(self._law(found.moved(step), width_ns, clock_ns))
+        return tuple(lights)
+
+    def _watch(self, edge: Edge) -> Watch:
+        hold = max(edge.dead_time_ns + CERTAIN * edge.jitter_ns, self.hold_off_ns or 0.0)
+        return Watch(edge.dead_time_ns, hold, edge.jitter_ns, edge.jitter_error_ns, edge.dead_time_error_ns, "edge")
+
+
+def _nearer(tried: list[tuple[float, float]]) -> float:
+    """Where what comes out is what was put in, by the last two tries."""
+    jitter, got = tried[-1]
+    if len(tried) > 1:
+        before, gave = tried[-2]
+        slope = (got - gave) / (jitter - before) if jitter != before else 1.0
+        if slope < 0.9:
+            got = float(np.clip(jitter + (got - jitter) / (1.0 - slope), 0.5 * jitter, 2.0 * jitter))
+    return got
+
+
+def _is_clock(edge: Edge, ages: Ages) -> bool:
+    """Whether the clock alone makes an edge as wide."""
+    return ages.clock_ns > 0.0 and edge.jitter_ns < max(ages.clock_ns, 2.0 * edge.jitter_error_ns)
+
+
+def _within_pulse(edge: Edge, found: Calibration) -> bool:
+    """Whether the edge is no wider than the pulse, which holds the jitter."""
+    return edge.jitter_ns - 3.0 * edge.jitter_error_ns < _width(found)
+
+
+def _width(found: Calibration) -> float:
+    """Sigma of a Gaussian pulse that is seen, else inf."""
+    return found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) and is_seen(found) else math.inf
+
+
+def _rate_after(stream: Stream, found: Calibration) -> float:
+    """Mean photons per period that fall on the pixel at the moment it re-arms."""
+    rate, bins = found.rate, found.armed.passes.size
+    shift = found.dead_time_ns / stream.period_ns
+    total = 0.0
+    for phase in stream.phases():
+        again = phase + shift
+        again -= np.floor(again)
+        total += float(rate[np.minimum((again * bins).astype(np.int64), bins - 1)].sum()) * bins
+    return total / max(stream.registrations, 1)

@@ -1,0 +1,197 @@
+"""`mars-lidar info` and `mars-lidar view`: what is in a file, in words and as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mars_lidar._version import other_version
+from mars_lidar.cli.console import check_picture, reported, save_picture, table
+
+if TYPE_CHECKING:
+    from mars_lidar.instrument.detector import Detector
+    from mars_lidar.io import Cube
+
+
+def info(
+    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="Simulate again and compare every count; exit code 1 if they differ."),
+    ] = False,
+) -> None:
+    """Say what is in a cube or a dataset: system, flux, engine, size, whether it is complete, how to open it."""
+    from mars_lidar.io import IncompleteFileError, load
+    from mars_lidar.io import verify as same_again
+
+    with reported():
+        from mars_lidar.cli.dataset_tables import dataset_rows
+
+        rows = dataset_rows(file)
+        if rows is not None:
+            if verify:
+                raise ValueError(f"{file} is a dataset: mars-lidar verify {file} makes its chunks again")
+            table(rows)
+            return
+        try:
+            cube = load(file, allow_incomplete=True)
+        except IncompleteFileError as error:  # nothing in it can be read
+            table([("file", str(file)), ("complete", f"NO: {error}")])
+            return
+        with cube:
+            table(_rows(cube))
+            if not verify:
+                return
+            from mars_lidar.cli.console import FAILED, progress_bar
+
+            if not cube.complete:
+                raise ValueError(f"{file} is incomplete: there is nothing to verify")
+            with progress_bar("verifying") as progress:
+                same = same_again(cube, progress=progress)
+            different = f"NO: counts differ{other_version(cube.version)}"
+            table([("verified", "simulated again, every count is the same" if same else different)])
+            if not same:
+                raise typer.Exit(FAILED)
+
+
+def view(
+    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="The picture: .png, .pdf or .svg.", show_default=False)
+    ],
+    pixel: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--pixel",
+            metavar="Y,X",
+            help="Pixel whose histogram is drawn; up to 6 times. "
+            "[dim]Default: a bright, a dim and an edge pixel.[/dim]",
+        ),
+    ] = None,
+    realization: Annotated[
+        int, typer.Option("--realization", help="Which exposure, counted from 0 in this file.")
+    ] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
+) -> None:
+    """Draw depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
+
+    Each histogram stands beside the incident rate, scaled to the same total: the difference is pile-up.
+    """
+    with reported():
+        check_picture(out, overwrite)
+        pixels = None if not pixel else [parsed_pixel(text) for text in pixel]
+        from mars_lidar.io import load
+
+        with load(file) as cube:
+            from mars_lidar.plot import overview
+
+            figure = overview(cube, realization=realization, pixels=pixels)
+        save_picture(figure, out)
+        table([("picture", str(out))])
+
+
+def parsed_pixel(text: str) -> tuple[int, int]:
+    """The (y, x) of an option ``--pixel Y,X``."""
+    try:
+        y, x = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--pixel must be two integers Y,X (row, column), got {text!r}") from None
+    return y, x
+
+
+def _rows(cube: Cube) -> list[tuple[str, str]]:
+    system, flux, recipe = cube.system, cube.flux, cube.recipe
+    count, height, width, bins = cube.shape
+    photons = f"mean S {flux.signal.mean():.4g}, B {flux.background.mean():.4g} photons per laser period"
+    if flux.waveform is not None:
+        photons += f"; waveform of {flux.waveform.shape[-1]} parts"
+    elif len(flux.returns_signal) > 1:
+        photons += f"; {len(flux.returns_signal)} returns"
+    complete = "yes" if cube.complete else "NO: the simulation did not finish"
+    if cube.progress:
+        complete += f"; {cube.progress}"
+    rows = [
+        ("file", f"{cube.path} (mars-lidar {cube.version})"),
+        ("complete", complete),
+        (
+            "counts",
+            f"{count} × {height} × {width} × {bins} (realization, y, x, time) {recipe.dtype}, "
+            f"{recipe.nbytes / 1e6:,.4g} MB in memory, {_on_disk(cube) / 1e6:,.4g} MB on disk",
+        ),
+    ]
+    if cube.registrations is not None:
+        pixels = count * height * width
+        each = cube.registrations / pixels
+        rows.append(("registrations", f"{cube.registrations:,}, {each:,.4g} per pixel and exposure"))
+    first = recipe.first_realization
+    numbers = f"{first}" if count == 1 else f"{first} to {first + count - 1}"
+    dead = system.detector.dead_time_ns
+    made = "".join(f", {name} {_short(value)}" for name, value in cube.settings.items() if name != "table")
+    rows += [
+        ("engine", f"{cube.engine}{made}, seed {cube.seed}, realization {numbers}"),
+        (
+            "laser",
+            f"period {system.period_ns:.6g} ns ({1e3 / system.period_ns:.4g} MHz, unambiguous to "
+            f"{system.unambiguous_range_m:.4g} m), {system.cycles:,} cycles",
+        ),
+        ("pulse", repr(system.pulse)),
+        (
+            "detector",
+            f"dead time {dead:.6g} ns ({system.dead_time_periods:.4g} periods), {system.detector.mode}, "
+            f"start {system.start}",
+        ),
+        *_gate(system.detector),
+        *_effects(system.detector),
+        ("bins", f"{1e3 * system.bin_ns:.5g} ps, {system.depth_m(system.bin_ns):.3g} m of depth each"),
+        ("flux", photons),
+    ]
+    if "table" in cube.settings:
+        rows.append(("table", ", ".join(f"{name} {value}" for name, value in cube.settings["table"].items())))
+    made_of = [f"{k} {_short(v)}" for k, v in flux.info.items() if not k.endswith("_definition")]
+    if made_of:
+        rows.append(("flux made of", ", ".join(made_of)))
+    if recipe.source:
+        rows.append(("scene", recipe.source))
+    opener = f"xarray.open_zarr({str(cube.path)!r})" if str(cube.path).endswith(".zarr") else ""
+    mine = f"mars_lidar.io.load({str(cube.path)!r})"
+    if not cube.complete:
+        rows.append(("open with", f"{mine[:-1]}, allow_incomplete=True)"))
+    else:
+        rows.append(("open with", f"{mine}  or  {opener}" if opener else mine))
+    return rows
+
+
+def _gate(detector: Detector) -> list[tuple[str, str]]:
+    if detector.gate_start_ns is None:
+        return []
+    told = f"{detector.gate_width_ns:.6g} ns from {detector.gate_start_ns:.6g} ns of each period"
+    if detector.gate_moves:
+        every = "every period" if detector.gate_cycles == 1 else f"every {detector.gate_cycles} periods"
+        told += f", moved by {detector.gate_step_ns:.6g} ns {every}"
+    return [("gate", told)]
+
+
+def _effects(detector: Detector) -> list[tuple[str, str]]:
+    told = []
+    for name in detector.effects:
+        value = getattr(detector, name)
+        if name == "code_density":
+            told.append(f"code_density of {len(value)} codes")
+        else:
+            told.append(f"{name} {_short(value)}")
+    return [("effects", ", ".join(told))] if told else []
+
+
+def _on_disk(cube: Cube) -> int:
+    path = cube.path
+    if path is None:
+        return 0
+    if path.is_file():
+        return path.stat().st_size
+    return sum(part.stat().st_size for part in path.rglob("*") if part.is_file())
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

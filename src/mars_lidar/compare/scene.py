@@ -1,0 +1,162 @@
+"""One engine on a whole image: its time, how its counts deviate over all pixels, and what a peak picker makes of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.compare.expected import Expected
+from mars_lidar.compare.sample import Estimate, FloatArray, score
+from mars_lidar.engines import Engine
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.plot.data import bin_depth_m
+from mars_lidar.simulate import simulate
+
+
+@dataclass(frozen=True, eq=False)
+class SceneStatistics:
+    """One engine on the whole image.
+
+    Attributes
+    ----------
+    seconds
+        Wall time of each cube, into memory that has been touched.
+    registrations
+        Of a cube, on average.
+    mean_counts
+        Mean count (H, W) over the cubes.
+    bias
+        Mean over the predicted pixels of (mean count - expected) / standard deviation of the count.
+    relative_bias
+        Total counts over the expected total - 1; over the reference engine's total where nothing is predicted.
+    dispersion
+        Mean of (count - expected)^2 / variance over pixels and cubes: 1 where mean and variance are right.
+    depth_error_m
+        Median of |depth at the largest bin - true depth|, m, and `outliers`, the share of pixels in which it
+        exceeds three standard deviations of the pulse or a bin; NaN without a true depth.
+    report
+        What the engine told beside the counts, of the last cube.
+    """
+
+    engine: str
+    seconds: tuple[float, ...]
+    registrations: float
+    mean_counts: FloatArray
+    bias: Estimate
+    relative_bias: Estimate
+    dispersion: Estimate
+    depth_error_m: float
+    outliers: float
+    report: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def median_s(self) -> float:
+        """Median wall time of a cube."""
+        return float(np.median(self.seconds))
+
+    @property
+    def ns_per_registration(self) -> float:
+        """Median time of a cube over its registrations."""
+        return 1e9 * self.median_s / self.registrations if self.registrations > 0 else math.nan
+
+
+def scene_statistics(
+    flux: Flux,
+    system: System,
+    engine: Engine,
+    expected: Expected,
+    depth_m: FloatArray,
+    repeats: int,
+    seed: int,
+    threads: int,
+    budget_s: float,
+    reference: SceneStatistics | None,
+) -> SceneStatistics:
+    """Draw up to `repeats` cubes of an image one after another; fewer where `budget_s` ends."""
+    cube = np.zeros((1, *flux.shape, system.bins), system.histogram_dtype)
+    cube.fill(0)  # zeros alone is memory that is not there yet
+    seconds: list[float] = []
+    counts: list[NDArray[np.int64]] = []
+    errors: list[FloatArray] = []
+    report: dict[str, float] = {}
+    while len(seconds) < repeats and sum(seconds) < budget_s:
+        began = time.perf_counter()
+        simulate(
+            flux, system, engine=engine, first_realization=len(seconds), seed=seed, threads=threads,
+            out=cube, report=report,
+        )  # fmt: skip
+        seconds.append(time.perf_counter() - began)
+        total = cube[0].sum(-1, dtype=np.int64)
+        counts.append(total)
+        errors.append(_depth_errors(cube[0], total, system, depth_m))
+    drawn = np.array(counts, dtype=np.float64)
+    bias, dispersion = _against(expected, drawn)
+    missed = np.abs(np.concatenate([e.ravel() for e in errors]))
+    missed = missed[np.isfinite(missed)]
+    limit = max(3.0 * float(system.depth_m(_pulse_deviation_ns(system))), float(system.depth_m(system.bin_ns)))
+    return SceneStatistics(
+        engine=engine.name,
+        seconds=tuple(seconds),
+        registrations=float(drawn.sum() / len(drawn)),
+        mean_counts=drawn.mean(0),
+        bias=bias,
+        relative_bias=_relative(expected, drawn, reference),
+        dispersion=dispersion,
+        depth_error_m=float(np.median(missed)) if missed.size else math.nan,
+        outliers=float((missed > limit).mean()) if missed.size else math.nan,
+        report=report,
+    )
+
+
+def _against(expected: Expected, drawn: FloatArray) -> tuple[Estimate, Estimate]:
+    """Bias in standard deviations and dispersion; errors from the spread over pixels, which are independent."""
+    use = expected.known & (expected.variance > 0)
+    if use.sum() < 2:
+        return Estimate(math.nan), Estimate(math.nan)
+    deviation = (expected.on_grid(drawn)[:, use] - expected.mean[use]) / np.sqrt(expected.variance[use])
+    return _mean(deviation.mean(0), 0.0), _mean((deviation**2).mean(0), 1.0)
+
+
+def _relative(expected: Expected, drawn: FloatArray, reference: SceneStatistics | None) -> Estimate:
+    if expected.known.sum() > 1:
+        total = float(expected.mean[expected.known].sum())
+        difference = (expected.on_grid(drawn).mean(0) - expected.mean)[expected.known]
+    elif reference is not None:
+        total = float(reference.mean_counts.sum())
+        difference = (drawn.mean(0) - reference.mean_counts).ravel()
+    else:
+        return Estimate(math.nan)
+    if total <= 0.0 or difference.size < 2:
+        return Estimate(math.nan)
+    value = _mean(difference, 0.0)
+    return Estimate(value.value * difference.size / total, value.error * difference.size / total, value.z)
+
+
+def _mean(values: FloatArray, goal: float) -> Estimate:
+    """Mean of independent values (n,)."""
+    mean, error = float(values.mean()), float(values.std(ddof=1)) / math.sqrt(values.size)
+    return Estimate(mean, error, score(mean - goal, error))
+
+
+def _depth_errors(
+    cube: NDArray[Any], total: NDArray[np.int64], system: System, depth_m: FloatArray
+) -> FloatArray:
+    span = system.unambiguous_range_m
+    found = np.where(total > 0, bin_depth_m(system, cube.argmax(-1)), np.nan)
+    return np.asarray((found - depth_m + 0.5 * span) % span - 0.5 * span, dtype=np.float64)
+
+
+def _pulse_deviation_ns(system: System) -> float:
+    low, high = system.pulse.support_ns()
+    edges = np.linspace(low, high, 4097)
+    weight = np.diff(system.pulse.cumulative(edges))
+    centres = 0.5 * (edges[1:] + edges[:-1])
+    weight = weight / weight.sum()
+    mean = float(weight @ centres)
+    return math.sqrt(float(weight @ (centres - mean) ** 2))

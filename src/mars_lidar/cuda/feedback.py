@@ -1,0 +1,99 @@
+"""The engine "feedback" on a GPU: what the processor prepares, and the launches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import _core
+from mars_lidar.cuda.kernels import feedback_histograms, overflow
+from mars_lidar.cuda.machine import Machine
+from mars_lidar.engines.engine import Progress, Task
+from mars_lidar.engines.feedback_grid import near_pulse
+from mars_lidar.engines.feedback_rule import Grid, Plan, sweep_pixels
+from mars_lidar.engines.parts import part_of
+
+IndexArray = NDArray[np.int64]
+
+_LANES = 32  # a warp: its threads' rows lie side by side
+_WORK_BYTES = 4 << 30  # of all warps that run at the same time, at most
+_STREAMS_EACH = 4  # batches for each warp in flight, where there are realizations enough
+
+Draw = Callable[[Task, Any], None]
+
+
+def feedback_histogram(
+    task: Task, out: Any, machine: Machine, draw_exactly: Draw, *, warps: int | None = None
+) -> None:
+    """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor.
+
+    What the sweeps are not tried on, what they refuse, and single exposures that do not settle are drawn by
+    ``draw_exactly(task, out)``.
+    """
+    arrays = _arrays(task, machine)
+
+    def sweep(group: IndexArray, grid: Grid, progress: Progress | None) -> NDArray[np.uint8]:
+        return _launch(task, out, group, grid, arrays, machine, warps)
+
+    plan = Plan.of(task.flux, task.system)
+    rest = sweep_pixels(replace(task, progress=None), plan, np.arange(task.pixel_index.size), sweep)
+    cube = out.reshape(task.realizations, task.pixel_index.size, task.system.bins)
+    for first, number, pixels in rest.blocks(task.realizations):
+        if pixels.size == task.pixel_index.size and number == task.realizations:
+            draw_exactly(task, out)
+            continue
+        part = replace(
+            task, flux=part_of(task.flux, pixels), pixel_index=task.pixel_index[pixels], progress=None, report={},
+            realizations=number, first_realization=task.first_realization + first,
+        )  # fmt: skip
+        rows = machine.empty((part.items, task.system.bins), out.dtype)
+        draw_exactly(part, rows)
+        cube[first : first + number, machine.array(pixels)] = rows.reshape(number, pixels.size, task.system.bins)
+    if task.progress is not None:
+        machine.host(out[:1, :1])  # all is done
+        task.progress(task.items, task.items)
+
+
+def _arrays(task: Task, machine: Machine) -> dict[str, Any]:
+    """What the kernel reads of the pixels and the pulse."""
+    here: dict[str, NDArray[Any]] = {
+        **task.pixel_arrays(),
+        **_core.feedback_pulse(task.pulse),
+    }
+    if task.flux.waveform is not None:
+        here["waveform"] = np.ascontiguousarray(task.flux.waveform.reshape(task.pixel_index.size, -1))
+    return {name: machine.array(array) for name, array in here.items() if array.size}
+
+
+def _launch(
+    task: Task, out: Any, pixels: IndexArray, grid: Grid, common: dict[str, Any], machine: Machine, warps: int | None
+) -> NDArray[np.uint8]:
+    """Draw some pixels (n,) on one internal grid; the status (realizations, n) of each exposure."""
+    on = (grid.merge, grid.parts, near_pulse(task.system, grid.merge), grid.laps)
+    cells = _core.feedback_grid(task.job, *on)
+    work = _core.feedback_warp_bytes(cells["place"].size - 1, grid.laps)
+    kernel = feedback_histograms(out.dtype.itemsize == 4)
+    held = machine.resident(kernel, _LANES, 0) if warps is None else warps
+    held = max(1, min(held, _WORK_BYTES // work))
+    # a stream: every `splits`-th realization of a pixel
+    splits = min(task.realizations, max(1, -(-_LANES * _STREAMS_EACH * held // pixels.size)))
+    streams = splits * pixels.size
+    held = min(held, -(-streams // _LANES))
+    arrays = common | {name: machine.array(array) for name, array in cells.items()}
+    arrays |= {
+        "pixels": machine.array(pixels), "status": machine.empty((task.realizations, pixels.size), np.uint8),
+        "out": out, "queue": machine.zeros((_LANES,), np.uint32), "full": machine.zeros((1,), np.uint32),
+        "work": machine.empty((held * work,), np.uint8),
+    }  # fmt: skip
+    addresses = {name: machine.address(array) for name, array in arrays.items()}
+    numbers = {"streams": streams, "splits": splits, "number": pixels.size, "work_bytes": work}
+    argument = _core.feedback_task(task.job, task.pulse, *on, addresses, numbers)
+    machine.launch(kernel, held, _LANES, argument)
+    status: NDArray[np.uint8] = machine.host(arrays["status"])
+    if int(machine.host(arrays["full"])[0]):
+        raise overflow(out.dtype.itemsize)
+    return status

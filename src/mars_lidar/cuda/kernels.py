@@ -1,0 +1,114 @@
+"""The source of the kernels, how they are compiled, and which of them a task takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
+from hashlib import blake2b
+from pathlib import Path
+
+from mars_lidar import _core
+from mars_lidar.engines.engine import Task
+from mars_lidar.instrument.detector import MODES
+
+HEADERS = Path(__file__).resolve().parent.parent / "native"
+AHEAD = 8  # registrations drawn ahead; changes speed only
+# The bits are those of the processor: no fused multiply-add, IEEE division, subnormal numbers.
+OPTIONS = (
+    "-std=c++17",  # in this form: CuPy looks whether it is there
+    "--fmad=false",
+    "--prec-div=true",
+    "--prec-sqrt=true",
+    "--ftz=false",
+    "--device-as-default-execution-space",
+)
+
+
+@cache
+def source(header: str) -> str:
+    """What is compiled. It tells the headers' contents, by which CuPy names what it has compiled before."""
+    contents = blake2b(digest_size=16)
+    for file in sorted(HEADERS.glob("*.h")):
+        contents.update(file.read_bytes())
+    return f'// {contents.hexdigest()}\n#include "{header}"\n'
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """One kernel: the header of `native` that has it, and its name in C++."""
+
+    header: str
+    expression: str
+
+
+MARS_LAWS = Kernel("mars_device.h", "mars::mars_laws")
+
+
+def mars_histograms(wide: bool) -> Kernel:
+    """The kernel that draws, into histograms of uint32 or uint16."""
+    return Kernel("mars_device.h", f"mars::mars_histograms<{str(wide).lower()}>")
+
+
+def feedback_histograms(wide: bool) -> Kernel:
+    """The engine "feedback", into histograms of uint32 or uint16."""
+    return Kernel("feedback_device.h", f"mars::feedback_histograms<{str(wide).lower()}>")
+
+
+class Sink(IntEnum):
+    """Where registrations go, `DeviceSink` of native/exact_device.h."""
+
+    COUNTS = 0
+    BLOCK16 = 1  # histograms counted in the memory of a block, with 8 bits a bin, then written as uint16
+    BLOCK32 = 2
+    ROWS16 = 3  # histograms counted in the device's memory
+    ROWS32 = 4
+    TIMESTAMPS = 5
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One instance of the kernel ``exact_items``."""
+
+    mode: int
+    gaussian: bool
+    whole: bool  # a dead time of whole periods
+    single: bool  # one return at most
+    sink: Sink
+    ahead: int = AHEAD
+
+    @classmethod
+    def of(cls, task: Task, sink: Sink) -> Variant:
+        """What a task needs."""
+        return cls(
+            mode=MODES.index(task.system.detector.mode),
+            gaussian=_core.device_tables(task.pulse)["inverse"].size > 0,
+            whole=_core.device_whole(task.job, task.pulse),
+            single=len(task.flux.returns_signal) <= 1,
+            sink=sink,
+        )
+
+    @property
+    def kernel(self) -> Kernel:
+        """As it is compiled."""
+        return Kernel("exact_device.h", self.expression)
+
+    @property
+    def expression(self) -> str:
+        """Its name in C++."""
+        flags = ", ".join(str(flag).lower() for flag in (self.gaussian, self.whole, self.single))
+        return f"mars::exact_items<{self.mode}, {flags}, {int(self.sink)}, {self.ahead}>"
+
+
+def overflow(itemsize: int) -> OverflowError:
+    """What the engines raise where a bin exceeds its type."""
+    most = 2 ** (8 * itemsize) - 1
+    return OverflowError(
+        f"a histogram bin exceeds {most} counts: use fewer cycles, less flux"
+        + (", or an output of uint32" if itemsize < 4 else "")
+    )
+
+
+def block_bytes(bins: int, lanes: int) -> int:
+    """Shared memory of a block that counts histograms of its `lanes` threads: 8 bits a bin."""
+    return 4 * ((bins + 3) // 4) * lanes

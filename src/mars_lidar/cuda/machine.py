@@ -1,0 +1,124 @@
+"""Where kernels run: CuPy's current device. Tests put the processor in its place (tests/gpu/host_machine.py)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar.cuda.kernels import HEADERS, OPTIONS, Kernel, source
+
+_PLAIN_SHARED = 48 << 10  # bytes that a block gets without asking
+
+
+class NoDeviceError(RuntimeError, ValueError):
+    """There is no GPU that CuPy can use."""
+
+
+def cupy_with_device() -> Any:
+    """CuPy, where it can compute; ImportError or RuntimeError that says what is missing."""
+    try:
+        import cupy
+    except ImportError as error:
+        raise MissingLibraryError(
+            "device='cuda' needs CuPy: pip install 'mars-lidar[cuda12]' or 'mars-lidar[cuda13]', as your driver has it"
+        ) from error
+    try:
+        number = cupy.cuda.runtime.getDeviceCount()
+    except cupy.cuda.runtime.CUDARuntimeError as error:
+        raise NoDeviceError(f"device='cuda' found no CUDA device ({error}); use device='cpu'") from error
+    if number == 0:
+        raise NoDeviceError("device='cuda' found no CUDA device; use device='cpu'")
+    return cupy
+
+
+class Machine(Protocol):
+    """Arrays and launches, in the order of one stream."""
+
+    shared_bytes: int  # of memory that a block can have
+    key: Any  # names the device
+
+    def array(self, host: NDArray[Any]) -> Any:
+        """A copy there."""
+
+    def zeros(self, shape: tuple[int, ...], dtype: Any) -> Any:
+        """An array there."""
+
+    def empty(self, shape: tuple[int, ...], dtype: Any) -> Any:
+        """The same, of anything."""
+
+    def host(self, array: Any) -> NDArray[Any]:
+        """A copy here, when everything queued before is done."""
+
+    def address(self, array: Any) -> int:
+        """Of its memory."""
+
+    def resident(self, kernel: Kernel, lanes: int, shared: int) -> int:
+        """Blocks that the machine runs at the same time."""
+
+    def launch(self, kernel: Kernel, blocks: int, lanes: int, argument: bytes, shared: int = 0) -> None:
+        """Queue a kernel of one argument."""
+
+
+class Cuda:
+    """CuPy's current device and stream."""
+
+    def __init__(self) -> None:
+        self._cupy = cupy_with_device()
+        self._device = self._cupy.cuda.Device()
+        self.key = int(self._device.id)
+        self.shared_bytes = int(self._device.attributes["MaxSharedMemoryPerBlockOptin"])
+
+    def array(self, host: NDArray[Any]) -> Any:
+        """A copy there."""
+        return self._cupy.asarray(host)
+
+    def zeros(self, shape: tuple[int, ...], dtype: Any) -> Any:
+        """An array there."""
+        return self._cupy.zeros(shape, dtype)
+
+    def empty(self, shape: tuple[int, ...], dtype: Any) -> Any:
+        """The same, of anything."""
+        return self._cupy.empty(shape, dtype)
+
+    def host(self, array: Any) -> NDArray[Any]:
+        """A copy here, when everything queued before is done."""
+        copy: NDArray[Any] = array.get()
+        return copy
+
+    def address(self, array: Any) -> int:
+        """Of its memory."""
+        return int(array.data.ptr)
+
+    def resident(self, kernel: Kernel, lanes: int, shared: int) -> int:
+        """Blocks that the device runs at the same time."""
+        compiled = self._compiled(kernel, shared)
+        each = self._cupy.cuda.driver.occupancyMaxActiveBlocksPerMultiprocessor(compiled.kernel.ptr, lanes, shared)
+        return max(1, int(each)) * int(self._device.attributes["MultiProcessorCount"])
+
+    def launch(self, kernel: Kernel, blocks: int, lanes: int, argument: bytes, shared: int = 0) -> None:
+        """Queue a kernel of one argument."""
+        # a structure passed by value: an array of no dimensions
+        told = np.frombuffer(argument, np.dtype((np.void, len(argument)))).reshape(())
+        self._compiled(kernel, shared)((blocks,), (lanes,), (told,), shared_mem=shared)
+
+    def _compiled(self, kernel: Kernel, shared: int) -> Any:
+        found = compiled(kernel, int(self._device.id))
+        if shared > _PLAIN_SHARED:
+            found.max_dynamic_shared_size_bytes = shared
+        return found
+
+
+@lru_cache(maxsize=64)
+def compiled(kernel: Kernel, device: int) -> Any:
+    """A kernel for a device; CuPy keeps what it has compiled in files."""
+    import cupy
+
+    module = cupy.RawModule(
+        code=source(kernel.header), options=(*OPTIONS, f"-I{HEADERS}"), backend="nvrtc",
+        name_expressions=(kernel.expression,),
+    )  # fmt: skip
+    return module.get_function(kernel.expression)

@@ -1,0 +1,77 @@
+"""What the engines "mars" and "renewal" share: pixels from a table, where there is one, the others one by one."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.engines.counts import CountLaws
+from mars_lidar.engines.engine import Engine, Task
+from mars_lidar.engines.synthesis import Run
+from mars_lidar.engines.table_reader import PIXELS, Entries, TableReader
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+
+if TYPE_CHECKING:
+    from mars_lidar.table import Table
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+class CountTimesShape(Engine):
+    """Draws N from a law of the count, and its registrations from a shape; both from a table or evaluated."""
+
+    def __init__(self, table: Table | None, interpolation: str | None, outside: str | None, level: str) -> None:
+        for name, value in (("interpolation", interpolation), ("outside", outside)):
+            if table is None and value is not None:
+                raise ValueError(f"{name} must be None without a table, got {value!r}")
+        self.reader = None if table is None else TableReader(table, interpolation, outside)
+        self.level = level
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The table, if there is one."""
+        return self.reader.settings if self.reader else {}
+
+    def check(self, flux: Flux, system: System) -> None:
+        """A table must be of the system, reach the pixels unless they may lie outside, and knows one return each."""
+        if self.reader:
+            self.reader.check(flux, system)
+
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        """Look up or evaluate, draw the counts, draw their places: batch by batch."""
+        run = Run(task, out, self.level)
+        pixels = np.arange(task.pixel_index.size)
+        if self.reader is None:
+            self._evaluate(run, pixels)
+            return
+        left = [self._look_up(run, self.reader, pixels[k : k + PIXELS]) for k in range(0, pixels.size, PIXELS)]
+        self._evaluate(run, np.concatenate(left))
+
+    def _look_up(self, run: Run, reader: TableReader, pixels: IndexArray) -> IndexArray:
+        """Draws the pixels on the grid; returns the others."""
+        with run.stage("lookup_s"):
+            entries, left = reader.read(run.task, pixels)
+        run.draw(entries.batch(self._laws_of(run, reader, entries)))
+        return left
+
+    @abstractmethod
+    def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:
+        """Laws of the counts of pixels from a table."""
+
+    @abstractmethod
+    def _evaluate(self, run: Run, pixels: IndexArray) -> None:
+        """Draws pixels without a table."""
+
+
+def normalised(histogram: FloatArray) -> NDArray[np.float32]:
+    """Shapes (cells, bins) of sum 1; uniform where nothing registers."""
+    flat = histogram.reshape(-1, histogram.shape[-1])
+    total = flat.sum(-1, keepdims=True)
+    dark = total == 0.0
+    shape = np.where(dark, 1.0 / flat.shape[-1], flat / np.where(dark, 1.0, total))
+    return np.ascontiguousarray(shape.astype(np.float32))

@@ -1,0 +1,244 @@
+"""What an engine is: the contract, written once; the leaves stay silent."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.instrument.detector import MODES, Detector, Mode
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter, code_edges, require_effects
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+
+if TYPE_CHECKING:
+    from mars_lidar import _core
+
+Progress = Callable[[int, int], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One checked request: which pixels of which realizations of which flux, seen by which system.
+
+    `flux` and `system` become those of detected photons (`Flux.detected`, `System.detected`), so that no engine needs
+    to know of efficiencies and dark counts.
+
+    `pixel_index` (H * W,) uint32 names the random stream of each pixel, so that any part of an image can be
+    made alone with the bits that it has in the whole. `report` is where an engine writes what it has to tell
+    beside the counts: numbers by name, such as seconds of its stages or pixels that it gave to another engine.
+    """
+
+    flux: Flux
+    system: System
+    realizations: int
+    first_realization: int
+    pixel_index: NDArray[np.uint32]
+    seed: int
+    threads: int
+    progress: Progress | None
+    report: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        flux, system = self.flux.detected(self.system), self.system.detected()
+        object.__setattr__(self, "flux", flux)
+        object.__setattr__(self, "system", system)
+
+    @property
+    def items(self) -> int:
+        """Exposures to simulate: realizations x pixels."""
+        return self.realizations * self.pixel_index.size
+
+    @cached_property
+    def pulse(self) -> _core.PulseTable:
+        """The native pulse."""
+        return _pulse_table(self.system.pulse, self.system.period_ns)
+
+    def pixel_arrays(self) -> dict[str, Any]:
+        """What kernels read of the pixels, by name: light and delays (in periods) of the returns, (returns, pixels)."""
+        return {
+            "signal": np.ascontiguousarray(self.flux.returns_signal.reshape(-1, self.pixel_index.size)),
+            "delay": self.flux.delay_periods(self.system.period_ns),
+            "background": np.ascontiguousarray(self.flux.background.reshape(-1)),
+            "pixel_index": self.pixel_index,
+        }
+
+    @cached_property
+    def job(self) -> _core.Job:
+        """The native form of this task; times in laser periods."""
+        from mars_lidar import _core
+
+        wave = self.flux.waveform
+        detector = self.system.detector
+        start, step, width = detector.gate_periods(self.system.period_ns)
+        return _core.Job(
+            **self.pixel_arrays(),
+            waveform=None if wave is None else np.ascontiguousarray(wave.reshape(self.pixel_index.size, -1)),
+            realizations=self.realizations,
+            first_realization=self.first_realization,
+            seed=self.seed,
+            cycles=self.system.cycles,
+            bins=self.system.bins,
+            dead_time=self.system.dead_time_periods,
+            stationary=self.system.start == "stationary",
+            mode=MODES.index(detector.mode),
+            gate_start=start,
+            gate_width=width,
+            gate_step=step,
+            gate_cycles=detector.gate_cycles or 1,
+            **self._avalanches(),
+            recording=_recording(detector, self.system.period_ns) if detector.effects else None,
+        )
+
+    def _avalanches(self) -> dict[str, Any]:
+        """What avalanches leave behind, as the native job takes it; only what is on."""
+        detector, period = self.system.detector, self.system.period_ns
+        told: dict[str, Any] = {}
+        traps, crosstalk = detector.afterpulsing, detector.crosstalk
+        if traps is not None:
+            told |= {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period}
+            if traps.delays is not None:
+                told |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period}
+            if traps.generations is not None:
+                told["generations"] = traps.generations
+        if detector.twilight_ns:
+            told["twilight"] = detector.twilight_ns / period
+        if crosstalk is not None:
+            height, width = self.flux.shape
+            told |= {"crosstalk": crosstalk.probabilities, "height": height, "width": width}
+        return told
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """Packed registrations of a task: item i owns ``[offsets[i], offsets[i + 1])``; times in periods."""
+
+    offsets: NDArray[np.int64]
+    times: NDArray[np.float64]
+    cycle: NDArray[np.int32]
+    bin: NDArray[np.int32]
+
+    @classmethod
+    def allocate(cls, counts: NDArray[np.int64]) -> Records:
+        """Room for `counts` (items,) registrations each."""
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        n = int(offsets[-1])
+        return cls(offsets, np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32))
+
+    def sort(self) -> None:
+        """Put the registrations of each item in order of time, which jitter may have changed."""
+        item = np.repeat(np.arange(self.offsets.size - 1), np.diff(self.offsets))
+        if not ((np.diff(self.times) < 0.0) & (np.diff(item) == 0)).any():
+            return
+        order = np.lexsort((self.times, item))
+        for array in (self.times, self.cycle, self.bin):
+            array[:] = array[order]
+
+
+class Engine(ABC):
+    """A way to draw histograms. Engines never see files or scenes.
+
+    Sampling is reproducible: it depends on the flux, the system, the seed, and on the pixel index and number
+    of the realization, never on threads, chunks, or what else is simulated in the same call.
+    """
+
+    name: ClassVar[str]
+    description: ClassVar[str]
+    modes: ClassVar[tuple[Mode, ...]] = ("nonparalyzable",)  # of the detector, that the engine reproduces
+    effects: ClassVar[tuple[str, ...]] = LIGHT_EFFECTS  # likewise
+    any_system: ClassVar[bool] = True  # False: it draws the system that it was made for
+    devices: ClassVar[tuple[str, ...]] = ("cpu",)  # that it runs on
+    options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
+
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
+        return f"{type(self).__name__}({told})"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a cube depends on beside system, flux and seed: plain data for the file of a cube."""
+        return {}
+
+    def check(self, flux: Flux, system: System) -> None:  # noqa: B027  (most engines take everything)
+        """Raise ValueError, naming the field, for what this engine cannot do."""
+
+    def check_mode(self, system: System) -> None:
+        """Raise ValueError, naming the engines to use, where the detector's mode is not among `modes`."""
+        mode = system.detector.mode
+        if mode not in self.modes:
+            from mars_lidar.engines import ENGINES
+
+            able = " or ".join(repr(name) for name, engine in ENGINES.items() if mode in engine.modes)
+            raise ValueError(
+                f"engine {self.name!r} does not do mode {mode!r} of the detector, only "
+                f"{', '.join(map(repr, self.modes))}; use {able}"
+            )
+
+    def check_effects(self, system: System) -> None:
+        """Raise ValueError, naming the effect and the engines to use, where one of the detector is not in `effects`."""
+        from mars_lidar.engines import ENGINES
+
+        def instead(effect: str) -> str:
+            return "; use " + " or ".join(repr(name) for name, engine in ENGINES.items() if effect in engine.effects)
+
+        require_effects(f"engine {self.name!r}", system.detector, self.effects, instead)
+
+    def check_device(self, device: str, flux: Flux, system: System) -> None:
+        """Raise ValueError, naming what to use, for what this engine cannot do on that device."""
+        if device not in self.devices:
+            from mars_lidar.engines import ENGINES
+
+            able = " or ".join(repr(name) for name, engine in ENGINES.items() if device in engine.devices)
+            raise ValueError(
+                f"engine {self.name!r} does not run on device {device!r}, only on "
+                f"{', '.join(map(repr, self.devices))}; use engine {able}, or device 'cpu'"
+            )
+
+    def histogram_on_cuda(self, task: Task, out: Any) -> None:
+        """`histogram` of a checked task into a CuPy array, on CuPy's current device and stream."""
+        raise ValueError(f"engine {self.name!r} does not run on device 'cuda'; use device 'cpu'")
+
+    @abstractmethod
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        """Fill `out` (items, bins), C-contiguous, of the system's histogram dtype."""
+
+    def counts(self, task: Task) -> NDArray[np.int64]:
+        """Registrations of each exposure (items,), with the draws of `histogram`."""
+        raise ValueError(f"engine {self.name!r} draws histograms only, not single registrations; use 'exact'")
+
+    def timestamps(self, task: Task, records: Records) -> None:
+        """Fill `records`, allocated from `counts`, with the draws of `histogram`."""
+        raise ValueError(f"engine {self.name!r} draws histograms only, not timestamps; use 'exact'")
+
+
+@lru_cache(maxsize=16)
+def _recording(detector: Detector, period_ns: float) -> _core.Recording:
+    from mars_lidar import _core
+
+    jitter, no_limit = detector.jitter, 2**31 - 1
+    shape: Pulse | None = None
+    tail = tail_fraction = 0.0
+    if isinstance(jitter, Jitter):
+        shape, tail, tail_fraction = GaussianPulse(sigma_ns=jitter.sigma_ns), jitter.tail_ns, jitter.tail_fraction
+    elif jitter is not None:
+        shape = jitter.shape
+    return _core.Recording(
+        electronics_dead_time=detector.electronics_dead_time_ns / period_ns,
+        most_per_period=detector.max_events_per_period or no_limit,
+        most_per_exposure=detector.max_events_per_exposure or no_limit,
+        jitter=None if shape is None else _pulse_table(shape, period_ns),
+        tail=tail / period_ns,
+        tail_fraction=tail_fraction,
+        code_edges=None if detector.code_density is None else code_edges(detector.code_density),
+    )
+
+
+@lru_cache(maxsize=16)
+def _pulse_table(pulse: Pulse, period_ns: float) -> _core.PulseTable:
+    return pulse._native(period_ns)

@@ -1,0 +1,169 @@
+"""Which exposures the feedback engine draws, on which internal grid, and which are drawn exactly instead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.engines.engine import Engine, Progress, Task
+from mars_lidar.engines.feedback_grid import MOST_CELLS, cell_cuts, internal_cells, meets_echo
+from mars_lidar.engines.parts import draw_pixels, stage
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+
+IndexArray = NDArray[np.int64]
+StatusArray = NDArray[np.uint8]
+
+FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly ...
+FEWEST_PERIODS_ECHO = 1000  # ... and where pulses meet their echo: phases settle slowly
+MOST_LAP_CELLS = 2**18  # of all laps: 150 MB for each thread
+BRIGHTEST_ECHO = 4.0  # signal photons of a pulse that meets its own echo; beyond, phases hardly settle at all
+
+
+class Reason(IntEnum):
+    """What became of an exposure: `FeedbackStatus` of native/feedback_kernel.h, and reasons known before."""
+
+    DRAWN = 0
+    SLOW = 1
+    LOCKED = 2
+    FEW = 3
+    UNSETTLED = 4
+    NEGATIVE = 5
+    UNLIKELY = 6
+    SHORT = 16
+    ECHO = 17
+    CELLS = 18
+    DEAR = 19
+    LAPS = 64  # and more: of a pixel that needs that many laps less 64
+
+    @property
+    def words(self) -> str:
+        """As a report names it."""
+        return _WORDS[self]
+
+
+_WORDS = {
+    Reason.SLOW: "slow sweeps", Reason.LOCKED: "narrow count law", Reason.FEW: "locked, short exposure",
+    Reason.UNSETTLED: "unsettled", Reason.NEGATIVE: "negative armed", Reason.UNLIKELY: "unlikely count",
+    Reason.SHORT: "short exposure", Reason.ECHO: "bright echo", Reason.CELLS: "too many cells",
+    Reason.DEAR: "quicker exactly",
+}  # fmt: skip
+
+
+class Grid(NamedTuple):
+    """Parts that a bin is cut into, that these are cut into near the pulse, and periods of a piece of the exposure."""
+
+    merge: int
+    parts: int
+    laps: int
+
+
+Sweep = Callable[[IndexArray, Grid, Progress | None], StatusArray]
+"""Draws some pixels (n,) of a task on one grid and returns the status (realizations, n) of each exposure."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What is to be drawn exactly: whole pixels (n,), and single exposures of others, (m,) realization and pixel."""
+
+    pixels: IndexArray
+    realization: IndexArray
+    pixel: IndexArray
+
+    @classmethod
+    def of(cls, task: Task, pixels: IndexArray, status: StatusArray) -> Rest:
+        """From the status (realizations, n) of `pixels` (n,); the task's report counts them by reason."""
+        all_of_it = (status != Reason.DRAWN).all(0) & (status == status[:1]).all(0)
+        some = np.where(all_of_it, Reason.DRAWN, status)
+        for about, codes in (("pixels given to exact", status[0, all_of_it]), ("exposures drawn again by exact", some)):
+            reasons, numbers = np.unique(codes[codes != Reason.DRAWN], return_counts=True)
+            task.report[about] = float(numbers.sum())
+            for reason, number in zip(reasons, numbers, strict=True):
+                task.report[f"{about}, {Reason(reason).words}"] = float(number)
+        realization, column = np.nonzero(some)
+        return cls(np.sort(pixels[all_of_it]), realization, pixels[column])
+
+    def blocks(self, realizations: int) -> Iterator[tuple[int, int, IndexArray]]:
+        """What is to be drawn as first realization of the call, number of them, and pixels."""
+        if self.pixels.size:
+            yield 0, realizations, self.pixels
+        for one in np.unique(self.realization):
+            yield int(one), 1, np.sort(self.pixel[self.realization == one])
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is known of the pixels (n,) of an image before their sweeps.
+
+    `merge` and `parts` are those of a `Grid`, `cells` its cells; `reason` why sweeps are not even tried, or DRAWN.
+    """
+
+    merge: IndexArray
+    parts: IndexArray
+    cells: IndexArray
+    reason: StatusArray
+
+    @classmethod
+    def of(cls, flux: Flux, system: System) -> Plan:
+        """For all pixels of an image."""
+        periods = math.ceil(system.dead_time_periods)
+        cuts = cell_cuts(flux, system)
+        cells = internal_cells(flux, system, cuts)
+        echo = meets_echo(flux, system)
+        fewest = np.where(echo.remembered, FEWEST_PERIODS_ECHO, FEWEST_PERIODS)
+        reason = np.zeros(flux.shape, np.uint8)
+        reason[cells > MOST_CELLS] = Reason.CELLS
+        reason[echo.remembered & (flux.signal > BRIGHTEST_ECHO)] = Reason.ECHO
+        reason[system.cycles < fewest * periods] = Reason.SHORT
+        return cls(cuts[0].reshape(-1), cuts[1].reshape(-1), cells.reshape(-1), reason.reshape(-1))
+
+
+def sweep_pixels(
+    task: Task, plan: Plan, pixels: IndexArray, sweep: Sweep, worth: NDArray[np.float64] | None = None
+) -> Rest:
+    """Draw `pixels` (n,) group by group of one grid, those again that ask for laps, and return what is left.
+
+    `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
+    """
+    merge, parts, cells = plan.merge[pixels], plan.parts[pixels], plan.cells[pixels]
+    status = np.tile(plan.reason[pixels], (task.realizations, 1))
+    # lanes go through their sweeps together: neighbours in background need about as many
+    able = np.flatnonzero(status[0] == Reason.DRAWN)
+    able = able[np.argsort(task.flux.background.reshape(-1)[pixels[able]], kind="stable")]
+    done, share = 0, 1.0 / max(able.size, 1)
+
+    def draw(wanted: IndexArray, laps: IndexArray) -> None:
+        nonlocal done
+        for grid in np.unique(np.stack([merge[wanted], parts[wanted], laps], -1), axis=0):
+            group = wanted[(merge[wanted] == grid[0]) & (parts[wanted] == grid[1]) & (laps == grid[2])]
+            part = stage(task.progress, done * share, (done + group.size) * share)
+            status[:, group] = sweep(np.ascontiguousarray(pixels[group]), Grid(*map(int, grid)), part)
+            done += int((status[0, group] < Reason.LAPS).sum())
+
+    draw(able, np.ones_like(able))
+    slow = able[status[0, able] >= Reason.LAPS]
+    laps = status[0, slow].astype(np.int64) - Reason.LAPS
+    large = cells[slow] * laps > MOST_LAP_CELLS
+    dear = np.zeros_like(large) if worth is None else cells[slow] * laps > worth[slow]
+    status[:, slow[dear]] = Reason.DEAR
+    status[:, slow[large]] = Reason.CELLS
+    draw(slow[~large & ~dear], laps[~large & ~dear])
+    return Rest.of(task, pixels, status)
+
+
+def draw_rest(engine: Engine, task: Task, out: NDArray[Any], rest: Rest) -> None:
+    """Fill the rows of `rest` in `out` (items, bins) with `engine`'s histograms."""
+    cube = out.reshape(task.realizations, task.pixel_index.size, task.system.bins)
+    for first, number, pixels in rest.blocks(task.realizations):
+        part = task
+        if number < task.realizations:
+            first_realization = task.first_realization + first
+            part = replace(task, realizations=number, first_realization=first_realization, progress=None)
+        rows = cube[first : first + number].reshape(-1, task.system.bins)
+        draw_pixels(engine, replace(part, report={}), rows, pixels)

@@ -1,0 +1,172 @@
+"""What engines ask of a lookup table: that it fits the system, the entries of pixels, a record for a cube's file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any, Literal
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base import checks
+from mars_lidar.engines.alignment import Alignment
+from mars_lidar.engines.counts import CountLaws
+from mars_lidar.engines.engine import Task
+from mars_lidar.engines.pixels import single_return
+from mars_lidar.engines.synthesis import Batch
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+
+if TYPE_CHECKING:
+    from mars_lidar.table import Table
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+PIXELS = 2**17  # looked up at a time: 14 MiB
+_INTERPOLATIONS = ("bilinear", "nearest")
+_OUTSIDE = ("error", "exact")
+
+
+@dataclass(frozen=True, eq=False)
+class Entries:
+    """What a table says of some pixels (P,) of the image, in the order of its grid.
+
+    Neighbours on the grid follow each other, so that their rows are still in the processor's cache.
+    """
+
+    pixels: IndexArray
+    signal: FloatArray
+    background: FloatArray
+    delay_ns: FloatArray
+    cumulants: FloatArray
+    shapes: NDArray[np.float32]
+    guides: NDArray[np.float32]
+    rows: IndexArray
+    weights: FloatArray
+    alignment: Alignment
+
+    def batch(self, laws: CountLaws) -> Batch:
+        """With counts from `laws`."""
+        return Batch(self.pixels, self.shapes, self.rows, self.weights, laws, self.alignment, self.guides)
+
+
+class TableReader:
+    """A table as an engine reads it: which, how between its grid points, and whether pixels may lie beyond them."""
+
+    def __init__(self, table: Table, interpolation: str | None, outside: str | None) -> None:
+        if not (callable(getattr(table, "lookup", None)) and callable(getattr(table, "shapes", None))):
+            raise TypeError(f"table must be a mars_lidar.Table, got {table!r}")
+        self.table = table
+        given = "bilinear" if interpolation is None else interpolation
+        nearest = checks.choice("interpolation", given, _INTERPOLATIONS) == "nearest"
+        self.refuses = checks.choice("outside", "error" if outside is None else outside, _OUTSIDE) == "error"
+        self.interpolation: Literal["bilinear", "nearest"] = "nearest" if nearest else "bilinear"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a cube depends on: interpolation, and which table."""
+        return {"interpolation": self.interpolation, "table": table_record(self.table)}
+
+    def check(self, flux: Flux, system: System) -> None:
+        """The table is of this system but for the number of cycles, and every pixel has one return, on its grid."""
+        ours, theirs = system.detected().to_dict(), self.table.system.to_dict()
+        for name in ours:
+            if name != "cycles" and ours[name] != theirs[name]:
+                raise ValueError(f"table must be of this system: {name} is {ours[name]}, the table's {theirs[name]}")
+        flux = flux.detected(system)
+        single = single_return(flux)
+        if single is None:
+            what = "a waveform" if flux.waveform is not None else "several returns in a pixel"
+            raise ValueError(f"flux must have one return a pixel with a table, got {what}; leave the table out")
+        if self.refuses:
+            self._check_range(single[0], flux.background.reshape(-1))
+
+    def _check_range(self, signal: FloatArray, background: FloatArray) -> None:
+        """Every pixel lies on the grid, or has no return, of which nothing but its background has to be known."""
+        beyond, told = np.zeros(signal.size, dtype=bool), []
+        for name, photons, axis in (
+            ("signal", signal, self.table.signal), ("background", background, self.table.background)
+        ):  # fmt: skip
+            out = (photons < axis[0]) | (photons > axis[-1])
+            if name == "signal":
+                out &= photons > 0.0
+            if out.any():
+                low, high = photons[out].min(), photons[out].max()
+                told.append(f"{name} {low:.4g} to {high:.4g} (the table: {axis[0]:g} to {axis[-1]:g})")
+            beyond |= out
+        if told:
+            raise ValueError(
+                f"table must reach every pixel, but {int(beyond.sum())} of {beyond.size} lie outside of it: "
+                f"{', '.join(told)} photons per period; build it over that range, or give outside='exact' "
+                "(--table-outside exact) to evaluate each of those by itself, which takes some ms"
+            )
+
+    def read(self, task: Task, pixels: IndexArray) -> tuple[Entries, IndexArray]:
+        """Entries of those of the pixels that lie on the grid; the others."""
+        single = single_return(task.flux)
+        assert single is not None  # see check
+        system = task.system
+        signal, delay = single[0][pixels], single[1][pixels]
+        background = np.ascontiguousarray(task.flux.background.reshape(-1)[pixels])
+        look = self.table.lookup(
+            signal,
+            background,
+            delay_ns=delay,
+            cycles=system.cycles,
+            interpolation=self.interpolation,
+            outside="exact",
+            threads=task.threads,
+        )
+        order = np.flatnonzero(~look.outside)
+        order = order[np.argsort(look.rows[order, 0])]
+        signal, background, delay = signal[order], background[order], delay[order]
+        cumulants = look.cumulants[order]
+        alignment = Alignment.of(system, signal, background, delay, cumulants[:, 0] / system.cycles)
+        entries = Entries(
+            pixels[order],
+            signal,
+            background,
+            delay,
+            cumulants,
+            *_shapes(self.table, system.cycles),
+            look.rows[order],
+            look.weights[order],
+            alignment,
+        )
+        return entries, pixels[look.outside]
+
+
+# A table computes its shapes for other cycles than it was built for at each call, which takes longer than a cube: those
+# of the last cycles asked for stay as long as the table lives, and with them what the sampler finds out about them.
+_last_shapes: WeakKeyDictionary[Table, tuple[int, NDArray[np.float32], NDArray[np.float32]]] = WeakKeyDictionary()
+
+
+def _shapes(table: Table, cycles: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Shapes, and the sampler's guides to them."""
+    kept = _last_shapes.get(table)
+    if kept is None or kept[0] != cycles:
+        shapes = table.shapes(cycles)
+        kept = _last_shapes[table] = cycles, shapes, np.zeros((len(shapes), 64), np.float32)
+    return kept[1:]
+
+
+def table_record(table: Table) -> dict[str, Any]:
+    """Names a table in the file of a cube: hash of its content, cycles, method and grid.
+
+    The hash is of what a cube depends on: axes, shapes, and cumulants at the nodes.
+    """
+    signal, background = (np.ascontiguousarray(axis, dtype=np.float64) for axis in (table.signal, table.background))
+    nodes = table.lookup(np.repeat(signal, background.size), np.tile(background, signal.size), interpolation="nearest")
+    digest = blake2b(digest_size=16)
+    for part in (signal, background, nodes.cumulants, table.shapes()):
+        digest.update(np.ascontiguousarray(part).data)
+    return {
+        "hash": digest.hexdigest(),
+        "method": table.method,
+        "cycles": table.system.cycles,
+        "signal": [float(signal[0]), float(signal[-1]), signal.size],
+        "background": [float(background[0]), float(background[-1]), background.size],
+    }

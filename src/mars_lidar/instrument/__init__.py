@@ -1,0 +1,1 @@
+"""The instrument: laser pulse, detector with its effects, histogram, and the system that they make."""

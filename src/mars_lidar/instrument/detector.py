@@ -1,0 +1,232 @@
+"""The detector pixel: dead time, when an arrival is registered, gate, effects. Definitions: docs/detectors.md."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument import effects
+from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
+from mars_lidar.instrument.effects import Jitter, SampledJitter
+
+Mode = Literal["nonparalyzable", "paralyzable", "synchronous", "gated"]
+MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "synchronous", "gated")
+
+_GATE = ("gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
+_MAX_GATE_CYCLES = 100_000_000
+_MIN_GATE_PERIODS = 1e-5  # phases have 24 bits: at 1e-6 periods the counts behind a gate were 4 % off
+_MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond it no digits are left
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detector:
+    """A single-photon detector pixel.
+
+    Parameters
+    ----------
+    dead_time_ns
+        After a registration the pixel is blind for this long, across period edges. 0, a fraction of the
+        laser period or many periods.
+    mode
+        - ``"nonparalyzable"``: free running; photons that arrive while the pixel is blind have no effect,
+        - ``"paralyzable"``: free running; every arrival, registered or not, begins the dead time anew, so that
+          an arrival is registered iff none came within the dead time before it,
+        - ``"synchronous"``: armed at the start of each laser period, registers the first photon and nothing
+          more until the next; a dead time that is not over at the start of a period costs that whole period,
+        - ``"gated"``: photons outside of the gate do not exist; inside, as ``"nonparalyzable"``. Where the gate
+          opens while the pixel is blind, the pixel is armed when its dead time is over.
+    gate_start_ns, gate_width_ns
+        The gate is open on [start, start + width) of each period; one that reaches beyond the end of the period
+        continues at its beginning. The start is taken modulo the period, the width is at most the period. Both
+        are needed by mode ``"gated"``; with the other modes all gate fields are None.
+    gate_step_ns
+        The start advances by this much (modulo the period, either sign) ...
+    gate_cycles
+        ... every so many periods, for a gate that is moved during the exposure. Default: 0 and 1, a gate that
+        stays.
+
+    Effects, in the order in which they act (docs/detectors.md); all are off by default:
+
+    detection_efficiency
+        Probability, fill factor included, that a photon of the `Flux` triggers an avalanche; in (0, 1]. 1: the flux
+        is given in detectable photons.
+    dark_count_hz
+        Rate of avalanches without a photon, counts/s: uniform in time, in the gate of a gated pixel only. Rates pixel
+        by pixel: `Flux.with_dark_counts`.
+    afterpulsing
+        `Afterpulsing`: carriers that an avalanche leaves in traps and that trigger others when they are released.
+    twilight_ns
+        Arrivals within this time before the end of a dead time, ns, are not lost: the pixel fires at its end (a
+        twilight pulse). At most the dead time; mode ``"nonparalyzable"`` only.
+    crosstalk
+        `Crosstalk`: avalanches trigger neighbouring pixels. The pixels of an image then depend on each other.
+    electronics_dead_time_ns
+        An avalanche is recorded only where none was within this time before it, t_e, ns, beside the dead time of the
+        pixel itself; without effect unless longer. The electronics are ready at the start of an exposure.
+    max_events_per_period, max_events_per_exposure
+        The electronics record no more events than this of a laser period, and of an exposure: the first ones.
+    jitter
+        `Jitter` or `SampledJitter`: what a record's time is off from that of its avalanche. It decides nothing: dead
+        times, gate, limits and exposure go by the avalanche.
+    code_density
+        Non-linearity of the time-to-digital converter: relative widths (n,) of n neighbouring codes, as a code-density
+        test finds them. n divides the number of bins, and the pattern repeats (the taps of a delay line in each cycle
+        of the clock); n = bins gives every bin its own.
+    """
+
+    dead_time_ns: float
+    mode: Mode = "nonparalyzable"
+    gate_start_ns: float | None = None
+    gate_width_ns: float | None = None
+    gate_step_ns: float | None = None
+    gate_cycles: int | None = None
+    detection_efficiency: float = 1.0
+    dark_count_hz: float = 0.0
+    afterpulsing: Afterpulsing | None = None
+    twilight_ns: float = 0.0
+    crosstalk: Crosstalk | None = None
+    electronics_dead_time_ns: float = 0.0
+    max_events_per_period: int | None = None
+    max_events_per_exposure: int | None = None
+    jitter: Jitter | SampledJitter | None = None
+    code_density: tuple[float, ...] | None = None
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        for name, field in effects.FIELDS.items():
+            if getattr(self, name) is not None or field.off is not None:
+                set_field(self, name, field.checked(getattr(self, name)))
+        set_field(self, "dead_time_ns", checks.real("dead_time_ns", self.dead_time_ns, low=0.0))
+        checks.choice("mode", self.mode, MODES)
+        self._check_avalanches()
+        if self.mode != "gated":
+            for name in _GATE:
+                if getattr(self, name) is not None:
+                    raise ValueError(
+                        f"{name} belongs to mode 'gated' and must be None with mode {self.mode!r}, "
+                        f"got {getattr(self, name)!r}"
+                    )
+            return
+        for name in ("gate_start_ns", "gate_width_ns"):
+            if getattr(self, name) is None:
+                raise ValueError(f"mode 'gated' needs {name}, in ns, got None")
+        set_field(
+            self,
+            "gate_start_ns",
+            checks.real("gate_start_ns", self.gate_start_ns, low=-_MAX_GATE_NS, high=_MAX_GATE_NS),
+        )
+        set_field(
+            self, "gate_width_ns", checks.real("gate_width_ns", self.gate_width_ns, low=0.0, strict_low=True)
+        )
+        step = 0.0 if self.gate_step_ns is None else self.gate_step_ns
+        set_field(
+            self, "gate_step_ns", checks.real("gate_step_ns", step, low=-_MAX_GATE_NS, high=_MAX_GATE_NS)
+        )
+        cycles = 1 if self.gate_cycles is None else self.gate_cycles
+        set_field(self, "gate_cycles", checks.integer("gate_cycles", cycles, low=1, high=_MAX_GATE_CYCLES))
+        if self.gate_cycles != 1 and self.gate_step_ns == 0.0:
+            raise ValueError(
+                "gate_cycles is the number of periods that a moving gate stays in place: give gate_step_ns too, "
+                f"got gate_cycles={self.gate_cycles} with gate_step_ns=0"
+            )
+
+    @classmethod
+    def preset(cls, name: str) -> Detector:
+        """A detector as published, by its name in `mars_lidar.instrument.presets.PRESETS` (docs/detectors.md).
+
+        `dataclasses.replace` changes fields. Efficiencies are left at 1: they go with the wavelength.
+        """
+        from mars_lidar.instrument.presets import preset
+
+        return preset(name)
+
+    def _check_avalanches(self) -> None:
+        if self.twilight_ns > 0.0 and self.mode != "nonparalyzable":
+            raise ValueError(
+                "twilight_ns belongs to mode 'nonparalyzable', whose pixel recovers at the end of the dead time, "
+                f"and must be 0 with mode {self.mode!r}, got {self.twilight_ns:g}"
+            )
+        if self.twilight_ns > self.dead_time_ns:
+            raise ValueError(
+                f"twilight_ns must lie in [0, {self.dead_time_ns:g}], the dead time at whose end it is, "
+                f"got {self.twilight_ns:g}"
+            )
+        if self.crosstalk is not None and self.dead_time_ns == 0.0:
+            raise ValueError(
+                "crosstalk needs dead_time_ns > 0: pixels that are never blind would trigger each other back and "
+                "forth at one instant, got dead_time_ns=0"
+            )
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that are on and change anything, in the order in which they act."""
+        on = [name for name, field in effects.FIELDS.items() if getattr(self, name) != field.off]
+        if self.electronics_dead_time_ns <= self.dead_time_ns:  # registrations are that far apart in every mode
+            on = [name for name in on if name != "electronics_dead_time_ns"]
+        return tuple(on)
+
+    def without(self, *names: str) -> Detector:
+        """This detector with some effects switched off."""
+        return dataclasses.replace(self, **{name: effects.FIELDS[name].off for name in names})
+
+    @property
+    def gate_moves(self) -> bool:
+        """Whether the gate is moved during the exposure."""
+        return bool(self.gate_step_ns)
+
+    def gate_periods(self, period_ns: float) -> tuple[float, float, float]:
+        """Start and step in [0, 1), and width in (0, 1], in laser periods; the whole period without a gate."""
+        if self.gate_start_ns is None or self.gate_width_ns is None or self.gate_step_ns is None:
+            return 0.0, 0.0, 1.0
+        start, step = self.gate_start_ns % period_ns / period_ns, self.gate_step_ns % period_ns / period_ns
+        return start % 1.0, step % 1.0, min(self.gate_width_ns / period_ns, 1.0)
+
+    def check(self, period_ns: float, bins: int, start: str) -> None:
+        """Raise ValueError, naming the field, for what makes no sense at this laser period, binning and start."""
+        if self.jitter is not None:
+            self.jitter.check(period_ns)
+        if self.afterpulsing is not None:
+            self.afterpulsing.check(period_ns)
+        if self.code_density is not None and bins % len(self.code_density):
+            raise ValueError(
+                f"code_density must have a number of codes that divides the {bins} bins of the histogram, "
+                f"got {len(self.code_density)}"
+            )
+        least, most = _MIN_GATE_PERIODS * period_ns, period_ns * (1 + 1e-12)
+        if self.gate_width_ns is not None and not least <= self.gate_width_ns <= most:
+            raise ValueError(
+                f"gate_width_ns must lie in [{least:g}, {period_ns:g}] ns (1e-5 to 1 period), "
+                f"got {self.gate_width_ns:g}"
+            )
+        if self.gate_moves and start == "stationary":
+            raise ValueError(
+                "start must be 'armed' with a gate that moves, which has no stationary state, got 'stationary' "
+                f"with gate_step_ns={self.gate_step_ns:g}"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `Detector.from_dict` makes an equal detector; gate and effects only where used."""
+        told = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            off = effects.FIELDS[field.name].off if field.name in effects.FIELDS else None
+            if value != off:
+                told[field.name] = effects.plain(value)
+        return told
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Detector:
+        """The detector that `to_dict` described; ``preset: NAME`` stands for the fields of a preset."""
+        names = tuple(field.name for field in dataclasses.fields(cls))
+        known = dict(checks.known_keys("detector", data, (*names, "preset")))
+        if "preset" in known:
+            known = cls.preset(known.pop("preset")).to_dict() | known
+        for name, field in effects.FIELDS.items():
+            if field.read is not None and known.get(name) is not None:
+                known[name] = field.read(known[name])
+        return cls(**known)

@@ -1,0 +1,207 @@
+"""Timing jitter: by how much a record is later than its avalanche."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Jitter:
+    """Timing jitter: a record is later than its avalanche by a Gaussian number, some by an exponential one on top.
+
+    Parameters
+    ----------
+    sigma_ns
+        Standard deviation of the Gaussian, of mean 0, ns. FWHM = 2.355 sigma; `Jitter.from_fwhm` takes that instead.
+    tail_ns
+        Mean of the exponential delay of carriers that diffuse into the multiplication region, ns.
+    tail_fraction
+        Share of the avalanches that have it, in [0, 1].
+    """
+
+    sigma_ns: float
+    tail_ns: float = 0.0
+    tail_fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        set_field(self, "sigma_ns", checks.real("sigma_ns", self.sigma_ns, low=0.0, strict_low=True))
+        set_field(self, "tail_ns", checks.real("tail_ns", self.tail_ns, low=0.0))
+        set_field(self, "tail_fraction", checks.real("tail_fraction", self.tail_fraction, low=0.0, high=1.0))
+        if (self.tail_ns > 0.0) != (self.tail_fraction > 0.0):
+            raise ValueError(
+                "tail_ns and tail_fraction of a jitter belong together: both positive, or both 0, "
+                f"got {self.tail_ns:g} ns and {self.tail_fraction:g}"
+            )
+
+    @classmethod
+    def from_fwhm(cls, *, fwhm_ns: float, tail_ns: float = 0.0, tail_fraction: float = 0.0) -> Jitter:
+        """Jitter whose Gaussian has the full width at half maximum `fwhm_ns` (ns)."""
+        sigma = checks.real("fwhm_ns", fwhm_ns, low=0.0, strict_low=True) / FWHM_PER_SIGMA
+        return cls(sigma_ns=sigma, tail_ns=tail_ns, tail_fraction=tail_fraction)
+
+    @property
+    def mean_ns(self) -> float:
+        """Mean, ns."""
+        return self.tail_fraction * self.tail_ns
+
+    @property
+    def std_ns(self) -> float:
+        """Standard deviation, ns."""
+        f = self.tail_fraction
+        return math.sqrt(self.sigma_ns**2 + f * (2.0 - f) * self.tail_ns**2)
+
+    def reach_ns(self) -> tuple[float, float]:
+        """Interval outside of which less than 1e-16 of the records lie, ns."""
+        return -8.5 * self.sigma_ns, 8.5 * self.sigma_ns + 37.0 * self.tail_ns
+
+    def cumulative(self, t_ns: ArrayLike) -> FloatArray:
+        """P(jitter <= t) (...) for `t_ns` (...)."""
+        from scipy.special import ndtr
+
+        t = np.asarray(t_ns, dtype=np.float64)
+        late = self._exponential(t) if self.tail_fraction > 0.0 else 0.0
+        return np.asarray(ndtr(t / self.sigma_ns) - self.tail_fraction * late, dtype=np.float64)
+
+    def integral(self, t_ns: ArrayLike) -> FloatArray:
+        """Integral of `cumulative` from -infinity to t (...), ns."""
+        from scipy.special import ndtr
+
+        t = np.asarray(t_ns, dtype=np.float64)
+        z = t / self.sigma_ns
+        gauss = self.sigma_ns * (z * ndtr(z) + np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
+        if self.tail_fraction == 0.0:
+            return np.asarray(gauss, dtype=np.float64)
+        # of Gaussian + exponential: density (ndtr - F) / tail, hence the integral of F is that of ndtr - tail F
+        return np.asarray(gauss - self.tail_fraction * self.tail_ns * (ndtr(z) - self._exponential(t)))
+
+    def _exponential(self, t: FloatArray) -> FloatArray:
+        """P(Gaussian <= t < Gaussian + exponential): Phi(z) minus the law of the sum."""
+        from scipy.special import erfcx, ndtr
+
+        z, ratio = t / self.sigma_ns, self.sigma_ns / self.tail_ns
+        x = (ratio - z) / math.sqrt(2.0)
+        near = np.exp(-0.5 * z * z) * 0.5 * erfcx(np.maximum(x, -5.0))
+        exponent = np.minimum(0.5 * ratio * ratio - t / self.tail_ns, 700.0)
+        return np.asarray(np.where(x > -5.0, near, np.exp(exponent) * ndtr(z - ratio)), dtype=np.float64)
+
+    def check(self, period_ns: float) -> None:
+        """Sigma from 1e-6 to 1/20 period: 8.5 sigma lie within half a period. The tail's mean up to a period."""
+        if not 1e-6 * period_ns <= self.sigma_ns <= 0.05 * period_ns:
+            raise ValueError(
+                f"sigma_ns of a jitter must lie in [{1e-6 * period_ns:g}, {0.05 * period_ns:g}] ns "
+                f"(1e-6 to 1/20 period), got {self.sigma_ns:g}"
+            )
+        if self.tail_ns > period_ns:
+            raise ValueError(f"tail_ns of a jitter must be at most the period, {period_ns:g} ns, got {self.tail_ns:g}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `jitter_from_dict` makes an equal jitter."""
+        tail = {"tail_ns": self.tail_ns, "tail_fraction": self.tail_fraction} if self.tail_fraction > 0.0 else {}
+        return {"kind": "gaussian", "sigma_ns": self.sigma_ns, **tail}
+
+
+@dataclass(frozen=True)
+class SampledJitter:
+    """A measured jitter: the density of the delay of a record behind its avalanche, constant on samples.
+
+    Parameters
+    ----------
+    values
+        (n,) non-negative, of positive sum.
+    bin_ns
+        Sample width, ns; n x bin_ns must fit in the laser period.
+    origin
+        Where the jitter is 0: ``"peak"``, ``"centroid"`` or ``"first"``, see `SampledPulse`.
+    """
+
+    values: tuple[float, ...]
+    bin_ns: float
+    origin: Literal["peak", "centroid", "first"] = "peak"
+
+    def __post_init__(self) -> None:
+        shape = SampledPulse(self.values, self.bin_ns, self.origin)
+        object.__setattr__(self, "values", tuple(shape.values.tolist()))
+        object.__setattr__(self, "bin_ns", shape.bin_ns)
+
+    @cached_property
+    def shape(self) -> SampledPulse:
+        """The density as a pulse."""
+        return SampledPulse(self.values, self.bin_ns, self.origin)
+
+    @property
+    def mean_ns(self) -> float:
+        """Mean, ns."""
+        return self._moment(1)
+
+    @property
+    def std_ns(self) -> float:
+        """Standard deviation, ns."""
+        return math.sqrt(max(self._moment(2) - self._moment(1) ** 2, 0.0))
+
+    def __repr__(self) -> str:
+        return f"SampledJitter({len(self.values)} samples, bin_ns={self.bin_ns:g}, origin={self.origin!r})"
+
+    def _moment(self, order: int) -> float:
+        edges, mass = self._edges(), np.diff(self.cumulative(self._edges()))
+        power = (edges[1:] ** (order + 1) - edges[:-1] ** (order + 1)) / ((order + 1) * np.diff(edges))
+        return float(mass @ power)
+
+    def _edges(self) -> FloatArray:
+        low, high = self.reach_ns()
+        return np.linspace(low, high, round((high - low) / self.bin_ns) + 1)
+
+    def reach_ns(self) -> tuple[float, float]:
+        """Interval outside of which no records lie, ns."""
+        return self.shape.support_ns()
+
+    def cumulative(self, t_ns: ArrayLike) -> FloatArray:
+        """P(jitter <= t) (...) for `t_ns` (...)."""
+        return self.shape.cumulative(t_ns)
+
+    def integral(self, t_ns: ArrayLike) -> FloatArray:
+        """Integral of `cumulative` from -infinity to t (...), ns."""
+        t, edges = np.asarray(t_ns, dtype=np.float64), self._edges()
+        level = self.cumulative(edges)
+        below = np.concatenate([[0.0], np.cumsum(0.5 * (level[1:] + level[:-1]) * np.diff(edges))])
+        k = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, edges.size - 2)
+        inside = np.clip(t - edges[k], 0.0, edges[k + 1] - edges[k])
+        area = below[k] + inside * 0.5 * (level[k] + self.cumulative(edges[k] + inside))
+        return np.asarray(area + np.maximum(t - edges[-1], 0.0), dtype=np.float64)
+
+    def check(self, period_ns: float) -> None:
+        """The record fits in the period."""
+        self.shape.check(period_ns)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `jitter_from_dict` makes an equal jitter."""
+        return {"kind": "sampled", "values": list(self.values), "bin_ns": self.bin_ns, "origin": self.origin}
+
+
+def jitter_from_dict(data: Any) -> Jitter | SampledJitter:
+    """The jitter that `to_dict` described; ``fwhm_ns`` may stand for ``sigma_ns``."""
+    kind = data.get("kind", "gaussian") if isinstance(data, dict) else None
+    if kind == "gaussian":
+        known = checks.known_keys("jitter", data, ("kind", "sigma_ns", "fwhm_ns", "tail_ns", "tail_fraction"))
+        given = {name: value for name, value in known.items() if name != "kind"}
+        if ("sigma_ns" in given) == ("fwhm_ns" in given):
+            raise ValueError(f"jitter of kind 'gaussian' must give one of sigma_ns and fwhm_ns, got {list(given)}")
+        return Jitter.from_fwhm(**given) if "fwhm_ns" in given else Jitter(**given)
+    if kind == "sampled":
+        known = checks.known_keys("jitter", data, ("kind", "values", "bin_ns", "origin"))
+        missing = [key for key in ("values", "bin_ns") if key not in known]
+        if missing:
+            raise ValueError(f"jitter of kind 'sampled' must give {missing[0]}")
+        return SampledJitter(known["values"], known["bin_ns"], known.get("origin", "peak"))
+    raise ValueError(f"jitter must be a mapping with kind 'gaussian' or 'sampled', got {data!r}")

@@ -1,0 +1,55 @@
+"""Detectors that have been measured, by name: parameters as published. Sources: docs/detectors.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mars_lidar._base import checks
+from mars_lidar.instrument.avalanches import Afterpulsing
+from mars_lidar.instrument.detector import Detector
+
+# Afterpulses of the module of serial number 3605H by time after the recovery, ns, and the share of them up to then:
+# the distribution that goes with Straka et al. (github.com/ivo-s/SPAD-counting-model, apDist_3605H.txt, 81 ps bins),
+# condensed to nine steps. Those up to 57 ns are read off that histogram; how the remaining 6 % spread up to 227 ns is
+# our estimate. Most of them come within a third of a nanosecond.
+_RECOVERY_NS, _STEP_NS = 24.0, 0.324
+_UNTIL_NS = np.array([0.324, 2.43, 8.1, 16.2, 24.3, 32.4, 56.7, 113.4, 226.8])
+_SHARE = np.array([0.593, 0.686, 0.784, 0.846, 0.883, 0.903, 0.938, 0.975, 1.0])
+
+
+def _excelitas_spcm_aqrh() -> Detector:
+    """Straka et al., J. Lightwave Technol. 38, 4765 (2020), and the program that goes with it."""
+    edges = np.arange(round(_UNTIL_NS[-1] / _STEP_NS) + 1) * _STEP_NS
+    share = np.diff(np.interp(edges, np.append(0.0, _UNTIL_NS), np.append(0.0, _SHARE)))
+    blind = np.zeros(round(_RECOVERY_NS / _STEP_NS))
+    return Detector(
+        dead_time_ns=_RECOVERY_NS,
+        afterpulsing=Afterpulsing(
+            probability=0.0171, delays=tuple(np.concatenate([blind, share]).round(9)), bin_ns=_RECOVERY_NS / blind.size
+        ),
+        twilight_ns=3.2,
+    )
+
+
+def _thorlabs_spcm20a() -> Detector:
+    """Thorlabs' page of the photon counters SPCM20A and SPCM50A: a photon every 35 and 45 ns, typical dark counts."""
+    return Detector(dead_time_ns=35.0, dark_count_hz=25.0)
+
+
+def _thorlabs_spcm50a() -> Detector:
+    """As `_thorlabs_spcm20a`, of a diode of 50 um instead of 20 um."""
+    return Detector(dead_time_ns=45.0, dark_count_hz=150.0)
+
+
+PRESETS: dict[str, Callable[[], Detector]] = {
+    "excelitas-spcm-aqrh": _excelitas_spcm_aqrh,
+    "thorlabs-spcm20a": _thorlabs_spcm20a,
+    "thorlabs-spcm50a": _thorlabs_spcm50a,
+}
+
+
+def preset(name: str) -> Detector:
+    """The detector of that name; ValueError with all names if there is none."""
+    return PRESETS[checks.choice("preset", name, tuple(PRESETS))]()

@@ -1,0 +1,281 @@
+"""Laser pulses: the temporal shape s(t) of the returned signal, detector response included.
+
+A pulse integrates to one and is wrapped into the laser period, so its tails continue in the neighbouring
+period. Times are relative to the delay of a return: positive is later.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+
+if TYPE_CHECKING:
+    from mars_lidar._core import PulseTable
+
+_GAUSSIAN_REACH = 8.5  # half support in sigma: what lies outside, 1e-17, is below one photon in any exposure
+FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
+_ORIGINS = ("peak", "centroid", "first")
+
+
+class Pulse(ABC):
+    """A pulse shape s(t), unit energy. Concrete pulses are final, frozen, hashable and serialisable."""
+
+    @abstractmethod
+    def support_ns(self) -> tuple[float, float]:
+        """Interval around the delay outside of which the pulse carries no energy, in ns."""
+
+    @abstractmethod
+    def cumulative(self, t_ns: ArrayLike) -> NDArray[np.float64]:
+        """Energy before `t_ns` (any shape, ns after the delay), without wrapping: 0 to 1."""
+
+    @abstractmethod
+    def check(self, period_ns: float) -> None:
+        """Raise ValueError where this pulse cannot be used at the given laser period."""
+
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which `pulse_from_dict` makes an equal pulse."""
+
+    @abstractmethod
+    def _native(self, period_ns: float) -> PulseTable:
+        """The sampler's table; built without libm, so the same to the last bit on every machine."""
+
+    def wrapped_cumulative(self, t_ns: ArrayLike, period_ns: float) -> NDArray[np.float64]:
+        """Energy of the periodic pulse train in (-inf, t], counted from a fixed origin: grows by 1 a period.
+
+        Differences of it are exact energies of an interval, wrap-around included.
+        """
+        t = np.asarray(t_ns, dtype=np.float64)
+        low, high = self.support_ns()
+        total = np.zeros_like(t)
+        whole = np.floor((t - high) / period_ns)
+        rest = t - whole * period_ns  # in [high, high + period): pulses k = 0, 1, .. up to those that start before
+        pulses = math.ceil((high - low) / period_ns) + 1
+        for k in range(pulses):
+            total += self.cumulative(rest - k * period_ns)
+        return total + whole
+
+    def bin_energy(self, delay_ns: ArrayLike, period_ns: float, bins: int) -> NDArray[np.float64]:
+        """Energy of the wrapped pulse in each of `bins` equal bins of the period.
+
+        Parameters
+        ----------
+        delay_ns
+            Delay of the return (...), ns.
+
+        Returns
+        -------
+        NDArray
+            (..., bins); sums to 1 over the last axis.
+        """
+        edges = np.linspace(0.0, period_ns, bins + 1)
+        delay = np.asarray(delay_ns, dtype=np.float64)[..., None]
+        return np.diff(self.wrapped_cumulative(edges - delay, period_ns), axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianPulse(Pulse):
+    """Gaussian pulse of standard deviation `sigma_ns` (ns), centred on the delay.
+
+    FWHM = 2.355 sigma; `GaussianPulse.from_fwhm(fwhm_ns=...)` takes that instead.
+    """
+
+    sigma_ns: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sigma_ns", checks.real("sigma_ns", self.sigma_ns, low=0.0, strict_low=True))
+
+    @classmethod
+    def from_fwhm(cls, *, fwhm_ns: float) -> GaussianPulse:
+        """Gaussian pulse of full width at half maximum `fwhm_ns` (ns)."""
+        return cls(sigma_ns=checks.real("fwhm_ns", fwhm_ns, low=0.0, strict_low=True) / FWHM_PER_SIGMA)
+
+    @property
+    def fwhm_ns(self) -> float:
+        """Full width at half maximum, ns."""
+        return self.sigma_ns * FWHM_PER_SIGMA
+
+    def support_ns(self) -> tuple[float, float]:
+        """+-8.5 sigma: 1e-17 of the energy lies outside."""
+        return -_GAUSSIAN_REACH * self.sigma_ns, _GAUSSIAN_REACH * self.sigma_ns
+
+    def cumulative(self, t_ns: ArrayLike) -> NDArray[np.float64]:
+        """Phi(t / sigma), relatively accurate in the lower tail."""
+        from scipy.special import ndtr
+
+        return np.asarray(ndtr(np.asarray(t_ns, dtype=np.float64) / self.sigma_ns), dtype=np.float64)
+
+    def check(self, period_ns: float) -> None:
+        """Sigma between 1e-6 and 1 period: narrower is a delta to the sampler, wider is a flat background."""
+        if not 1e-6 * period_ns <= self.sigma_ns <= period_ns:
+            raise ValueError(
+                f"sigma_ns must lie in [{1e-6 * period_ns:g}, {period_ns:g}] ns (1e-6 to 1 period), "
+                f"got {self.sigma_ns:g}"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """``{"kind": "gaussian", "sigma_ns": ...}``."""
+        return {"kind": "gaussian", "sigma_ns": self.sigma_ns}
+
+    def _native(self, period_ns: float) -> PulseTable:
+        from mars_lidar import _core
+
+        return _core.PulseTable.gaussian(self.sigma_ns / period_ns)
+
+
+class SampledPulse(Pulse):
+    """A measured impulse response: constant on samples of width `bin_ns`.
+
+    Parameters
+    ----------
+    values
+        (n,) non-negative, finite, with a positive sum; scaled to unit energy.
+    bin_ns
+        Sample width, ns. The record lasts n x bin_ns and must fit in the laser period.
+    origin
+        What the delay of a return refers to:
+
+        - ``"peak"``: the centre of the largest sample (the first of several equal ones),
+        - ``"centroid"``: the circular mean of the record,
+        - ``"first"``: the start of sample 0.
+
+        For ``"peak"`` and ``"centroid"`` the record is cyclic and is cut opposite the origin, so a response
+        whose rising edge was stored at the end of the array is put together again. For ``"first"`` it is
+        taken as it stands.
+    """
+
+    __slots__ = ("_bytes", "_cumulative", "_start_ns", "bin_ns", "origin", "values")
+
+    values: NDArray[np.float64]
+    bin_ns: float
+    origin: str
+    _start_ns: float
+    _cumulative: NDArray[np.float64]
+    _bytes: bytes
+
+    def __init__(self, values: ArrayLike, bin_ns: float, origin: str = "peak") -> None:
+        samples = np.array(values, dtype=np.float64)
+        if samples.ndim != 1 or samples.size == 0:
+            raise ValueError(f"values must be a 1-D array of at least one sample, got shape {samples.shape}")
+        bad = ~np.isfinite(samples) | (samples < 0)
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise ValueError(f"values must be finite and non-negative, got values[{k}] = {samples[k]}")
+        if not samples.max() > 0 or not np.isfinite(samples.sum()):
+            raise ValueError(f"values must have a positive, finite sum, got {samples.sum()}")
+        width = checks.real("bin_ns", bin_ns, low=0.0, strict_low=True)
+        checks.choice("origin", origin, _ORIGINS)
+        samples.flags.writeable = False
+        rolled, start = _unroll(samples, width, origin)
+        cumulative = np.concatenate([[0.0], np.cumsum(rolled)])
+        cumulative /= cumulative[-1]
+        for name, value in {
+            "values": samples,
+            "bin_ns": width,
+            "origin": origin,
+            "_start_ns": start,
+            "_cumulative": cumulative,
+            "_bytes": samples.tobytes(),
+        }.items():
+            object.__setattr__(self, name, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"SampledPulse is frozen: cannot set {name!r}")
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"SampledPulse is frozen: cannot delete {name!r}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SampledPulse, (self.values, self.bin_ns, self.origin)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SampledPulse):
+            return NotImplemented
+        return (self._bytes, self.bin_ns, self.origin) == (other._bytes, other.bin_ns, other.origin)
+
+    def __hash__(self) -> int:
+        return hash((self._bytes, self.bin_ns, self.origin))
+
+    def __repr__(self) -> str:
+        return f"SampledPulse({self.values.size} samples, bin_ns={self.bin_ns:g}, origin={self.origin!r})"
+
+    def support_ns(self) -> tuple[float, float]:
+        """The record's extent around the origin, samples without energy at either end left out."""
+        inside = np.flatnonzero(np.diff(self._cumulative) > 0)
+        return (
+            self._start_ns + float(inside[0]) * self.bin_ns,
+            self._start_ns + float(inside[-1] + 1) * self.bin_ns,
+        )
+
+    def cumulative(self, t_ns: ArrayLike) -> NDArray[np.float64]:
+        """Piecewise linear: the density is constant on each sample."""
+        x = (np.asarray(t_ns, dtype=np.float64) - self._start_ns) / self.bin_ns
+        return np.asarray(np.interp(x, np.arange(self._cumulative.size), self._cumulative), dtype=np.float64)
+
+    def check(self, period_ns: float) -> None:
+        """The record fits in the period."""
+        length = self.values.size * self.bin_ns
+        if length > period_ns * (1 + 1e-9):
+            raise ValueError(
+                f"values must span at most the laser period of {period_ns:g} ns, "
+                f"got {self.values.size} samples x {self.bin_ns:g} ns = {length:g} ns"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """``{"kind": "sampled", "values": [...], "bin_ns": ..., "origin": ...}``."""
+        return {"kind": "sampled", "values": self.values.tolist(), "bin_ns": self.bin_ns, "origin": self.origin}
+
+    def _native(self, period_ns: float) -> PulseTable:
+        from mars_lidar import _core
+
+        inside = np.flatnonzero(np.diff(self._cumulative) > 0)
+        knots = np.ascontiguousarray(self._cumulative[inside[0] : inside[-1] + 2])
+        return _core.PulseTable.sampled(knots, self.bin_ns / period_ns, self.support_ns()[0] / period_ns)
+
+
+def _unroll(samples: NDArray[np.float64], width: float, origin: str) -> tuple[NDArray[np.float64], float]:
+    """The record in order of time, and the time of its first edge relative to the origin."""
+    n = samples.size
+    if origin == "first":
+        return samples, 0.0
+    if origin == "peak":
+        centre = float(np.argmax(samples)) + 0.5
+    else:
+        angles = 2.0 * np.pi * (np.arange(n) + 0.5) / n
+        resultant = np.sum(samples * np.exp(1j * angles)) / samples.sum()
+        if abs(resultant) < 1e-9:
+            raise ValueError("origin='centroid' is not defined for values without a circular mean: a flat record")
+        centre = float(np.angle(resultant)) / (2.0 * np.pi) * n % n
+        centre = round(centre * 2.0**20) / 2.0**20  # the last bits of exp and angle differ between machines
+    first = math.ceil(centre - 0.5 * n - 1e-9)
+    rolled = np.roll(samples, -first)
+    rolled.flags.writeable = False
+    return rolled, (first - centre) * width
+
+
+def pulse_from_dict(data: Any) -> Pulse:
+    """The pulse that `Pulse.to_dict` described."""
+    kind = data.get("kind") if isinstance(data, dict) else None
+    if kind == "gaussian":
+        checks.known_keys("pulse", data, ("kind", "sigma_ns", "fwhm_ns"))
+        if "fwhm_ns" in data:
+            if "sigma_ns" in data:
+                raise ValueError("pulse must give one of sigma_ns and fwhm_ns, got both")
+            return GaussianPulse.from_fwhm(fwhm_ns=data["fwhm_ns"])
+        if "sigma_ns" not in data:
+            raise ValueError("pulse of kind 'gaussian' must give sigma_ns or fwhm_ns, got neither")
+        return GaussianPulse(sigma_ns=data["sigma_ns"])
+    if kind == "sampled":
+        checks.known_keys("pulse", data, ("kind", "values", "bin_ns", "origin"))
+        missing = [key for key in ("values", "bin_ns") if key not in data]
+        if missing:
+            raise ValueError(f"pulse of kind 'sampled' must give {missing[0]}")
+        return SampledPulse(data["values"], data["bin_ns"], data.get("origin", "peak"))
+    raise ValueError(f"pulse must be a mapping with kind 'gaussian' or 'sampled', got {data!r}")

@@ -1,0 +1,211 @@
+"""The instrument: laser, detector and histogram, as one frozen object that goes along with every result."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.detector import Detector as Detector
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.pulse import Pulse, pulse_from_dict
+
+SPEED_OF_LIGHT_M_PER_NS = 0.299792458
+_STARTS = ("armed", "stationary")
+_MAX_CYCLES = 100_000_000  # the sampler counts periods in 32 bits: ten seconds at 10 MHz
+_MAX_BINS = 2**20
+_MAX_DEAD_PERIODS = 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class System:
+    """Laser, detector and histogram.
+
+    Parameters
+    ----------
+    period_ns
+        Laser period t_r, ns.
+    cycles
+        Laser periods per exposure N_r; the exposure lasts ``cycles * period_ns``.
+    bins
+        Histogram bins over one period n_b.
+    pulse
+        Shape of the returned pulse, detector response included; without it where the detector has a jitter.
+    detector
+        Dead time, mode and gate of the pixel, and what else it does.
+    start
+        State of the pixel at the start of the exposure: ``"armed"`` (ready at t = 0) or ``"stationary"``
+        (warmed up). The two differ by up to half a count in the mean.
+    """
+
+    period_ns: float
+    cycles: int
+    bins: int
+    pulse: Pulse
+    detector: Detector
+    start: Literal["armed", "stationary"] = "armed"
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        set_field = object.__setattr__
+        set_field(self, "period_ns", checks.real("period_ns", self.period_ns, low=0.0, strict_low=True))
+        set_field(self, "cycles", checks.integer("cycles", self.cycles, low=1, high=_MAX_CYCLES))
+        set_field(self, "bins", checks.integer("bins", self.bins, low=1, high=_MAX_BINS))
+        if not isinstance(self.pulse, Pulse):
+            raise TypeError(f"pulse must be a GaussianPulse or a SampledPulse, got {self.pulse!r}")
+        if not isinstance(self.detector, Detector):
+            raise TypeError(f"detector must be a Detector, got {self.detector!r}")
+        checks.choice("start", self.start, _STARTS)
+        self.pulse.check(self.period_ns)
+        if self.dead_time_periods > _MAX_DEAD_PERIODS:
+            raise ValueError(
+                f"dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
+                f"got {self.detector.dead_time_ns:g} ns"
+            )
+        self.detector.check(self.period_ns, self.bins, self.start)
+        if self.electronics_dead_time_periods > _MAX_DEAD_PERIODS:
+            raise ValueError(
+                f"electronics_dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
+                f"got {self.detector.electronics_dead_time_ns:g} ns"
+            )
+
+    @property
+    def bin_ns(self) -> float:
+        """Width of a histogram bin, ns."""
+        return self.period_ns / self.bins
+
+    @property
+    def exposure_ns(self) -> float:
+        """Length of one exposure, ns."""
+        return self.period_ns * self.cycles
+
+    @property
+    def dead_time_periods(self) -> float:
+        """Dead time in laser periods, t_d / t_r."""
+        return self.detector.dead_time_ns / self.period_ns
+
+    @property
+    def electronics_dead_time_periods(self) -> float:
+        """Dead time of the electronics in laser periods, t_e / t_r."""
+        return self.detector.electronics_dead_time_ns / self.period_ns
+
+    def detected(self) -> System:
+        """This system for a flux of detected photons, `Flux.detected`: efficiency and dark counts are in that flux."""
+        bare = self.detector.without(*LIGHT_EFFECTS)
+        return self if bare == self.detector else self.replace(detector=bare)
+
+    @property
+    def unambiguous_range_m(self) -> float:
+        """Depth c t_r / 2 beyond which returns wrap into the next period, m."""
+        return 0.5 * SPEED_OF_LIGHT_M_PER_NS * self.period_ns
+
+    @property
+    def time_ns(self) -> NDArray[np.float64]:
+        """Centres of the histogram bins (bins,), ns."""
+        return (np.arange(self.bins, dtype=np.float64) + 0.5) * self.bin_ns
+
+    def delay_ns(self, depth_m: ArrayLike) -> NDArray[np.float64]:
+        """Round-trip time 2 z / c of depths (...) in m, in ns, not wrapped."""
+        return 2.0 / SPEED_OF_LIGHT_M_PER_NS * np.asarray(depth_m, dtype=np.float64)
+
+    def depth_m(self, delay_ns: ArrayLike) -> NDArray[np.float64]:
+        """Depth c tau / 2 of delays (...) in ns, in m."""
+        return 0.5 * SPEED_OF_LIGHT_M_PER_NS * np.asarray(delay_ns, dtype=np.float64)
+
+    @property
+    def max_bin_count(self) -> float:
+        """Most registrations that one bin can hold: inf for a dead time of 0.
+
+        A bin is open for one bin width per period, which fits floor(width / t_d) + 1 registrations, and an
+        exposure fits floor(exposure / t_d) + 1 in all; only the latter where records are moved into the bin. A
+        synchronous pixel registers once in max(1, ceil(t_d / t_r)) periods.
+        """
+        dead = self.detector.dead_time_ns
+        if self.detector.mode == "synchronous":
+            return math.ceil(self.cycles / max(1, math.ceil(self.dead_time_periods - 1e-9)))
+        if dead == 0.0:
+            return math.inf
+        most = self.exposure_ns // dead + 1
+        if set(TIMING_EFFECTS) & set(self.detector.effects):
+            return most
+        return min(self.cycles * (self.bin_ns // dead + 1), most)
+
+    @property
+    def histogram_dtype(self) -> np.dtype[Any]:
+        """uint16, or uint32 where a bin could exceed 65535; a function of the system alone."""
+        return np.dtype(np.uint16 if self.max_bin_count <= np.iinfo(np.uint16).max else np.uint32)
+
+    def replace(self, **changes: Any) -> System:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, JSON and YAML ready, from which `System.from_dict` makes an equal system."""
+        return {
+            "period_ns": self.period_ns,
+            "cycles": self.cycles,
+            "bins": self.bins,
+            "pulse": self.pulse.to_dict(),
+            "detector": self.detector.to_dict(),
+            "start": self.start,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Any) -> System:
+        """The system that `to_dict` described; unknown or missing keys are errors that name them."""
+        names = tuple(field.name for field in dataclasses.fields(cls))
+        known = dict(checks.known_keys("system", data, names))
+        missing = [name for name in names if name not in known and name != "start"]
+        if missing:
+            raise ValueError(f"system must give {missing[0]}; needed: {', '.join(names[:-1])}")
+        known["pulse"] = pulse_from_dict(known["pulse"])
+        known["detector"] = Detector.from_dict(known["detector"])
+        return cls(**known)
+
+    def to_json(self) -> str:
+        """One line of JSON; floats are written so that they read back to the same bits."""
+        return json.dumps(self.to_dict())
+
+    @classmethod
+    def from_json(cls, text: str) -> System:
+        """The system that `to_json` wrote."""
+        return cls.from_dict(json.loads(text))
+
+    def save(self, path: str | Path) -> None:
+        """Write to a ``.json``, ``.yaml`` or ``.yml`` file."""
+        target = Path(path)
+        if target.suffix == ".json":
+            target.write_text(json.dumps(self.to_dict(), indent=2) + "\n")
+        elif target.suffix in (".yaml", ".yml"):
+            import yaml
+
+            target.write_text(yaml.safe_dump(self.to_dict(), sort_keys=False))
+        else:
+            raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
+
+    @classmethod
+    def load(cls, path: str | Path) -> System:
+        """Read what `save` wrote; an error names the file and the key."""
+        source = Path(path)
+        if source.suffix not in (".json", ".yaml", ".yml"):
+            raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
+        text = source.read_text(encoding="utf-8-sig")
+        try:
+            if source.suffix == ".json":
+                return cls.from_dict(json.loads(text))
+            import yaml
+
+            from mars_lidar._base.yaml import loader
+
+            return cls.from_dict(yaml.load(text, Loader=loader()))  # a safe loader
+        except Exception as error:
+            raise ValueError(f"{source}: {error}") from error

@@ -1,0 +1,295 @@
+"""Simulate straight into a file, and make a cube again: where the verb `simulate` and the files meet."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar.engines import find_engine
+from mars_lidar.instrument.system import System
+from mars_lidar.io.cube import Cube, check_output, create
+from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.store import WriteError as WriteError
+from mars_lidar.io.store import reason
+from mars_lidar.light.flux import Flux
+
+if TYPE_CHECKING:
+    from mars_lidar.learn.neural import NeuralMap
+    from mars_lidar.table import Table
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Written:
+    """What `simulate_to` did.
+
+    Attributes
+    ----------
+    path
+        The file.
+    registrations
+        Total counts of the cube.
+    simulate_s, write_s
+        Seconds spent in the engine and on the file.
+    report
+        What the engine had to tell beside the counts, numbers by name, added up.
+    """
+
+    path: Path
+    registrations: int
+    simulate_s: float
+    write_s: float
+    report: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def ns_per_registration(self) -> float:
+        """Engine time per registration, all threads together; NaN without registrations."""
+        return 1e9 * self.simulate_s / self.registrations if self.registrations else math.nan
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during `simulate_to`; its text says what is left on disk."""
+
+
+def simulate_to(
+    path: str | Path,
+    flux: Flux,
+    system: System,
+    *,
+    engine: str = "exact",
+    realizations: int = 1,
+    first_realization: int = 0,
+    pixel_index: ArrayLike | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
+    depth_m: ArrayLike | None = None,
+    reflectivity: ArrayLike | None = None,
+    source: str = "",
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    table: Table | None = None,
+    count: Literal["exact", "matched", "gaussian"] | None = None,
+    interpolation: Literal["bilinear", "nearest"] | None = None,
+    outside: Literal["error", "exact"] | None = None,
+    model: NeuralMap | str | Path | None = None,
+) -> Written:
+    """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
+
+    Blocks of at most about 64 MiB are simulated and written one after the other, so the cube never needs
+    to fit in memory; its counts are those of one `mars_lidar.simulate`, bit for bit.
+
+    Parameters
+    ----------
+    path
+        The file; its suffix chooses the format.
+    flux, system, engine, realizations, first_realization, pixel_index, seed, threads, device
+        As for `mars_lidar.simulate`; blocks from a GPU are copied from there, and the file does not tell.
+    table, count, interpolation, outside, model
+        As for `mars_lidar.simulate`; the file keeps the name of the engine, its settings, and a hash of the table.
+    depth_m, reflectivity
+        Maps (H, W) of the scene to store beside the counts; depth is c tau / 2 by default.
+    source
+        Free text: where the scene came from.
+    overwrite
+        Replace an existing file.
+    progress
+        Called with (pixel exposures done, in all).
+
+    Raises
+    ------
+    ValueError, TypeError
+        A bad argument; nothing was written.
+    FileExistsError
+        `path` exists and `overwrite` is false.
+    MemoryError
+        An ``.npz`` that could not be read back in this machine's memory.
+    WriteError, Interrupted
+        Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
+    """
+    options = _given(table=table, count=count, interpolation=interpolation, outside=outside, model=model)
+    recipe = Recipe(
+        system=system,
+        flux=flux,
+        engine=engine,
+        seed=seed,
+        realizations=realizations,
+        first_realization=first_realization,
+        pixel_index=None if pixel_index is None else np.asarray(pixel_index),
+        depth_m=system.depth_m(flux.delay_ns) if depth_m is None else np.asarray(depth_m),
+        reflectivity=None if reflectivity is None else np.asarray(reflectivity),
+        source=source,
+        options=options,
+        settings=_settings(engine, options),
+    )
+    target = Path(path)
+    check_output(target, recipe, overwrite=overwrite)
+    if isinstance(engine, str):  # every pixel, before the blocks one by one
+        find_engine(engine, **options).check(flux, system)
+    _try_brightest_pixel(recipe, threads, device)
+    try:
+        writer = create(target, recipe, overwrite=overwrite)
+    except OSError as error:
+        raise WriteError(error.errno, f"{reason(error)}; nothing was left at {target}") from error
+    registrations = 0
+    simulate_s = write_s = 0.0
+    report: dict[str, float] = {}
+    try:
+        for images, rows in recipe.blocks(writer.chunks):
+            began = time.perf_counter()
+            told: dict[str, float] = {}
+            tell = _of_the_whole(progress, recipe, images, rows)
+            block = _simulate(recipe, images, rows, threads, tell, told, device)
+            ended = time.perf_counter()
+            writer.write(images, rows, block)
+            registrations += int(block.sum(dtype=np.uint64))
+            simulate_s += ended - began
+            write_s += time.perf_counter() - ended
+            for name, value in told.items():
+                report[name] = report.get(name, 0.0) + value
+        writer.finish(registrations)
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {writer.abandon()}") from None
+    except OSError as error:
+        raise WriteError(error.errno, f"{reason(error)}; {writer.abandon()}") from error
+    except BaseException:
+        writer.abandon()
+        raise
+    return Written(target, registrations, simulate_s, write_s, report)
+
+
+def regenerate(
+    cube: Cube | Recipe,
+    *,
+    realizations: slice = slice(None),
+    rows: slice = slice(None),
+    threads: int | None = None,
+    table: Table | None = None,
+) -> NDArray[Any]:
+    """Simulate a cube, or a part of it, again from its recipe.
+
+    Parameters
+    ----------
+    cube
+        What `load` returned, or its recipe.
+    realizations, rows
+        Part to make: slices of step 1 that count from the start of the cube.
+    threads
+        As for `mars_lidar.simulate`.
+    table
+        The table that the cube was made with, if there was one; another one is refused.
+
+    Returns
+    -------
+    NDArray
+        (realizations, rows, W, bins): the bits of the cube, with the same engine on the same version.
+    """
+    recipe = _repeatable(cube.recipe if isinstance(cube, Cube) else cube, table)
+    parts = []
+    count, height = recipe.shape[:2]
+    for name, part, size in (("realizations", realizations, count), ("rows", rows, height)):
+        first, last, step = part.indices(size)
+        if step != 1 or first >= last:
+            raise ValueError(f"{name} must select a run of at least one of {size}, got {part!r}")
+        parts.append(slice(first, last))
+    return _simulate(recipe, parts[0], parts[1], threads, None)
+
+
+def verify(
+    cube: Cube, *, threads: int | None = None, progress: Progress | None = None, table: Table | None = None
+) -> bool:
+    """Whether simulating again gives the stored counts, bit for bit; one block in memory at a time.
+
+    A cube that was made with a table needs that `table`; another one is refused.
+    """
+    recipe = _repeatable(cube.recipe, table)
+    for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
+        again = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))
+        if not np.array_equal(again, np.asarray(cube.histogram[images, rows])):
+            return False
+    return True
+
+
+def _simulate(
+    recipe: Recipe,
+    images: slice,
+    rows: slice,
+    threads: int | None,
+    progress: Progress | None,
+    report: dict[str, float] | None = None,
+    device: Literal["cpu", "cuda"] = "cpu",
+) -> NDArray[Any]:
+    from mars_lidar import simulate
+
+    part = recipe.part(images, rows)
+    counts: Any = simulate(**part, threads=threads, device=device, progress=progress, report=report)
+    here: NDArray[Any] = counts if device == "cpu" else counts.get()
+    return here
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _settings(engine: str, options: dict[str, Any]) -> dict[str, Any]:
+    """What a cube of this engine depends on, as plain data; checks the options on the way."""
+    return find_engine(engine, **options).settings if isinstance(engine, str) else {}
+
+
+def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
+    """The recipe with the options that its settings ask for, of which only the table is not in a file."""
+    recorded = recipe.settings
+    table = recipe.options.get("table") if table is None else table
+    if table is None and "table" in recorded:
+        raise ValueError(f"table must be the one that the cube was made with, got None: {_grid(recorded['table'])}")
+    options = _given(
+        table=table,
+        count=recorded.get("count"),
+        interpolation=recorded.get("interpolation"),
+        outside=None if table is None else "exact",  # no count depends on it
+    )
+    settings = _settings(recipe.engine, options)
+    if table is not None and settings.get("table") != recorded.get("table"):
+        was = _grid(recorded["table"]) if "table" in recorded else "none"
+        raise ValueError(f"table must be the one that the cube was made with ({was}), got {_grid(settings['table'])}")
+    return recipe.replace(options=options)
+
+
+def _grid(record: dict[str, Any]) -> str:
+    axes = ", ".join("{} {:g} to {:g} in {}".format(name, *record[name]) for name in ("signal", "background"))
+    return f"method {record['method']!r}, {axes}, hash {record['hash']}"
+
+
+def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["cpu", "cuda"]) -> None:
+    """Let the simulator check its arguments before anything on disk is touched."""
+    y, x = (int(k) for k in np.unravel_index(np.argmax(recipe.flux.total), recipe.flux.shape))
+    one = recipe.replace(
+        flux=recipe.flux[y, x],
+        realizations=1,
+        pixel_index=np.array([0 if recipe.pixel_index is None else recipe.pixel_index.max()]),
+        depth_m=recipe.depth_m[:1, :1],
+        reflectivity=None,
+    )
+    _simulate(one, slice(0, 1), slice(0, 1), threads, None, device=device)
+
+
+def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
+    """A callback for one block that tells `progress` how far the whole cube is, in pixel exposures."""
+    if progress is None:
+        return None
+    count, height, width, _ = recipe.shape
+    before = images.start * height * width + rows.start * width
+    size = (images.stop - images.start) * (rows.stop - rows.start) * width
+
+    def shifted(done: int, total: int) -> None:
+        progress(before + size * done // max(total, 1), count * height * width)
+
+    return shifted

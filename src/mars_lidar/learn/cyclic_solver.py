@@ -1,0 +1,263 @@
+"""Registrations round the laser period under dead time: a linear equation in each pixel, solved at a cost of O(bins).
+
+With l photons in a bin, p = 1 - e^-l is the chance that an armed pixel fires in it, q = 1 - p / l that of one which is
+re-armed in it (uniformly). G counts the registrations of the preceding dead time, L moves them by it, and
+
+    A h = s,     A = 1 + diag(p) G - diag(q) L                                                          (1)
+
+gives registrations h from a source s: s = p for one settled period (docs/joint_law.md, 3.1). G need not be formed:
+c = G h grows from bin to bin by h - L h, so that with (1) it obeys a recursion of first order round the circle,
+
+    c_{j+1} = e^-l_j c_j + s_j - (1 - q_j) (L h)_j,     in short c = C [s - (1 - q) L h],                (2)
+    h = T L h + (s - p C s),     T x = q x + p C [(1 - q) x].                                            (3)
+
+T L is the chain of the phases of successive registrations (arXiv 2512.04924), without a matrix. How many there are (3)
+leaves open: the pixel is blind for t_d after each, so that mean(c) = t_d sum(h). Hence
+
+    B h = Q s,     B h = h - T L h + v (t_d sum(h) + mean C [(1 - q) L h]),     Q s = s - p C s + v mean(C s)   (4)
+
+for any v that does not sum to 0. B = Q A, so that (1) transposed, A' y = g, is y = Q' z with B' z = g. Both are solved
+by GMRES (Saad & Schultz 1986), all pixels of a batch at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+
+Rows = torch.Tensor  # (pixels, bins), double
+
+_KRYLOV, _RESTARTS = 40, 25
+TOLERANCE = 1e-13  # of the residual, relative to the source
+_GOOD = 1e-9  # that is still accepted where rounding ends the descent
+_BLOCK = 2**15  # pixels x bins solved at a time: what is used again and again stays in the cache
+
+
+def fired(light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """p and q of photons in a bin."""
+    p = -torch.expm1(-light)
+    dim = light < 0.02
+    series = light * (0.5 - light * (1 / 6 - light * (1 / 24 - light * (1 / 120 - light / 720))))
+    return p, torch.where(dim, series, 1 - p / torch.where(dim, torch.ones_like(light), light))
+
+
+class Delay:
+    """A dead time of K + (d + f) / n periods on n bins: what re-arms where, and who is blind."""
+
+    def __init__(self, dead: float, bins: int) -> None:
+        self.periods, self.bins = dead, bins
+        self.whole = math.floor(dead)
+        steps = (dead - self.whole) * bins  # whole periods apart first: else they cost digits of the fraction
+        self.shift = min(math.floor(steps + 1e-9), bins - 1)
+        self.part = max(steps - self.shift, 0.0)
+
+    def rearmed(self, h: torch.Tensor, near: Any = 1.0, far: Any = 1.0) -> torch.Tensor:
+        """L h, its two parts weighted."""
+        d, f = self.shift, self.part
+        moved: torch.Tensor = near * (1.0 - f) * torch.roll(h, d, -1) + far * f * torch.roll(h, d + 1, -1)
+        return moved
+
+    def rearmed_transposed(self, y: torch.Tensor) -> torch.Tensor:
+        """L' y."""
+        d, f = self.shift, self.part
+        return (1.0 - f) * torch.roll(y, -d, -1) + f * torch.roll(y, -d - 1, -1)
+
+    def blind(self, h: torch.Tensor) -> torch.Tensor:
+        """G h: registrations that keep the pixel blind at the start of each bin."""
+        n, d = self.bins, self.shift
+        below = torch.nn.functional.pad(torch.cat([h, h], -1).cumsum(-1), (1, 0))
+        window = below[..., n : 2 * n] - below[..., n - d : 2 * n - d] + self.part * torch.roll(h, d + 1, -1)
+        return window + self.whole * h.sum(-1, keepdim=True)
+
+    def left(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of settled registrations h a period: e and its falls (4.6 of docs/joint_law.md), the dead time at the end.
+
+        e: expected periods, of those that follow the exposure, in which the pixel is still blind at the start of a
+        bin; its falls: re-armings that come after the end.
+        """
+        k, j = self.whole, torch.arange(self.bins, device=h.device)
+        falls = self.rearmed(h, k + (j < self.shift).to(h.dtype), k + (j <= self.shift).to(h.dtype))
+        total = h.sum(-1, keepdim=True)
+        first = (k + 1) * (self.blind(h)[..., :1] - k * total) + 0.5 * k * (k + 1) * total
+        return first - torch.nn.functional.pad(falls.cumsum(-1), (1, -1)), falls
+
+
+class Circle:
+    """(4) and its transpose for rows of photons per bin."""
+
+    def __init__(self, photons: Rows, delay: Delay) -> None:
+        self.delay = delay
+        n = photons.shape[1]
+        # a pixel without light fires never: as good as once in 1e12 periods, and nothing is divided by 0
+        photons = torch.where(photons.sum(-1, keepdim=True) > 0.0, photons, torch.full_like(photons, 1e-12 / n))
+        self.p, self.q = fired(photons)
+        before = torch.nn.functional.pad(photons.cumsum(-1), (1, 0))
+        self.decays = []  # of 1, 2, 4, .. bins: recursions by doubling, for they are many short sums
+        step = 1
+        while step < n:
+            self.decays.append((step, torch.exp(before[:, :-step] - before[:, step:])))
+            step *= 2
+        total = before[:, -1:]
+        self.since, self.until = torch.exp(-before[:, 1:]), torch.exp(before[:, :-1] - total)
+        self.closing = -1.0 / torch.expm1(-total)
+        ones = torch.ones_like(photons) / n
+        shape = self.chain(ones)
+        wait = self.recursion((1.0 - self.q) * self.delay.rearmed(shape)).mean(-1, keepdim=True)
+        self.v = shape / (delay.periods + wait)
+
+    def recursion(self, x: Rows) -> Rows:
+        """C x: c_{j+1} = e^-l_j c_j + x_j round the circle."""
+        y = x.clone()
+        for step, decay in self.decays:
+            y[:, step:] += decay[:, 1:] * y[:, :-step]
+        return torch.roll(y + self.since * (self.closing * y[:, -1:]), 1, -1)
+
+    def recursion_transposed(self, x: Rows) -> Rows:
+        """C' x."""
+        y = x.clone()
+        for step, decay in self.decays:
+            y[:, :-step] += decay[:, :-1] * y[:, step:]
+        return torch.roll(y + self.until * (self.closing * y[:, :1]), -1, -1)
+
+    def chain(self, h: Rows) -> Rows:
+        """T L h."""
+        x = self.delay.rearmed(h)
+        return self.q * x + self.p * self.recursion((1.0 - self.q) * x)
+
+    def apply(self, h: Rows) -> Rows:
+        """B h."""
+        x = self.delay.rearmed(h)
+        c = self.recursion((1.0 - self.q) * x)
+        total = self.delay.periods * h.sum(-1, keepdim=True) + c.mean(-1, keepdim=True)
+        return h - self.q * x - self.p * c + self.v * total
+
+    def apply_transposed(self, z: Rows) -> Rows:
+        """B' z."""
+        weight = (self.v * z).sum(-1, keepdim=True)
+        c = self.recursion_transposed(weight / z.shape[-1] - self.p * z)
+        back = self.delay.rearmed_transposed((1.0 - self.q) * c - self.q * z)
+        return z + back + self.delay.periods * weight
+
+    def source(self, s: Rows) -> Rows:
+        """Q s."""
+        c = self.recursion(s)
+        return s - self.p * c + self.v * c.mean(-1, keepdim=True)
+
+    def source_transposed(self, z: Rows) -> Rows:
+        """Q' z."""
+        weight = (self.v * z).sum(-1, keepdim=True)
+        return z + self.recursion_transposed(weight / z.shape[-1] - self.p * z)
+
+    def solve(self, s: Rows, tolerance: float = TOLERANCE) -> Rows:
+        """h of (1)."""
+        return gmres(self.apply, self.source(s), tolerance)
+
+    def solve_transposed(self, g: Rows, tolerance: float = TOLERANCE) -> Rows:
+        """y of A' y = g."""
+        return self.source_transposed(gmres(self.apply_transposed, g, tolerance))
+
+
+def gmres(apply: Callable[[Rows], Rows], wanted: Rows, tolerance: float = TOLERANCE) -> Rows:
+    """x (rows, n) of apply(x) = wanted; rows are independent of each other.
+
+    Raises
+    ------
+    ConvergenceError
+        Where a residual stays above 1e-9.
+    """
+    size = torch.linalg.vector_norm(wanted, dim=-1).clamp_min(1e-300)
+    x, rest, last = torch.zeros_like(wanted), wanted, math.inf
+    for _ in range(_RESTARTS):
+        left = float((torch.linalg.vector_norm(rest, dim=-1) / size).max())
+        if left <= tolerance or (left <= _GOOD and left > 0.3 * last):  # the latter: rounding
+            return x
+        last = left
+        x = x + _krylov(apply, rest, tolerance * size)
+        rest = wanted - apply(x)
+    if not last <= _GOOD:
+        raise ConvergenceError(
+            f"the feedback equation is left with a relative residual of {last:.1e} after {_KRYLOV * _RESTARTS} steps"
+        )
+    return x
+
+
+def _krylov(apply: Callable[[Rows], Rows], rest: Rows, enough: torch.Tensor) -> Rows:
+    """What to add to x: the least residual in the space that `apply` makes of `rest`."""
+    least = torch.finfo(rest.dtype).tiny
+    size = torch.linalg.vector_norm(rest, dim=-1)
+    basis = rest.new_empty((len(rest), _KRYLOV + 1, rest.shape[-1]))
+    basis[:, 0] = rest / size.clamp_min(least)[:, None]
+    triangle = rest.new_zeros((len(rest), _KRYLOV, _KRYLOV))
+    target, cosines, sines = [size], list[torch.Tensor](), list[torch.Tensor]()
+    for k in range(_KRYLOV):
+        fresh = apply(basis[:, k])
+        known = basis[:, : k + 1]
+        column = torch.bmm(known, fresh.unsqueeze(-1)).squeeze(-1)  # once: what rounding leaves, a restart takes away
+        fresh = fresh - torch.bmm(column.unsqueeze(1), known).squeeze(1)
+        length = torch.linalg.vector_norm(fresh, dim=-1)
+        basis[:, k + 1] = fresh / length.clamp_min(least)[:, None]
+        entries = list(column.unbind(-1))
+        for i, (c, s) in enumerate(zip(cosines, sines, strict=True)):  # Givens rotations
+            entries[i], entries[i + 1] = c * entries[i] + s * entries[i + 1], c * entries[i + 1] - s * entries[i]
+        radius = torch.hypot(entries[k], length).clamp_min(least)
+        cosines.append(entries[k] / radius)
+        sines.append(length / radius)
+        entries[k] = radius
+        triangle[:, : k + 1, k] = torch.stack(entries, -1)
+        target.append(-sines[k] * target[k])
+        target[k] = cosines[k] * target[k]
+        if bool((target[k + 1].abs() <= enough).all()):
+            break
+    used = len(cosines)
+    right = torch.stack(target[:used], -1).unsqueeze(-1)
+    steps = torch.linalg.solve_triangular(triangle[:, :used, :used], right, upper=True)
+    return torch.bmm(steps.mT, basis[:, :used]).squeeze(1)
+
+
+class _Registered(torch.autograd.Function):
+
+    @staticmethod
+    def forward(ctx: Any, photons: Rows, source: Rows, delay: Delay, tolerance: float, known: Rows | None) -> Rows:
+        ctx.delay, ctx.tolerance = delay, tolerance
+        if known is None:
+            h = torch.cat([Circle(light, delay).solve(s, tolerance) for light, s in _blocks(photons, source)])
+        else:
+            h = known.clone()
+        ctx.save_for_backward(photons, h)
+        return h
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Rows) -> tuple[Rows, Rows, None, None, None]:
+        photons, h = ctx.saved_tensors
+        parts = _blocks(photons, gradient)
+        worth = torch.cat([Circle(light, ctx.delay).solve_transposed(g, ctx.tolerance) for light, g in parts])
+        with torch.enable_grad():
+            light = photons.detach().requires_grad_()
+            p, q = fired(light)
+            # of A h = s with s held: A dh = -dp G h + dq L h
+            (moved,) = torch.autograd.grad(
+                (worth * (q * ctx.delay.rearmed(h) - p * ctx.delay.blind(h))).sum(), light
+            )
+        return moved, worth, None, None, None
+
+
+def registered(
+    photons: Rows, source: Rows, delay: Delay, tolerance: float = TOLERANCE, known: Rows | None = None
+) -> Rows:
+    """h (pixels, bins) of (1) from photons and sources (pixels, bins), in double; differentiable once in both.
+
+    `known`: h itself, where it was found before and only gradients are wanted.
+    """
+    h: Rows = _Registered.apply(photons, source, delay, tolerance, known)  # type: ignore[no-untyped-call]
+    return h
+
+
+def _blocks(*rows: Rows) -> Any:
+    some = max(1, _BLOCK // rows[0].shape[-1])
+    return zip(*(torch.split(one, some) for one in rows), strict=True)

@@ -1,0 +1,282 @@
+"""Photon flux at the pixels: what arrives at the detector, per laser period."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar.light.photon_maps import MAX_PHOTONS as MAX_PHOTONS
+from mars_lidar.light.photon_maps import FloatArray as FloatArray
+from mars_lidar.light.photon_maps import broadcast, check_photons, common_shape, frozen, light_map, waveform_maps
+
+if TYPE_CHECKING:
+    from mars_lidar.instrument.system import System
+
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Flux:
+    """Expected *detectable* photons per laser period at each pixel (photon detection efficiency included).
+
+    For a detector with a `Detector.detection_efficiency` below 1: photons on the pixel, of which it detects that share.
+
+    The arrival rate at a pixel is periodic: ``lambda(t) = S s(t - tau) + B / t_r`` with the pulse s of the
+    `System`, or any non-negative waveform.
+
+    Parameters
+    ----------
+    signal
+        Signal photons per period S: scalar or (H, W).
+    background
+        Background photons per period B, uniform in time: scalar or (H, W).
+    delay_ns
+        Delay tau of the return, ns: scalar or (H, W). Any finite value: it wraps into the laser period.
+        NaN, for "no return", is allowed where the signal is 0.
+    waveform
+        Instead of `signal` and `delay_ns`: photons per period in each of T equal parts of the period
+        (..., T), as they reach the detector (the pulse of the system is *not* applied), constant inside
+        each part. T is free: it need not be the number of histogram bins.
+
+    Attributes
+    ----------
+    signal, background, delay_ns
+        (H, W), read-only. With several returns `signal` is their sum and `delay_ns` that of the strongest;
+        with a waveform `signal` is its sum and `delay_ns` is NaN.
+    returns_signal, returns_delay_ns
+        (K, H, W), one row per return (K = 0 with a waveform).
+    waveform
+        (H, W, T) or None.
+    info
+        What made this flux, for the record (scene radiometry puts its achieved means here).
+    """
+
+    signal: FloatArray
+    background: FloatArray
+    delay_ns: FloatArray
+    returns_signal: FloatArray
+    returns_delay_ns: FloatArray
+    waveform: FloatArray | None
+    info: dict[str, Any]
+
+    def __init__(
+        self,
+        signal: ArrayLike | None = None,
+        background: ArrayLike = 0.0,
+        delay_ns: ArrayLike | None = None,
+        *,
+        waveform: ArrayLike | None = None,
+        info: dict[str, Any] | None = None,
+    ) -> None:
+        if waveform is not None:
+            if signal is not None or delay_ns is not None:
+                raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
+            wave, back = waveform_maps(waveform, background)
+            _fill(self, np.empty((0, *back.shape)), np.empty((0, *back.shape)), back, wave, info)
+            return
+        if signal is None:
+            raise ValueError("signal must be given (photons per period), or a waveform instead of it")
+        maps = [light_map("signal", signal), light_map("background", background)]
+        maps.append(light_map("delay_ns", 0.0 if delay_ns is None else delay_ns, photons=False))
+        s, b, tau = broadcast(("signal", "background", "delay_ns"), maps)
+        if delay_ns is None and (s > 0).any():
+            raise ValueError("delay_ns must be given where signal > 0")
+        _fill(self, s[None], tau[None], b, None, info)
+
+    @classmethod
+    def multi(cls, *fluxes: Flux, info: dict[str, Any] | None = None) -> Flux:
+        """The sum of several fluxes: their returns side by side, their backgrounds added.
+
+        For a pane of glass in front of a wall, say. Waveforms of equal length add up; a waveform cannot be
+        mixed with returns, because the pulse that shapes those belongs to the `System`.
+        """
+        if not fluxes or not all(isinstance(f, Flux) for f in fluxes):
+            raise TypeError(f"multi takes one or more Flux objects, got {fluxes!r}")
+        waves = [f.waveform for f in fluxes if f.waveform is not None]
+        if waves and len(waves) != len(fluxes):
+            raise ValueError("multi cannot mix waveforms with returns; write the returns into the waveform")
+        shape = common_shape(tuple(f"fluxes[{k}]" for k in range(len(fluxes))), [f.shape for f in fluxes])
+        back = np.sum([np.broadcast_to(f.background, shape) for f in fluxes], axis=0)
+        self = cls.__new__(cls)
+        if waves:
+            lengths = {w.shape[-1] for w in waves}
+            if len(lengths) > 1:
+                raise ValueError(f"waveforms must have equal lengths to add up, got {sorted(lengths)}")
+            wave = np.sum([np.broadcast_to(w, (*shape, w.shape[-1])) for w in waves], axis=0)
+            _fill(self, np.empty((0, *shape)), np.empty((0, *shape)), back, wave, info)
+            return self
+        s = np.concatenate([np.broadcast_to(f.returns_signal, (len(f.returns_signal), *shape)) for f in fluxes])
+        tau = np.concatenate([np.broadcast_to(f.returns_delay_ns, (len(f.returns_delay_ns), *shape)) for f in fluxes])
+        _fill(self, s, tau, back, None, info)
+        return self
+
+    @classmethod
+    def from_transient(
+        cls, values: ArrayLike, system: System, *, bin_ns: float, start_ns: float = 0.0, **level: Any
+    ) -> Flux:
+        """The flux of a rendered transient (H, W, T): light in bins of `bin_ns` from the time `start_ns`.
+
+        `level` takes the arguments of `mars_lidar.io.Transient.flux`: ``signal`` or ``photons_per_unit``, and
+        ``sbr``, ``dark_counts_per_s``, ``pulse``, ``parts``. Files are read by `mars_lidar.io.read_transient`.
+        """
+        from mars_lidar.light.transient import Transient
+
+        return Transient(values, bin_ns, start_ns=start_ns).flux(system, **level)
+
+    def detected(self, system: System) -> Flux:
+        """The photons that avalanches follow: times `Detector.detection_efficiency`, plus `Detector.dark_count_hz`.
+
+        Poisson photons that are each detected with a probability are Poisson photons of the thinned rate, and dark
+        counts are background: what a pixel registers of this flux is exactly what one without these two effects
+        (`System.detected`) registers of the flux returned. This flux itself where neither is on.
+        """
+        share, dark = system.detector.detection_efficiency, _dark_photons(system.detector.dark_count_hz, system)
+        if share == 1.0 and dark == 0.0:
+            return self
+        return self._scaled(share, dark)
+
+    def delay_periods(self, period_ns: float) -> FloatArray:
+        """Delays of the returns (K, H * W) within the period, in periods: [0, 1); 0 where there is no return."""
+        pixels = self.background.size
+        delay = np.ascontiguousarray(self.returns_delay_ns.reshape(-1, pixels)) / period_ns
+        return np.nan_to_num(delay - np.floor(delay), nan=0.0)
+
+    def with_dark_counts(self, rate_hz: ArrayLike, system: System) -> Flux:
+        """This flux with dark counts at `rate_hz`, counts/s: scalar or (H, W), such as `dark_count_map` draws.
+
+        They are background that the detection efficiency of the system does not reduce (hence divided by it here, for
+        `detected` multiplies), uniform in time; a gated pixel has them in its gate only.
+        """
+        rate = light_map("rate_hz", rate_hz, photons=False)
+        if not (rate >= 0.0).all():
+            raise ValueError(f"rate_hz must be counts/s >= 0, got {rate.min():g}")
+        common_shape(("flux", "rate_hz"), [self.shape, rate.shape])
+        if np.broadcast_shapes(self.shape, rate.shape) != self.shape:
+            raise ValueError(f"rate_hz must be a scalar or {self.shape}, got {rate.shape}")
+        return self._scaled(1.0, _dark_photons(rate, system) / system.detector.detection_efficiency)
+
+    def _scaled(self, share: float, more: float | FloatArray) -> Flux:
+        """Signal and background times `share`, and more background."""
+        background = self.background * share + more
+        check_photons("background with dark counts", background)
+        flux, wave = Flux.__new__(Flux), None if self.waveform is None else self.waveform * share
+        _fill(flux, self.returns_signal * share, self.returns_delay_ns, background, wave, self.info)
+        return flux
+
+    def in_fog(
+        self,
+        system: System,
+        *,
+        extinction_per_m: float,
+        backscatter: float,
+        nearest_m: float = 1.0,
+        parts: int | None = None,
+    ) -> Flux:
+        """The same returns through homogeneous fog, as a waveform: attenuated, and behind the fog's own light.
+
+        With alpha the extinction and z = c tau / 2, by the lidar equation for single scattering (U. Wandinger,
+        "Introduction to lidar", in C. Weitkamp, ed., Lidar, Springer 2005), through the pulse of the system::
+
+            S_k -> S_k exp(-2 alpha z_k)
+            fog:   backscatter * g(z),   g(z) ~ exp(-2 alpha z) / z^2   from z_0 to the pixel's farthest return
+
+        g integrates to 1 from z_0 to infinity; a pixel without a return sees all of it.
+
+        Parameters
+        ----------
+        extinction_per_m
+            Extinction coefficient alpha, 1/m; 3.91 / (visibility in m), by Koschmieder's law.
+        backscatter
+            Photons per period that fog without a target sends back.
+        nearest_m
+            Depth z_0 from which on laser and field of view overlap, m, > 0.
+        parts
+            Parts of the waveform; default 4 for each bin of the histogram.
+        """
+        from mars_lidar.light.fog import in_fog
+
+        return in_fog(self, system, extinction_per_m, backscatter, nearest_m, parts)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        h, w = self.background.shape
+        return h, w
+
+    @property
+    def total(self) -> FloatArray:
+        """Photons per period Lambda = S + B (H, W)."""
+        return self.signal + self.background
+
+    def __getitem__(self, key: Any) -> Flux:
+        """Part of the image: ``flux[rows]``, ``flux[rows, columns]``; integers keep their axis, so the part
+        is an image again.
+        """
+        keys = key if isinstance(key, tuple) else (key,)
+        if len(keys) > 2:
+            raise IndexError(f"flux has two axes (rows, columns), got {len(keys)} indices")
+        window = tuple(slice(k, k + 1 or None) if isinstance(k, (int, np.integer)) else k for k in keys)
+        for k, n in zip(keys, self.shape, strict=False):
+            if isinstance(k, (int, np.integer)) and not -n <= k < n:
+                raise IndexError(f"index {k} is out of range for an axis of {n} pixels")
+            if not isinstance(k, (int, np.integer, slice)):
+                raise IndexError(f"flux takes integers and slices, got {k!r}")
+        part = Flux.__new__(Flux)
+        _fill(
+            part,
+            self.returns_signal[(slice(None), *window)],
+            self.returns_delay_ns[(slice(None), *window)],
+            self.background[window],
+            None if self.waveform is None else self.waveform[window],
+            self.info,
+        )
+        if 0 in part.shape:
+            raise IndexError(f"flux{list(keys)} selects no pixel of {self.shape}")
+        return part
+
+    def __repr__(self) -> str:
+        h, w = self.shape
+        what = f"waveform of {self.waveform.shape[-1]}" if self.waveform is not None else ""
+        what = what or (f"{len(self.returns_signal)} returns" if len(self.returns_signal) > 1 else "1 return")
+        return (
+            f"Flux({h} x {w} pixels, {what}, mean signal {self.signal.mean():.4g}, "
+            f"mean background {self.background.mean():.4g} photons per period)"
+        )
+
+
+def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatArray:
+    """Dark counts per period."""
+    return rate_hz * (system.period_ns * 1e-9)
+
+
+def _fill(
+    flux: Flux,
+    signal: FloatArray,
+    delay: FloatArray,
+    background: FloatArray,
+    waveform: FloatArray | None,
+    info: dict[str, Any] | None,
+) -> None:
+    lost = np.isnan(delay)
+    if lost.any() and (lost := lost & (signal > 0)).any():
+        where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
+        raise ValueError(f"delay_ns must be finite where signal > 0, got NaN at pixel {where}")
+    if waveform is not None:
+        total, nearest = waveform.sum(-1), np.full(background.shape, np.nan)
+    elif len(signal) == 1:
+        total, nearest = signal[0], delay[0]
+    else:
+        total = signal.sum(0)
+        nearest = np.take_along_axis(delay, signal.argmax(0)[None], axis=0)[0]
+    for name, array in {
+        "signal": total,
+        "background": background,
+        "delay_ns": nearest,
+        "returns_signal": signal,
+        "returns_delay_ns": delay,
+    }.items():
+        object.__setattr__(flux, name, frozen(array))
+    object.__setattr__(flux, "waveform", None if waveform is None else frozen(waveform))
+    object.__setattr__(flux, "info", dict(info or {}))

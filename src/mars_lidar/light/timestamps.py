@@ -1,0 +1,146 @@
+"""Registration times of an image, packed ragged."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from mars_lidar.instrument.system import System
+
+
+@dataclass(frozen=True, eq=False)
+class Timestamps:
+    """Registrations of every pixel, pixel after pixel (row-major).
+
+    Attributes
+    ----------
+    times_ns
+        (n,) absolute times since the start of the exposure, ns, sorted within a pixel.
+    cycle
+        (n,) int32, laser period of each registration, from 0.
+    bin
+        (n,) int32, histogram bin of its phase.
+    offsets
+        (H * W + 1,) int64; pixel k owns ``[offsets[k], offsets[k + 1])``.
+    shape
+        (H, W).
+    bins
+        Bins of the histogram.
+    period_ns, cycles
+        Laser period, ns, and laser periods of the exposure.
+    info
+        Where they come from: ``system`` (as `System.to_dict` gives it), ``engine``, ``seed``, ``realization``,
+        ``source``, ``unit_ns`` (resolution of the clock that recorded them), as far as they are known.
+    """
+
+    times_ns: NDArray[np.float64]
+    cycle: NDArray[np.int32]
+    bin: NDArray[np.int32]
+    offsets: NDArray[np.int64]
+    shape: tuple[int, int]
+    bins: int
+    dtype: np.dtype[Any]
+    period_ns: float = math.nan
+    cycles: int = 0
+    info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def system(self) -> System | None:
+        """Laser, detector and histogram, or None where they are not known (a measured stream)."""
+        from mars_lidar.instrument.system import System
+
+        told = self.info.get("system")
+        return None if told is None else System.from_dict(told)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write to a ``.npz`` (exact), ``.ptu`` or ``.h5`` / ``.hdf5`` (Photon-HDF5); see docs/formats.md.
+
+        Raises
+        ------
+        ValueError
+            Another suffix, or a stream that the format cannot hold.
+        OSError
+            `path` exists and `overwrite` is false, or cannot be written.
+        """
+        from mars_lidar.io.photons.streams import save
+
+        save(path, self, overwrite=overwrite)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        period_ns: float | None = None,
+        bins: int | None = None,
+        unit_ns: float | None = None,
+        variable: str | None = None,
+    ) -> Timestamps:
+        """Read what `save` wrote, or a photon stream that others recorded: PTU (T2, T3), Photon-HDF5, .mat, .npz.
+
+        Parameters
+        ----------
+        path
+            ``.npz``, ``.ptu``, ``.h5``, ``.hdf5`` or ``.mat``. In PTU and Photon-HDF5 of others a pixel is a
+            detector (channel), and the image is (1, detectors); in ``.mat`` and ``.npz`` an array of absolute times
+            is one pixel, and a cell array (.mat) an image of them.
+        period_ns
+            Laser period, for files of others that do not tell (T2), or tell a rounded one.
+        bins
+            Histogram bins, for files of others; None: their own, one per unit of their fine clock.
+        unit_ns, variable
+            For ``.mat`` and ``.npz`` of others: unit of the times in ns, and the variable that holds them.
+
+        Raises
+        ------
+        ValueError
+            A file of the wrong kind, damaged or incomplete: the message names it.
+        """
+        from mars_lidar.io.photons.streams import load
+
+        return load(path, period_ns=period_ns, bins=bins, unit_ns=unit_ns, variable=variable)
+
+    def pixel(self, y: int, x: int) -> Timestamps:
+        """The registrations of one pixel, as views."""
+        h, w = self.shape
+        if not (-h <= y < h and -w <= x < w):
+            raise IndexError(f"pixel ({y}, {x}) is outside of an image of {h} x {w}")
+        k = (y % h) * w + x % w
+        part = slice(self.offsets[k], self.offsets[k + 1])
+        offsets = np.array([0, self.offsets[k + 1] - self.offsets[k]], np.int64)
+        return dataclasses.replace(
+            self,
+            times_ns=self.times_ns[part],
+            cycle=self.cycle[part],
+            bin=self.bin[part],
+            offsets=offsets,
+            shape=(1, 1),
+        )
+
+    def __len__(self) -> int:
+        """Number of registrations."""
+        return int(self.offsets[-1])
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Registrations of each pixel (H, W)."""
+        return np.diff(self.offsets).reshape(self.shape)
+
+    def histogram(self) -> NDArray[Any]:
+        """(H, W, bins): equals the cube of the same engine and seed exactly."""
+        pixels = self.shape[0] * self.shape[1]
+        out = np.empty((pixels, self.bins), self.dtype)
+        for k in range(pixels):
+            out[k] = np.bincount(self.bin[self.offsets[k] : self.offsets[k + 1]], minlength=self.bins)
+        return out.reshape(*self.shape, self.bins)
+
+    def __repr__(self) -> str:
+        h, w = self.shape
+        return f"Timestamps({len(self)} registrations, {h} x {w} pixels)"

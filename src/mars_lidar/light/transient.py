@@ -1,0 +1,294 @@
+"""Rendered transients: light against time at each pixel, as the detector's input.
+
+A transient path tracer gives what a delta pulse sends back. `Transient.flux` puts it on the laser period, gives
+it the system's pulse, and scales it to photons.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cached_property, lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.memory import check_memory
+from mars_lidar._base.resample import new_size, window
+from mars_lidar.instrument.pulse import Pulse
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.rate_parts import CroppedRates, ResizedRates
+from mars_lidar.light.stored_flux import StoredFlux
+
+FloatArray = NDArray[np.float64]
+_BAND_BYTES = 64 * 2**20
+_WORK_BYTES = 8 * 2**20  # of rows that are folded and convolved together, some six times over
+_MAX_PARTS = 2**20
+_DELAYS = 64  # midpoints inside a part for the pulse's average: error below (part / pulse width)^2 / 1e5
+
+
+class RateArray(Protocol):
+    """Rates (H, W, T) in memory or on disk: `shape`, and rows by ``values[first:last]``."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W, T)."""
+
+    def __getitem__(self, key: Any) -> Any:
+        """The selected rows, in memory."""
+
+
+class Transient:
+    """Light in each time bin at each pixel.
+
+    Parameters
+    ----------
+    values
+        (H, W, T), >= 0, in any linear unit (radiance per bin): an array, a memory map, or anything with `shape`
+        that gives rows when it is sliced. It is read in bands of rows, never whole.
+    bin_ns
+        Width of a time bin, ns of travel time (for a bin of d metres of optical path, d / c).
+    start_ns
+        Travel time at the start of bin 0, ns.
+    source
+        Where it comes from, for the record.
+    totals
+        (H, W), sums over all bins, where they are known already: else the values are read once for them.
+    """
+
+    def __init__(
+        self,
+        values: RateArray | ArrayLike,
+        bin_ns: float,
+        *,
+        start_ns: float = 0.0,
+        source: str = "",
+        totals: ArrayLike | None = None,
+    ) -> None:
+        self.bin_ns = checks.real("bin_ns", bin_ns, low=0.0, strict_low=True)
+        self.start_ns = checks.real("start_ns", start_ns)
+        rates: Any = values if hasattr(values, "shape") else np.asarray(values)
+        if len(rates.shape) != 3 or 0 in rates.shape:
+            raise ValueError(f"values must be (H, W, T) with at least one bin, got shape {tuple(rates.shape)}")
+        self.values: RateArray = rates
+        self.source = source
+        if totals is not None:
+            self.totals = np.asarray(totals, dtype=np.float64)
+            if self.totals.shape != self.shape:
+                raise ValueError(f"totals must have shape {self.shape}, got {self.totals.shape}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        height, width, _ = self.values.shape
+        return height, width
+
+    def __repr__(self) -> str:
+        h, w, bins = self.values.shape
+        return f"Transient({h} x {w} pixels, {bins} bins of {self.bin_ns:.6g} ns from {self.start_ns:.6g} ns)"
+
+    def __getitem__(self, key: Any) -> Transient:
+        """A crop: ``transient[rows, columns]`` with slices; nothing is read."""
+        rows, columns = window("transient", key, self.shape)
+        return self._with(CroppedRates(self.values, rows, columns))
+
+    def resize(self, size: int | tuple[int, int]) -> Transient:
+        """At another size, (H, W) or the longer side: mean light over the area of the new pixels; nothing is read."""
+        return self._with(ResizedRates(self.values, new_size(size, self.shape)))
+
+    def _with(self, values: RateArray) -> Transient:
+        return Transient(values, self.bin_ns, start_ns=self.start_ns, source=self.source)
+
+    @cached_property
+    def totals(self) -> FloatArray:
+        """Light of each pixel (H, W): the sum over all bins. Reads the whole transient once, band by band."""
+        return np.concatenate([self.rows(some).sum(-1) for some in self.bands()])
+
+    def bands(self, band_bytes: int = _BAND_BYTES) -> Iterator[slice]:
+        """Rows that take at most about `band_bytes` as float64 each, at least one; together the image."""
+        height, width, bins = self.values.shape
+        step = max(1, band_bytes // (8 * width * bins))
+        for first in range(0, height, step):
+            yield slice(first, min(first + step, height))
+
+    def pixel_index(self, rows: slice) -> NDArray[np.int64]:
+        """What `mars_lidar.simulate` needs as `pixel_index`, so that some rows have the photons of the whole."""
+        first, last, _ = rows.indices(self.shape[0])
+        width = self.shape[1]
+        return np.arange(first * width, last * width, dtype=np.int64)
+
+    def flux(
+        self,
+        system: System,
+        *,
+        signal: float | None = None,
+        photons_per_unit: float | None = None,
+        sbr: float = math.inf,
+        dark_counts_per_s: float = 0.0,
+        pulse: bool = True,
+        parts: int | None = None,
+        rows: slice = slice(None),
+    ) -> Flux:
+        """The photon flux at each pixel, as a waveform.
+
+        With L the light of a pixel, summed over all bins, and V the pixels with any light::
+
+            S = signal * L / mean_V(L)      or      S = photons_per_unit * L
+            B = mean_V(S) / sbr  +  dark_counts_per_s * t_r / detection_efficiency
+
+        Time is folded with the laser period: light that arrives after its end comes in the next one.
+
+        Parameters
+        ----------
+        system
+            Gives the laser period and the pulse.
+        signal
+            Mean detectable signal photons per laser period over the pixels with light, > 0.
+        photons_per_unit
+            Instead of `signal`: detectable photons per laser period for one unit of light, > 0.
+        sbr
+            Mean signal over ambient photons, uniform over the image; inf: no ambient light.
+        dark_counts_per_s
+            Dark counts of a pixel, counts/s, besides those of the detector (`Detector.dark_count_hz`): what is counted,
+            whatever the detection efficiency.
+        pulse
+            Convolve with the system's pulse (for what a delta pulse sends back). False: the pulse and the
+            detector's response are in the transient already.
+        parts
+            Parts of the waveform in a period. Default: as fine as the transient and the histogram. A transient
+            whose bins fit the period a whole number of times is taken over unchanged.
+        rows
+            Rows of the image, of step 1; the levels are those of the whole image whatever the rows.
+
+        Raises
+        ------
+        ValueError, TypeError
+            A bad argument; light that is negative or not finite; no light anywhere.
+        """
+        if (signal is None) == (photons_per_unit is None):
+            raise ValueError("the level is one of signal and photons_per_unit, got neither or both")
+        for name, value in (("signal", signal), ("photons_per_unit", photons_per_unit)):
+            if value is not None:
+                checks.real(name, value, low=0.0, strict_low=True)
+        if sbr != math.inf:
+            checks.real("sbr", sbr, low=0.0, strict_low=True)
+        checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
+        first, last, stride = rows.indices(self.shape[0])
+        if stride != 1 or first >= last:
+            raise ValueError(f"rows must select a run of at least one of {self.shape[0]}, got {rows!r}")
+        number = checks.integer("parts", parts_of(self, system) if parts is None else parts, low=1, high=_MAX_PARTS)
+        lit = self.totals[self.totals > 0]
+        if lit.size == 0:
+            raise ValueError("values must have light in some pixel, got none")
+        mean = float(lit.mean())
+        scale = signal / mean if signal is not None else float(photons_per_unit or 0.0)
+        dark = dark_counts_per_s * 1e-9 * system.period_ns / system.detector.detection_efficiency
+        background = (scale * mean / sbr if sbr != math.inf else 0.0) + dark
+        size = 8 * (last - first) * self.shape[1] * number
+        check_memory(4 * size, "the waveforms of these rows", "take fewer rows at a time")  # Flux keeps a copy
+        waveform = np.empty((last - first, self.shape[1], number))
+        step = max(1, _WORK_BYTES // (8 * self.shape[1] * max(number, self.values.shape[2])))
+        for begin in range(first, last, step):
+            here = slice(begin, min(begin + step, last))
+            light = self._on_period(self.rows(here), system.period_ns, number)
+            if pulse:
+                light = through_pulse(light, system)
+            waveform[here.start - first : here.stop - first] = scale * light
+        info = {
+            "transient": self.source,
+            "bin_ns": self.bin_ns,
+            "start_ns": self.start_ns,
+            "mean_signal": scale * mean,
+            "mean_background": background,
+            "sbr": None if sbr == math.inf else sbr,
+            "dark_counts_per_s": dark_counts_per_s,
+            "pulse_convolved": pulse,
+        }
+        return Flux(waveform=waveform, background=background, info=info)
+
+    def stored_flux(
+        self,
+        system: System,
+        *,
+        signal: float | None = None,
+        photons_per_unit: float | None = None,
+        sbr: float = math.inf,
+        dark_counts_per_s: float = 0.0,
+        pulse: bool = True,
+        parts: int | None = None,
+    ) -> StoredFlux:
+        """The flux as `flux` gives it, for a transient larger than memory: rows are read when they are used.
+
+        `mars_lidar.io.simulate_to` takes it band by band. Parameters and errors are those of `flux`; the transient
+        is read once at this call, for its `totals`.
+        """
+
+        def make(rows: slice) -> Flux:
+            return self.flux(
+                system, signal=signal, photons_per_unit=photons_per_unit, sbr=sbr,
+                dark_counts_per_s=dark_counts_per_s, pulse=pulse, parts=parts, rows=rows,
+            )  # fmt: skip
+
+        first = make(slice(0, 1))
+        assert first.waveform is not None
+        lit = self.totals[self.totals > 0]
+        scale = first.info["mean_signal"] / float(lit.mean())
+        background = np.full(self.shape, first.info["mean_background"])
+        return StoredFlux(scale * self.totals, background, first.waveform.shape[-1], make, first.info)
+
+    def rows(self, rows: slice) -> FloatArray:
+        """Light of some rows (rows, W, T), checked."""
+        values = np.asarray(self.values[rows])
+        if values.dtype.kind not in "fiu":
+            raise TypeError(f"values must be real numbers, got dtype {values.dtype}")
+        light = values.astype(np.float64)
+        wrong = ~((light >= 0.0) & (light < np.inf))
+        if wrong.any():
+            y, x, k = (int(n) for n in np.argwhere(wrong)[0])
+            place = (y + rows.start, x, k)
+            raise ValueError(f"values must be finite and >= 0, got {light[y, x, k]} at (y, x, bin) {place}")
+        return light
+
+    def _on_period(self, light: FloatArray, period_ns: float, number: int) -> FloatArray:
+        """Light in `number` equal parts of the period, energy kept; constant inside each bin of the source."""
+        bins = light.shape[-1]
+        before = np.concatenate([np.zeros((*light.shape[:2], 1)), light.cumsum(-1)], axis=-1)
+        edges = np.arange(number + 1) * (period_ns / number)
+        out = np.zeros((*light.shape[:2], number))
+        end_ns = self.start_ns + bins * self.bin_ns
+        for n in range(math.floor(self.start_ns / period_ns), math.floor(end_ns / period_ns) + 1):
+            place = (edges + n * period_ns - self.start_ns) / self.bin_ns
+            whole = np.round(place)  # edges that meet must meet exactly, or light leaks into a neighbour
+            place = np.clip(np.where(np.abs(place - whole) < 1e-9 * bins, whole, place), 0.0, bins)
+            left = np.minimum(place.astype(np.int64), bins - 1)
+            at = before[..., left] + (place - left) * light[..., left]
+            out += np.diff(at, axis=-1)
+        return np.maximum(out, 0.0)
+
+
+def parts_of(transient: Transient, system: System) -> int:
+    """Parts of a waveform as fine as the transient and the histogram."""
+    return max(system.bins, math.ceil(system.period_ns / transient.bin_ns * (1 - 1e-12)))
+
+
+def through_pulse(light: FloatArray, system: System) -> FloatArray:
+    """Light in equal parts of the period (..., T), even inside each, after the system's pulse; its energy is kept."""
+    number = light.shape[-1]
+    total = light.sum(-1, keepdims=True)
+    spread = np.fft.irfft(np.fft.rfft(light) * _spectrum(system.pulse, system.period_ns, number), n=number)
+    spread = np.maximum(spread, 0.0)  # the transform's rounding
+    spread *= np.divide(total, spread.sum(-1, keepdims=True), out=np.zeros_like(total), where=total > 0)
+    return spread
+
+
+@lru_cache(maxsize=4)
+def _spectrum(pulse: Pulse, period_ns: float, number: int) -> NDArray[np.complex128]:
+    """Transform of the pulse's energy in each part, for light that is spread evenly over part 0."""
+    part_ns = period_ns / number
+    energy = np.zeros(number)
+    for k in range(_DELAYS):
+        energy += pulse.bin_energy((k + 0.5) / _DELAYS * part_ns, period_ns, number)
+    return np.fft.rfft(energy / _DELAYS)

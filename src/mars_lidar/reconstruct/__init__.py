@@ -1,0 +1,38 @@
+"""Reconstruction: depth, signal and background of every pixel of a cube, with errors and bounds."""
+
+from mars_lidar.reconstruct.coates import Coates, coates_rates
+from mars_lidar.reconstruct.generalised_coates import GeneralisedCoates, generalised_coates_rates
+from mars_lidar.reconstruct.histogram_bound import HistogramBound, cramer_rao, window_error, window_weights
+from mars_lidar.reconstruct.matched_filter import MatchedFilter
+from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood, log_likelihood
+from mars_lidar.reconstruct.mchc import ChainCorrection, mchc_rates
+from mars_lidar.reconstruct.method import Flags, Method
+from mars_lidar.reconstruct.peak import Peak
+from mars_lidar.reconstruct.reconstruction import Reconstruction, reconstruct
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (MaximumLikelihood(), GeneralisedCoates(), ChainCorrection(), Coates(), MatchedFilter(), Peak())
+}
+
+__all__ = [
+    "METHODS",
+    "ChainCorrection",
+    "Coates",
+    "Flags",
+    "GeneralisedCoates",
+    "HistogramBound",
+    "MatchedFilter",
+    "MaximumLikelihood",
+    "Method",
+    "Peak",
+    "Reconstruction",
+    "coates_rates",
+    "cramer_rao",
+    "generalised_coates_rates",
+    "log_likelihood",
+    "mchc_rates",
+    "reconstruct",
+    "window_error",
+    "window_weights",
+]

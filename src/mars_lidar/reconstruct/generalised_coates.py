@@ -1,0 +1,35 @@
+"""Generalised Coates: each bin's registrations over the periods in which the pixel was armed there.
+
+Gupta, Ingle, Gupta, Asynchronous single-photon 3D imaging, ICCV 2019; here for bins of any brightness, dead times of
+any length, and both ends of the exposure (docs/reconstruction.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from numpy.typing import ArrayLike
+
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruct.method import FloatArray, RateMethod
+
+
+@dataclass(frozen=True)
+class GeneralisedCoates(RateMethod):
+    """Rates with which every bin registers as often as it did, given when the histogram says the pixel was armed (R8).
+
+    `filter` on the rates: as `MatchedFilter`.
+    """
+
+    name = "generalised_coates"
+    modes = ("nonparalyzable", "gated")
+    assumes = "nothing of the flux but its period"
+
+
+def generalised_coates_rates(cube: ArrayLike, system: System, *, threads: int | None = None) -> FloatArray:
+    """Photons per period in each bin (..., bins) behind the histograms (..., bins) of a free-running detector.
+
+    Whatever the waveform: no pulse is assumed. Bins that registered whenever they could are infinite. The variance of
+    a bin's rate l is about l^2 / h, h its registrations, and bins are independent of each other.
+    """
+    return GeneralisedCoates().rates(cube, system, threads)

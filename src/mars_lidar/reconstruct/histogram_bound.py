@@ -1,0 +1,165 @@
+"""How well depth and flux can be known: the Cramer-Rao bound, and the errors of linear window estimates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, require_effects
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruct.histogram_record import core_ns, open_bins, relative_width
+from mars_lidar.reconstruct.method import FloatArray
+
+_SINGULAR = 1e-11  # of the largest eigenvalue, all of size 1 to 3: rounding of the sums over the bins is 1e-15 of it
+
+
+@dataclass(frozen=True, eq=False)
+class HistogramBound:
+    """Cramer-Rao bound of (S, B, delay) for pixels of shape (...).
+
+    Attributes
+    ----------
+    information
+        (..., 3, 3) Fisher information of (S, B, delay in ns).
+    signal, background, delay_ns, depth_m
+        (...) least standard deviations of unbiased estimates; inf where nothing is known of them.
+    """
+
+    information: FloatArray
+    signal: FloatArray
+    background: FloatArray
+    delay_ns: FloatArray
+    depth_m: FloatArray
+
+    __repr__ = brief
+
+
+def cramer_rao(
+    signal: ArrayLike, background: ArrayLike, system: System, *, delay_ns: ArrayLike, threads: int | None = None
+) -> HistogramBound:
+    """Least standard deviations of S, B and depth from a histogram, whatever the method.
+
+    The information of registrations at the rate l_j in the armed time of bin j is that of a Poisson process,
+    ``I = sum_j E[D_j] (dl_j)(dl_j)' / l_j``, with E[D_j] = E[h_j] / l_j the mean armed time; a bin that hides the times
+    inside of it keeps the share (x / sinh x)^2 of that, x = l_j / 2 (R18). The armed time is taken as known: that a
+    histogram hides what the ends of the exposure took from it is not in the bound (docs/reconstruction.md, section 3).
+
+    Parameters
+    ----------
+    signal, background
+        S and B > 0, photons per period as a `Flux` has them (on the pixel, where the detector has an efficiency, and
+        without its dark counts); they broadcast with `delay_ns` to (...).
+    system
+        Detectors of mode nonparalyzable, synchronous, or gated with a gate that stays, without effects beyond detection
+        efficiency and dark counts.
+    delay_ns
+        Delay of the return, ns.
+    threads
+        As `exposure_moments`.
+    """
+    from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood
+    from mars_lidar.statistics import mean_histogram
+
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    MaximumLikelihood().check(system)
+    require_effects("cramer_rao", system.detector, LIGHT_EFFECTS, _simulate_instead)
+    mean = mean_histogram(signal, background, system, delay_ns=delay_ns, threads=threads)  # checks the arguments
+    s, b, tau = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (signal, background, delay_ns)))
+    if not (b > 0).all():
+        raise ValueError(f"background must be > 0, got {b[~(b > 0)].flat[0]}")
+    if not np.isfinite(tau).all():
+        raise ValueError(f"delay_ns must be finite, got {tau[~np.isfinite(tau)].flat[0]}")
+    energy, slope, share = _pulse_bins(system, tau)
+    flat = share / system.bins
+    seen = system.detector.detection_efficiency  # of the photons; dark counts come on top of them
+    dark = 1e-9 * system.detector.dark_count_hz * system.period_ns
+    rate = seen * s[..., None] * energy + (seen * b[..., None] + dark) * flat
+    gradient = seen * np.stack([energy, np.broadcast_to(flat, energy.shape), s[..., None] * slope], axis=-1)
+    weight = np.where(rate > 0, mean / np.where(rate > 0, rate, 1.0) ** 2, 0.0)  # E[D] / l = E[h] / l^2
+    if system.detector.mode == "synchronous" or system.detector.dead_time_ns >= system.bin_ns:
+        x = np.clip(0.5 * rate, 1e-6, 300.0)
+        weight = weight * (x / np.sinh(x)) ** 2
+    information = np.einsum("...j,...ja,...jb->...ab", weight, gradient, gradient)
+    deviation = np.sqrt(_inverse_diagonal(information))
+    of_signal, of_background, of_delay = np.moveaxis(deviation, -1, 0)
+    return HistogramBound(information, of_signal, of_background, of_delay, system.depth_m(of_delay))
+
+
+def window_error(
+    weights: ArrayLike, signal: float, background: float, system: System, *, delay_ns: float
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and standard deviation (...) of linear estimates ``weights @ h`` (..., bins) under dead time.
+
+    Exact, by `joint_law`: bins of one histogram are not independent, so the Poisson error of a window is wrong
+    (docs/joint_law.md). For the estimates of signal that `MatchedFilter` and `Peak` take from windows, say.
+    """
+    from mars_lidar.statistics import joint_law
+
+    mean, variance = joint_law(signal, background, system, delay_ns=delay_ns).window(weights)
+    return mean, np.sqrt(variance)
+
+
+def window_weights(system: System, delay_ns: float) -> FloatArray:
+    """Weights (bins,) with which `weights @ h` is the signal that a window around a delay gives (R16)."""
+    tau = checks.real("delay_ns", delay_ns)
+    energy, _, share = _pulse_bins(system, np.asarray(tau))
+    low, high = core_ns(system)
+    first, last = np.floor((tau + low) / system.bin_ns), np.ceil((tau + high) / system.bin_ns)
+    inside = np.zeros(system.bins, bool)
+    inside[np.arange(int(first), max(int(last), int(first) + 1)) % system.bins] = True
+    inside &= share > 0
+    outside = ~inside & (share > 0)
+    ratio = share[inside].sum() / share[outside].sum()
+    weights = np.where(inside, 1.0, np.where(outside, -ratio, 0.0))
+    return np.asarray(weights / (energy[inside].sum() * system.cycles), dtype=np.float64)
+
+
+def _pulse_bins(system: System, delay_ns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Energy of the pulse in the open part of each bin (..., bins), its derivative by the delay (1/ns), open shares."""
+    low, high = open_bins(system)
+    if low.size == 0:
+        edges = np.arange(system.bins + 1) / system.bins
+        low, high = edges[:-1], edges[1:]
+    period, step = system.period_ns, 1e-4 * min(system.bin_ns, relative_width(system) * system.period_ns)
+
+    def energy_at(delay: FloatArray) -> FloatArray:
+        at = delay[..., None]
+        before = system.pulse.wrapped_cumulative(low * period - at, period)
+        return np.asarray(system.pulse.wrapped_cumulative(high * period - at, period) - before)
+
+    slope = (energy_at(delay_ns + step) - energy_at(delay_ns - step)) / (2.0 * step)
+    return np.maximum(energy_at(delay_ns), 0.0), slope, (high - low) * system.bins
+
+
+def _simulate_instead(_: str) -> str:
+    return ", and neither do the estimators: reconstruct simulated cubes (engine 'exact') to see their errors"
+
+
+def _inverse_diagonal(information: FloatArray) -> FloatArray:
+    """Diagonal of the inverse (..., 3); what nothing is known of is inf and left out of the rest.
+
+    So is what cannot be told from something else: the signal from the background, say, in a single bin.
+    """
+    flat = information.reshape(-1, 3, 3)
+    out = np.full((len(flat), 3), np.inf)
+    for row, matrix in zip(out, flat, strict=True):
+        known = np.diag(matrix) > 0
+        if known.any():
+            row[known] = _variances(matrix[np.ix_(known, known)])
+    return out.reshape(*information.shape[:-1])
+
+
+def _variances(information: FloatArray) -> FloatArray:
+    """Diagonal of the inverse of a matrix of positive diagonal, inf where a direction without information reaches."""
+    size = np.sqrt(np.diag(information))
+    value, vector = np.linalg.eigh(information / np.outer(size, size))
+    blank = value <= _SINGULAR * value[-1]
+    if not blank.any():
+        return np.asarray(np.diag(np.linalg.inv(information)))
+    seen = (vector[:, ~blank] ** 2 / value[~blank]).sum(-1) / size**2
+    return np.asarray(np.where((vector[:, blank] ** 2).sum(-1) > _SINGULAR, np.inf, seen))

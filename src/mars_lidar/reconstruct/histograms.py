@@ -1,0 +1,60 @@
+"""Checks of the histograms that are given to an estimator."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruct.method import Histograms, Progress
+
+
+def checked(
+    cube: ArrayLike, system: System, threads: int | None, progress: Progress | None = None
+) -> tuple[Histograms, tuple[int, ...]]:
+    """Histograms (pixels, bins) in a type that the native core takes, and the leading shape (...) of the cube."""
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    team = default_threads() if threads is None else checks.integer("threads", threads, low=1, high=1024)
+    if progress is not None and not callable(progress):
+        raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
+    counts = np.asarray(cube)
+    if counts.dtype.kind in "OUS":
+        raise TypeError(f"cube must be an array of counts (of a loaded cube its histogram), got {type(cube).__name__}")
+    if counts.ndim == 0 or counts.shape[-1] != system.bins or counts.size == 0:
+        raise ValueError(
+            f"cube must be (..., {system.bins}), the system's bins last and not empty, got shape {counts.shape}"
+        )
+    shape = counts.shape[:-1]
+    flat = np.ascontiguousarray(_typed(counts).reshape(-1, system.bins))
+    return Histograms(flat, system, team, progress), shape
+
+
+def _typed(counts: NDArray[Any]) -> NDArray[Any]:
+    kind = counts.dtype.kind
+    if kind == "f":
+        bad = ~(np.isfinite(counts) & (counts >= 0))
+        if bad.any():
+            raise ValueError(f"cube must hold finite counts >= 0, got {counts[bad].flat[0]}")
+        return counts.astype(np.float64, copy=False)
+    if kind not in "iub":
+        raise TypeError(f"cube must hold counts, integers or means of them, got dtype {counts.dtype}")
+    if counts.dtype in (np.uint16, np.uint32):
+        return counts
+    if kind == "i" and counts.min() < 0:
+        raise ValueError(f"cube must hold counts >= 0, got {counts.min()}")
+    if counts.dtype.itemsize > 4 and counts.max() >= 2**32:
+        raise ValueError(f"cube must hold counts below 2**32, got {counts.max()}")
+    return counts.astype(np.uint16 if counts.dtype.itemsize == 1 else np.uint32)
+
+
+def default_threads() -> int:
+    """All processors that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1

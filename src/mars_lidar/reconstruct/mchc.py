@@ -1,0 +1,93 @@
+"""Markov-chain histogram correction: Rapp et al., Dead time compensation for high-flux ranging, IEEE TSP 2019."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar._base import checks
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruct.histograms import checked
+from mars_lidar.reconstruct.method import (
+    _CHAIN,
+    Estimates,
+    FloatArray,
+    Histograms,
+    RateMethod,
+    corrected_rates,
+    window_estimates,
+)
+
+
+@dataclass(frozen=True)
+class ChainCorrection(RateMethod):
+    """Rates whose Markov chain of phases has the histogram f as its stationary distribution.
+
+    ``l <- f; repeat s = (f P(l)) / l, l <- f / s``, scaled to the total flux (R14, R15). The paper takes the total from
+    the times between registrations, which a histogram does not have; here it is that of `GeneralisedCoates` (the
+    number of registrations alone hardly tells it of a bright pixel). Phases are taken as stationary: the start and
+    the end of the exposure are neglected.
+
+    Parameters
+    ----------
+    filter
+        On the rates: as `MatchedFilter`.
+    iterations, tolerance
+        Stops when the rates move by less than `tolerance` of their sum, or after so many iterations.
+    """
+
+    iterations: int = 60
+    tolerance: float = 1e-5
+
+    correction = _CHAIN
+    name = "mchc"
+    modes = ("nonparalyzable", "gated")
+    assumes = "a long exposure, in which the phases are stationary"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.integer("iterations", self.iterations, low=1, high=100_000)
+        checks.real("tolerance", self.tolerance, low=0.0, high=0.1, strict_low=True)
+
+    def check(self, system: System) -> None:
+        """As any method; and the dead time is at least one bin."""
+        super().check(system)
+        if system.detector.dead_time_ns < system.bin_ns:
+            raise ValueError(
+                f"method 'mchc' needs a dead time of at least one bin ({system.bin_ns:g} ns), got "
+                f"{system.detector.dead_time_ns:g} ns; use 'generalised_coates'"
+            )
+
+    def estimate(self, histograms: Histograms) -> Estimates:
+        """Delay by the filter, signal and background by its window."""
+        return window_estimates(
+            histograms, self.filter, self.correction, steps=self.iterations, tolerance=self.tolerance
+        )
+
+
+def mchc_rates(
+    cube: ArrayLike,
+    system: System,
+    *,
+    total: ArrayLike | None = None,
+    iterations: int = 60,
+    tolerance: float = 1e-5,
+    threads: int | None = None,
+) -> FloatArray:
+    """Photons per period in each bin (..., bins) behind the histograms (..., bins), by `ChainCorrection`.
+
+    `total`: photons per period in all, a scalar or (...), where they are known, from the times between registrations
+    for instance.
+    """
+    method = ChainCorrection(iterations=iterations, tolerance=tolerance)
+    given, shape = checked(cube, system, threads)
+    method.check(system)
+    flat = None
+    if total is not None:
+        flat = np.ascontiguousarray(np.broadcast_to(np.asarray(total, np.float64), shape).reshape(-1))
+        if not ((flat > 0) & np.isfinite(flat)).all():
+            raise ValueError("total must be finite and positive, photons per period")
+    rates = corrected_rates(given, _CHAIN, steps=iterations, tolerance=tolerance, total=flat)
+    return rates.reshape(*shape, system.bins)

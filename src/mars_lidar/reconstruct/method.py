@@ -1,0 +1,184 @@
+"""What a reconstruction method is: the contract, written once; the leaves stay silent."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import IntFlag
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruct.histogram_record import check_window, recording_of
+
+if TYPE_CHECKING:
+    from mars_lidar import _core
+
+FloatArray = NDArray[np.float64]
+Progress = Callable[[int, int], object]
+Filter = Literal["log", "linear"]
+FILTERS = ("log", "linear")
+
+_NONE, _PASSES, _CHAIN = range(3)  # corrections, as the native core numbers them
+_LOCATORS = {"peak": 0, "linear": 1, "log": 2}
+
+
+class Flags(IntFlag):
+    """What is to be said of a pixel; 0 where nothing is."""
+
+    EMPTY = 1
+    """No registrations: signal and background 0, no depth."""
+    NO_SIGNAL = 2
+    """No signal that stands out from the background."""
+    SATURATED = 4
+    """Bins that registered whenever they could: the rate has no upper bound."""
+    UNCONVERGED = 8
+    """The iteration did not come to rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Histograms:
+    """What a method works on: `counts` (pixels, bins) of uint16, uint32 or float64, and how they were recorded."""
+
+    counts: NDArray[Any]
+    system: System
+    threads: int
+    progress: Progress | None = None
+
+    @property
+    def recording(self) -> _core.HistogramRecord:
+        """The native form of the system."""
+        return recording_of(self.system)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What a method found, each (pixels,); None for what it does not give.
+
+    Delay in periods, the rest in photons per period.
+    """
+
+    signal: FloatArray
+    background: FloatArray
+    delay: FloatArray
+    flags: NDArray[np.uint8]
+    signal_error: FloatArray | None = None
+    background_error: FloatArray | None = None
+    delay_error: FloatArray | None = None
+    significance: FloatArray | None = field(default=None)
+
+
+class Method(ABC):
+    """A way from histograms to depth and signal."""
+
+    name: ClassVar[str]
+    modes: ClassVar[tuple[Mode, ...]]  # of the detector, that the method holds for
+    assumes: ClassVar[str]  # in words, for tables
+    windows: ClassVar[bool] = True  # signal and background come from inside and outside of a window
+
+    def check(self, system: System) -> None:
+        """Raise ValueError, naming mode and method, for a system that this method does not hold for."""
+        from mars_lidar.reconstruct import METHODS
+
+        mode = system.detector.mode
+        if mode not in self.modes:
+            able = " or ".join(repr(name) for name, method in METHODS.items() if mode in method.modes)
+            raise ValueError(
+                f"method {self.name!r} is not for detectors of mode {mode!r}, only for "
+                f"{', '.join(map(repr, self.modes))}; use {able}"
+            )
+        if system.detector.gate_moves:
+            raise ValueError(
+                f"method {self.name!r} needs a gate that repeats every period, got "
+                f"gate_step_ns={system.detector.gate_step_ns:g}"
+            )
+        if self.windows:
+            check_window(self.name, system)
+        recording_of(system)
+
+    @abstractmethod
+    def estimate(self, histograms: Histograms) -> Estimates:
+        """Estimates of every pixel; the system is one that `check` let pass."""
+
+
+def tell_effects(system: System) -> None:
+    """Warn of what the detector does and no method knows: a histogram shows it, and the estimates take it for light."""
+    beyond = [name for name in system.detector.effects if name not in LIGHT_EFFECTS]
+    if beyond:
+        warnings.warn(
+            f"no method of reconstruction knows {', '.join(beyond)} of the detector: estimates are biased by it, which "
+            "their standard errors do not tell",
+            UserWarning,
+            stacklevel=3,
+        )
+
+
+@dataclass(frozen=True)
+class RateMethod(Method):
+    """A method that corrects the rates, finds the delay by a filter on them, and signal and background by its window.
+
+    `filter` on the rates: as `MatchedFilter`.
+    """
+
+    filter: Filter = "log"
+
+    correction: ClassVar[int] = _PASSES
+
+    def __post_init__(self) -> None:
+        checks.choice("filter", self.filter, FILTERS)
+
+    def estimate(self, histograms: Histograms) -> Estimates:
+        """Delay by the filter, signal and background by its window, and their standard errors."""
+        return window_estimates(histograms, self.filter, self.correction)
+
+    def rates(self, cube: ArrayLike, system: System, threads: int | None) -> FloatArray:
+        """Photons per period in each bin (..., bins) behind the histograms (..., bins)."""
+        from mars_lidar.reconstruct.histograms import checked
+
+        given, shape = checked(cube, system, threads)
+        self.check(system)
+        return corrected_rates(given, self.correction).reshape(*shape, system.bins)
+
+
+def window_estimates(
+    given: Histograms,
+    locator: str,
+    correction: int = _NONE,
+    *,
+    steps: int = 0,
+    tolerance: float = 0.0,
+    total: FloatArray | None = None,
+) -> Estimates:
+    """Delay by a filter or the peak, signal and background by the window around it, of corrected rates."""
+    from mars_lidar import _core
+
+    out, flags = np.empty((len(given.counts), 5)), np.empty(len(given.counts), np.uint8)
+    _core.window_estimates(
+        given.recording, given.counts, correction=correction, locator=_LOCATORS[locator], steps=steps,
+        tolerance=tolerance, total=total, out=out, flags=flags, threads=given.threads, progress=given.progress,
+    )  # fmt: skip
+    signal, background, delay, signal_error, background_error = np.ascontiguousarray(out.T)
+    if correction != _PASSES:
+        return Estimates(signal, background, delay, flags)
+    return Estimates(signal, background, delay, flags, signal_error, background_error)
+
+
+def corrected_rates(
+    given: Histograms, correction: int, *, steps: int = 0, tolerance: float = 0.0, total: FloatArray | None = None
+) -> FloatArray:
+    """Photons per period in each bin (pixels, bins)."""
+    from mars_lidar import _core
+
+    out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)
+    _core.corrected_rates(
+        given.recording, given.counts, correction=correction, steps=steps, tolerance=tolerance, total=total, out=out,
+        flags=flags, threads=given.threads,
+    )  # fmt: skip
+    return out

@@ -1,0 +1,101 @@
+"""Errors of reconstructed maps against the truth; PSNR and SSIM by scikit-image (extra ``estimate``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mars_lidar.reconstruct.method import FloatArray
+
+if TYPE_CHECKING:
+    from mars_lidar.io import Cube
+    from mars_lidar.reconstruct.reconstruction import Reconstruction
+
+_LEAST_SIDE = 7  # of scikit-image's SSIM window
+
+
+@dataclass(frozen=True)
+class MapError:
+    """Errors of a map over the pixels whose truth is known, pooled over realizations.
+
+    rmse, median
+        Root mean square and median absolute error of the pixels with an estimate, in the map's unit.
+    psnr
+        Peak signal-to-noise ratio, dB: range of the truth over `rmse`.
+    ssim
+        Structural similarity (Wang et al., 2004), mean over pixels; NaN for images of less than 7 pixels a side.
+    missing
+        Share of pixels without an estimate; SSIM takes them as the median of the others.
+    """
+
+    rmse: float
+    median: float
+    psnr: float
+    ssim: float
+    missing: float
+
+
+class MissingExtraError(ImportError, ValueError):
+    """scikit-image is not installed."""
+
+
+def map_error(truth: FloatArray, estimate: FloatArray) -> MapError:
+    """Errors of `estimate` (..., H, W) against `truth` (H, W); NaN is unknown in either."""
+    metrics = _skimage_metrics()
+    truth, estimate = np.asarray(truth, np.float64), np.asarray(estimate, np.float64)
+    if truth.ndim != 2 or estimate.shape[-2:] != truth.shape:
+        raise ValueError(
+            f"truth must be (H, W) and estimate (..., H, W) of the same image, got {truth.shape} and {estimate.shape}"
+        )
+    known = np.isfinite(truth)
+    images = estimate.reshape(-1, *truth.shape)
+    both = known & np.isfinite(images)
+    if not both.any():
+        return MapError(np.nan, np.nan, np.nan, np.nan, missing=1.0)
+    error = (images - truth)[both]
+    rmse = float(np.sqrt(np.mean(error**2)))
+    span = float(np.ptp(truth[known]))
+    psnr = ssim = float("nan")
+    if span > 0.0:
+        where = np.broadcast_to(truth, images.shape)[both]
+        psnr = float(metrics.peak_signal_noise_ratio(where, images[both], data_range=span)) if rmse > 0 else np.inf
+        if min(truth.shape) >= _LEAST_SIDE:
+            plain = np.where(known, truth, np.median(truth[known]))
+            each = []
+            for image, good in zip(images, both, strict=True):
+                middle = np.median(image[good]) if good.any() else plain.mean()
+                filled = np.where(known, np.where(good, image, middle), plain)
+                local = metrics.structural_similarity(plain, filled, data_range=span, full=True)[1]
+                each.append(float(local[known].mean()))
+            ssim = float(np.mean(each))
+    missing = 1.0 - float(both.sum()) / (len(images) * int(known.sum()))
+    return MapError(rmse, float(np.median(np.abs(error))), psnr, ssim, missing)
+
+
+def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:
+    """Errors of depth, in m modulo the unambiguous range, and of reflectivity or else signal, of a known scene."""
+    out: dict[str, MapError] = {}
+    lit = cube.flux.signal > 0
+    if (lit & np.isfinite(cube.depth_m)).any():
+        span = cube.system.unambiguous_range_m
+        truth = np.where(lit, cube.depth_m, np.nan)
+        lag = (found.depth_m - truth + 0.5 * span) % span - 0.5 * span
+        out["depth"] = map_error(truth, truth + lag)
+    if lit.any():
+        if cube.reflectivity is not None:
+            out["reflectivity"] = map_error(np.where(lit, cube.reflectivity, np.nan), found.reflectivity)
+        else:
+            out["signal"] = map_error(np.where(lit, cube.flux.signal, np.nan), found.signal)
+    return out
+
+
+def _skimage_metrics() -> Any:
+    try:
+        from skimage import metrics
+    except ImportError as error:
+        raise MissingExtraError(
+            f"PSNR and SSIM need scikit-image: pip install 'mars-lidar[estimate]' ({error})"
+        ) from error
+    return metrics

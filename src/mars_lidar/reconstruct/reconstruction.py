@@ -1,0 +1,168 @@
+"""The verb: histogram cube to depth and reflectivity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.brief import brief
+from mars_lidar.instrument.system import System
+from mars_lidar.reconstruct.histograms import checked
+from mars_lidar.reconstruct.method import Estimates, Flags, FloatArray, Method, Progress, tell_effects
+
+ATTENUATIONS = ("none", "inverse_square")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reconstruction:
+    """What was found in a cube (..., bins): maps of shape (...), usually (H, W) or (realizations, H, W).
+
+    Attributes
+    ----------
+    method
+        Name of the method.
+    system
+        How the cube was recorded.
+    delay_ns, depth_m
+        Delay tau in [0, period), ns, and depth c tau / 2, m; NaN where there is no estimate.
+    signal, background
+        S and B, detectable photons per laser period: a detection efficiency and dark counts are in them. B is that of
+        the whole period, also behind a gate.
+    reflectivity
+        S over `level`, times depth^2 where the light falls off with it.
+    level
+        Signal photons per period of a surface of reflectivity 1 (at 1 m where the light falls off).
+    delay_error_ns, depth_error_m, signal_error, background_error
+        Standard errors, or None where the method gives none; NaN where an estimate lies on its bound.
+    significance
+        Root of twice the gain in log likelihood by the signal, in standard deviations about; or None.
+    flags
+        (...) uint8, `Flags`.
+    """
+
+    method: str
+    system: System
+    delay_ns: FloatArray
+    depth_m: FloatArray
+    signal: FloatArray
+    background: FloatArray
+    reflectivity: FloatArray
+    level: float
+    delay_error_ns: FloatArray | None
+    depth_error_m: FloatArray | None
+    signal_error: FloatArray | None
+    background_error: FloatArray | None
+    significance: FloatArray | None
+    flags: NDArray[np.uint8]
+
+    __repr__ = brief
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(...) whether a return was seen: a depth, and a signal above the background."""
+        return _seen(self.depth_m, self.flags)
+
+    def maps(self) -> dict[str, NDArray[Any]]:
+        """The maps that this method gives, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def reconstruct(
+    cube: ArrayLike,
+    system: System,
+    method: str | Method = "maximum_likelihood",
+    *,
+    level: float | None = None,
+    attenuation: Literal["none", "inverse_square"] = "none",
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Depth, signal and background of every pixel of a histogram cube.
+
+    Parameters
+    ----------
+    cube
+        (..., bins) counts, e.g. (realizations, H, W, bins) of `simulate`. Float cubes are means of counts per exposure.
+    system
+        How they were recorded. Flux is periodic, with the system's pulse.
+    method
+        ``"maximum_likelihood"`` (default), ``"generalised_coates"``, ``"mchc"``, ``"coates"``, ``"matched_filter"``,
+        ``"peak"``, or a `Method` of your own settings. Each refuses detectors that it does not hold for.
+    level
+        Detectable signal photons per period of a surface of reflectivity 1 (at 1 m, with
+        ``attenuation="inverse_square"``).
+        None: so that the mean reflectivity of the pixels with a return is 1, which makes it relative.
+    attenuation
+        As in `Scene.flux`: ``"inverse_square"`` makes reflectivity proportional to S times depth squared.
+    threads
+        Threads to run on; default: all processors this process may use. The result does not depend on it.
+    progress
+        Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
+
+    Returns
+    -------
+    Reconstruction
+        Maps of shape (...).
+    """
+    used = find_method(method)
+    checks.choice("attenuation", attenuation, ATTENUATIONS)
+    if level is not None:
+        level = checks.real("level", level, low=0.0, strict_low=True)
+    given, shape = checked(cube, system, threads, progress)
+    used.check(system)
+    tell_effects(system)
+    return assembled(used.name, system, used.estimate(given), shape, level, attenuation)
+
+
+def find_method(method: str | Method) -> Method:
+    """The method of that name, of default settings, or the method itself."""
+    from mars_lidar.reconstruct import METHODS
+
+    if isinstance(method, Method):
+        return method
+    return METHODS[checks.choice("method", method, tuple(METHODS))]
+
+
+def assembled(
+    name: str, system: System, found: Estimates, shape: tuple[int, ...], level: float | None, attenuation: str
+) -> Reconstruction:
+    """The result (...) from the estimates of a method (pixels,)."""
+    period = system.period_ns
+
+    def mapped(values: FloatArray | None, unit: float = 1.0) -> FloatArray | None:
+        return None if values is None else (values * unit).reshape(shape)
+
+    delay = (found.delay - np.floor(found.delay)).reshape(shape) * period
+    delay = np.where(delay >= period, 0.0, delay)
+    depth, signal = system.depth_m(delay), found.signal.reshape(shape)
+    returned = signal * depth**2 if attenuation == "inverse_square" else signal
+    flags = found.flags.reshape(shape)
+    if level is None:
+        seen = _seen(depth, flags)
+        level = (float(returned[seen].mean()) if seen.any() else 0.0) or 1.0
+    return Reconstruction(
+        method=name,
+        system=system,
+        delay_ns=delay,
+        depth_m=depth,
+        signal=signal,
+        background=found.background.reshape(shape),
+        reflectivity=returned / level,
+        level=level,
+        delay_error_ns=mapped(found.delay_error, period),
+        depth_error_m=mapped(found.delay_error, float(system.depth_m(period))),
+        signal_error=mapped(found.signal_error),
+        background_error=mapped(found.background_error),
+        significance=mapped(found.significance),
+        flags=flags,
+    )
+
+
+def _seen(depth: FloatArray, flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    lacking = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL)
+    return np.asarray(np.isfinite(depth) & ((flags & lacking) == 0), dtype=np.bool_)

@@ -1,0 +1,150 @@
+"""Scenes with several surfaces on the ray of a pixel: glass before a wall, nets, foliage, the two sides of an edge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base import checks
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.scene.radiometry import scene_flux
+from mars_lidar.scene.scene import FloatArray, Scene
+
+MOST = 16  # returns of a pixel
+
+
+class LayeredScene:
+    """Surfaces seen by the same pixels, one return each.
+
+    Parameters
+    ----------
+    layers
+        Scenes of one shape, up to 16, in any order; NaN in the depth of one: it has no surface there. Reflectivities
+        share one scale and include what the surfaces before them let through. The first is the one whose depth and
+        reflectivity count as the scene's, and its background map is taken for the ambient light.
+    """
+
+    def __init__(self, layers: Sequence[Scene]) -> None:
+        self.layers = tuple(layers)
+        if not 1 <= len(self.layers) <= MOST or not all(isinstance(one, Scene) for one in self.layers):
+            raise ValueError(f"layers must be 1 to {MOST} Scenes, got {layers!r}")
+        if len({one.shape for one in self.layers}) > 1:
+            raise ValueError(f"layers must have one shape, got {[one.shape for one in self.layers]}")
+
+    @classmethod
+    def behind_pane(
+        cls, scene: Scene | LayeredScene, depth_m: float, reflectivity: float, transmission: float = 1.0
+    ) -> LayeredScene:
+        """What is seen through a pane at one range.
+
+        Parameters
+        ----------
+        scene
+            Without the pane.
+        depth_m
+            Range of the pane along every ray, m. Where the first layer is nearer the pane is hidden.
+        reflectivity
+            Of the pane, on the scale of the scene's, in [0, 1].
+        transmission
+            Share of the light that passes it on the way there and back, in (0, 1]: a factor on the reflectivity of
+            everything farther away.
+        """
+        depth = checks.real("depth_m", depth_m, low=0.0, strict_low=True)
+        share = checks.real("reflectivity", reflectivity, low=0.0, high=1.0)
+        passed = checks.real("transmission", transmission, low=0.0, high=1.0, strict_low=True)
+        behind = scene.layers if isinstance(scene, LayeredScene) else (scene,)
+
+        def dimmed(one: Scene) -> Scene:
+            far = np.nan_to_num(one.depth_m, nan=np.inf) > depth
+            return Scene(one.depth_m, np.where(far, passed, 1.0) * one.reflectivity, one.background)
+
+        seen = np.where(behind[0].depth_m <= depth, np.nan, depth)
+        return cls([*map(dimmed, behind), Scene(seen, share)])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.layers[0].shape
+
+    @property
+    def depth_m(self) -> FloatArray:
+        """Of the first layer (H, W)."""
+        return self.layers[0].depth_m
+
+    @property
+    def reflectivity(self) -> FloatArray:
+        """Of the first layer (H, W)."""
+        return self.layers[0].reflectivity
+
+    @property
+    def background(self) -> FloatArray | None:
+        """Of the first layer (H, W), or None."""
+        return self.layers[0].background
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Pixels with a return from any layer (H, W)."""
+        return np.asarray(np.stack([one.valid for one in self.layers]).any(axis=0))
+
+    def __repr__(self) -> str:
+        return f"LayeredScene({len(self.layers)} layers, the first {self.layers[0]!r})"
+
+    def __getitem__(self, key: Any) -> LayeredScene:
+        """A crop, as of a `Scene`."""
+        return LayeredScene([one[key] for one in self.layers])
+
+    def resize(self, size: int | tuple[int, int]) -> LayeredScene:
+        """At another size, as `Scene.resize`."""
+        return LayeredScene([one.resize(size) for one in self.layers])
+
+    def flux(
+        self,
+        system: System,
+        *,
+        signal: float,
+        sbr: float,
+        attenuation: Literal["none", "inverse_square"] = "none",
+        ambient: Literal["uniform", "reflectivity", "map"] | None = None,
+        dark_counts_per_s: float = 0.0,
+    ) -> Flux:
+        """The photon flux, one return for each layer.
+
+        As `Scene.flux`, with V the pixels in which any layer has a surface, w_k = rho_k g(z_k), and one scale for all::
+
+            S_k = signal * w_k / mean_V(sum_k w_k)
+
+        so that all returns of a pixel together have the mean `signal`. Ambient ``"reflectivity"`` is the sum of the
+        reflectivities of the surfaces that a pixel sees, and where it sees none the largest reflectivity of all
+        layers, in whatever order they come.
+        """
+        return scene_flux(self.layers, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+
+
+def read_layers(
+    path: str | Path, *, depth_unit_m: float | None = None, focal_px: float | None = None
+) -> LayeredScene:
+    """The scene in an ``.npz`` whose ``depth`` and ``reflectivity`` are (layers, H, W).
+
+    ``background`` is (H, W), where there is one. Units and what means "no return": `mars_lidar.Scene.from_rgbd`.
+
+    Raises
+    ------
+    ValueError
+        A damaged file, or arrays that do not fit together: the message starts with the file.
+    """
+    from mars_lidar.io.rgbd.stack import is_stack, read_stack
+
+    source = Path(path)
+    if not is_stack(source):
+        raise ValueError(f"{source}: must be an .npz with a depth of (layers, H, W)")
+    depth, reflectivity, background = read_stack(source, depth_unit_m=depth_unit_m, focal_px=focal_px)
+    try:
+        first = Scene(depth[0], reflectivity[0], background)
+        return LayeredScene([first, *map(Scene, depth[1:], reflectivity[1:])])
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error

@@ -1,0 +1,288 @@
+"""What the LiDAR looks at: depth, reflectivity and ambient light of each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.scene.radiometry import scene_flux
+
+FloatArray = NDArray[np.float64]
+
+_EXAMPLES = ("room", "random")
+_MAX_DEPTH_M = 1e9  # beyond the Moon; keeps delays far inside what a double resolves to a picosecond
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Scene:
+    """Depth, reflectivity and ambient light of each pixel.
+
+    Parameters
+    ----------
+    depth_m
+        Range along the ray of each pixel (H, W), m: what time of flight measures, delay = 2 z / c. Positive,
+        or NaN for "no return". Masked entries of a masked array are "no return" too.
+    reflectivity
+        Fraction of the laser light that comes back, relative, in [0, 1]: (H, W), or one number for all. It
+        includes everything but distance: albedo, incidence (Lambert's cosine), and transmission.
+    background
+        Relative ambient light reaching each pixel (H, W), >= 0, in any unit; `flux` scales it. None: the
+        ambient light is chosen there.
+
+    Attributes
+    ----------
+    depth_m, reflectivity, background
+        Read-only float64 (H, W); `background` may be None.
+    valid
+        Pixels with a return (H, W), bool.
+    """
+
+    depth_m: FloatArray
+    reflectivity: FloatArray
+    background: FloatArray | None
+
+    def __init__(
+        self, depth_m: ArrayLike, reflectivity: ArrayLike, background: ArrayLike | None = None
+    ) -> None:
+        depth = _numbers("depth_m", depth_m)
+        if depth.ndim != 2 or depth.size == 0:
+            raise ValueError(f"depth_m must be (H, W) with at least one pixel, got shape {depth.shape}")
+        with np.errstate(invalid="ignore"):
+            wrong = ~np.isnan(depth) & ~((depth > 0.0) & (depth <= _MAX_DEPTH_M))
+        _refuse("depth_m", depth, wrong, f"in (0, {_MAX_DEPTH_M:g}] m, or NaN for no return")
+        share = _like("reflectivity", reflectivity, depth.shape)
+        _refuse("reflectivity", share, ~((share >= 0.0) & (share <= 1.0)), "in [0, 1]")
+        ambient = None
+        if background is not None:
+            ambient = _like("background", background, depth.shape)
+            _refuse("background", ambient, ~((ambient >= 0.0) & (ambient < np.inf)), "finite and >= 0")
+        self._fill(depth, share, ambient)
+
+    def _fill(self, depth: FloatArray, reflectivity: FloatArray, background: FloatArray | None) -> None:
+        for name, value in (("depth_m", depth), ("reflectivity", reflectivity), ("background", background)):
+            if value is not None:
+                value = np.array(value, dtype=np.float64, order="C")
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        h, w = self.depth_m.shape
+        return h, w
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Pixels with a return (H, W)."""
+        return ~np.isnan(self.depth_m)
+
+    def __repr__(self) -> str:
+        h, w = self.shape
+        z = self.depth_m[self.valid]
+        span = f"depth {z.min():.4g} to {z.max():.4g} m" if z.size else "no return anywhere"
+        lost = f", {h * w - z.size} pixels without return" if 0 < z.size < h * w else ""
+        ambient = "" if self.background is None else ", background map"
+        share = self.reflectivity
+        return (
+            f"Scene({h} x {w} pixels, {span}{lost}, "
+            f"reflectivity {share.min():.3g} to {share.max():.3g}{ambient})"
+        )
+
+    def __getitem__(self, key: Any) -> Scene:
+        """A crop: ``scene[rows, columns]`` with slices."""
+        keys = window("scene", key, self.shape)
+        return self._with(lambda depth: depth[keys], lambda image: image[keys])
+
+    def resize(self, size: int | tuple[int, int]) -> Scene:
+        """The scene at another size.
+
+        Depth takes the nearest pixel, so it is never blended across an edge and NaN stays NaN; reflectivity
+        and background take the mean over the area of the new pixel.
+
+        Parameters
+        ----------
+        size
+            (H, W), or the longer side: the other one then keeps the aspect ratio.
+        """
+        height, width = new_size(size, self.shape)
+        rows, columns = nearest(self.shape[0], height), nearest(self.shape[1], width)
+        return self._with(
+            lambda depth: depth[np.ix_(rows, columns)],
+            lambda image: area_mean(area_mean(image, height, axis=0), width, axis=1),
+        )
+
+    def _with(self, depth: Any, image: Any) -> Scene:
+        scene = Scene.__new__(Scene)
+        background = None if self.background is None else image(self.background)
+        scene._fill(depth(self.depth_m), image(self.reflectivity), background)
+        return scene
+
+    def flux(
+        self,
+        system: System,
+        *,
+        signal: float,
+        sbr: float,
+        attenuation: Literal["none", "inverse_square"] = "none",
+        ambient: Literal["uniform", "reflectivity", "map"] | None = None,
+        dark_counts_per_s: float = 0.0,
+    ) -> Flux:
+        """The photon flux at each pixel, at a stated mean signal level and signal-to-background ratio.
+
+        With V the set of valid pixels (those with a return), z the depth, rho the reflectivity::
+
+            S   = signal * w / mean_V(w),             w = rho * g(z),   g = 1 or 1 / z^2
+            B   = signal / sbr * a / mean_V(a)  +  dark_counts_per_s * t_r / detection_efficiency
+            tau = 2 z / c
+
+        so that ``mean_V(S) = signal`` and ``mean_V(S) / mean_V(B - dark) = sbr``. Pixels without return have
+        S = 0, tau = NaN and the B of the formula.
+
+        Parameters
+        ----------
+        system
+            Gives the laser period t_r.
+        signal
+            Mean signal photons per laser period over the valid pixels, > 0, at the detector's output (photon
+            detection efficiency included).
+        sbr
+            Mean signal over mean *ambient* photons, both over the valid pixels and per laser period, in
+            (0, inf]; inf is no ambient light. Dark counts are not part of it: they come on top.
+        attenuation
+            g(z): ``"none"`` (distance already in the reflectivity, or compensated) or ``"inverse_square"``.
+        ambient
+            a: ``"uniform"``, ``"reflectivity"`` (sunlight or lamps scattered by the same surface; radiance
+            does not fall with distance) or ``"map"`` (the scene's background map). None: the map where there
+            is one, else uniform.
+        dark_counts_per_s
+            Dark counts of a pixel, counts/s, the same in all, besides those of the detector (`Detector.dark_count_hz`):
+            what is counted, whatever the detection efficiency.
+
+        Returns
+        -------
+        Flux
+            Its `info` holds the parameters, the achieved means and counts of pixels, as plain JSON types;
+            an infinite ratio is None.
+
+        Warns
+        -----
+        UserWarning
+            Pixels without return; pixels whose depth reaches the unambiguous range c t_r / 2.
+
+        Raises
+        ------
+        TypeError, ValueError
+            An argument of the wrong kind or out of range; no valid pixel; a level or ratio that cannot be
+            reached because reflectivity or ambient light is zero at every valid pixel.
+        """
+        return scene_flux((self,), system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+
+    @staticmethod
+    def example_names() -> tuple[str, ...]:
+        """Names that `example` knows."""
+        return _EXAMPLES
+
+    @classmethod
+    def example(cls, name: str = "room", size: int | tuple[int, int] = 128, seed: int = 0) -> Scene:
+        """A built-in scene, ray-cast by this package: no files needed, exact depth, any size.
+
+        ``"room"``: walls, floor, a door to a passage, boxes, spheres, a table, a test chart; 2.4 to 8.7 m.
+        ``"random"``: a room of its own for every seed, boxes and spheres in it, and its own view; up to 17 m.
+        Depth is the range along the ray of the pixel's centre; reflectivity is albedo times the cosine of
+        incidence (Lambert, laser at the camera).
+
+        Parameters
+        ----------
+        name
+            One of `example_names()`.
+        size
+            (H, W), or one number for a square. The longer side always spans the same field of view.
+        seed
+            Positions, sizes and textures; the same seed gives the same scene at every size.
+        """
+        checks.choice("name", name, _EXAMPLES)
+        seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
+        shape = image_size(size if isinstance(size, tuple | list) else (size, size))
+        if name == "random":
+            from mars_lidar.scene.random_scene import random_scene
+
+            return cls(*random_scene(shape, seed))
+        from mars_lidar.scene.room import room
+
+        return cls(*room(shape, seed))
+
+    @classmethod
+    def from_rgbd(
+        cls,
+        depth_path: str | Path,
+        image_path: str | Path | None = None,
+        *,
+        size: int | tuple[int, int] | None = None,
+        depth_unit_m: float | None = None,
+        focal_px: float | None = None,
+        index: int | None = None,
+    ) -> Scene:
+        """A scene from a depth file and an image; what is read, and how: `mars_lidar.io.rgbd.read_rgbd`.
+
+        Parameters
+        ----------
+        depth_path
+            16-bit PNG (or TIFF), ``.pfm``, ``.exr``, ``.npy``, ``.npz``, NYUv2's labelled ``.mat``, or the
+            folder of a Middlebury scene.
+        image_path
+            Image whose linear luminance stands for the reflectivity; None: what the depth file or folder
+            brings along, else 1 everywhere.
+        size
+            As in `resize`; None keeps the size of the files.
+        depth_unit_m
+            Metres per stored unit of depth; None: 0.001 (mm) for 16-bit images, 1 (m) for arrays.
+        focal_px
+            Focal length in pixels of the depth file: turns depth perpendicular to the image plane, which
+            RGB-D cameras give, into range along the ray. None: the depth is taken as it is.
+        index
+            Frame of a NYUv2 ``.mat``, from 0; None for everything else.
+
+        Raises
+        ------
+        ValueError
+            A file that is missing, damaged or of the wrong kind: the message names it and says why.
+        """
+        from mars_lidar.io.rgbd import read_rgbd
+
+        if size is not None:  # refuse a bad size before reading anything
+            cls(np.ones((1, 1)), 1.0).resize(size)
+        read = read_rgbd(depth_path, image_path, depth_unit_m=depth_unit_m, focal_px=focal_px, index=index)
+        scene = cls(*read)
+        return scene if size is None else scene.resize(size)
+
+
+def _numbers(name: str, value: ArrayLike) -> FloatArray:
+    if isinstance(value, np.ma.MaskedArray):
+        if name != "depth_m" and np.ma.is_masked(value):
+            raise ValueError(f"{name} must not have masked entries; mark pixels without return in depth_m")
+        value = np.ma.filled(value.astype(np.float64), np.nan)
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
+    return array.astype(np.float64)
+
+
+def _like(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    array = _numbers(name, value)
+    if array.shape not in ((), shape):
+        raise ValueError(f"{name} must have the shape of depth_m, {shape}, or be a scalar, got {array.shape}")
+    return np.broadcast_to(array, shape)
+
+
+def _refuse(name: str, array: FloatArray, wrong: NDArray[np.bool_], allowed: str) -> None:
+    if wrong.any():
+        where = tuple(int(k) for k in np.argwhere(wrong)[0])
+        raise ValueError(f"{name} must be {allowed}, got {array[where]} at pixel {where}")

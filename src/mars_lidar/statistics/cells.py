@@ -1,0 +1,281 @@
+"""Pixels of the exposure statistics: checked, flattened, and put on the grid of the native recursion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.gate import PLAIN, photons_before, require_mode
+
+if TYPE_CHECKING:
+    from mars_lidar import _core
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+_MAX_PHOTONS = 1e6
+_MIN_BINS = 128
+_MAX_FIRST_BINS = 2**14  # finer first grids only where the tolerance asks for them
+_BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # of 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
+_MAX_STEPS = 4_000_000_000  # bins x periods of one cell before it counts as not settling: minutes
+LAW_STEPS = 40_000_000  # of the laws, which are to take 2 s at most
+_WARM_PERIODS = 400  # sweeps for a warm state; beyond, an equation is solved (_warm.py)
+_CHUNK_BYTES = 64 << 20
+_MAX_HISTORY_BYTES = 1 << 30  # for each thread
+_SETTLED = 1e-12  # relative change of the state per period (20)
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Pixels (S, B, delay or waveform) seen by one system, flat, with the shape they came in.
+
+    `signal`, `background`, `delay` (periods) are (cells,); `waveform` is (rows, T) of unit sum with `row`
+    (cells,) its row of each cell, or None.
+    """
+
+    system: System
+    shape: tuple[int, ...]
+    signal: FloatArray
+    background: FloatArray
+    delay: FloatArray
+    waveform: FloatArray | None
+    row: IndexArray
+
+    @classmethod
+    def of(
+        cls,
+        signal: ArrayLike | None,
+        background: ArrayLike,
+        system: System,
+        *,
+        delay_ns: ArrayLike | None = None,
+        waveform: ArrayLike | None = None,
+        what: str = "this statistic",
+        modes: tuple[Mode, ...] = PLAIN,
+        effects: tuple[str, ...] = LIGHT_EFFECTS,
+    ) -> Cells:
+        """Check the arguments and broadcast them; `waveform` (..., T) broadcasts over its leading axes.
+
+        `what` is computed from the cells, and treats `modes` and `effects` of the detector. The cells have the flux
+        of detected photons, and the system for that.
+        """
+        if not isinstance(system, System):
+            raise TypeError(f"system must be a System, got {type(system).__name__}")
+        require_mode(what, system, modes, effects)
+        share, dark = system.detector.detection_efficiency, system.detector.dark_count_hz * system.period_ns * 1e-9
+        back = _photons("background", background)
+        if share != 1.0 or dark > 0.0:
+            system, back = system.detected(), _photons("background with dark counts", back * share + dark)
+        if waveform is not None:
+            if signal is not None or delay_ns is not None:
+                raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
+            wave = _photons("waveform", waveform) * share
+            if wave.ndim == 0 or wave.shape[-1] == 0:
+                raise ValueError(f"waveform must be (..., T) with T >= 1, got shape {wave.shape}")
+            total = _photons("waveform summed over a period", wave.sum(-1))
+            rows = np.arange(total.size).reshape(total.shape)
+            total, back, rows = _broadcast(("waveform", "background", "waveform"), total, back, rows)
+            unit = wave.reshape(-1, wave.shape[-1])
+            unit = unit / np.maximum(unit.sum(-1, keepdims=True), np.finfo(float).tiny)
+            return cls(
+                system, total.shape, _flat(total), _flat(back), np.zeros(total.size), unit,
+                np.ascontiguousarray(rows.reshape(-1), dtype=np.int64),
+            )  # fmt: skip
+        if signal is None:
+            raise ValueError("signal must be given (photons per period), or a waveform instead of it")
+        total = _photons("signal", signal) * share
+        given = _reals("delay_ns", 0.5 * system.period_ns if delay_ns is None else delay_ns)
+        total, back, delay = _broadcast(("signal", "background", "delay_ns"), total, back, given)
+        bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (total == 0))
+        if bad.any():
+            raise ValueError(
+                f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}"
+            )
+        phase = np.nan_to_num(_flat(delay) / system.period_ns)
+        phase -= np.floor(phase)
+        return cls(
+            system, total.shape, _flat(total), _flat(back), phase, None, np.zeros(total.size, np.int64)
+        )
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return self.signal.size
+
+    @property
+    def native_flux(self) -> tuple[FloatArray, FloatArray]:
+        """Photons (cells,) of the shapes of `energies`, and of a flat background, as the native core adds them.
+
+        Behind a gate nothing is flat: all is in the shapes.
+        """
+        if self.system.detector.mode != "gated":
+            return self.signal, self.background
+        total = photons_before(self, np.ones(1))[:, 0]
+        return total, np.zeros_like(total)
+
+    @property
+    def total(self) -> FloatArray:
+        """Photons per period (cells,), inside of the gate if there is one."""
+        return np.asarray(sum(self.native_flux), dtype=np.float64)
+
+    def part(self, index: IndexArray | slice) -> Cells:
+        """Some of the cells, flat."""
+        signal = self.signal[index]
+        return Cells(
+            self.system, signal.shape, signal, self.background[index], self.delay[index], self.waveform,
+            self.row[index],
+        )  # fmt: skip
+
+    def name(self, index: int) -> str:
+        """One cell in words, for errors."""
+        where = "waveform" if self.waveform is not None else f"S = {self.signal[index]:g}"
+        delay = "" if self.waveform is not None else f", delay = {self.delay[index]:g} periods"
+        place = "" if self.size == 1 else f" (cell {index} of {self.size})"
+        return (
+            f"{where}, B = {self.background[index]:g} photons per period{delay}, "
+            f"t_d = {self.system.dead_time_periods:g} periods, {self.system.cycles} cycles{place}"
+        )
+
+    @property
+    def instead(self) -> str:
+        """What to use where an exact law is refused, for errors."""
+        able = [] if self.system.detector.mode != "nonparalyzable" else [
+            "joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)"
+        ]  # fmt: skip
+        return f"use {', '.join(able)}{', or ' if able else ''}simulate it with engine 'exact'"
+
+    @property
+    def _sharpness(self) -> float:
+        """Integral of the squared shape of the signal over the period: 1 / width, the narrowest of all cells."""
+        if self.waveform is not None:
+            return float(self.waveform.shape[-1] * np.max(np.sum(self.waveform**2, -1)))
+        probe = 2**14
+        energy = self.system.pulse.bin_energy(0.5 * self.system.period_ns, self.system.period_ns, probe)
+        return float(probe * np.sum(energy**2))
+
+    @property
+    def finest(self) -> float:
+        """Standard deviation, in periods, of a Gaussian as narrow as the signal."""
+        return float(1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0)))
+
+    def first_bins(self, out_bins: int) -> int:
+        """Bins of the first grid: even, a multiple of `out_bins`, a bin at most half a sigma of the pulse."""
+        sharpness = self._sharpness
+        gate_width = self.system.detector.gate_periods(self.system.period_ns)[2]
+        sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / _MAX_FIRST_BINS))
+        wanted = min(max(_MIN_BINS, _BINS_PER_WIDTH * sharpness), _MAX_FIRST_BINS)
+        step = out_bins if out_bins % 2 == 0 else 2 * out_bins
+        return step * math.ceil(wanted / step)
+
+    def grid(self, bins: int, out_bins: int, steps: int | None = None) -> _core.ExposureGrid:
+        """The native grid of `bins` bins per period; a cell is given up after `steps` bins x periods (None: many)."""
+        from mars_lidar import _core
+
+        dead = self.system.dead_time_periods
+        whole = math.floor(dead)
+        position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
+        shift = math.floor(position)
+        fraction = position - shift
+        if fraction < 1e-9:
+            fraction = 0.0
+        elif fraction > 1.0 - 1e-9:
+            shift, fraction = shift + 1, 0.0
+        if shift == bins:
+            whole, shift = whole + 1, 0
+        return _core.ExposureGrid(
+            cycles=self.system.cycles,
+            max_periods=max(10_000, _MAX_STEPS // bins) if steps is None else max(1, steps // bins),
+            whole=whole,
+            bins=bins,
+            out_bins=out_bins,
+            shift=shift,
+            fraction=fraction,
+            stationary=self.system.start == "stationary",
+            tolerance=_SETTLED,
+            warm_periods=_WARM_PERIODS,
+        )
+
+    def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:
+        """Parts whose energies on the grid, and histograms, fit in a moderate amount of memory."""
+        per_cell = 8 * (4 * bins + 2 * out_bins)
+        least = 64
+        if self.system.detector.mode == "paralyzable":  # kinds x moments of the rate, and what they are made of
+            per_cell, least = 8 * (40 * bins + 2 * out_bins), 1
+        elif self.waveform is None and np.unique(self.delay).size == 1 and self.system.detector.mode != "gated":
+            per_cell = 16 * out_bins + 128
+        step = max(least, _CHUNK_BYTES // per_cell)
+        for start in range(0, self.size, step):
+            yield slice(start, min(start + step, self.size))
+
+    def check_history(self, bins: int) -> None:
+        """Refuse, before any work, dead times whose history would not fit in memory."""
+        needed = int(self.grid(bins, 1).bytes)
+        if needed > _MAX_HISTORY_BYTES:
+            raise MemoryError(
+                f"exposure statistics of {self.name(0)}: {bins} bins per period need "
+                f"{needed / 2**30:.3g} GiB to remember one dead time, at most "
+                f"{_MAX_HISTORY_BYTES / 2**30:g} GiB are allowed; {self.instead}"
+            )
+
+    def energies(self, bins: int) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Unit energies (rows, parts of bins) of the distinct signal shapes, and each cell's row (cells,)."""
+        from mars_lidar import _core
+
+        parts = bins * int(_core.EXPOSURE_PARTS)
+        if self.system.detector.mode == "gated":
+            before = photons_before(self, np.arange(parts + 1) / parts)
+            unit = np.diff(before) / np.maximum(before[:, -1:], np.finfo(float).tiny)
+            return np.ascontiguousarray(np.maximum(unit, 0.0)), np.arange(self.size, dtype=np.int32)
+        if self.waveform is None:
+            delays, rows = np.unique(self.delay, return_inverse=True)
+            energy = self.system.pulse.bin_energy(
+                delays * self.system.period_ns, self.system.period_ns, parts
+            )
+        else:
+            used, rows = np.unique(self.row, return_inverse=True)
+            samples = self.waveform.shape[-1]
+            cumulative = np.zeros((used.size, samples + 1))
+            np.cumsum(self.waveform[used], axis=-1, out=cumulative[:, 1:])
+            edges = np.arange(parts + 1) * (samples / parts)
+            knots = np.arange(samples + 1)
+            energy = np.diff(np.stack([np.interp(edges, knots, c) for c in cumulative]), axis=-1)
+        return np.ascontiguousarray(np.maximum(energy, 0.0)), rows.reshape(-1).astype(np.int32)
+
+
+def _reals(name: str, value: ArrayLike) -> FloatArray:
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
+    if array.size == 0:
+        raise ValueError(f"{name} must not be empty, got shape {array.shape}")
+    return array.astype(np.float64)
+
+
+def _photons(name: str, value: ArrayLike) -> FloatArray:
+    array = _reals(name, value)
+    bad = ~((array >= 0) & (array <= _MAX_PHOTONS))
+    if bad.any():
+        raise ValueError(
+            f"{name} must lie in [0, {_MAX_PHOTONS:g}] photons per period, got {array[bad].flat[0]}"
+        )
+    return array
+
+
+def _broadcast(names: tuple[str, ...], *arrays: NDArray[Any]) -> list[NDArray[Any]]:
+    try:
+        return list(np.broadcast_arrays(*arrays))
+    except ValueError:
+        told = ", ".join(f"{n} {a.shape}" for n, a in zip(names, arrays, strict=False))
+        raise ValueError(f"shapes must broadcast, got {told}") from None
+
+
+def _flat(array: NDArray[Any]) -> FloatArray:
+    return np.ascontiguousarray(array.reshape(-1), dtype=np.float64)

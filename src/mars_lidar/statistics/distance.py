@@ -1,0 +1,167 @@
+"""Distance of a count law to simulated counts, and what of it is sampling noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.statistics.pmf import gaussian_window
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+_POOLED = 5.0  # expected counts below which cells of a G-test are pooled
+KL_FLOOR = 1e-12  # of a law's probabilities in a Kullback-Leibler divergence, which is infinite without
+_NEGLIGIBLE = 1e-10  # probability left out of the bootstrap's classes, in one class of its own
+
+
+@dataclass(frozen=True, eq=False)
+class Pmf:
+    """Probabilities (w,) of the counts `first`, `first` + 1, ...; of simulated counts their frequencies."""
+
+    first: int
+    p: FloatArray
+
+    @classmethod
+    def of_counts(cls, counts: NDArray[np.integer[Any]]) -> Pmf:
+        """Frequencies of simulated counts (n,)."""
+        first = int(counts.min())
+        return cls(first, np.bincount((counts - first).astype(np.int64)) / counts.size)
+
+    @classmethod
+    def gaussian(cls, mean: float, variance: float) -> Pmf:
+        """The normal law on the integers, as `count_law` understands it."""
+        window = gaussian_window(mean, variance)
+        return cls(window.first, window.pmf)
+
+    def on(self, low: int, high: int) -> FloatArray:
+        """Probabilities of the counts low .. high (inclusive)."""
+        out = np.zeros(high - low + 1)
+        begin, end = max(low, self.first), min(high, self.last)
+        if begin <= end:
+            out[begin - low : end - low + 1] = self.p[begin - self.first : end - self.first + 1]
+        return out
+
+    @property
+    def last(self) -> int:
+        """The largest count with an entry."""
+        return self.first + self.p.size - 1
+
+
+def total_variation(a: Pmf, b: Pmf) -> float:
+    """Half the sum of |difference| over all counts."""
+    if a.last < b.first or b.last < a.first:
+        return 0.5 * float(a.p.sum() + b.p.sum())
+    low, high = min(a.first, b.first), max(a.last, b.last)
+    return 0.5 * float(np.abs(a.on(low, high) - b.on(low, high)).sum())
+
+
+def sampling_floor(law: Pmf, size: int, draws: int, random: np.random.Generator) -> FloatArray:
+    """Total variation (draws,) to `law` of samples of `size` counts drawn from it (parametric bootstrap)."""
+    kept = law.p > _NEGLIGIBLE / size
+    p = np.append(law.p[kept], max(1.0 - float(law.p[kept].sum()), 0.0))
+    p /= p.sum()
+    found = np.empty(draws)
+    step = max(1, 2**22 // p.size)
+    for start in range(0, draws, step):
+        drawn = random.multinomial(size, p, size=min(step, draws - start))
+        found[start : start + step] = 0.5 * np.abs(drawn / size - p).sum(-1)
+    return found
+
+
+def g_test(law: Pmf, sample: Pmf, size: int, *, any_mean: bool = False) -> float:
+    """p-value of a sample of `size` counts under the law; counts expected fewer than 5 times are pooled.
+
+    1 where the law leaves nothing to test: a single class. `any_mean`: the law's mean has an error of its own, or was
+    fitted to the sample; a shift of the mean, to first order, is left out.
+    """
+    from scipy.stats import binomtest, chi2
+
+    low, high = min(law.first, sample.first), max(law.last, sample.last)
+    expected, observed = law.on(low, high) * size, sample.on(low, high) * size
+    counts = low + np.arange(expected.size)
+    moved = expected * (counts - float(expected @ counts) / max(float(expected.sum()), 1e-300))  # by a shift of the law
+    common = expected >= _POOLED
+    e = np.append(expected[common], max(size - float(expected[common].sum()), 0.0))
+    o = np.append(observed[common], max(size - float(observed[common].sum()), 0.0))
+    d = np.append(moved[common], -float(moved[common].sum()))
+    if e[-1] < _POOLED and e.size > 2:  # too rare on its own: with the rarest of the others
+        rarest = int(e[:-1].argmin())
+        for of in (e, o, d):
+            of[rarest] += of[-1]
+        e, o, d = e[:-1], o[:-1], d[:-1]
+    if e.size < 2:
+        return 1.0
+    if e.size == 2:  # a count that hardly ever changes
+        return float(binomtest(round(float(o[1])), size, min(float(e[1]) / size, 1.0)).pvalue)
+    ratio = np.where(o > 0, o / e, 1.0)
+    square = 2.0 * float((o * np.log(ratio)).sum())
+    if any_mean:
+        square -= float(((o - e) * d / e).sum()) ** 2 / max(float((d**2 / e).sum()), 1e-300)
+    return float(chi2.sf(max(square, 0.0), e.size - 1 - any_mean))
+
+
+def two_sample_g_test(
+    first: Pmf, first_size: int, second: Pmf, second_size: int, *, any_mean: bool = False
+) -> float:
+    """p-value of two samples of counts being of one law; counts expected fewer than 5 times in either are pooled.
+
+    `any_mean`: as for `g_test`, of the difference of the two means.
+    """
+    from scipy.stats import chi2, chi2_contingency
+
+    low, high = min(first.first, second.first), max(first.last, second.last)
+    table = np.stack([first.on(low, high) * first_size, second.on(low, high) * second_size])
+    expected = table.sum(0) * min(first_size, second_size) / (first_size + second_size)
+    common = expected >= _POOLED
+    table = np.column_stack([table[:, common], table[:, ~common].sum(1)])
+    if table.shape[1] > 2 and table[:, -1].sum() * min(first_size, second_size) < _POOLED * (first_size + second_size):
+        rarest = int(table[:, :-1].sum(0).argmin())
+        table[:, rarest] += table[:, -1]
+        table = table[:, :-1]
+    table = table[:, table.sum(0) > 0]
+    if table.shape[1] < 2:
+        return 1.0
+    found = chi2_contingency(table, correction=False, lambda_="log-likelihood")
+    square, freedom = float(found.statistic), int(found.dof)
+    if any_mean and freedom > 1:
+        both = (first_size * first.on(low, high) + second_size * second.on(low, high)) / (first_size + second_size)
+        counts = low + np.arange(both.size)
+        variance = float(both @ (counts - both @ counts) ** 2) * (1.0 / first_size + 1.0 / second_size)
+        square -= float((first.on(low, high) - second.on(low, high)) @ counts) ** 2 / max(variance, 1e-300)
+        freedom -= 1
+    return float(chi2.sf(max(square, 0.0), freedom))
+
+
+def mean_score(law_mean: float, law_variance: float, mean: float, size: int) -> float:
+    """Standard scores by which a sample mean differs from the law's; 0 where both are certain and agree."""
+    error = mean - law_mean
+    return error / math.sqrt(law_variance / size) if law_variance > 0 else (0.0 if error == 0 else math.inf)
+
+
+def variance_score(cumulants: FloatArray, sample: Pmf, size: int, variance: float | None = None) -> float:
+    """Standard scores by which the mean square about the true mean differs from the law's variance.
+
+    `cumulants` (4,) of the true law give the mean and the standard error; `variance` that of another law.
+    """
+    counts = sample.first + np.arange(sample.p.size)
+    square = float((sample.p * (counts - cumulants[0]) ** 2).sum())
+    spread = float(cumulants[3] + 2.0 * cumulants[1] ** 2)
+    error = square - (float(cumulants[1]) if variance is None else variance)
+    return error / math.sqrt(spread / size) if spread > 0 else (0.0 if error == 0 else math.inf)
+
+
+def wasserstein(sample: FloatArray, law: FloatArray) -> FloatArray:
+    """First Wasserstein distance (...) of pmfs (..., w) to one of (w,), on the same consecutive counts."""
+    return np.asarray(np.abs(np.cumsum(sample - law, axis=-1)).sum(-1), dtype=np.float64)
+
+
+def kl_divergence(sample: FloatArray, law: FloatArray) -> FloatArray:
+    """KL(sample || law) (...) in nats, pmfs (..., w) and (w,) on the same counts; `law` floored at `KL_FLOOR`."""
+    log_law = np.log(np.maximum(law, KL_FLOOR))
+    log_sample = np.log(np.where(sample > 0, sample, 1.0))
+    return np.asarray((sample * (log_sample - log_law)).sum(-1), dtype=np.float64)

@@ -1,0 +1,99 @@
+"""The stationary shape behind electronics with a dead time of their own: phases of records as a Markov chain.
+
+After a record at some phase nothing that went before matters, so the phases of successive records are a chain. Its
+transition probabilities are the kernel (10) of docs/detectors.md folded over the periods; its stationary law is the
+mean histogram of a pixel that has been running for long (20), the case of Rapp et al., IEEE TSP 2019.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from mars_lidar._base import checks
+from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.electronics import coarsest_grid, rebinned, without_effect
+from mars_lidar.statistics.electronics_grid import LAW_EFFORT, RecordGrid
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.stationary import stationary_histogram
+
+_LEAST_TOLERANCE = 1e-3
+_DENSE = 2048  # bins up to which the chain is solved directly
+_TURNS = 2000
+_STANDS = 1e-9  # change of the law in a turn, total variation, relative to what turns still forget
+
+
+def stationary_records(cells: Cells, out: int, *, tolerance: float, threads: int | None) -> FloatArray:
+    """Shapes (cells, out) of the records of pixels that have been running for long; 0 where there is no flux.
+
+    The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
+    """
+    tolerance = max(checks.real("tolerance", tolerance, low=1e-9, high=0.1), _LEAST_TOLERANCE)
+    alike, slower = without_effect(cells)
+    if alike is not None:  # a pixel with the longer of the two dead times
+        return stationary_histogram(alike, out, tolerance=tolerance, threads=threads)
+    bare = cells.system.detector.without("electronics_dead_time_ns")
+    alone = replace(cells, system=cells.system.replace(detector=bare, start="armed"))  # no start is needed
+    return np.stack([_shape(alone.part(slice(k, k + 1)), slower, out, tolerance) for k in range(cells.size)])
+
+
+def _shape(cell: Cells, electronics_ns: float, out: int, tolerance: float) -> FloatArray:
+    if float(cell.total[0]) == 0.0:
+        return np.zeros(out)
+    electronics = electronics_ns / cell.system.period_ns
+    bins = coarsest_grid(cell)
+    coarse = _phases(RecordGrid(cell, bins, electronics, LAW_EFFORT))
+    while True:
+        bins *= 2
+        fine = _phases(RecordGrid(cell, bins, electronics, LAW_EFFORT))
+        if 0.5 * float(np.abs(fine.reshape(-1, 2).sum(-1) - coarse).sum()) <= tolerance:
+            return rebinned(cell, fine, coarse, out)
+        coarse = fine
+
+
+def _phases(grid: RecordGrid) -> FloatArray:
+    """Stationary law (bins,) of the phase of a record on one grid (20)."""
+    matrix = _transitions(grid)
+    n = grid.bins
+    if n <= _DENSE:
+        system = np.eye(n) - matrix.T
+        system[-1] = 1.0  # the equations add up to 0: one gives way to the sum
+        right = np.zeros(n)
+        right[-1] = 1.0
+        direct = np.maximum(np.linalg.solve(system, right), 0.0)
+        return np.asarray(direct / direct.sum())
+    law: FloatArray = np.full(n, 1.0 / n)
+    moved = math.inf
+    for _ in range(_TURNS):
+        following = np.asarray(law @ matrix, dtype=np.float64)
+        following /= following.sum()
+        before, moved = moved, 0.5 * float(np.abs(following - law).sum())
+        law = following
+        forgotten = 1.0 - min(moved / before, 1.0) if before > 0.0 else 1.0
+        if moved <= _STANDS * forgotten:
+            return law
+    raise ConvergenceError(
+        f"stationary shape of {grid.cell.name(0)} behind electronics with a dead time: {n} phases do not settle; use "
+        "method 'exposure', or simulate it with engine 'exact'"
+    )
+
+
+def _transitions(grid: RecordGrid) -> FloatArray:
+    """(bins, bins) probabilities that the next record after one in a bin is in another, whatever the period."""
+    n, columns = grid.bins, grid.kernel.shape[1]
+    place = np.arange(n)
+    matrix = np.zeros((n, n))
+    for first in range(0, columns, n):  # each offset occurs once among n successive ones
+        some = grid.kernel[:, first : first + n]
+        ahead = (place[:, None] + grid.off + first + np.arange(some.shape[1])) % n
+        matrix[place[:, None], ahead] += some
+    # those armed and ready, with nothing on the way, at the start of bin `begin`: the first photon from there on
+    before = np.concatenate([[0.0], np.cumsum(grid.photons)])
+    total = before[-1]
+    begin = (place + grid.steps + 1) % n
+    passed = before[:-1] - before[begin][:, None]
+    passed += np.where(place < begin[:, None], total, 0.0)
+    fires = np.exp(-np.maximum(passed, 0.0)) * -np.expm1(-grid.photons)
+    return np.asarray(matrix + (grid.late / -math.expm1(-total))[:, None] * fires)

@@ -1,0 +1,91 @@
+"""Which statistics treat which mode and effects of the detector, and the flux behind a gate.
+
+A gate that repeats every period makes a gated pixel a free-running one that sees the flux inside of the gate, so that
+the exposure recursion holds for it with that flux: docs/detectors.md.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.instrument.detector import Mode
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, require_effects
+from mars_lidar.instrument.system import System
+
+if TYPE_CHECKING:
+    from mars_lidar.statistics.cells import Cells
+
+FloatArray = NDArray[np.float64]
+
+PLAIN: tuple[Mode, ...] = ("nonparalyzable",)
+_INSTEAD = {
+    "nonparalyzable": "",
+    "paralyzable": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
+    "synchronous": "; count_law, mean_histogram and registration_pdf have its exact statistics",
+    "gated": "; count_law, exposure_moments, mean_histogram and registration_pdf have its exact statistics",
+}
+
+
+def require_mode(
+    what: str, system: System, modes: tuple[Mode, ...] = PLAIN, effects: tuple[str, ...] = LIGHT_EFFECTS
+) -> None:
+    """Raise ValueError, naming what to use, where `what` does not treat the detector's mode, or one of its effects."""
+    require_effects(what, system.detector, effects, _simulated)
+    mode = system.detector.mode
+    if mode not in modes:
+        told = " and ".join(map(repr, modes))
+        raise ValueError(
+            f"{what} is for detectors of mode {told}, got {mode!r}{_INSTEAD[mode]}; any mode can be simulated"
+        )
+    if system.detector.gate_moves:
+        raise ValueError(
+            f"{what} needs a gate that repeats every period, got gate_step_ns={system.detector.gate_step_ns:g}; "
+            "a moving gate can be simulated"
+        )
+
+
+def _simulated(effect: str) -> str:
+    from mars_lidar.engines import ENGINES
+
+    able = " or ".join(repr(name) for name, engine in ENGINES.items() if effect in engine.effects)
+    return f"; simulate it with engine {able}"
+
+
+def open_parts(system: System) -> tuple[tuple[float, float], ...]:
+    """The parts [low, high) of the period [0, 1), in order, in which a gate that does not move is open."""
+    start, _, width = system.detector.gate_periods(system.period_ns)
+    end = start + width
+    return ((start, end),) if end <= 1.0 else ((0.0, end - 1.0), (start, 1.0))
+
+
+def photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
+    """Photons that reach each cell between the start of the period and `edges` (n,) in [0, 1]: (cells, n).
+
+    What lies outside of the detector's gate is left out.
+    """
+    if cells.system.detector.mode != "gated":
+        return _photons_before(cells, edges)
+    total = np.zeros((cells.size, edges.size))
+    for low, high in open_parts(cells.system):
+        bounded = np.concatenate([[low], np.clip(edges, low, high)])
+        inside = _photons_before(cells, bounded)
+        total += inside[:, 1:] - inside[:, :1]
+    return total
+
+
+def _photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
+    if cells.waveform is None:
+        period = cells.system.period_ns
+        at = np.concatenate([[0.0], edges])
+        energy = cells.system.pulse.wrapped_cumulative((at - cells.delay[:, None]) * period, period)
+        energy = energy[:, 1:] - energy[:, :1]
+    else:
+        knots = np.linspace(0.0, 1.0, cells.waveform.shape[-1] + 1)
+        rows, used = np.unique(cells.row, return_inverse=True)
+        below = [np.concatenate([[0.0], np.cumsum(cells.waveform[row])]) for row in rows]
+        energy = np.stack([np.interp(edges, knots, b) for b in below])[used.reshape(-1)]
+    total = cells.signal[:, None] * energy + cells.background[:, None] * edges
+    return np.asarray(np.maximum(total, 0.0), dtype=np.float64)

@@ -1,0 +1,346 @@
+"""The folded exposure of one pixel on one grid: registrations, their noise, and what a window feels of it.
+
+Equation numbers are those of docs/joint_law.md. Arrays of the two numbers of a bin (mass and first moment, 4.1)
+are (..., 2, n).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
+
+FloatArray = NDArray[np.float64]
+
+MOST_FACTORED = 2**14  # bins of an equation that is factorised: a second
+_SWEEPS = 200  # beyond, a factorisation is cheaper
+_TOLERANCE = 1e-10  # of a solution, relative to its largest value
+_GOOD = 1e-9  # relative residual with which a solution is accepted
+
+
+@dataclass(eq=False)
+class FoldedGrid:
+    """One pixel on n bins; dead time K + (d + f)/n periods. Made by `FoldedGrid.of`.
+
+    `response` (6, n) is (4.1); `sweeps` tells what the slowest solution so far took, `residual` what the worst of those
+    that were checked left.
+    """
+
+    cycles: int
+    warm: bool
+    whole: int
+    shift: int
+    fraction: float
+    response: FloatArray
+    sweeps: int = 0
+    residual: float = 0.0
+    direct: bool = False
+    unproven: int = 2  # transposed solutions by sweeps that are still to be checked by `residual`; later ones are alike
+
+    @classmethod
+    def of(cls, cells: Cells, bins: int) -> FoldedGrid:
+        """The only cell of `cells` on `bins` bins."""
+        from mars_lidar import _core
+
+        dead = cells.system.dead_time_periods
+        whole = int(np.floor(dead))
+        position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
+        if cells.system.start == "armed":  # a dead time beyond the end of the exposure is as good as one up to it
+            whole = min(whole, cells.system.cycles)
+        shift = int(np.floor(position))
+        fraction = position - shift
+        if fraction < 1e-9:
+            fraction = 0.0
+        elif fraction > 1.0 - 1e-9:
+            shift, fraction = shift + 1, 0.0
+        if shift == bins:
+            whole, shift = whole + 1, 0
+        energy, row = cells.energies(bins)
+        signal, background = cells.native_flux
+        photons = signal[0] * energy[row[0]] + background[0] / energy.shape[-1]
+        response = np.empty((6, bins))
+        _core.joint_response(photons, response)
+        return cls(cells.system.cycles, cells.system.start == "stationary", whole, shift, fraction, response)
+
+    @property
+    def bins(self) -> int:
+        """Bins of the grid n."""
+        return int(self.response.shape[1])
+
+    # What re-arms (4.2), and who is blind
+
+    @cached_property
+    def _maps(self) -> tuple[FloatArray, FloatArray]:
+        """The 2 x 2 maps `near` and `far` of a shift by f bins."""
+        f = self.fraction
+        g, c = f * (1.0 - f), 1.0 - 2.0 * f
+        near = [[1.0 - f, -3.0 * g], [g, 0.5 * (1.0 + c**3) - 6.0 * f * g]]
+        far = [[f, 3.0 * g], [-g, 0.5 * (1.0 - c**3) - 6.0 * (1.0 - f) * g]]
+        return np.array(near), np.array(far)
+
+    def rearmed(self, x: FloatArray, near: ArrayLike = 1.0, far: ArrayLike = 1.0) -> FloatArray:
+        """(2, n) of what registrations `x` (2, n) re-arm in each bin, its two parts weighted."""
+        a, b = self._maps
+        stays, goes_on = a @ np.roll(x, self.shift, -1), b @ np.roll(x, self.shift + 1, -1)
+        return np.asarray(np.asarray(near) * stays + np.asarray(far) * goes_on, dtype=np.float64)
+
+    def blind(self, x: FloatArray) -> FloatArray:
+        """(n,) registrations that keep the pixel blind at the start of each bin, whole periods included (4.3)."""
+        mass, n, d = x[0], self.bins, self.shift
+        below = np.concatenate([[0.0], np.cumsum(np.concatenate([mass, mass]))])
+        j = np.arange(n)
+        last = (self._maps[1] @ np.roll(x, d + 1, -1))[0]
+        return np.asarray(below[j + n] - below[j + n - d] + last + self.whole * mass.sum())
+
+    def noise(self, x: FloatArray, armed: FloatArray, again: FloatArray) -> FloatArray:
+        """(3, n) covariance of the noise of (mass, moment) in a bin: (5.2)."""
+        pa, p0, p1, qa, q0, q1 = self.response
+        mass, moment = x
+        total, slope = again
+        return np.array(
+            [
+                mass - pa**2 * armed - p0**2 * total - 2 * p0 * p1 * slope - p1**2 * total / 3,
+                moment - pa * qa * armed - p0 * q0 * total - (p0 * q1 + p1 * q0) * slope - p1 * q1 * total / 3,
+                mass / 3 - qa**2 * armed - q0**2 * total - 2 * q0 * q1 * slope - q1**2 * total / 3,
+            ]
+        )
+
+    # Solutions
+
+    @cached_property
+    def _unit(self) -> FloatArray:
+        """Registrations (2, n) of one armed pixel per bin, whole periods left out: w of (4.5)."""
+        return self._forward(self.response[[0, 3]])
+
+    @cached_property
+    def state(self) -> FloatArray:
+        """Stationary registrations of one period (2, n)."""
+        return np.asarray(self._unit / (1.0 + self.whole * self._unit[0].sum()))
+
+    def solve(self, source: FloatArray) -> FloatArray:
+        """Registrations (2, n) that follow from `source` (2, n): (4.5)."""
+        x = self._forward(source)
+        share = self.whole * x[0].sum() / (1.0 + self.whole * self._unit[0].sum())
+        return np.asarray(x - share * self._unit)
+
+    @cached_property
+    def _flat(self) -> tuple[FloatArray, float]:
+        """(2, n) and its total worth: the transposed solution for a window of ones."""
+        y = self._adjoint(np.ones((1, self.bins)), None, _TOLERANCE)[0]
+        return y, float(self.worth(y).sum())
+
+    def worth(self, y: FloatArray) -> FloatArray:
+        """(..., n) what being armed at the start of a bin is worth: alpha of (5.3)."""
+        return np.asarray(self.response[0] * y[..., 0, :] + self.response[3] * y[..., 1, :])
+
+    def adjoint(
+        self, mass: FloatArray, moment: FloatArray | None = None, tolerance: float = _TOLERANCE
+    ) -> FloatArray:
+        """(m, 2, n) solution of the transposed equations (5.4) for sources (m, n)."""
+        y = self._adjoint(mass, moment, tolerance)
+        if self.whole:
+            flat, total = self._flat
+            share = self.whole * self.worth(y).sum(-1) / (1.0 + self.whole * total)
+            y -= share[:, None, None] * flat
+        return y
+
+    def _forward(self, source: FloatArray) -> FloatArray:
+        from mars_lidar import _core
+
+        source = np.ascontiguousarray(source)
+        if not self.direct:
+            out = np.empty((self.bins, 2))
+            done, error = _core.joint_forward(
+                response=self.response, shift=self.shift, fraction=self.fraction, mass_in=source[0],
+                moment_in=source[1], out=out, sweeps=_SWEEPS, tolerance=_TOLERANCE,
+            )  # fmt: skip
+            x = np.ascontiguousarray(out.T)
+            self.direct = not (error <= _TOLERANCE and _left(source - self._apply(x), x) <= _GOOD)
+            self.sweeps = max(self.sweeps, int(done))
+        if self.direct:
+            x = np.zeros((2, self.bins))
+            for _ in range(2):  # the second round takes away the rounding of the first
+                rest = np.concatenate([(source - self._apply(x)).reshape(-1), np.zeros(self.bins)])
+                x = x + self._factors(rest, trans="T")[: 2 * self.bins].reshape(2, -1)
+        self._judge(source - self._apply(x), x)
+        return x
+
+    def _adjoint(self, mass: FloatArray, moment: FloatArray | None, tolerance: float) -> FloatArray:
+        from mars_lidar import _core
+
+        m, n = mass.shape
+        y = np.zeros((m, 2, n))
+        mass = np.ascontiguousarray(mass)
+        moment = None if moment is None else np.ascontiguousarray(moment)
+        if not self.direct:
+            first, second = np.empty((m, n)), np.empty((m, n))
+            done, error = np.empty(m, np.int64), np.empty(m)
+            _core.joint_adjoint(
+                response=self.response, shift=self.shift, fraction=self.fraction, mass_in=mass, moment_in=moment,
+                mass=first, moment=second, sweeps=_SWEEPS, tolerance=tolerance, done=done, error=error,
+            )  # fmt: skip
+            y[:, 0], y[:, 1] = first, second
+            self.direct = not (error <= tolerance).all()
+            self.sweeps = max(self.sweeps, int(done.max()))
+            if self.unproven > 0 and moment is None and not self.direct:
+                rest = -self._apply_transposed(y)
+                rest[:, 0] += mass
+                self.unproven -= 1
+                self.direct = not _left(rest, y) <= _GOOD
+                if not self.direct:
+                    self._judge(rest, y)
+        if self.direct:
+            source = np.zeros((m, 2, n))
+            source[:, 0] = mass
+            if moment is not None:
+                source[:, 1] = moment
+            y = np.zeros((m, 2, n))
+            for _ in range(2):
+                rest = source - self._apply_transposed(y)
+                step = self._factors(np.concatenate([rest.reshape(m, -1), np.zeros((m, n))], -1).T)
+                y = y + step[: 2 * n].T.reshape(m, 2, n)
+            self._judge(source - self._apply_transposed(y), y)
+        return y
+
+    def _judge(self, rest: FloatArray, x: FloatArray) -> None:
+        left = _left(rest, x)
+        self.residual = max(self.residual, left)
+        if not left <= _GOOD:
+            raise ConvergenceError(f"the feedback equation is left with a relative residual of {left:.1e}")
+
+    def _apply(self, x: FloatArray) -> FloatArray:
+        """The left side of (4.4), without whole periods of dead time, by prefix sums: no code of the sweeps."""
+        pa, p0, p1, qa, q0, q1 = self.response
+        total, slope = self.rearmed(x)
+        blind = self.blind(x) - self.whole * x[0].sum()
+        return np.array(
+            [x[0] + pa * blind - p0 * total - p1 * slope, x[1] + qa * blind - q0 * total - q1 * slope]
+        )
+
+    def _apply_transposed(self, y: FloatArray) -> FloatArray:
+        """The left side of (5.4) for `y` (m, 2, n), without whole periods of dead time."""
+        _, p0, p1, _, q0, q1 = self.response
+        d, n = self.shift, self.bins
+        near, far = self._maps
+        armed = self.worth(y)
+        again = np.stack([p0 * y[:, 0] + q0 * y[:, 1], p1 * y[:, 0] + q1 * y[:, 1]], 1)
+        below = np.concatenate([np.zeros((len(y), 1)), np.cumsum(np.concatenate([armed, armed], -1), -1)], -1)
+        i = np.arange(n)
+        out = y - near.T @ np.roll(again, -d, -1) - far.T @ np.roll(again, -d - 1, -1)
+        out += far[0][:, None] * np.roll(armed, -d - 1, -1)[:, None]
+        out[:, 0] += below[:, i + d + 1] - below[:, i + 1]
+        return np.asarray(out)
+
+    @cached_property
+    def _factors(self) -> Callable[..., FloatArray]:
+        """Sparse factors of (5.4) with the windows of worths as further unknowns: few entries in every row.
+
+        The window that the others follow from sums many bins: that one full row would fill the factors. So it is held
+        at 0 in them, and put back as a change of rank one. That is well conditioned where the pixel's state is all but
+        certain: behind the brightest light. Other places are tried where a solution shows that it is not.
+        """
+        if self.bins > MOST_FACTORED:
+            raise ConvergenceError(
+                f"sweeps do not solve the feedback equation, and it is too large to be factorised on {self.bins} bins"
+            )
+        lit = self.response[0]
+        peak = int(np.argmax(lit))
+        dim = np.roll(lit, -peak) <= lit.min() + 1e-3 * (lit.max() - lit.min())
+        behind = (peak + int(np.argmax(dim))) % self.bins
+        best, least = None, np.inf
+        for place in dict.fromkeys((behind, 0, peak, (peak + self.bins // 2) % self.bins)):
+            solve = self._factors_at(place)
+            source = self.response[[0, 3]]
+            x = np.zeros_like(source)
+            for _ in range(2):
+                rest = np.concatenate([(source - self._apply(x)).reshape(-1), np.zeros(self.bins)])
+                x = x + solve(rest, trans="T")[: 2 * self.bins].reshape(2, -1)
+            left = _left(source - self._apply(x), x)
+            if best is None or left < least:
+                best, least = solve, left
+            if least <= 0.1 * _GOOD:
+                break
+        assert best is not None
+        return best
+
+    def _factors_at(self, place: int) -> Callable[..., FloatArray]:
+        """Factors with the window before bin `place` held, and put back."""
+        from scipy.sparse.linalg import splu
+
+        n, d = self.bins, self.shift
+        turned = replace(self, response=np.ascontiguousarray(np.roll(self.response, -place, axis=1)))
+        pa, qa = turned.response[0], turned.response[3]
+        row, matrix = np.zeros(3 * n), turned._matrix()
+        row[:d], row[n : n + d] = -pa[:d], -qa[:d]
+        order = np.arange(3 * n).reshape(3, n).T.reshape(-1)  # bin after bin: entries near the diagonal
+        try:
+            factors: Any = splu(matrix[order][:, order])
+        except RuntimeError as error:  # SuperLU's word for an exactly singular matrix
+            raise ConvergenceError(f"the feedback equation is singular: {error}") from None
+
+        def bare(right: FloatArray, trans: str) -> FloatArray:
+            out, ordered = np.empty_like(right), np.ascontiguousarray(right[order])
+            out[order] = factors.solve(ordered, trans=trans)
+            return out
+
+        one = np.zeros(3 * n)
+        one[2 * n] = 1.0
+        change = {"N": (bare(one, "N"), row), "T": (bare(row, "T"), one)}
+
+        def whole(right: FloatArray, trans: str = "N") -> FloatArray:
+            three = right.reshape(3, n, -1)
+            out = bare(np.roll(three, -place, axis=1).reshape(3 * n, -1), trans)
+            step, weight = change[trans]
+            out -= step[:, None] * (weight @ out / (1.0 + weight @ step))
+            return np.asarray(np.roll(out.reshape(3, n, -1), place, axis=1).reshape(right.shape))
+
+        return whole
+
+    def _matrix(self) -> csc_matrix:
+        """The equations without the sum over a window in row 2 n, the window before the first bin."""
+        from scipy.sparse import csc_matrix
+
+        pa, p0, p1, qa, q0, q1 = self.response
+        n, d = self.bins, self.shift
+        near, far = self._maps
+        i = np.arange(n)
+        rows: list[NDArray[np.int64]] = []
+        columns: list[NDArray[np.int64]] = []
+        values: list[FloatArray] = []
+
+        def add(row: NDArray[np.int64], column: NDArray[np.int64], value: FloatArray) -> None:
+            rows.append(row)
+            columns.append(column)
+            values.append(value)
+
+        for k in (0, 1):
+            add(i + k * n, i + k * n, np.ones(n))
+            for part, away, armed in ((near, d, 0.0), (far, d + 1, far[0, k])):
+                j = (i + away) % n
+                add(i + k * n, j, armed * pa[j] - part[0, k] * p0[j] - part[1, k] * p1[j])
+                add(i + k * n, j + n, armed * qa[j] - part[0, k] * q0[j] - part[1, k] * q1[j])
+        add(i, i + 2 * n, np.ones(n))
+        rest = i[1:]
+        add(i + 2 * n, (i - 1) % n + 2 * n, np.ones(n))  # row i: window after bin i - 1
+        add(rest + 2 * n, rest + 2 * n, -np.ones(n - 1))
+        for away, sign in ((0, -1.0), (d, 1.0)):
+            j = (rest + away) % n
+            add(rest + 2 * n, j, sign * pa[j])
+            add(rest + 2 * n, j + n, sign * qa[j])
+        entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+        return csc_matrix(entries, shape=(3 * n, 3 * n))
+
+
+def _left(rest: FloatArray, x: FloatArray) -> float:
+    size = float(np.abs(x).max())
+    return float(np.abs(rest).max()) / size if size > 0.0 else 0.0

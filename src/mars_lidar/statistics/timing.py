@@ -1,0 +1,113 @@
+"""From the time of avalanches to that of records: jitter and code widths, as one linear map of mean histograms.
+
+Neither decides what is recorded (docs/detectors.md), and the jitter of a record knows nothing of any other. So the
+mean histogram of the records is that of the registrations, convolved round the period with the density of the jitter
+and cut at the edges of the codes; the count law is the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.instrument.effects import TIMING_EFFECTS, code_edges
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import Cells
+
+FloatArray = NDArray[np.float64]
+
+_PARTS_PER_SIGMA = 24.0  # a part adds 1/6 of its square to the variance: 3e-4 of it
+_MOST_PARTS = 2**16
+
+
+def is_timed(system: System) -> bool:
+    """Whether records have another time than their avalanches."""
+    return any(name in TIMING_EFFECTS for name in system.detector.effects)
+
+
+def recorded(cells: Cells, compute: Callable[[Cells, int], FloatArray]) -> FloatArray:
+    """Histograms (..., bins) of records, from `compute` (cells, parts) -> (..., parts) of registrations."""
+    system = cells.system
+    if not is_timed(system):
+        return compute(cells, system.bins)
+    timing = Timing(system, cells.finest)
+    return timing.forward(compute(replace(cells, system=timing.untimed), timing.parts))
+
+
+class Timing:
+    """The map from registrations in equal parts of the period to records in the bins of the histogram.
+
+    `finest` is the standard deviation, in periods, of the narrowest feature of the flux.
+    """
+
+    def __init__(self, system: System, finest: float) -> None:
+        self.system = system
+        jitter = system.detector.jitter
+        width = math.hypot(finest, 0.0 if jitter is None else jitter.std_ns / system.period_ns)
+        split = math.ceil(_PARTS_PER_SIGMA / (max(width, 1e-9) * system.bins))
+        split = 2 * max(1, min(split, _MOST_PARTS // system.bins) // 2)
+        self.parts = system.bins * split
+
+    @cached_property
+    def untimed(self) -> System:
+        """The system without these effects, its bins the parts."""
+        return self.system.replace(bins=self.parts, detector=self.system.detector.without(*TIMING_EFFECTS))
+
+    @cached_property
+    def _jitter(self) -> NDArray[np.complex128] | None:
+        """Transform of the probabilities that a record is d parts after its avalanche, both uniform in their part."""
+        jitter = self.system.detector.jitter
+        if jitter is None:
+            return None
+        part = self.system.period_ns / self.parts
+        low, high = jitter.reach_ns()
+        first, last = math.floor(low / part) - 1, math.ceil(high / part) + 1
+        area = jitter.integral(np.arange(first - 1, last + 2) * part)
+        mass = np.maximum(np.diff(area, 2), 0.0) / part
+        kernel = np.bincount(np.arange(first, last + 1) % self.parts, mass, minlength=self.parts)
+        return np.fft.rfft(kernel / kernel.sum())
+
+    @cached_property
+    def _edges(self) -> FloatArray:
+        """Where the bins of the histogram begin and end in the time of the avalanche, in parts (bins + 1,)."""
+        density, bins = self.system.detector.code_density, self.system.bins
+        split = self.parts // bins
+        if density is None:
+            return np.arange(bins + 1.0) * split
+        edges, codes = code_edges(density), len(density)
+        starts = (np.arange(0, bins, codes)[:, None] + edges[:-1]).reshape(-1)
+        return np.append(starts, bins) * split
+
+    def forward(self, histogram: FloatArray) -> FloatArray:
+        """Records (..., bins) of registrations (..., parts)."""
+        if self._jitter is not None:
+            spectrum = np.fft.rfft(histogram, axis=-1) * self._jitter
+            histogram = np.maximum(np.fft.irfft(spectrum, self.parts, axis=-1), 0.0)
+        before = np.concatenate([np.zeros((*histogram.shape[:-1], 1)), np.cumsum(histogram, axis=-1)], axis=-1)
+        whole, rest = self._split
+        at = before[..., whole] + rest * histogram[..., np.minimum(whole, self.parts - 1)]
+        return np.asarray(np.diff(at, axis=-1), dtype=np.float64)
+
+    def backward(self, weights: FloatArray) -> FloatArray:
+        """Mean of the weight (..., bins) of the record of a registration in each part: (..., parts)."""
+        whole, rest = self._split
+        whole, rest = whole[1:-1], rest[1:-1, None]
+        step = np.diff(weights.reshape(-1, weights.shape[-1]), axis=-1).T  # beyond each edge
+        beyond = np.zeros((self.parts + 2, step.shape[1]))
+        np.add.at(beyond, whole, step * (1.0 - rest))  # several edges may lie in one part
+        np.add.at(beyond, whole + 1, step * rest)
+        at = np.cumsum(beyond[: self.parts], axis=0).T.reshape(*weights.shape[:-1], self.parts) + weights[..., :1]
+        if self._jitter is not None:
+            at = np.fft.irfft(np.fft.rfft(at, axis=-1) * np.conj(self._jitter), self.parts, axis=-1)
+        return np.asarray(at, dtype=np.float64)
+
+    @cached_property
+    def _split(self) -> tuple[NDArray[np.int64], FloatArray]:
+        whole = np.minimum(np.floor(self._edges), self.parts).astype(np.int64)
+        return whole, self._edges - whole
+

@@ -1,0 +1,92 @@
+"""``python -m studies``: run studies and write their reports."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from mars_lidar._base.optional import MissingLibraryError
+from studies import STUDIES, OtherRunsError, Request
+from studies.classifiers import MissingExtra
+
+
+def _parser(command: str) -> argparse.ArgumentParser:
+    told = "\n".join(f"  {name:<17} {words}" for name, (words, _) in STUDIES.items())
+    parser = argparse.ArgumentParser(
+        prog=command,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Run studies. Each writes NAME.md, its figures and NAME.csv into the output folder.",
+        epilog=f"studies:\n{told}\n\nexample:\n"
+        f"  {command} covariance law --out docs/studies\n\n"
+        "exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted",
+    )
+    parser.add_argument(
+        "studies", nargs="+", choices=list(STUDIES), metavar="STUDY", help="one or more of the list below"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("study-results"), metavar="DIR",
+        help="folder to write into, made if missing (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--quick", action="store_true", help="small grids, few realizations: seconds, not for citing"
+    )
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR",
+        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance', 'domain'), or of "
+        "measured scenes, rgbd/ (study 'downstream')",
+    )
+    parser.add_argument(
+        "--stream", type=Path, metavar="FILE",
+        help="measured photon stream: a .mat with times in units of 64 ps (study 'hardware')",
+    )  # fmt: skip
+    parser.add_argument(
+        "--truth", choices=("sequential", "exact"), default="sequential",
+        help="engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is "
+        "several times faster (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--config", choices=("small", "full"), default="small",
+        help="size of the study 'downstream': an hour or two of two cores, or a GPU (default: %(default)s); with "
+        "--quick a tiny one, seconds",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, metavar="N", help="another sweep (study 'domain')")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None, command: str = "python -m studies") -> int:
+    """Entry point; returns the exit code. `command` is what was called, for the help."""
+    parser = _parser(command)
+    given = parser.parse_args(arguments)
+    if "reference" in given.studies and given.data is None:
+        parser.error("study 'reference' needs --data DIR, the folder of the reference cases")
+    if given.data is not None and not (any(given.data.glob("*.json")) or (given.data / "rgbd").is_dir()):
+        parser.error(f"--data must be a folder with *.json cases or rgbd/, got {str(given.data)!r}")
+    if given.stream is not None and not given.stream.is_file():
+        parser.error(f"--stream must be a file, got {str(given.stream)!r}")
+    try:
+        given.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--out must be a folder that can be made, got {str(given.out)!r}: {error.strerror}")
+    tell = partial(print, file=sys.stderr, flush=True)
+    request = Request(given.out, given.quick, given.data, tell, given.truth, given.stream, given.config, given.seed)
+    try:
+        for name in dict.fromkeys(given.studies):
+            began = time.monotonic()
+            for path in STUDIES[name][1](request):
+                print(path)
+            tell(f"{name}: done in {time.monotonic() - began:.0f} s")
+    except (MissingExtra, MissingLibraryError, OtherRunsError) as error:
+        tell(str(error))
+        return 1
+    except KeyboardInterrupt:
+        tell("interrupted")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

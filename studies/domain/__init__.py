@@ -1,0 +1,12 @@
+"""A sweep of the declared domain: every engine and prediction on random systems, against whatever is independent of it.
+
+Systems (`case`, `systems`), what is drawn of each (`samples`), comparisons (`checks`, `records`), what they are held
+against (`predictions`, `closed_forms`, `simulator`, `references`), one case (`judge`, in its own process: `watch`),
+who is to blame (`verdict`), the sweep (`sweep`) and its report (`run`, `report`, `figures`).
+"""
+
+from __future__ import annotations
+
+from studies.domain.run import run
+
+__all__ = ["run"]

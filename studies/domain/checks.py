@@ -1,0 +1,205 @@
+"""p-values of a sweep: one sample against known moments and laws, two samples against each other.
+
+`Check.effect` is what a reader wants to know of a failing one: the difference in standard deviations of one exposure,
+the ratio of variances less 1, or the total variation.
+
+Checks allow for what the thing checked states of itself (`slack`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from studies.domain.samples import Sample
+
+FloatArray = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+LEAST = 40.0  # expected events of a cell of a chi-square test
+EVENTS = 400  # events from which a variance is compared
+
+
+@dataclass(frozen=True)
+class Check:
+    """One comparison of two parties, named as `a` and `b`; `p` of the null hypothesis that they agree."""
+
+    a: str
+    b: str
+    what: str
+    p: float
+    effect: float
+
+
+def against_law(sample: Sample, oracle: str, first: int, pmf: FloatArray) -> list[Check]:
+    """Counts against P(N = first), P(N = first + 1), ...: chi-square over merged counts, and no count outside."""
+    n = sample.items
+    beyond = (sample.counts < first) | (sample.counts >= first + pmf.size)
+    stray = float(beyond.mean())
+    checks = [Check(sample.engine, oracle, "extremes of the count", 0.0 if beyond.any() else 1.0, stray)]
+    inside = np.clip(sample.counts - first, 0, pmf.size - 1)
+    expected = pmf * n
+    cell = merge(expected)
+    expected = np.bincount(cell, expected).astype(np.float64)
+    observed = np.bincount(cell[inside], minlength=expected.size)
+    if expected.size > 1 and expected.min() > 0.5 * LEAST:
+        p = float(stats.chi2.sf(((observed - expected) ** 2 / expected).sum(), expected.size - 1))
+        variation = 0.5 * float(np.abs(observed - expected).sum()) / n
+        checks.append(Check(sample.engine, oracle, "law of the count", p, variation))
+    return checks
+
+
+def mean_of(
+    sample: Sample, oracle: str, what: str, x: Numbers, mean: FloatArray, variance: FloatArray, slack: FloatArray
+) -> list[Check]:
+    """Means of `x` (items, k) against known ones with known variances: the largest |z| of the k, by Bonferroni.
+
+    Small numbers are not normal: below `EVENTS` expected events in all Poisson's law is taken where its tail is larger.
+    """
+    n = len(x)
+    off = x.mean(0) - mean
+    excess = np.maximum(np.abs(off) - slack, 0.0)
+    sd = np.sqrt(np.maximum(variance, 1e-300))
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        z = np.where(excess > 0.0, excess * np.sqrt(n) / sd, 0.0)
+    p: FloatArray = np.atleast_1d(np.asarray(2.0 * stats.norm.sf(z), dtype=np.float64))
+    few = mean * n < EVENTS
+    p[few] = np.maximum(p[few], _poisson(x.sum(0)[few], (mean * n)[few], n * slack[few]))
+    # far below Poisson: what moves at all are single registrations more or fewer, as rare as the variance says
+    rigid = ~few & (variance * n < 100.0)
+    moves = np.asarray(stats.poisson.sf(np.ceil(excess * n) - 1.0, variance * n + 1.0), dtype=np.float64)
+    p[rigid] = np.maximum(p[rigid], moves[rigid])
+    # what never moves but once in many exposures: no more can be said than that it did not happen here
+    still = (variance * n < 1.0) & (np.ptp(x, axis=0) == 0)
+    p[still] = np.maximum(p[still], np.exp(-np.abs(off[still]) * n))
+    with np.errstate(over="ignore"):
+        worst = float(np.max(np.where(p < 1.0, np.abs(off) / np.maximum(sd, 1e-12), 0.0), initial=0.0))
+    return [Check(sample.engine, oracle, what, float(min(1.0, p.size * p.min(initial=1.0))), worst)]
+
+
+def variances_of(sample: Sample, oracle: str, names: list[str], x: Numbers, variance: FloatArray) -> list[Check]:
+    """Sample variances of `x` (items, k) against known ones, by logarithm, with their error from the fourth moment."""
+    found = []
+    n = len(x)
+    for name, y, known in zip(names, np.asarray(x, float).T, variance, strict=True):
+        square = (y - y.mean()) ** 2
+        second = square.mean()
+        if n < 60 or second == 0.0 or known <= 0.0 or known * n < 60.0:
+            continue
+        kurtosis = max((square**2).mean() / second**2 - 1.0, 2.0)
+        if kurtosis > n / 100.0:
+            continue
+        z = np.log(second * n / (n - 1) / known) / np.sqrt(kurtosis / n)
+        found.append(
+            Check(sample.engine, oracle, name, float(2.0 * stats.norm.sf(abs(z))), float(second / known - 1.0))
+        )
+    return found
+
+
+def covariance_of(sample: Sample, oracle: str, name: str, x: FloatArray, y: FloatArray, known: float) -> list[Check]:
+    """Sample covariance of two windows against the known one."""
+    a, b = x - x.mean(), y - y.mean()
+    product, n = a * b, len(a)
+    error = product.std(ddof=1) / np.sqrt(n) if n > 1 else 0.0
+    if n < 200 or error == 0.0 or (product**4).mean() > n / 50.0 * (product**2).mean() ** 2:
+        return []
+    size = float(np.sqrt(max(a.var() * b.var(), 1e-300)))
+    off = float(product.mean() * n / (n - 1) - known)
+    return [Check(sample.engine, oracle, name, float(2.0 * stats.norm.sf(abs(off) / error)), off / size)]
+
+
+def rare(sample: Sample, oracle: str, what: str, events: int, expected: float) -> Check:
+    """Few events against a small expectation, by Poisson's law."""
+    p = float(_poisson(np.array([events], float), np.array([expected]), np.array([0.01 * expected]))[0])
+    return Check(sample.engine, oracle, what, p, events - expected)
+
+
+def two_samples(a: Sample, b: Sample) -> list[Check]:
+    """Law of the count, mean histogram, variances of windows: the same in two samples?"""
+    checks: list[Check] = []
+    if min(a.counts.sum(), b.counts.sum()) + min(a.items, b.items) < 100:
+        return checks
+    low, high = min(a.counts.min(), b.counts.min()), max(a.counts.max(), b.counts.max())
+    if high > low and min(a.items, b.items) >= 100:
+        edges = np.unique(np.quantile(np.concatenate([a.counts, b.counts]), np.linspace(0, 1, 25)).astype(np.int64))
+        table = np.array([np.bincount(np.searchsorted(edges, s.counts), minlength=edges.size + 1) for s in (a, b)])
+        checks.append(_homogeneous(a, b, "law of the count", table))
+    x, y = a.cells, b.cells
+    n, m = a.items, b.items
+    often = (x.sum(0) + y.sum(0)) >= 60
+    if min(n, m) >= 30 and often.any():
+        x, y = x[:, often], y[:, often]
+        spread = np.maximum(x.var(0), y.var(0))
+        z = _score(x.mean(0) - y.mean(0), spread * (1.0 / n + 1.0 / m))
+        p = 2.0 * stats.t.sf(z, min(n, m) - 1.0)
+        sd = np.sqrt(np.maximum(spread, 1e-300))
+        off = float((np.abs(x.mean(0) - y.mean(0)) / sd).max())
+        checks.append(Check(a.engine, b.engine, "mean histogram", float(min(1.0, p.size * p.min())), off))
+    for k, name in enumerate(("variance of the count", "variance of the window", "variance of the echo")):
+        u, v = a.windows[:, k].astype(float), b.windows[:, k].astype(float)
+        checks += _two_variances(a, b, name, u, v)
+    if _sparse(a, b):
+        checks.append(_homogeneous(a, b, "sum histogram", np.array([a.cells.sum(0), b.cells.sum(0)])))
+    return checks
+
+
+def _sparse(a: Sample, b: Sample) -> bool:
+    """Whether registrations of these samples are as good as independent: at most one in ten exposures."""
+    return bool(max(a.counts.mean(), b.counts.mean()) < 0.1 and min(a.counts.sum(), b.counts.sum()) > 100)
+
+
+def _two_variances(a: Sample, b: Sample, name: str, u: FloatArray, v: FloatArray) -> list[Check]:
+    if min(len(u), len(v)) < 200 or min(u.var() * len(u), v.var() * len(v)) < 200.0:
+        return []
+    error = 0.0
+    for w in (u, v):
+        square = (w - w.mean()) ** 2
+        kurtosis = max((square**2).mean() / square.mean() ** 2 - 1.0, 2.0)
+        if kurtosis > len(w) / 100.0:
+            return []
+        error += kurtosis / len(w)
+    ratio = float(u.var() / v.var())
+    p = float(2.0 * stats.norm.sf(abs(np.log(ratio)) / np.sqrt(error)))
+    return [Check(a.engine, b.engine, name, p, ratio - 1.0)]
+
+
+def _homogeneous(a: Sample, b: Sample, what: str, table: NDArray[np.int64]) -> Check:
+    """Chi-square of two rows of numbers of events, cells merged until each expects enough in either row."""
+    share = min(table.sum(1)) / max(table.sum(), 1)
+    cell = merge(table.sum(0) * share)
+    merged = np.array([np.bincount(cell, row) for row in table])
+    if merged.shape[1] < 2:
+        return Check(a.engine, b.engine, what, 1.0, 0.0)
+    p = float(stats.chi2_contingency(merged, correction=False).pvalue)
+    rows = merged / merged.sum(1, keepdims=True)
+    return Check(a.engine, b.engine, what, p, 0.5 * float(np.abs(rows[0] - rows[1]).sum()))
+
+
+def merge(weight: FloatArray, least: float = LEAST) -> NDArray[np.intp]:
+    """Cell of each outcome: neighbours join until a cell weighs `least`; the last joins the one before."""
+    below = np.cumsum(weight)
+    cell = np.empty(weight.size, np.intp)
+    number, held, start = 0, 0.0, 0
+    while start < weight.size:
+        end = int(np.searchsorted(below, held + least)) + 1
+        if end >= weight.size or below[-1] - below[end - 1] < least:
+            end = weight.size
+        cell[start:end] = number
+        number, start = number + 1, end
+        held = below[end - 1]
+    return cell
+
+
+def _poisson(events: FloatArray, expected: FloatArray, slack: FloatArray) -> FloatArray:
+    """Two-sided p of numbers of events by Poisson's law, expectations off by `slack` allowed."""
+    more = stats.poisson.sf(events - 1, expected + slack)
+    fewer = stats.poisson.cdf(events, np.maximum(expected - slack, 0.0))
+    return np.asarray(np.minimum(1.0, 2.0 * np.minimum(more, fewer)), dtype=np.float64)
+
+
+def _score(off: FloatArray, variance: FloatArray) -> FloatArray:
+    still = variance <= 0.0
+    z = np.abs(off) / np.sqrt(np.where(still, 1.0, variance))
+    return np.asarray(np.where(still, np.where(np.abs(off) > 1e-9, np.inf, 0.0), z))

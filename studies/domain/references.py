@@ -1,0 +1,91 @@
+"""Engines and predictions against the cases of another program: `--data DIR` with its *.json."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import System
+from mars_lidar.simulate import simulate
+from mars_lidar.statistics import count_law, joint_law, mean_histogram
+from studies.domain.case import PERIOD_NS, Case
+from studies.domain.checks import Check, merge
+
+_EXPOSURES = 4000
+_PIXELS = 16
+
+
+def compare(folder: Path | None, seed: int) -> list[Check]:
+    """Checks of every case in `folder`; none where it is None."""
+    return [check for path in sorted(folder.glob("*.json")) for check in _case(path, seed)] if folder else []
+
+
+def _case(path: Path, seed: int) -> list[Check]:
+    data = json.loads(path.read_text())
+    system = System(
+        period_ns=PERIOD_NS, cycles=data["cycles"], bins=data["bins"],
+        pulse=GaussianPulse(sigma_ns=data["sigma"] * PERIOD_NS),
+        detector=Detector(dead_time_ns=data["dead"] * PERIOD_NS),
+    )  # fmt: skip
+    case = Case(path.stem, "reference", system, (data["S"],), (data["tau"],), data["B"])
+    items = int(np.clip(4e6 / case.registrations(), 200, _EXPOSURES))
+    mean, reals = np.array(data["hist_mean"]), data["reals"]
+    counts = {int(k): v for k, v in data["count"].items()}
+    table = np.bincount(list(counts), weights=list(counts.values())).astype(np.int64)
+    found = []
+    for engine in ("exact", "sequential", "auto", "feedback", "mars"):
+        cube = simulate(
+            case.flux(_PIXELS), system, engine=engine, realizations=-(-items // _PIXELS), seed=seed, threads=1
+        ).reshape(-1, system.bins)
+        found += _counts(f"{engine}, {path.stem}", cube.sum(1, dtype=np.int64), table)
+        share = 1.0 / len(cube) + 1.0 / reals
+        z = np.abs(cube.mean(0) - mean) / np.sqrt(np.maximum(np.array(data["hist_var"]), 1e-12) * share)
+        often = mean * len(cube) > 200
+        p = float(min(1.0, often.sum() * (2.0 * stats.norm.sf(z[often])).min(initial=1.0)))
+        found.append(
+            Check(f"{engine}, {path.stem}", "reference", "mean histogram", p, float(z[often].max(initial=0.0)))
+        )
+    return found + _laws(case, data)
+
+
+def _counts(name: str, counts: NDArray[np.int64], table: NDArray[np.int64]) -> list[Check]:
+    wide = max(table.size, int(counts.max()) + 1)
+    rows = np.array([np.bincount(counts, minlength=wide), np.pad(table, (0, wide - table.size))])
+    cell = merge(rows.sum(0) * (rows.sum(1).min() / rows.sum()))
+    merged = np.array([np.bincount(cell, row) for row in rows])
+    if merged.shape[1] < 2:
+        return []
+    p = float(stats.chi2_contingency(merged, correction=False).pvalue)
+    shares = merged / merged.sum(1, keepdims=True)
+    return [Check(name, "reference", "law of the count", p, 0.5 * float(np.abs(shares[0] - shares[1]).sum()))]
+
+
+def _laws(case: Case, data: dict[str, Any]) -> list[Check]:
+    """Predictions against the means and variances of the reference; an error of its variance from normal counts."""
+    reals, light = data["reals"], case.light()
+    law, joint = count_law(system=case.system, threads=1, **light), joint_law(system=case.system, **light)
+    histogram = mean_histogram(system=case.system, threads=1, **light)
+    found = []
+    for name, mean, variance in (
+        ("count_law", float(law.mean), float(law.variance)), ("joint_law", joint.count_mean, joint.count_variance),
+    ):  # fmt: skip
+        z = (data["count_mean"] - mean) / np.sqrt(max(variance, 1e-12) / reals)
+        found.append(
+            Check(f"{name}, {case.name}", "reference", "mean of the count", float(2 * stats.norm.sf(abs(z))), z)
+        )
+        if variance > 0.5:
+            z = np.log(data["count_var"] / variance) / np.sqrt(2.0 / reals)
+            p = float(2 * stats.norm.sf(abs(z)))
+            found.append(Check(f"{name}, {case.name}", "reference", "variance of the count", p, z))
+    z = np.abs(np.array(data["hist_mean"]) - histogram) / np.sqrt(np.maximum(np.array(data["hist_var"]), 1e-9) / reals)
+    often = histogram * reals > 400
+    p = float(min(1.0, often.sum() * (2 * stats.norm.sf(z[often])).min()))
+    found.append(Check(f"mean_histogram, {case.name}", "reference", "mean histogram", p, float(z[often].max())))
+    return found

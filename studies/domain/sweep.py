@@ -1,0 +1,152 @@
+"""The sweep: every case judged, suspicious ones drawn again with fresh numbers, and what came of it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from queue import Empty, Queue
+from threading import Thread
+from typing import Any
+
+from studies import Tell
+from studies.domain.case import Case
+from studies.domain.checks import Check
+from studies.domain.judge import Budget
+from studies.domain.systems import draw
+from studies.domain.verdict import (
+    FAILED,
+    FIRST_LEVEL,
+    UNJUDGED,
+    VERIFIED,
+    Outcome,
+    blamed,
+    second_level,
+)  # fmt: skip
+from studies.domain.watch import Watched
+
+AGAIN = 4  # times as much is drawn the second time
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Systems, seed, and the checks foreseen, from which the level of the second drawing follows."""
+
+    systems: int
+    seed: int
+    budget: Budget
+    checks: int
+
+
+@dataclass
+class Judged:
+    """A case with its outcomes; `failing`: checks that both drawings reject; `suspects`: the first did."""
+
+    case: Case
+    outcomes: list[Outcome]
+    failing: list[Check]
+    suspects: list[Check]
+    seconds: float
+
+    @property
+    def checks(self) -> int:
+        """Comparisons made in the first drawing."""
+        return sum(len(outcome.checks) for outcome in self.outcomes)
+
+
+def sweep(settings: Settings, tell: Tell, workers: int = 1) -> Iterator[Judged]:
+    """Judge system after system, in order, `workers` at a time, each in a process of its own."""
+    numbers: Queue[int] = Queue()
+    for number in range(settings.systems):
+        numbers.put(number)
+    done: Queue[tuple[int, Judged | BaseException]] = Queue()
+    for _ in range(workers):
+        Thread(target=_workers, args=(settings, numbers, done), daemon=True).start()
+    held: dict[int, Judged] = {}
+    for number in range(settings.systems):
+        while number not in held:
+            at, judged = done.get()
+            if isinstance(judged, BaseException):
+                raise judged
+            held[at] = judged
+        judged = held.pop(number)
+        for subject in sorted({o.subject for o in judged.outcomes if o.state == FAILED}):
+            tell(f"{judged.case.name} ({judged.case.family}): {subject} failed")
+        yield judged
+
+
+def _workers(settings: Settings, numbers: Queue[int], done: Queue[tuple[int, Judged | BaseException]]) -> None:
+    """One thread: takes numbers until there are none."""
+    with Watched() as watched:
+        while True:
+            try:
+                number = numbers.get_nowait()
+            except Empty:
+                return
+            try:
+                case = draw(settings.seed, number)
+                done.put((number, judge_case(case, settings, watched, settings.seed * 1_000_003 + number)))
+            except BaseException as error:
+                done.put((number, error))
+                return
+
+
+def judge_case(case: Case, settings: Settings, watched: Watched, seed: int) -> Judged:
+    """First drawing; a second one, of other random numbers and `AGAIN` times the size, where a check looks wrong."""
+    began = time.monotonic()
+    outcomes = watched.judge(case, 10_000 * seed, settings.budget)
+    suspects = [check for outcome in outcomes for check in outcome.checks if not check.p >= FIRST_LEVEL]
+    failing: list[Check] = []
+    if suspects:
+        again = watched.judge(case, 10_000 * seed + 5_000, settings.budget.times(AGAIN), 2.0 * watched.patience)
+        level = second_level(settings.checks)
+        seen = {(c.a, c.b, c.what): c for outcome in again for c in outcome.checks}
+        for check in suspects:
+            if check.a == check.b:  # what must hold of every registration: no chance is in it
+                failing.append(check)
+                continue
+            found = seen.get((check.a, check.b, check.what))
+            if found is None:  # not made a second time: kept only where no chance is in it
+                failing += [check] if check.p == 0.0 else []
+            elif not found.p >= level:
+                failing.append(found)
+    for party, checks in blamed(failing).items():
+        _blame(outcomes, case, party, checks)
+    return Judged(case, outcomes, failing, suspects, time.monotonic() - began)
+
+
+def _blame(outcomes: list[Outcome], case: Case, party: str, checks: list[Check]) -> None:
+    words = "; ".join(f"{c.what} ({c.a} against {c.b}): p {c.p:.1g}, effect {c.effect:.3g}" for c in checks[:4])
+    for outcome in outcomes:
+        if outcome.subject == party:
+            if outcome.state in (VERIFIED, UNJUDGED) or outcome.state != FAILED:
+                outcome.note = words + (f" [{outcome.state}]" if outcome.state not in (VERIFIED, UNJUDGED) else "")
+            outcome.state = FAILED
+            return
+    outcomes.append(Outcome(case.name, party, FAILED, note=words))
+
+
+def rows(judged: Judged) -> list[dict[str, Any]]:
+    """One row of the data for each subject."""
+    facts = judged.case.facts()
+    return [
+        facts | {
+            "subject": o.subject, "state": o.state, "seconds": o.seconds, "checks": len(o.checks),
+            "least p": min((c.p for c in o.checks), default=1.0), "note": o.note.replace("\n", " "),
+        }
+        for o in judged.outcomes
+    ]  # fmt: skip
+
+
+def describe(check: Check) -> str:
+    """A check on one line."""
+    return json.dumps(asdict(check))
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Rows of an earlier sweep."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))

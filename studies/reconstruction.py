@@ -1,0 +1,178 @@
+"""Reconstruction over flux: bias and error of depth and signal by every method, beside the Cramer-Rao bound."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruct import METHODS, Flags, Reconstruction, cramer_rao, reconstruct, window_error, window_weights
+from mars_lidar.scene.scene import Scene
+from mars_lidar.simulate import simulate
+from studies import Request
+
+SEED = 9
+SBR = 1.0
+OUTLIER_SIGMAS = 4.0  # of the pulse: further off the pulse itself was missed
+_DEAD_NS = 75.0
+_BOUNDS = 17  # delays at which the bound is computed; between them its logarithm is interpolated
+BRIGHT = 3.0  # mean signal photons per period of the picture
+PLAIN = System(
+    period_ns=1e3 / 7.5,
+    cycles=1000,
+    bins=1024,
+    pulse=GaussianPulse(sigma_ns=0.5),
+    detector=Detector(dead_time_ns=_DEAD_NS),
+)
+SYNCHRONOUS = PLAIN.replace(detector=Detector(dead_time_ns=0.0, mode="synchronous"))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Levels of signal photons per period, pixels at each, side of the picture's image, timed cubes."""
+
+    signals: tuple[float, ...]
+    pixels: int
+    size: int
+    repeats: int
+
+
+FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 48, 2)
+QUICK = Settings((0.03, 0.3, 3.0), 100, 24, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A bright room: true depth (H, W), m, and what two methods make of it."""
+
+    depth_m: Any
+    signal: Any
+    found: dict[str, Reconstruction]
+    seconds: dict[str, float]
+
+
+def run(request: Request) -> list[Path]:
+    """Write reconstruction.md, reconstruction.csv and two figures."""
+    from studies.reconstruction_bounds import lines
+    from studies.reconstruction_report import write
+
+    settings = QUICK if request.quick else FULL
+    rows = []
+    for signal in settings.signals:
+        request.tell(f"reconstruction: S = {signal:.3g}")
+        rows += sweep(PLAIN, signal, settings.pixels)
+        rows += sweep(SYNCHRONOUS, signal, settings.pixels)
+    request.tell("reconstruction: near the bound")
+    near = lines(2 * settings.pixels)
+    request.tell("reconstruction: picture")
+    shown = picture(settings)
+    request.tell("reconstruction: time")
+    return write(request.out, settings, rows, near, shown, timings(settings))
+
+
+def sweep(system: System, signal: float, pixels: int) -> list[dict[str, Any]]:
+    """A line for each method that suits the detector: errors over `pixels` exposures, delays all over the period."""
+    background = signal / SBR
+    period = system.period_ns
+    delay = np.random.default_rng(SEED).uniform(0.0, period, pixels)
+    cube = simulate(Flux(np.full(pixels, signal), background, delay), system, seed=SEED)[0, 0]
+    places = np.linspace(0.0, period, _BOUNDS)
+    bound = cramer_rao(signal, background, system, delay_ns=places)
+    least = {}
+    for name in ("depth_m", "signal"):  # of these delays: a synchronous pixel sees late ones less well
+        at = np.exp(np.interp(delay, places, np.log(getattr(bound, name))))
+        least[name] = float(np.sqrt(np.mean(at**2)))
+    lines = []
+    for name, method in METHODS.items():
+        if system.detector.mode not in method.modes:
+            continue
+        found = reconstruct(cube, system, method)
+        lag = (found.delay_ns - delay + 0.5 * period) % period - 0.5 * period
+        near = np.abs(lag) < OUTLIER_SIGMAS * system.pulse.sigma_ns  # type: ignore[attr-defined]
+        off = np.asarray(system.depth_m(lag))[near]
+        bounded = found.flags & Flags.SATURATED == 0
+        error = (found.signal - signal)[bounded]
+        lines.append(
+            {
+                "detector": system.detector.mode,
+                "method": name,
+                "signal": signal,
+                "outliers %": 100.0 * float(1.0 - near.mean()),
+                "depth bias mm": 1e3 * float(off.mean()) if near.any() else float("nan"),
+                "depth RMSE mm": 1e3 * float(np.sqrt(np.mean(off**2))) if near.any() else float("nan"),
+                "depth bound mm": 1e3 * least["depth_m"],
+                "saturated %": 100.0 * float(1.0 - bounded.mean()),
+                "signal bias %": 100.0 * float(error.mean()) / signal if error.size else float("nan"),
+                "signal RMSE %": 100.0 * float(np.sqrt(np.mean(error**2))) / signal if error.size else float("nan"),
+                "signal bound %": 100.0 * least["signal"] / signal,
+            }
+        )
+    return lines
+
+
+def window_lines(settings: Settings) -> list[dict[str, Any]]:
+    """The raw window estimate of the signal, predicted by the joint law of the bins: no simulation."""
+    delay = 0.37 * PLAIN.period_ns
+    weights = window_weights(PLAIN, delay)
+    lines = []
+    for signal in settings.signals[:: max(1, len(settings.signals) // 5)]:
+        mean, deviation = window_error(weights, signal, signal / SBR, PLAIN, delay_ns=delay)
+        bound = float(cramer_rao(signal, signal / SBR, PLAIN, delay_ns=delay).signal)
+        lines.append(
+            {
+                "S": signal,
+                "bias %": 100.0 * float(mean / signal - 1.0),
+                "standard deviation %": 100.0 * float(deviation) / signal,
+                "bound %": 100.0 * bound / signal,
+            }
+        )
+    return lines
+
+
+def picture(settings: Settings) -> Picture:
+    """A room of `BRIGHT` signal photons per period by the matched filter on raw counts and by maximum likelihood."""
+    scene = Scene.example("room", size=settings.size)
+    flux = scene.flux(PLAIN, signal=BRIGHT, sbr=SBR)
+    cube = simulate(flux, PLAIN, seed=SEED)[0]
+    found, seconds = {}, {}
+    for name in ("matched_filter", "maximum_likelihood"):
+        began = time.perf_counter()
+        found[name] = reconstruct(cube, PLAIN, name)
+        seconds[name] = time.perf_counter() - began
+    return Picture(scene.depth_m, flux.signal, found, seconds)
+
+
+def timings(settings: Settings) -> list[dict[str, Any]]:
+    """Seconds of each method for one 128 x 128 x 1024 cube (a quarter of the side in the quick form)."""
+    side = 128 if settings.repeats > 1 else 32
+    flux = Scene.example("room", size=side).flux(PLAIN, signal=1.0, sbr=SBR)
+    lines = []
+    for system in (PLAIN, SYNCHRONOUS):
+        cube = simulate(flux, system, seed=SEED)[0]
+        for name, method in METHODS.items():
+            if system.detector.mode not in method.modes:
+                continue
+            wall, processor = [], []
+            for _ in range(settings.repeats):
+                began, used = time.perf_counter(), time.process_time()
+                reconstruct(cube, system, method)
+                wall.append(time.perf_counter() - began)
+                processor.append(time.process_time() - used)
+            lines.append(
+                {
+                    "detector": system.detector.mode,
+                    "method": name,
+                    "pixels": side * side,
+                    "seconds": min(wall),
+                    "processor seconds": min(processor),
+                    "us a pixel": 1e6 * min(processor) / side**2,
+                }
+            )
+    return lines

@@ -56,9 +56,7 @@ SECTIONS: dict[str, Callable[[Config, Bandwidth], Section]] = {
 }
 
 
-def run(
-    config: Config, names: Sequence[str] = tuple(SECTIONS), tell: Callable[[str], object] = str
-) -> Report:
+def run(config: Config, names: Sequence[str] = tuple(SECTIONS), tell: Callable[[str], object] = str) -> Report:
     """Run the named sections; `tell` hears each as it is done."""
     began, interference = time.perf_counter(), Interference()
     machine = describe_machine(config)
@@ -97,7 +95,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--full", action="store_true", help="many turns, NumPy's loops and the table unscaled: for the record"
     )
     parser.add_argument(
-        "--only", action="append", choices=list(SECTIONS), metavar="NAME",
+        "--only",
+        action="append",
+        choices=list(SECTIONS),
+        metavar="NAME",
         help=f"this section, may be repeated: {', '.join(SECTIONS)}",
     )
     parser.add_argument(

@@ -69,7 +69,13 @@ def baselines(config: Config, bandwidth: Bandwidth) -> Section:
     section.rows = [engine_row(name, run, times[name], bandwidth, reference) for name, run in runs.items()]
     section.rows.append(
         timing_row(
-            stage, workload, times[stage], bandwidth, engine="numpy", fresh=True, reference=reference,
+            stage,
+            workload,
+            times[stage],
+            bandwidth,
+            engine="numpy",
+            fresh=True,
+            reference=reference,
             output_bytes=8 * workload.pixels * workload.system.bins,
         )
     )
@@ -117,9 +123,7 @@ def _loop_row(
     return timing_row(case, workload, scaled, bandwidth, engine="numpy", fresh=True, reference=reference)
 
 
-def _paper_note(
-    config: Config, workload: Workload, times: dict[str, Timing], chosen: NDArray[np.intp]
-) -> str:
+def _paper_note(config: Config, workload: Workload, times: dict[str, Timing], chosen: NDArray[np.intp]) -> str:
     scaling = (
         "run unscaled at full size"
         if chosen.size == workload.pixels

@@ -44,10 +44,16 @@ def reconstruction(config: Config, bandwidth: Bandwidth) -> Section:
     slowest = 0.0
     for key, (mode, name, signal, background) in told.items():
         pixel = min(times[key].cpu) / pixels
-        section.rows.append({
-            "detector": mode, "method": name, "S": signal, "B": background, "us per pixel": 1e6 * pixel,
-            "CPU s per 128 x 128": CUBE_PIXELS * pixel,
-        })  # fmt: skip
+        section.rows.append(
+            {
+                "detector": mode,
+                "method": name,
+                "S": signal,
+                "B": background,
+                "us per pixel": 1e6 * pixel,
+                "CPU s per 128 x 128": CUBE_PIXELS * pixel,
+            }
+        )
         if name == "maximum_likelihood":
             slowest = max(slowest, CUBE_PIXELS * pixel)
     section.goals = [Goal("maximum likelihood, CPU of 128 x 128, any flux", slowest, GOAL_CUBE_S, "s")]

@@ -44,9 +44,15 @@ def long_exposures(config: Config, bandwidth: Bandwidth) -> Section:
         registrations = int(out.sum(dtype=np.int64))  # of whichever ran last: all agree to a part in a thousand
         for name in names:
             row = timing_row(
-                f"N_r = {cycles:,}", workload, times[name], bandwidth, engine=name, threads=config.threads,
-                reference=times["feedback"], registrations=registrations,
-            )  # fmt: skip
+                f"N_r = {cycles:,}",
+                workload,
+                times[name],
+                bandwidth,
+                engine=name,
+                threads=config.threads,
+                reference=times["feedback"],
+                registrations=registrations,
+            )
             section.rows.append(row)
         goals = {"feedback": GOAL_FEEDBACK_S, "mars": GOAL_MARS_SHORT_S if cycles == 1000 else GOAL_MARS_S}
         for name, wanted in goals.items():

@@ -32,9 +32,13 @@ def forward(config: Config, bandwidth: Bandwidth) -> Section:
 
 def _rows(section: Section, bins: int, config: Config, bandwidth: Bandwidth) -> None:
     system = ml.System(
-        period_ns=1e3 / 7.5, cycles=config.cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=75.0), start="stationary",
-    )  # fmt: skip
+        period_ns=1e3 / 7.5,
+        cycles=config.cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=0.5),
+        detector=ml.Detector(dead_time_ns=75.0),
+        start="stationary",
+    )
     random = np.random.default_rng(0)
     s, b = np.exp(random.uniform(np.log(0.05), np.log(2.0), (2, PIXELS)))
     tau = random.uniform(0.0, system.period_ns, PIXELS)
@@ -62,11 +66,15 @@ def _rows(section: Section, bins: int, config: Config, bandwidth: Bandwidth) -> 
     for name in ("mean_histogram", *models):
         value, both = (timings.get(one) for one in (name, name + ", gradient"))
         assert value is not None
-        section.rows.append({
-            "case": name, "bins": bins, "value, CPU us a pixel": 1e6 * min(value.cpu) / PIXELS,
-            "value and gradient": None if both is None else 1e6 * min(both.cpu) / PIXELS,
-            "write floor us": 1e6 * floor,
-        })  # fmt: skip
+        section.rows.append(
+            {
+                "case": name,
+                "bins": bins,
+                "value, CPU us a pixel": 1e6 * min(value.cpu) / PIXELS,
+                "value and gradient": None if both is None else 1e6 * min(both.cpu) / PIXELS,
+                "write floor us": 1e6 * floor,
+            }
+        )
 
 
 def _gradient(model: Callable[..., torch.Tensor], at: list[torch.Tensor]) -> list[torch.Tensor | None]:

@@ -44,9 +44,12 @@ class Case:
     @property
     def system(self) -> ml.System:
         return ml.System(
-            period_ns=100.0, cycles=self.cycles, bins=BINS, pulse=ml.GaussianPulse(sigma_ns=0.5),
+            period_ns=100.0,
+            cycles=self.cycles,
+            bins=BINS,
+            pulse=ml.GaussianPulse(sigma_ns=0.5),
             detector=ml.Detector(dead_time_ns=self.dead_ns),
-        )  # fmt: skip
+        )
 
     def flux(self, scenes: int) -> ml.Flux:
         """Scenes below each other: one tall image."""
@@ -138,10 +141,15 @@ def measure(cupy: Any, case: Case, scenes: int, realizations: int, in_block: boo
         times.append(cupy.cuda.get_elapsed_time(begin, end) / cubes)
     ms, passes = float(np.median(times)), 2.0 if case.engine == "exact" else 1.0
     return {
-        "engine": case.engine, "case": case.name, "scenes": scenes, "realizations": realizations,
-        "counted": "" if in_block is None else "block" if in_block else "device", "ms": ms,
-        "registrations": float(first.sum()), "bandwidth": passes * first.nbytes / (ms * 1e-3) / MEMORY_BYTES_PER_S,
-    }  # fmt: skip
+        "engine": case.engine,
+        "case": case.name,
+        "scenes": scenes,
+        "realizations": realizations,
+        "counted": "" if in_block is None else "block" if in_block else "device",
+        "ms": ms,
+        "registrations": float(first.sum()),
+        "bandwidth": passes * first.nbytes / (ms * 1e-3) / MEMORY_BYTES_PER_S,
+    }
 
 
 def _engine(case: Case) -> Engine:

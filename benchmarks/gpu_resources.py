@@ -65,8 +65,12 @@ def main() -> None:
     variants += [replace(plain, mode=mode, whole=mode != 2) for mode in (1, 2, 3)]
     variants += [replace(plain, sink=sink) for sink in (Sink.ROWS16, Sink.COUNTS, Sink.TIMESTAMPS)]
     others = [
-        MARS_LAWS, mars_histograms(False), mars_histograms(True), feedback_histograms(False), feedback_histograms(True)
-    ]  # fmt: skip
+        MARS_LAWS,
+        mars_histograms(False),
+        mars_histograms(True),
+        feedback_histograms(False),
+        feedback_histograms(True),
+    ]
     shorter = replace(plain, ahead=AHEAD // 2)
     lines = [
         "# Kernels on CUDA",
@@ -156,9 +160,7 @@ def mars_estimate(found: dict[Kernel, Resources]) -> list[str]:
     issue = ISSUE_PER_S * 32 / (each * BINS * PIXELS)
     written = PIXELS * BINS * 4
     block, used = mars_block(), found[mars_histograms(True)]
-    blocks = min(
-        SHARED_BYTES // (block + RESERVED_BYTES), REGISTERS // (LANES * used.registers), MOST_THREADS // LANES
-    )
+    blocks = min(SHARED_BYTES // (block + RESERVED_BYTES), REGISTERS // (LANES * used.registers), MOST_THREADS // LANES)
     return [
         f"## Bounds for an NVIDIA H200: `mars` with a table, 128 x 128 pixels, {BINS} bins of uint32, N_r = 1e5",
         "",

@@ -59,13 +59,19 @@ class Drawn:
             pulse = ml.SampledPulse(values, bin_ns=min(6.0 * self.sigma, 0.99) * PERIOD_NS / values.size)
         gate = {"gate_start_ns": 20.0, "gate_width_ns": 55.0} if self.mode == "gated" else {}
         detector = ml.Detector(
-            dead_time_ns=self.dead * PERIOD_NS, mode=self.mode,  # type: ignore[arg-type]
-            electronics_dead_time_ns=self.electronics * PERIOD_NS, **gate,
-        )  # fmt: skip
+            dead_time_ns=self.dead * PERIOD_NS,
+            mode=self.mode,  # type: ignore[arg-type]
+            electronics_dead_time_ns=self.electronics * PERIOD_NS,
+            **gate,
+        )
         return ml.System(
-            period_ns=PERIOD_NS, cycles=self.cycles, bins=self.bins, pulse=pulse, detector=detector,
+            period_ns=PERIOD_NS,
+            cycles=self.cycles,
+            bins=self.bins,
+            pulse=pulse,
+            detector=detector,
             start=self.start,  # type: ignore[arg-type]
-        )  # fmt: skip
+        )
 
 
 def draw(seed: int) -> Drawn:
@@ -98,10 +104,19 @@ def draw(seed: int) -> Drawn:
         electronics = dead * random.uniform(1.0, 3.0) + random.uniform(0.0, 1.0)
     cycles = random.choice([1, 2, 1000, 10**8]) if random.random() < 0.25 else power(0, 8)
     return Drawn(
-        seed, flux(), flux(), dead, int(cycles), round(2 ** random.uniform(1, 20 if random.random() < 0.3 else 11)),
-        power(-4, 0), bool(random.random() < 0.2), str(random.choice(["armed", "stationary"])), mode,
-        min(electronics, 1e6), float(random.random()),
-    )  # fmt: skip
+        seed,
+        flux(),
+        flux(),
+        dead,
+        int(cycles),
+        round(2 ** random.uniform(1, 20 if random.random() < 0.3 else 11)),
+        power(-4, 0),
+        bool(random.random() < 0.2),
+        str(random.choice(["armed", "stationary"])),
+        mode,
+        min(electronics, 1e6),
+        float(random.random()),
+    )
 
 
 def laws(drawn: Drawn) -> dict[str, Callable[[Values], Values]]:
@@ -120,9 +135,12 @@ def laws(drawn: Drawn) -> dict[str, Callable[[Values], Values]]:
         first, p = float(law.support[0]) - float(law.mean), law.pmf
         offset = first + np.arange(p.size)
         return {
-            "pmf sum": float(p.sum()), "pmf mean": float(p @ offset) + float(law.mean),
-            "pmf variance": float(p @ offset**2), "pmf least": float(p.min()), "pmf size": float(p.size),
-        }  # fmt: skip
+            "pmf sum": float(p.sum()),
+            "pmf mean": float(p @ offset) + float(law.mean),
+            "pmf variance": float(p @ offset**2),
+            "pmf least": float(p.min()),
+            "pmf size": float(p.size),
+        }
 
     def shape(method: str) -> Callable[[Values], Values]:
         def of(_: Values) -> Values:
@@ -144,9 +162,12 @@ def laws(drawn: Drawn) -> dict[str, Callable[[Values], Values]]:
         return {"joint variance": held["joint"].count_variance}
 
     found = {
-        "count_law": count, "pmf": pmf, "exposure": shape("exposure"), "stationary": shape("stationary"),
+        "count_law": count,
+        "pmf": pmf,
+        "exposure": shape("exposure"),
+        "stationary": shape("stationary"),
         "mean_histogram": histogram,
-    }  # fmt: skip
+    }
     if drawn.mode == "nonparalyzable" and drawn.electronics == 0.0:
         found |= {"joint_law": joint, "window": window}
     return found

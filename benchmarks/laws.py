@@ -40,27 +40,35 @@ def exposure_laws(config: Config, bandwidth: Bandwidth) -> Section:
 
     cases: dict[str, tuple[int, int, Callable[[], object]]] = {
         "moments and mean histogram": (
-            signal.size, 1, lambda: exposure_moments(signal, background, instrument, threads=1)
+            signal.size,
+            1,
+            lambda: exposure_moments(signal, background, instrument, threads=1),
         ),
         "count pmf": (signal.size, 1, pmf),
         "count pmf of a bright pixel, cumulants from a table": (
-            narrow.size, 1, lambda: guessed_windows(narrow, known.cumulants, known.bins, 1)
+            narrow.size,
+            1,
+            lambda: guessed_windows(narrow, known.cumulants, known.bins, 1),
         ),
         "table entries, moments and shapes": (
-            grid.shape[1], every, lambda: exposure_moments(*grid, instrument, threads=every)
+            grid.shape[1],
+            every,
+            lambda: exposure_moments(*grid, instrument, threads=every),
         ),
     }
     times = in_turn({name: case for name, (_, _, case) in cases.items()}, config)
     section = Section("Laws of a finite exposure", notes=[_EXPOSURE_NOTE])
-    section.rows = [
-        _row(name, config.bins, threads, cells, times[name]) for name, (cells, threads, _) in cases.items()
-    ]
+    section.rows = [_row(name, config.bins, threads, cells, times[name]) for name, (cells, threads, _) in cases.items()]
     cell_ms = {row["case"]: row["ms per (S, B)"] for row in section.rows}
     whole = 1e-3 * cell_ms["table entries, moments and shapes"] * TABLE[0] * TABLE[1]
     scaled = "" if grid.shape[1] == TABLE[0] * TABLE[1] else f", scaled from {grid.shape[1]}"
     section.goals = [
-        Goal("exact moments and mean histogram, per (S, B), 1 thread", cell_ms["moments and mean histogram"],
-             GOAL_MOMENTS_MS, "ms"),
+        Goal(
+            "exact moments and mean histogram, per (S, B), 1 thread",
+            cell_ms["moments and mean histogram"],
+            GOAL_MOMENTS_MS,
+            "ms",
+        ),
         Goal("exact count pmf, per (S, B), 1 thread", cell_ms["count pmf"], GOAL_PMF_MS, "ms"),
         Goal(f"25,600 table entries, {every} threads{scaled}", whole, GOAL_TABLE_S, "s"),
     ]

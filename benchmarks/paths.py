@@ -47,8 +47,14 @@ def exact_paths(config: Config, bandwidth: Bandwidth) -> Section:
     section.rows = [engine_row(name, run, times[name], bandwidth, reference) for name, run in runs.items()]
     section.rows.append(
         timing_row(
-            "timestamps (two passes)", usual, times["timestamps"], bandwidth, engine="exact", fresh=True,
-            reference=reference, output_bytes=_RECORD_BYTES * usual.registrations,
+            "timestamps (two passes)",
+            usual,
+            times["timestamps"],
+            bandwidth,
+            engine="exact",
+            fresh=True,
+            reference=reference,
+            output_bytes=_RECORD_BYTES * usual.registrations,
         )
     )
     start_s = (times[_STATIONARY].cpu_median - times[_ARMED].cpu_median) / some.pixels

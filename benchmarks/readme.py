@@ -55,9 +55,7 @@ def _rows(saved: Saved) -> dict[str, str]:
         "`feedback`, two cores, at the same exposures": long("feedback"),
         "`sequential`, two cores": saved.ms(_EXACT, "sequential, all threads"),
         "`poisson`, two cores": saved.ms(_EXACT, "poisson, all threads"),
-        "the paper's pipeline in NumPy, one core": saved.ms(
-            _PIPELINE, "NumPy, lookup + alignment + multinomial"
-        ),
+        "the paper's pipeline in NumPy, one core": saved.ms(_PIPELINE, "NumPy, lookup + alignment + multinomial"),
         "waveforms / timestamps (two passes, into fresh memory), one core": (
             f"{saved.ns(_PATHS, 'waveform of 1024 samples')} / {saved.ns(_PATHS, 'timestamps (two passes)')}"
         ),

@@ -50,9 +50,7 @@ def timing_row(
     }
 
 
-def engine_row(
-    case: str, run: EngineRun, timing: Timing, bandwidth: Bandwidth, reference: Timing | None = None
-) -> Row:
+def engine_row(case: str, run: EngineRun, timing: Timing, bandwidth: Bandwidth, reference: Timing | None = None) -> Row:
     """The row of a run of an engine."""
     return timing_row(
         case,

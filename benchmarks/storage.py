@@ -84,8 +84,9 @@ def codecs(config: Config, bandwidth: Bandwidth) -> Section:
             }
             section.rows.append(row)
             if name == "sparse" and level == 1.0:
-                section.goals.append(Goal("sparse counts over dense uint16, S = 1, 1000 cycles", row["of dense"],
-                                          GOAL_SIZE, ""))  # fmt: skip
+                section.goals.append(
+                    Goal("sparse counts over dense uint16, S = 1, 1000 cycles", row["of dense"], GOAL_SIZE, "")
+                )
     return section
 
 
@@ -134,9 +135,12 @@ def _dataset_row(case: str, level: float, found: dict[str, float], alone: dict[s
 
 def _system(config: Config) -> ml.System:
     return ml.System(
-        period_ns=1e3 / 7.5, cycles=config.cycles, bins=config.bins, pulse=ml.GaussianPulse(sigma_ns=0.5),
+        period_ns=1e3 / 7.5,
+        cycles=config.cycles,
+        bins=config.bins,
+        pulse=ml.GaussianPulse(sigma_ns=0.5),
         detector=ml.Detector(dead_time_ns=75.0),
-    )  # fmt: skip
+    )
 
 
 def _child(config: Config, what: str, level: float, scenes: int, threads: int) -> dict[str, float]:

@@ -27,10 +27,12 @@ def main(what: str, level: float, scenes: int, threads: int, cycles: int, bins: 
     system = _system(Config(mode="child", cycles=cycles, bins=bins))
     told: list[tuple[float, int]] = []
     recipe = {
-        "scenes": {"path": str(out.parent / "scenes")}, "systems": [system],
-        "light": {"signal": level}, "realizations": REALIZATIONS,
+        "scenes": {"path": str(out.parent / "scenes")},
+        "systems": [system],
+        "light": {"signal": level},
+        "realizations": REALIZATIONS,
         "store": {"layout": "dense" if what == "dense" else "sparse"},
-    }  # fmt: skip
+    }
     exposures = scenes * REALIZATIONS * SIDE**2
     rooms = [ml.Scene.example("room", SIDE, k) for k in range(scenes)]
     (out.parent / "scenes").mkdir()

@@ -29,9 +29,12 @@ def stream(config: Config, bandwidth: Bandwidth) -> Section:
     """One thread in this process, then workers of a loader with a thread each."""
     side = max(4, config.side // 2)
     system = ml.System(
-        period_ns=1e3 / 7.5, cycles=config.cycles, bins=config.bins, pulse=ml.GaussianPulse(sigma_ns=0.5),
+        period_ns=1e3 / 7.5,
+        cycles=config.cycles,
+        bins=config.bins,
+        pulse=ml.GaussianPulse(sigma_ns=0.5),
         detector=ml.Detector(dead_time_ns=75.0),
-    )  # fmt: skip
+    )
     section = Section("Stream of training cubes", notes=[_NOTE.format(side=side, bins=config.bins)])
     out = np.empty((1, side, side, system.bins), system.histogram_dtype)
     floor = bandwidth.seconds(out.nbytes, threads=1, fresh=False)
@@ -73,15 +76,27 @@ def stream(config: Config, bandwidth: Bandwidth) -> Section:
 
 
 def _row(
-    case: str, level: float, workers: int, cpu: float | None, received: float | None, wall: float, engine: float,
+    case: str,
+    level: float,
+    workers: int,
+    cpu: float | None,
+    received: float | None,
+    wall: float,
+    engine: float,
     floor: float,
-) -> Row:  # fmt: skip
+) -> Row:
     return {
-        "case": case, "S": level, "workers": workers, "CPU ms per cube": None if cpu is None else 1e3 * cpu,
-        "of it the receiver's": None if received is None else 1e3 * received, "wall ms per cube": 1e3 * wall,
-        "cubes/s": 1.0 / wall, "of the engine's rate, CPU": None if cpu is None else engine / cpu,
-        "of so many engines' rate, wall": engine / max(1, workers) / wall, "write floor ms": 1e3 * floor,
-    }  # fmt: skip
+        "case": case,
+        "S": level,
+        "workers": workers,
+        "CPU ms per cube": None if cpu is None else 1e3 * cpu,
+        "of it the receiver's": None if received is None else 1e3 * received,
+        "wall ms per cube": 1e3 * wall,
+        "cubes/s": 1.0 / wall,
+        "of the engine's rate, CPU": None if cpu is None else engine / cpu,
+        "of so many engines' rate, wall": engine / max(1, workers) / wall,
+        "write floor ms": 1e3 * floor,
+    }
 
 
 def _numbers(processors: int) -> list[int]:

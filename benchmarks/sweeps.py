@@ -58,7 +58,5 @@ def _sweep(title: str, cases: dict[str, Workload], config: Config, bandwidth: Ba
         runs["sequential"] = EngineRun(workload, engine="sequential", out=out)
         times = in_turn(runs, each)
         reference = times[_core.levels()[0]]
-        section.rows += [
-            engine_row(case, run, times[name], bandwidth, reference) for name, run in runs.items()
-        ]
+        section.rows += [engine_row(case, run, times[name], bandwidth, reference) for name, run in runs.items()]
     return section

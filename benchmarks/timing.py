@@ -54,8 +54,7 @@ def in_turn(cases: Mapping[str, Case], config: Config) -> dict[str, Timing]:
         first = len(turns) % len(names)
         turns.append(_turn(names[first:] + names[:first], cases))
     return {
-        name: Timing(tuple(turn[name][0] for turn in turns), tuple(turn[name][1] for turn in turns))
-        for name in names
+        name: Timing(tuple(turn[name][0] for turn in turns), tuple(turn[name][1] for turn in turns)) for name in names
     }
 
 

@@ -28,31 +28,40 @@ def _parser(command: str) -> argparse.ArgumentParser:
         "studies", nargs="+", choices=list(STUDIES), metavar="STUDY", help="one or more of the list below"
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("study-results"), metavar="DIR",
+        "--out",
+        type=Path,
+        default=Path("study-results"),
+        metavar="DIR",
         help="folder to write into, made if missing (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--quick", action="store_true", help="small grids, few realizations: seconds, not for citing"
     )
+    parser.add_argument("--quick", action="store_true", help="small grids, few realizations: seconds, not for citing")
     parser.add_argument(
-        "--data", type=Path, metavar="DIR",
+        "--data",
+        type=Path,
+        metavar="DIR",
         help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance', 'domain'), or of "
         "measured scenes, rgbd/ (study 'downstream')",
     )
     parser.add_argument(
-        "--stream", type=Path, metavar="FILE",
+        "--stream",
+        type=Path,
+        metavar="FILE",
         help="measured photon stream: a .mat with times in units of 64 ps (study 'hardware')",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--truth", choices=("sequential", "exact"), default="sequential",
+        "--truth",
+        choices=("sequential", "exact"),
+        default="sequential",
         help="engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is "
         "several times faster (default: %(default)s)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--config", choices=("small", "full"), default="small",
+        "--config",
+        choices=("small", "full"),
+        default="small",
         help="size of the study 'downstream': an hour or two of two cores, or a GPU (default: %(default)s); with "
         "--quick a tiny one, seconds",
-    )  # fmt: skip
+    )
     parser.add_argument("--seed", type=int, metavar="N", help="another sweep (study 'domain')")
     return parser
 

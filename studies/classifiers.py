@@ -29,9 +29,7 @@ def require_sklearn() -> str:
     try:
         import sklearn
     except ImportError as error:
-        raise MissingExtra(
-            "study 'joint' needs scikit-learn >= 1.5: pip install 'mars-lidar[studies]'"
-        ) from error
+        raise MissingExtra("study 'joint' needs scikit-learn >= 1.5: pip install 'mars-lidar[studies]'") from error
     return str(sklearn.__version__)
 
 
@@ -80,9 +78,7 @@ def _model(kind: str, seed: int) -> Any:
         from sklearn.preprocessing import StandardScaler
 
         # tol only decides about warnings: the total is the sum of the bins, on purpose
-        return make_pipeline(
-            StandardScaler(), QuadraticDiscriminantAnalysis(reg_param=REGULARISATION, tol=0.0)
-        )
+        return make_pipeline(StandardScaler(), QuadraticDiscriminantAnalysis(reg_param=REGULARISATION, tol=0.0))
     if kind == BOOSTING:
         from sklearn.ensemble import HistGradientBoostingClassifier
 

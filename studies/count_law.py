@@ -190,11 +190,22 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
         laws = {name: one.pmfs[k] for name, one in predictions.items()}
         scores = _scores(settings, sample, found, predictions, k, random)
         counts = sample.counts[:, k].astype(np.float64)
-        cells.append(Cell(
-            grid.name, grid.period_ns, float(signal[k]), float(background[k]), dead_ns,
-            float(counts.mean()), float(counts.var(ddof=1)), cumulants[k], settings.realizations,
-            scores, found, laws,
-        ))  # fmt: skip
+        cells.append(
+            Cell(
+                grid.name,
+                grid.period_ns,
+                float(signal[k]),
+                float(background[k]),
+                dead_ns,
+                float(counts.mean()),
+                float(counts.var(ddof=1)),
+                cumulants[k],
+                settings.realizations,
+                scores,
+                found,
+                laws,
+            )
+        )
     return cells
 
 
@@ -212,9 +223,7 @@ def _scores(
     scores = {}
     for name, one in predictions.items():
         if one.sampled not in noise:
-            noise[one.sampled] = resampled_figures(
-                exact.pmfs[k], size, one.sampled, settings.resamplings, random
-            )
+            noise[one.sampled] = resampled_figures(exact.pmfs[k], size, one.sampled, settings.resamplings, random)
         shape = 0.5 * float(np.abs(sample.shape[k] - one.shape[k]).sum())
         # a sample has its own noise as well, as much as the truth's for the same number of exposures
         own = float(np.sqrt(1.0 + size / one.sampled)) if one.sampled else 1.0
@@ -254,9 +263,7 @@ def resampled_figures(law: Pmf, size: int, sampled: int, number: int, random: np
     return np.array(rows)
 
 
-def _figures(
-    sample: FloatArray, law: FloatArray, first: int, mean: float, variance: float, size: int
-) -> FloatArray:
+def _figures(sample: FloatArray, law: FloatArray, first: int, mean: float, variance: float, size: int) -> FloatArray:
     """`FIGURES` (n, 4) of frequencies `sample` (n, w) of `size` counts against `law` (w,), counts from `first`."""
     offset = first + np.arange(law.size) - mean
     shift = sample @ offset

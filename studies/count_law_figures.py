@@ -158,20 +158,28 @@ def _shape(path: Path, settings: Settings, cells: Sequence[Cell], sweep: dict[st
             marker = "s" if name == "mars_exact" else "o"
             size = 4.5 if name == "mars_exact" else 2.8
             ax.plot(
-                np.array(ticks) / WIDE_PERIOD_NS, here, marker, ms=size, color=_colour(name)[0], label=labels.get(name),
-                mfc="none" if name == "mars_exact" else None, mew=0.8,
+                np.array(ticks) / WIDE_PERIOD_NS,
+                here,
+                marker,
+                ms=size,
+                color=_colour(name)[0],
+                label=labels.get(name),
+                mfc="none" if name == "mars_exact" else None,
+                mew=0.8,
             )
         noise = [[c.scores["mars_exact"].shape_floor for c in grid if c.dead_ns == d] for d in ticks]
         ax.plot(
-            np.array(ticks) / WIDE_PERIOD_NS, [float(np.quantile(v, quantile)) for v in noise], "_", ms=9,
-            color=MUTED, label="sampling floor",
+            np.array(ticks) / WIDE_PERIOD_NS,
+            [float(np.quantile(v, quantile)) for v in noise],
+            "_",
+            ms=9,
+            color=MUTED,
+            label="sampling floor",
         )
         ax.set(yscale="log", xlabel="$t_d / t_r$", ylim=(1e-6, 1.0))
         ax.set_title(words, loc="left")
     axes[0, 0].set_ylabel("total variation of the shape")
-    figure.legend(
-        *axes[0, 0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=3
-    )
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=3)
     return save_figure(path, figure)
 
 

@@ -78,9 +78,7 @@ def _words(cells: Sequence[Cell]) -> dict[str, str]:
     return {one.name: one.words for one in simulators(1, 0) if one.name in cells[0].scores}
 
 
-def _text(
-    settings: Settings, cells: list[Cell], findings: list[str], request: Request, spent: float
-) -> list[str]:
+def _text(settings: Settings, cells: list[Cell], findings: list[str], request: Request, spent: float) -> list[str]:
     flag = (" --quick" if request.quick else "") + f" --truth {request.truth}"
     grids = {
         f"grid {grid.name}": f"t_r = {grid.period_ns:.6g} ns, S x B = {len(grid.flux)} x {len(grid.flux)} {grid.words} "
@@ -97,16 +95,18 @@ def _text(
         "freedom but the grid, come closest on *near*, so the comparison with the paper is made there.",
         "## Configuration",
         f"Command: `python -m studies count-law{flag} --out DIR`",
-        configuration({
-            **grids,
-            "exposure": f"N_r = {settings.cycles}, armed start, delay t_r / 2",
-            "histogram and statistics grid of the chain": f"{settings.bins} bins",
-            "pulse": f"Gaussian, sigma = {settings.sigma_ns:g} ns",
-            "truth": f"engine `{request.truth}`, {settings.realizations} realizations a cell, seed {settings.seed}",
-            "floors": f"{settings.resamplings} samples of the exact law of that size in each cell",
-            "machine": machine(),
-            "run time": f"{spent:.0f} s",
-        }),
+        configuration(
+            {
+                **grids,
+                "exposure": f"N_r = {settings.cycles}, armed start, delay t_r / 2",
+                "histogram and statistics grid of the chain": f"{settings.bins} bins",
+                "pulse": f"Gaussian, sigma = {settings.sigma_ns:g} ns",
+                "truth": f"engine `{request.truth}`, {settings.realizations} realizations a cell, seed {settings.seed}",
+                "floors": f"{settings.resamplings} samples of the exact law of that size in each cell",
+                "machine": machine(),
+                "run time": f"{spent:.0f} s",
+            }
+        ),
         "- Wasserstein: first distance, in counts. KL: KL(simulation || law) in nats over the integers, the law "
         f"floored at {KL_FLOOR:g}. Mean and variance: absolute differences of the law's moments to the sample's. "
         "All averaged over the cells of a grid.\n"
@@ -117,7 +117,9 @@ def _text(
         "- Shape: total variation of the mean histogram to the simulated one; its floor comes from the scatter "
         "between blocks of realizations.",
         f"Known by sampling only ({settings.sampled} exposures a cell; the floors include their noise): "
-        f"{', '.join(sampled)}." if sampled else "",
+        f"{', '.join(sampled)}."
+        if sampled
+        else "",
         "## Result",
         "\n".join(findings),
         *[part for grid in settings.grids for part in _grid_text(_of(cells, grid.name), grid.name)],
@@ -136,7 +138,7 @@ def _text(
         "without noise. Marks: to the simulation, on the cells of *wide*.",
         "![A histogram before and after dead time](count_law_dead_time.png)",
         f"S = {HISTOGRAM[0]:g}, B = {HISTOGRAM[1]:g}, one exposure of {HISTOGRAM_CYCLES} cycles.",
-    ]  # fmt: skip
+    ]
 
 
 def _grid_text(cells: Sequence[Cell], grid: str) -> list[str]:
@@ -147,8 +149,7 @@ def _grid_text(cells: Sequence[Cell], grid: str) -> list[str]:
         noise = float(np.mean([c.scores[name].shape_floor for c in cells]))
         rows.append(_result_row(words, figures, floor) | {"shape": _beside(shape, noise)})
     rows += [
-        _result_row(f"_paper: {words}_", list(PAPER[key]), None) | {"shape": "-"}
-        for words, key in PAPER_ROWS.items()
+        _result_row(f"_paper: {words}_", list(PAPER[key]), None) | {"shape": "-"} for words, key in PAPER_ROWS.items()
     ]
     parts = [f"### Grid {grid}", "In brackets the sampling floor.", table(rows)]
     return parts + (["Beside the paper:", table(_judgement(cells))] if grid == "near" else [])
@@ -217,10 +218,16 @@ def _findings(cells: Sequence[Cell]) -> list[str]:
 
 def _csv_row(cell: Cell) -> Row:
     row: dict[str, object] = {
-        "grid": cell.grid, "period_ns": cell.period_ns, "signal": cell.signal, "background": cell.background,
-        "dead_time_ns": cell.dead_ns, "simulated_mean": cell.mean, "simulated_variance": cell.variance,
-        "exact_mean": float(cell.exact[0]), "exact_variance": float(cell.exact[1]),
-    }  # fmt: skip
+        "grid": cell.grid,
+        "period_ns": cell.period_ns,
+        "signal": cell.signal,
+        "background": cell.background,
+        "dead_time_ns": cell.dead_ns,
+        "simulated_mean": cell.mean,
+        "simulated_variance": cell.variance,
+        "exact_mean": float(cell.exact[0]),
+        "exact_variance": float(cell.exact[1]),
+    }
     floor = cell.scores["mars_exact"].floors.mean(0)
     row |= {f"floor_{key}": float(v) for key, v in zip(FIGURES, floor, strict=True)}
     row["floor_shape"] = cell.scores["mars_exact"].shape_floor

@@ -154,21 +154,15 @@ def compute(settings: Settings, rearm: Rearm, tell: Tell) -> list[Cell]:
     return cells
 
 
-def one_cell(
-    settings: Settings, signal: float, background: float, dead_periods: float, rearm: Rearm
-) -> Cell:
+def one_cell(settings: Settings, signal: float, background: float, dead_periods: float, rearm: Rearm) -> Cell:
     """A cell outside of the grids, at the period of the canonical system."""
     grid = Grid("single", PERIOD_NS, (signal,), (background,), _periods(dead_periods))
     system = settings.system(PERIOD_NS, grid.dead_ns[0])
     return _cell(settings, grid, system, signal, background, rearm)
 
 
-def _cell(
-    settings: Settings, grid: Grid, system: System, signal: float, background: float, rearm: Rearm
-) -> Cell:
-    full = holding_time_covariance(
-        signal, background, system, lags=CUTOFFS[-1], rearm=rearm, bins=settings.bins
-    )
+def _cell(settings: Settings, grid: Grid, system: System, signal: float, background: float, rearm: Rearm) -> Cell:
+    full = holding_time_covariance(signal, background, system, lags=CUTOFFS[-1], rearm=rearm, bins=settings.bins)
     terms = LeadingTerms.of(full)
     sums = {cutoff_name(c): terms.cutoff_sum(c) for c in CUTOFFS}
     sums[spectral_name()] = terms.spectral_sum(*SPECTRAL)

@@ -59,9 +59,14 @@ def _decay(path: Path, settings: Settings) -> Path:
         title="$t_d / t_r$", title_fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5)
     )
     axes[0, 0].annotate(
-        "filled: positive\nopen: negative", (0.97, 0.97), xycoords="axes fraction", ha="right", va="top",
-        fontsize=7, color=MUTED,
-    )  # fmt: skip
+        "filled: positive\nopen: negative",
+        (0.97, 0.97),
+        xycoords="axes fraction",
+        ha="right",
+        va="top",
+        fontsize=7,
+        color=MUTED,
+    )
     return save_figure(path, figure)
 
 
@@ -84,9 +89,14 @@ def _eigenvalues(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     axes[0, 0].set_ylabel(r"$|\lambda_k|$")
     axes[0, -1].legend(frameon=False, loc="upper right")
     axes[0, 0].annotate(
-        "0.7", (0.97, 0.7), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7,
+        "0.7",
+        (0.97, 0.7),
+        xycoords=("axes fraction", "data"),
+        ha="right",
+        va="bottom",
+        fontsize=7,
         color=MUTED,
-    )  # fmt: skip
+    )
     return save_figure(path, figure)
 
 
@@ -94,9 +104,7 @@ def _truncation(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     """Mean absolute error of the sum against the fixed cut-off, with the other rules as levels."""
     figure, axes = panels(2.7, 1, len(settings.grids), sharey=True)
     levels = [(spectral_name(), COLOURS[1], "-")]
-    levels += [
-        (automatic_name(t), c, "--") for t, c in zip(TOLERANCES, (COLOURS[2], COLOURS[3]), strict=True)
-    ]
+    levels += [(automatic_name(t), c, "--") for t, c in zip(TOLERANCES, (COLOURS[2], COLOURS[3]), strict=True)]
     for ax, grid in zip(axes[0], settings.grids, strict=True):
         here = [cell for cell in cells if cell.grid is grid]
         error = [np.mean([abs(cell.error(cutoff_name(c))) for cell in here]) for c in CUTOFFS]
@@ -126,10 +134,12 @@ def _map(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     norm, mesh = LogNorm(1e-6, 1.0), None
     for row, rule in zip(axes, rules, strict=True):
         for ax, dead_ns in zip(row, dead, strict=True):
-            error = np.array([
-                [_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.signal]
-                for b in grid.background
-            ])  # fmt: skip
+            error = np.array(
+                [
+                    [_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.signal]
+                    for b in grid.background
+                ]
+            )
             mesh = heat(ax, grid.signal, grid.background, np.abs(error), norm)
     for ax, dead_ns in zip(axes[0], dead, strict=True):
         ax.set_title(f"$t_d$ = {dead_ns / grid.period_ns:g} $t_r$", fontsize=7)

@@ -67,17 +67,19 @@ def findings(settings: Settings, cells: list[Cell], checks: list[DenseCheck]) ->
         f"{100 * worst.relative_error(spectral):+.2g} % ({worst.name()}). "
         f"{_verdict(off[int(0.95 * len(off))] < 2e-4, 'usually within 0.02 %')}. "
         f"{_verdict(off[-1] < 0.014, 'never worse than 1.4 %')}.",
-    ]  # fmt: skip
+    ]
     signal, background, dead = _HARD
     for rearm in ("centre", "edge"):
         cell = one_cell(settings, signal, background, dead, "centre" if rearm == "centre" else "edge")
-        told = [f"{words} {100 * cell.relative_error(r):+.3g} %" for words, r in
-                (("no covariance", cutoff_name(0)), ("20 lags", cut20), ("spectral", spectral))]  # fmt: skip
+        told = [
+            f"{words} {100 * cell.relative_error(r):+.3g} %"
+            for words, r in (("no covariance", cutoff_name(0)), ("20 lags", cut20), ("spectral", spectral))
+        ]
         lines.append(
             f"- Noted before for S = {signal:g}, B = {background:g}, t_d = t_r: no covariance +417 %, 20 "
             "lags +23 %, spectral -1.4 %. "
             f"Here, re-arming at the bin {rearm}: {', '.join(told)}."
-        )  # fmt: skip
+        )
     poisson = [c for c in cells if c.dead_ns == 0.0]
     if poisson:
         # without dead time N is Poisson: sigma^2 = mu^2 = (t_r / Lambda)^2
@@ -92,7 +94,7 @@ def findings(settings: Settings, cells: list[Cell], checks: list[DenseCheck]) ->
             f"rule adds {100 * far.relative_error(spectral):+.2g} %. Noted before: centre re-arming is right "
             "to 0.1 % from 512 bins on; "
             f"{_verdict(abs(bias[far]) < 1e-3, 'right to 0.1 %')}."
-        )  # fmt: skip
+        )
     failed = [c for c in checks if not abs(c.inverse) < 0.01]
     lines.append(
         f"- Left eigenvectors as rows of $V^{{-1}}$ spoil sigma² by more than 1 % in {len(failed)} of "

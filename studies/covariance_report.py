@@ -53,9 +53,7 @@ def run(request: Request) -> list[Path]:
     found = findings(settings, centre, checks)
     for line in found:
         request.tell(line)
-    text = save_text(
-        request.out / "covariance.md", _text(settings, centre, edge, checks, found, request.quick)
-    )
+    text = save_text(request.out / "covariance.md", _text(settings, centre, edge, checks, found, request.quick))
     return [text, *figures, save_csv(request.out / "covariance.csv", [_csv_row(c) for c in (*centre, *edge)])]
 
 
@@ -106,22 +104,26 @@ def _text(
         "arXiv 2512.04924.",
         "## Configuration",
         f"Command: `python -m studies covariance{' --quick' if quick else ''} --out DIR`",
-        configuration({
-            "statistics grid": f"{settings.bins} bins per period in every cell",
-            "pulse": f"Gaussian, sigma = {settings.sigma_ns:g} ns; delay t_r / 2",
-            "seed": f"{settings.seed} (draws the cells of the dense check only; nothing else is random)",
-            "cells computed": f"{len(centre)} of {wanted}, each with re-arming at bin centre and at bin edge",
-            "cells skipped": wanted - len(centre) + wanted - len(edge),
-        }),
+        configuration(
+            {
+                "statistics grid": f"{settings.bins} bins per period in every cell",
+                "pulse": f"Gaussian, sigma = {settings.sigma_ns:g} ns; delay t_r / 2",
+                "seed": f"{settings.seed} (draws the cells of the dense check only; nothing else is random)",
+                "cells computed": f"{len(centre)} of {wanted}, each with re-arming at bin centre and at bin edge",
+                "cells skipped": wanted - len(centre) + wanted - len(edge),
+            }
+        ),
         table(grids),
         "A dead time of whole periods more changes neither the chain nor any covariance: the column 0 stands "
         "for "
         "$t_d = t_r, 2 t_r, \\dots$ as well.",
         "## Result beside the paper",
-        table([_against_paper(settings, grid.name, _on(centre, grid)) for grid in settings.grids]
-              + [_against_paper(settings, "all", centre)]
-              + [_against_paper(settings, "all, edge re-arming", edge)]
-              + [_paper_row(_against_paper(settings, "", centre))]),
+        table(
+            [_against_paper(settings, grid.name, _on(centre, grid)) for grid in settings.grids]
+            + [_against_paper(settings, "all", centre)]
+            + [_against_paper(settings, "all, edge re-arming", edge)]
+            + [_paper_row(_against_paper(settings, "", centre))]
+        ),
         "Mean absolute error of $\\sum_l \\gamma_l$. The paper states neither the unit nor the grid of its "
         "two figures, so "
         "they cannot be compared in size; the ratio has no unit and can. Errors are given in ns² and in "
@@ -159,7 +161,7 @@ def _text(
         "sums are relative to $\\sigma^2$. The last columns use rows of $V^{-1}$ as left eigenvectors "
         "instead of LAPACK's.",
         table([_check_row(check) for check in checks]),
-    ]  # fmt: skip
+    ]
 
 
 def _is_log(grid: Grid) -> bool:

@@ -189,8 +189,6 @@ def of_figure(outcomes: Sequence[Outcome], figure: str) -> list[Outcome]:
 
 
 def _settings(system: System, exposures: int) -> dict[str, Any]:
-    told = {
-        field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"
-    }
+    told = {field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"}
     flux = {"signal S": SIGNAL, "background B": BACKGROUND, "delay_ns": DELAY_NS}
     return told | flux | {"dead_time_ns": DEAD_NS, "exposures": exposures, "engine": "exact", "seed": SEED}

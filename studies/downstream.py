@@ -136,14 +136,19 @@ def train_and_test(one: Run, config: Config, data: Data, folder: Path, tell: Tel
         network,
         examples(training, data.training, target, config),
         examples(validation, data.validation, target, config),
-        folder, plan, about=asdict(one), tell=tell,
-    )  # fmt: skip
+        folder,
+        plan,
+        about=asdict(one),
+        tell=tell,
+    )
     gold = data.gold(one.sbr)
     own_maps, gold_maps = predict(network, test, plan.scale), predict(network, gold[0], plan.scale)
     result: dict[str, Any] = {
-        "run": asdict(one), "training": asdict(fitted),
-        "own": errors(own_maps, data.test, target, config), "gold": errors(gold_maps, data.test, target, config),
-    }  # fmt: skip
+        "run": asdict(one),
+        "training": asdict(fitted),
+        "own": errors(own_maps, data.test, target, config),
+        "gold": errors(gold_maps, data.test, target, config),
+    }
     if data.measured:
         maps = predict(network, gold[1], plan.scale)
         result["measured"] = {
@@ -173,10 +178,14 @@ def by_arm(found: Mapping[Run, Any]) -> Iterator[tuple[str, float, dict[str, lis
     """Results by arm and ratio: of each target, one for each seed."""
     keys = dict.fromkeys((one.sbr, one.arm) for one in found)
     for sbr, arm in keys:
-        yield arm, sbr, {
-            target: [r for one, r in found.items() if (one.sbr, one.arm, one.target) == (sbr, arm, target)]
-            for target in TARGETS
-        }
+        yield (
+            arm,
+            sbr,
+            {
+                target: [r for one, r in found.items() if (one.sbr, one.arm, one.target) == (sbr, arm, target)]
+                for target in TARGETS
+            },
+        )
 
 
 def _write(path: Path, text: str) -> None:

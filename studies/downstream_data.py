@@ -23,9 +23,13 @@ SYSTEM = System(  # that of the neural map which comes with the package
     period_ns=1e3 / 7.5, cycles=1000, bins=1024, pulse=GaussianPulse(sigma_ns=0.5), detector=Detector(dead_time_ns=75.0)
 )
 WORDS = {
-    "poisson": "Poisson", "renewal": "renewal", "neural": "neural, stand-in", "nearest": "MaRS, nearest grid point",
-    "mars": "MaRS, ours", "exact": "exact",
-}  # fmt: skip
+    "poisson": "Poisson",
+    "renewal": "renewal",
+    "neural": "neural, stand-in",
+    "nearest": "MaRS, nearest grid point",
+    "mars": "MaRS, ours",
+    "exact": "exact",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,24 +71,67 @@ class Config:
 
 _ONE, _THREE = (0,), (0, 1, 2)
 _ARMS: dict[str, tuple[int, ...]] = {
-    "poisson": _ONE, "renewal": _ONE, "neural": _ONE, "nearest": _ONE, "mars": _THREE, "exact": _THREE
-}  # fmt: skip
+    "poisson": _ONE,
+    "renewal": _ONE,
+    "neural": _ONE,
+    "nearest": _ONE,
+    "mars": _THREE,
+    "exact": _THREE,
+}
 CONFIGS = {
     "small": Config(
-        name="small", sbr=(1.0,), arms=_ARMS, train=(1000, 40), validation=(2000, 6), test=(3000, 8), size=64,
-        render=160, steps=1000, batch=4, every=100, patience=4, stem=64, widths=(32, 64, 96), blocks=1,
+        name="small",
+        sbr=(1.0,),
+        arms=_ARMS,
+        train=(1000, 40),
+        validation=(2000, 6),
+        test=(3000, 8),
+        size=64,
+        render=160,
+        steps=1000,
+        batch=4,
+        every=100,
+        patience=4,
+        stem=64,
+        widths=(32, 64, 96),
+        blocks=1,
     ),
     "full": Config(
-        name="full", sbr=(0.6, 1.0), arms=dict.fromkeys(_ARMS, _THREE), train=(1000, 400), validation=(2000, 40),
-        test=(3000, 40), size=64, render=160, steps=40_000, batch=16, every=500, patience=10, stem=128,
-        widths=(64, 128, 256, 256), blocks=2,
+        name="full",
+        sbr=(0.6, 1.0),
+        arms=dict.fromkeys(_ARMS, _THREE),
+        train=(1000, 400),
+        validation=(2000, 40),
+        test=(3000, 40),
+        size=64,
+        render=160,
+        steps=40_000,
+        batch=16,
+        every=500,
+        patience=10,
+        stem=128,
+        widths=(64, 128, 256, 256),
+        blocks=2,
     ),
     "tiny": Config(
-        name="tiny", sbr=(1.0,), arms={"poisson": _ONE, "neural": _ONE, "nearest": _ONE, "mars": (0, 1)},
-        train=(1000, 3), validation=(2000, 1), test=(3000, 2), size=16, render=32, steps=6, batch=2, every=3,
-        patience=5, stem=8, widths=(8, 16), blocks=1, table=(10, 8),
+        name="tiny",
+        sbr=(1.0,),
+        arms={"poisson": _ONE, "neural": _ONE, "nearest": _ONE, "mars": (0, 1)},
+        train=(1000, 3),
+        validation=(2000, 1),
+        test=(3000, 2),
+        size=16,
+        render=32,
+        steps=6,
+        batch=2,
+        every=3,
+        patience=5,
+        stem=8,
+        widths=(8, 16),
+        blocks=1,
+        table=(10, 8),
     ),
-}  # fmt: skip
+}
 
 
 def crop(number: int, config: Config) -> Scene:
@@ -103,9 +150,7 @@ def rgbd_scenes(folder: Path, config: Config) -> dict[str, Scene]:
     """Measured scenes that are there, at the size of the crops: their middle."""
     found: dict[str, Callable[[], Scene]] = {
         "Art (Middlebury 2005)": partial(Scene.from_rgbd, folder / "middlebury_art"),
-        "NYUv2 frame 1": partial(
-            Scene.from_rgbd, folder / "nyuv2_00001_depth.png", folder / "nyuv2_00001_colors.png"
-        ),
+        "NYUv2 frame 1": partial(Scene.from_rgbd, folder / "nyuv2_00001_depth.png", folder / "nyuv2_00001_colors.png"),
     }
     present = {"Art (Middlebury 2005)": "middlebury_art", "NYUv2 frame 1": "nyuv2_00001_depth.png"}
     scenes = {}

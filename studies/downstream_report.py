@@ -54,24 +54,29 @@ def _text(
         f"tested on that simulator's own data and on the gold standard, engine `{config.gold}`. Train, validation and "
         "test scenes are disjoint.",
         "## Configuration",
-        configuration({
-            "command": f"`python -m studies downstream --config {config.name} --out DIR`",
-            "system": f"t_r = {SYSTEM.period_ns:.6g} ns, N_r = {SYSTEM.cycles}, {SYSTEM.bins} bins, Gaussian pulse of "
-            f"sigma = 0.5 ns, t_d = {SYSTEM.detector.dead_time_ns:g} ns, armed start",
-            "flux": f"S = {config.photons:g} x reflectivity photons per period; B uniform, by the ratio of the means",
-            "scenes": f"{config.train[1]} to train, {config.validation[1]} to validate, {config.test[1]} to test: "
-            f"crops of {config.size} x {config.size} of rooms of {config.render} x {config.render}, depths scaled by "
-            f"{config.depth_scale[0]:g} to {config.depth_scale[1]:g}; one exposure of each; flips as augmentation",
-            "input": f"all {SYSTEM.bins} bins; sqrt(counts / {config.plan(0).scale:g}) for every pixel and simulator",
-            "network": f"`CubeUNet`, stem {config.stem}, levels {config.widths}, {config.blocks} block(s) a level",
-            "training": f"L1, AdamW, at most {config.steps} steps of {config.batch}; stops after {config.patience} "
-            f"validations, {config.every} steps each, without improvement ({stopped} of {len(found)} did so); the best "
-            "validation's weights are tested",
-            "PSNR": f"range 1 for reflectivity, {config.depth_range_m:g} m for depth",
-            "tables": f"{config.table[0]} x {config.table[1]} points on [0.01, 10] photons per period",
-            "machine": machine(),
-            "training time": f"{seconds / 60:.0f} minutes in all",
-        }),
+        configuration(
+            {
+                "command": f"`python -m studies downstream --config {config.name} --out DIR`",
+                "system": f"t_r = {SYSTEM.period_ns:.6g} ns, N_r = {SYSTEM.cycles}, {SYSTEM.bins} bins, Gaussian pulse "
+                f"of sigma = 0.5 ns, t_d = {SYSTEM.detector.dead_time_ns:g} ns, armed start",
+                "flux": f"S = {config.photons:g} x reflectivity photons per period; B uniform, by the ratio of the "
+                f"means",
+                "scenes": f"{config.train[1]} to train, {config.validation[1]} to validate, {config.test[1]} to test: "
+                f"crops of {config.size} x {config.size} of rooms of {config.render} x {config.render}, depths scaled "
+                f"by {config.depth_scale[0]:g} to {config.depth_scale[1]:g}; one exposure of each; flips as "
+                f"augmentation",
+                "input": f"all {SYSTEM.bins} bins; sqrt(counts / {config.plan(0).scale:g}) for every pixel and "
+                f"simulator",
+                "network": f"`CubeUNet`, stem {config.stem}, levels {config.widths}, {config.blocks} block(s) a level",
+                "training": f"L1, AdamW, at most {config.steps} steps of {config.batch}; stops after {config.patience} "
+                f"validations, {config.every} steps each, without improvement ({stopped} of {len(found)} did so); the "
+                "best validation's weights are tested",
+                "PSNR": f"range 1 for reflectivity, {config.depth_range_m:g} m for depth",
+                "tables": f"{config.table[0]} x {config.table[1]} points on [0.01, 10] photons per period",
+                "machine": machine(),
+                "training time": f"{seconds / 60:.0f} minutes in all",
+            }
+        ),
         "## Result",
         "Reflectivity PSNR (dB) / depth RMSE (m), mean over the seeds, with the standard deviation between seeds where "
         "there are several.",
@@ -89,7 +94,7 @@ def _text(
         "## Pictures",
         *[f"![Reconstructions]({path.name})" for path in pictures],
         "The first test scene, seed 0 of each simulator.",
-    ]  # fmt: skip
+    ]
 
 
 def _values(results: list[Any], data: str, measure: str) -> list[float]:
@@ -192,8 +197,11 @@ def _measured(found: Mapping[Run, Any]) -> list[str]:
             rows.append(
                 {"SBR": f"{sbr:g}", "trained on": WORDS[arm], "scene": name, "PSNR, dB": pair[0], "RMSE, m": pair[1]}
             )
-    return ["### Measured scenes, gold-standard data", "Depth and image of a kind that no network was trained on.",
-            table(rows)]  # fmt: skip
+    return [
+        "### Measured scenes, gold-standard data",
+        "Depth and image of a kind that no network was trained on.",
+        table(rows),
+    ]
 
 
 def _csv_row(one: Run, result: Any) -> Row:

@@ -100,9 +100,13 @@ def constant_light(exposures: int) -> list[dict[str, Any]]:
     detector, lines = Detector.preset("excelitas-spcm-aqrh"), []
     for rate in (1e5, 1e6, 1e7, 3e7, 1e8):
         system = System(
-            period_ns=100.0, cycles=2000, bins=2, pulse=GaussianPulse(sigma_ns=1.0), detector=detector,
+            period_ns=100.0,
+            cycles=2000,
+            bins=2,
+            pulse=GaussianPulse(sigma_ns=1.0),
+            detector=detector,
             start="stationary",
-        )  # fmt: skip
+        )
         flux = Flux(np.zeros((1, exposures)), rate * 1e-9 * system.period_ns, 0.0)
         found = simulate(flux, system, seed=SEED).sum(-1).ravel() / (system.exposure_ns * 1e-9)
         error = float(found.std(ddof=1)) / found.size**0.5

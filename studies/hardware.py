@@ -49,10 +49,21 @@ class Settings:
 
 FULL = Settings()
 QUICK = Settings(
-    cycles=500, realizations=300, swept_cycles=200, swept_realizations=200, fault_cycles=500, fault_realizations=200,
-    replicates=8, replicate_cycles=4000, fluxes=(0.5,), signals=(0.1, 3.0), delays=(0.2,), alarms=2, sensed=1,
+    cycles=500,
+    realizations=300,
+    swept_cycles=200,
+    swept_realizations=200,
+    fault_cycles=500,
+    fault_realizations=200,
+    replicates=8,
+    replicate_cycles=4000,
+    fluxes=(0.5,),
+    signals=(0.1, 3.0),
+    delays=(0.2,),
+    alarms=2,
+    sensed=1,
     mismatched=4,
-)  # fmt: skip
+)
 
 PIXELS = {"bright": (0.8, 0.1), "dark": (0.25, 0.1)}  # the paper's S and B are not known
 
@@ -113,9 +124,12 @@ class Spread:
 def system_of(cycles: int, detector: Detector | None = None) -> System:
     """The paper's laser and detector, started ready as a recording is."""
     return System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=BINS, pulse=GaussianPulse(sigma_ns=SIGMA_NS),
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=BINS,
+        pulse=GaussianPulse(sigma_ns=SIGMA_NS),
         detector=Detector(dead_time_ns=DEAD_NS) if detector is None else detector,
-    )  # fmt: skip
+    )
 
 
 def recorded(times: Timestamps) -> Timestamps:

@@ -73,7 +73,10 @@ def alarms(settings: Settings, tell: Tell) -> list[Alarms]:
 def alarm_row(one: Alarms) -> Row:
     """Of the table."""
     return {
-        "calibrated with": one.way, "streams": one.streams, "refused": one.refused,
-        "p of as many": f"{one.p:.2f}", "TV / floor": one.ratio,
+        "calibrated with": one.way,
+        "streams": one.streams,
+        "refused": one.refused,
+        "p of as many": f"{one.p:.2f}",
+        "TV / floor": one.ratio,
         "by": "; ".join(f"{name} ({times})" for name, times in sorted(one.by.items())) or "-",
-    }  # fmt: skip
+    }

@@ -16,16 +16,18 @@ def example_parts(found: Example | None, settings: Settings, figures: Sequence[P
     told = ", ".join(f"{name} {value:.4g} ns" for name, value in found.told.items())
     rows = [
         {
-            "calibration": name, "dead time (ns)": case.calibration.dead_time_ns,
+            "calibration": name,
+            "dead time (ns)": case.calibration.dead_time_ns,
             "Lambda": f"{case.calibration.total:.3f} ± {case.calibration.total_error:.3f}",
             "by Rapp": f"{case.calibration.rapp.total:.3f} ± {case.calibration.rapp.total_error:.3f}",
-            "photons used": case.calibration.armed.used, "TV": case.total_variation,
+            "photons used": case.calibration.armed.used,
+            "TV": case.total_variation,
             "floor": case.total_variation_floor[0],
             "failed": "; ".join(check.name for check in case.failed) or "-",
             "verdict": "fits" if case.consistent else "does not fit",
         }
         for name, case in found.cases
-    ]  # fmt: skip
+    ]
     first = found.cases[0][1].calibration
     return [
         "## A measured stream",
@@ -52,8 +54,10 @@ def _example_limits(found: Example, settings: Settings) -> list[str]:
         refused = "refused" if not gaussian[0].consistent else "not refused, for lack of photons"
         lines.append(f"- A Gaussian pulse is {refused}.")
     if free:
-        trace = "is seen in the recovery" if any(case.recovery.findings() for case in free) else (
-            "leaves no trace in the recovery of so few photons"
+        trace = (
+            "is seen in the recovery"
+            if any(case.recovery.findings() for case in free)
+            else ("leaves no trace in the recovery of so few photons")
         )
         agrees = "agrees" if all(case.consistent for case in free) else "does not agree"
         lines.append(

@@ -38,9 +38,13 @@ def mismatch_parts(
 def _weak_row(one: Sensitivity) -> Row:
     by = sorted(one.by.items(), key=lambda item: -item[1])
     return {
-        "detector": one.name, "B": f"{one.background:g}", "streams": one.streams, "refused": one.refused,
-        "B is off": f"{one.score:+.1f}", "by": "; ".join(f"{name} ({times})" for name, times in by) or "-",
-    }  # fmt: skip
+        "detector": one.name,
+        "B": f"{one.background:g}",
+        "streams": one.streams,
+        "refused": one.refused,
+        "B is off": f"{one.score:+.1f}",
+        "by": "; ".join(f"{name} ({times})" for name, times in by) or "-",
+    }
 
 
 def _fault_row(one: Mismatch, case: Case) -> Row:
@@ -49,11 +53,18 @@ def _fault_row(one: Mismatch, case: Case) -> Row:
     told = [check.name for check in found.failed]
     told += ["short intervals"] * found.too_short
     return {
-        "detector": one.name, "dead time (ns)": light.dead_time_ns, "S": light.signal, "B": light.background,
-        "true B": case.truth[1], "z S": f"{case.scores[0]:+.1f}", "z B": f"{case.scores[1]:+.1f}",
-        "TV / floor": case.ratio, "verdict": case.verdict,
-        "predicted by": found.prediction.words, "failed": "; ".join(told) or "-",
-    }  # fmt: skip
+        "detector": one.name,
+        "dead time (ns)": light.dead_time_ns,
+        "S": light.signal,
+        "B": light.background,
+        "true B": case.truth[1],
+        "z S": f"{case.scores[0]:+.1f}",
+        "z B": f"{case.scores[1]:+.1f}",
+        "TV / floor": case.ratio,
+        "verdict": case.verdict,
+        "predicted by": found.prediction.words,
+        "failed": "; ".join(told) or "-",
+    }
 
 
 def _fault_finding(faults: Sequence[tuple[Mismatch, Case]]) -> str:

@@ -107,9 +107,7 @@ def mismatches(settings: Settings, tell: Tell) -> list[tuple[Mismatch, Case]]:
         else:
             known = GaussianPulse(sigma_ns=SIGMA_NS) if one.known_pulse else None
             fitted = calibrate(times, pulse=known, dead_time_ns=one.assumed_ns, hold_off_ns=one.hold_off_ns)
-        found = validate(
-            times, fitted, cycles=settings.fault_cycles, detector=one.detector if one.told else None
-        )
+        found = validate(times, fitted, cycles=settings.fault_cycles, detector=one.detector if one.told else None)
         cases.append((one, Case(one.name, (signal, background, DELAY_NS), found)))
     return cases
 

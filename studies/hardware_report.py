@@ -174,10 +174,16 @@ def _sweep_row(case: Case) -> Row:
         f"{s:.4f} at {tau:.3f} ns" for s, tau in zip(light.returns_signal, light.returns_delay_ns, strict=True)
     )
     return {
-        "stream": case.name, "calibrated S": returns, "z S": z[0], "z B": z[1], "z delay": z[2],
-        "TV / floor": case.ratio, "99 %": found.total_variation_floor[1] / found.total_variation_floor[0],
-        "histogram TV / floor": found.shape_variation / found.shape_floor, "verdict": case.verdict,
-    }  # fmt: skip
+        "stream": case.name,
+        "calibrated S": returns,
+        "z S": z[0],
+        "z B": z[1],
+        "z delay": z[2],
+        "TV / floor": case.ratio,
+        "99 %": found.total_variation_floor[1] / found.total_variation_floor[0],
+        "histogram TV / floor": found.shape_variation / found.shape_floor,
+        "verdict": case.verdict,
+    }
 
 
 def _sweep_finding(cases: Sequence[Case]) -> str:
@@ -201,17 +207,30 @@ def _csv_row(case: Case) -> Row:
     light = found.calibration
     signal, background, delay = case.truth
     return {
-        "stream": case.name, "true_signal": signal, "true_background": background, "true_delay_ns": delay,
-        "registrations": light.summary.registrations, "realizations": found.realizations, "cycles": found.system.cycles,
-        "signal": light.signal, "background": light.background, "delay_ns": light.delay_ns,
-        "dead_time_ns": light.dead_time_ns, "hold_off_ns": light.hold_off_ns,
-        "signal_error": light.errors.get("signal", float("nan")), "background_error": light.errors["background"],
-        "rapp_total": light.rapp.total, "count_tv": found.total_variation,
+        "stream": case.name,
+        "true_signal": signal,
+        "true_background": background,
+        "true_delay_ns": delay,
+        "registrations": light.summary.registrations,
+        "realizations": found.realizations,
+        "cycles": found.system.cycles,
+        "signal": light.signal,
+        "background": light.background,
+        "delay_ns": light.delay_ns,
+        "dead_time_ns": light.dead_time_ns,
+        "hold_off_ns": light.hold_off_ns,
+        "signal_error": light.errors.get("signal", float("nan")),
+        "background_error": light.errors["background"],
+        "rapp_total": light.rapp.total,
+        "count_tv": found.total_variation,
         "count_tv_floor": found.total_variation_floor[0],
-        "count_kl": found.kl, "count_kl_floor": found.kl_floor[0], "histogram_tv": found.shape_variation,
-        "histogram_tv_floor": found.shape_floor, **{f"p_{check.name}": check.p for check in found.checks},
+        "count_kl": found.kl,
+        "count_kl_floor": found.kl_floor[0],
+        "histogram_tv": found.shape_variation,
+        "histogram_tv_floor": found.shape_floor,
+        **{f"p_{check.name}": check.p for check in found.checks},
         "consistent": found.consistent,
-    }  # fmt: skip
+    }
 
 
 def _image(path: Path) -> str:

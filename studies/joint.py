@@ -89,11 +89,15 @@ def random_systems(settings: Settings) -> list[Case]:
             dead = min(whole - side * 10 ** random.uniform(-3, -1), 4.0)
         found.append(
             Case(
-                f"r{k:02d}", float(signal), float(background), float(dead),
-                delay=float(random.uniform()), sigma=float(10 ** random.uniform(-2.7, -1.5)),
+                f"r{k:02d}",
+                float(signal),
+                float(background),
+                float(dead),
+                delay=float(random.uniform()),
+                sigma=float(10 ** random.uniform(-2.7, -1.5)),
                 cycles=int(np.exp(random.uniform(*np.log([1e3, 2e4])))),
             )
-        )  # fmt: skip
+        )
     return found
 
 

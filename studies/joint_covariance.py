@@ -120,9 +120,14 @@ def second_look(o: Outcome, settings: Settings) -> float | None:
 
 
 def _compare(
-    k: int, signal: float, background: float, delay: float, system: System, settings: Settings,
+    k: int,
+    signal: float,
+    background: float,
+    delay: float,
+    system: System,
+    settings: Settings,
     weights: int | None = None,
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """System number `k`; `weights` is the seed of the random weights, by default that of the settings."""
     random = np.random.default_rng([settings.seed if weights is None else weights, k])
     law = joint_law(signal, background, system, delay_ns=delay * PERIOD_NS, tolerance=TOLERANCE)
@@ -148,7 +153,10 @@ def _compare(
     return Outcome(
         name=str(k),
         settings={
-            "S": signal, "B": background, "t_d": system.dead_time_periods, "cycles": float(system.cycles),
+            "S": signal,
+            "B": background,
+            "t_d": system.dead_time_periods,
+            "cycles": float(system.cycles),
             "sigma": system.pulse.sigma_ns / PERIOD_NS,  # type: ignore[attr-defined]
             "start": system.start,
         },
@@ -160,7 +168,7 @@ def _compare(
         lags=np.asarray((product[:, pairs].mean(0) - law.lag(1)[pairs]) / error),
         lag_index=np.flatnonzero(pairs),
         inputs=(signal, background, delay, system),
-    )  # fmt: skip
+    )
 
 
 def variance_scores(x: FloatArray, variance: FloatArray) -> FloatArray:
@@ -215,11 +223,14 @@ def reference_case(path: Path) -> Outcome:
         ),
         lag_index=np.flatnonzero(pairs),
         leading={
-            "count": law.count_variance, "count simulated": float(case["count_var"]),
-            "count leading": leading(law, np.ones(bins)), "window": variance,
-            "window simulated": float(case["win_var"]), "window leading": leading(wide, window),
+            "count": law.count_variance,
+            "count simulated": float(case["count_var"]),
+            "count leading": leading(law, np.ones(bins)),
+            "window": variance,
+            "window simulated": float(case["win_var"]),
+            "window leading": leading(wide, window),
         },
-    )  # fmt: skip
+    )
 
 
 def _excess(count: dict[str, int]) -> float:

@@ -32,9 +32,13 @@ from studies.joint_covariance import (
 from studies.report import Row, configuration, save_csv, save_figure, save_text, table
 
 _SINGLE = (
-    "count, mean", "count, variance", "window, mean", "window, variance", "random weights, mean",
+    "count, mean",
+    "count, variance",
+    "window, mean",
+    "window, variance",
+    "random weights, mean",
     "random weights, variance",
-)  # fmt: skip
+)
 _WORST = 10  # systems listed
 
 
@@ -75,15 +79,17 @@ def _text(
         "[joint_law.md](../joint_law.md).",
         "## Configuration",
         f"Command: `python -m studies joint-covariance{' --quick' if quick else ''} --data DIR --out DIR`",
-        configuration({
-            "random systems": f"{settings.systems}: S 0.01-10, B 0.001-10, t_d 0.02-4 periods (a third within 0.1 of "
-            f"a whole period), sigma 0.002-0.03 periods, {low:g}-{high:g} cycles, all log-uniform, delays uniform, "
-            f"armed and stationary start by turns, {settings.bins} bins",
-            "simulation": f"exact engine, {settings.exposures} exposures a system, seed {settings.seed}",
-            "law": f"tolerance {TOLERANCE:g}",
-            "left out": f"numbers that differ from their usual value in fewer than {OFTEN} exposures (variance x "
-            "exposures)",
-        }),
+        configuration(
+            {
+                "random systems": f"{settings.systems}: S 0.01-10, B 0.001-10, t_d 0.02-4 periods (a third within 0.1 "
+                f"of a whole period), sigma 0.002-0.03 periods, {low:g}-{high:g} cycles, all log-uniform, delays "
+                f"uniform, armed and stationary start by turns, {settings.bins} bins",
+                "simulation": f"exact engine, {settings.exposures} exposures a system, seed {settings.seed}",
+                "law": f"tolerance {TOLERANCE:g}",
+                "left out": f"numbers that differ from their usual value in fewer than {OFTEN} exposures (variance x "
+                "exposures)",
+            }
+        ),
         "## Random systems",
         table([_law_row(name, z) for name, z in scores.items()]),
         "One number from each system, so that the rows of z are independent: KS is the Kolmogorov-Smirnov test "
@@ -103,7 +109,7 @@ def _text(
         "and that of a multinomial histogram with the exact law of the count. Middle: correlations, closed form "
         "(upper triangle) and simulation (lower): bins within one dead time repel, and more so around the pulse. "
         "Right: quantiles of the z of the random systems.",
-    ]  # fmt: skip
+    ]
 
 
 def _reference_text(cases: list[Outcome]) -> list[str]:
@@ -141,10 +147,14 @@ def _worst_row(o: Outcome, again: float | None) -> Row:
     given = {k: v if isinstance(v, str) else f"{v:.4g}" for k, v in o.settings.items()}
     numbers = len(o.single) + o.bins.size + o.lags.size
     return {
-        "system": o.name, **given, "z": f"{o.scores()[what]:+.2f}" if numbers else "", "of": what, "among": numbers,
+        "system": o.name,
+        **given,
+        "z": f"{o.scores()[what]:+.2f}" if numbers else "",
+        "of": what,
+        "among": numbers,
         "p, Bonferroni": f"{min(1.0, 2 * numbers * stats.norm.sf(z)):.2g}",
         "again": "" if again is None else f"{again:+.2f}",
-    }  # fmt: skip
+    }
 
 
 def _reference_row(o: Outcome) -> Row:
@@ -169,13 +179,22 @@ def _row(o: Outcome) -> Row:
     given = {k: o.settings.get(k, "") for k in ("S", "B", "t_d", "cycles", "sigma", "start")}
     worst, what = o.worst()
     return {
-        "name": o.name, **given, "count_mean": o.law.count_mean, "count_variance": o.law.count_variance,
+        "name": o.name,
+        **given,
+        "count_mean": o.law.count_mean,
+        "count_variance": o.law.count_variance,
         **{"z_" + name.replace(", ", "_").replace(" ", "_"): o.single.get(name, "") for name in _SINGLE},
-        "bins": o.bins.size, "rms_z_bins": float(np.sqrt(np.mean(o.bins**2))) if o.bins.size else "",
-        "lags": o.lags.size, "rms_z_lags": float(np.sqrt(np.mean(o.lags**2))) if o.lags.size else "",
-        "worst_z": worst, "worst_of": what, "grid_bins": o.law.grid_bins, "movement": o.law.movement,
-        "sweeps": o.law.sweeps, "settled": o.law.settled,
-    }  # fmt: skip
+        "bins": o.bins.size,
+        "rms_z_bins": float(np.sqrt(np.mean(o.bins**2))) if o.bins.size else "",
+        "lags": o.lags.size,
+        "rms_z_lags": float(np.sqrt(np.mean(o.lags**2))) if o.lags.size else "",
+        "worst_z": worst,
+        "worst_of": what,
+        "grid_bins": o.law.grid_bins,
+        "movement": o.law.movement,
+        "sweeps": o.law.sweeps,
+        "settled": o.law.settled,
+    }
 
 
 def _figure(path: Path, scores: dict[str, FloatArray], exposures: int) -> Path:
@@ -213,14 +232,14 @@ def _correlations(figure: Any, ax: Any, law: FloatArray, sample: FloatArray) -> 
 
 def _quantiles(ax: Any, scores: dict[str, FloatArray]) -> None:
     named = {
-        "count variance": "count, variance", "window variance": "window, variance",
-        "bin variance": "variance of a bin at random", "lag 1": "lag-1 covariance at random",
-    }  # fmt: skip
+        "count variance": "count, variance",
+        "window variance": "window, variance",
+        "bin variance": "variance of a bin at random",
+        "lag 1": "lag-1 covariance at random",
+    }
     ax.plot([-3.3, 3.3], [-3.3, 3.3], color=INK, lw=0.7)
     for (words, key), colour in zip(named.items(), COLOURS, strict=False):
         z = np.sort(scores[key])
-        ax.plot(
-            stats.norm.ppf((np.arange(z.size) + 0.5) / z.size), z, "o", ms=2.0, mew=0, color=colour, label=words
-        )
+        ax.plot(stats.norm.ppf((np.arange(z.size) + 0.5) / z.size), z, "o", ms=2.0, mew=0, color=colour, label=words)
     ax.set(xlabel="normal quantile", ylabel="z, random systems", xlim=(-3.3, 3.3), ylim=(-4, 4))
     ax.legend(frameon=False, loc="upper left", handletextpad=0.1, borderaxespad=0.0)

@@ -72,22 +72,26 @@ def _text(settings: Settings, outcomes: list[Outcome], quick: bool, spent: float
         "itself (another seed) and from the others.",
         "## Configuration",
         f"Command: `python -m studies joint{' --quick' if quick else ''} --out DIR`",
-        configuration({
-            "engines": f"{', '.join(ENGINES)}; as shipped, mars and renewal without a table",
-            "exposures": f"{settings.exposures} a sample, {settings.random_exposures} in the random systems; half to "
-            f"learn from, half to judge; seed {settings.seed}",
-            "histogram": f"{settings.bins} bins, t_r = {PERIOD_NS:.6g} ns, armed start",
-            "what classifiers see": f"the histogram summed to {COARSE} bins, its total and the count within 3 sigma of "
-            f"the return; *{FINE}*: single bins, {REACH} on either side of the return and of its echo one dead time on",
-            "classifiers": f"scikit-learn {require_sklearn()}: quadratic discriminant (QDA, covariances of "
-            f"standardised features regularised by {REGULARISATION:g}), histogram gradient boosting (default "
-            f"settings, no early stopping), random forest ({TREES} trees, at least {LEAF} a leaf)",
-            "random systems": f"{settings.systems}: S 0.01-10, B 0.001-10, t_d 0.02-4 periods (a third within 0.1 of a "
-            "whole period), sigma 0.002-0.03 periods, 1e3-2e4 cycles, all log-uniform, delays uniform; QDA alone",
-            "closed form": f"`joint_law`, tolerance {TOLERANCE:g}",
-            "machine": machine(),
-            "run time": f"{spent:.0f} s",
-        }),
+        configuration(
+            {
+                "engines": f"{', '.join(ENGINES)}; as shipped, mars and renewal without a table",
+                "exposures": f"{settings.exposures} a sample, {settings.random_exposures} in the random systems; half "
+                f"to learn from, half to judge; seed {settings.seed}",
+                "histogram": f"{settings.bins} bins, t_r = {PERIOD_NS:.6g} ns, armed start",
+                "what classifiers see": f"the histogram summed to {COARSE} bins, its total and the count within 3 "
+                f"sigma of the return; *{FINE}*: single bins, {REACH} on either side of the return and of its echo "
+                f"one dead time on",
+                "classifiers": f"scikit-learn {require_sklearn()}: quadratic discriminant (QDA, covariances of "
+                f"standardised features regularised by {REGULARISATION:g}), histogram gradient boosting (default "
+                f"settings, no early stopping), random forest ({TREES} trees, at least {LEAF} a leaf)",
+                "random systems": f"{settings.systems}: S 0.01-10, B 0.001-10, t_d 0.02-4 periods (a third within 0.1 "
+                "of a whole period), sigma 0.002-0.03 periods, 1e3-2e4 cycles, all log-uniform, delays "
+                "uniform; QDA alone",
+                "closed form": f"`joint_law`, tolerance {TOLERANCE:g}",
+                "machine": machine(),
+                "run time": f"{spent:.0f} s",
+            }
+        ),
         table([_case_row(o) for o in named if o.engine == "exact"]),
         "S and B in photons per period, times in periods.",
         "## Result",
@@ -110,7 +114,7 @@ def _text(settings: Settings, outcomes: list[Outcome], quick: bool, spent: float
         "in standard errors. Squares of few counts are skewed, so z of the smallest variances is not quite normal.",
         "The random systems in which *feedback* differs most from chance:",
         table(_worst_rows(drawn, settings)),
-    ]  # fmt: skip
+    ]
 
 
 def _chance(exposures: int) -> float:
@@ -151,9 +155,14 @@ def _handed(outcomes: Sequence[Outcome]) -> list[str]:
 def _case_row(o: Outcome) -> Row:
     c = o.case
     return {
-        "case": c.name, "S": f"{c.signal:g}", "B": f"{c.background:g}", "t_d": f"{c.dead:g}", "tau": f"{c.delay:g}",
-        "sigma": f"{c.sigma:g}", "cycles": c.cycles,
-    }  # fmt: skip
+        "case": c.name,
+        "S": f"{c.signal:g}",
+        "B": f"{c.background:g}",
+        "t_d": f"{c.dead:g}",
+        "tau": f"{c.delay:g}",
+        "sigma": f"{c.sigma:g}",
+        "cycles": c.cycles,
+    }
 
 
 def _auc_rows(named: list[Outcome], test: str, settings: Settings) -> list[Row]:
@@ -198,14 +207,16 @@ def _random_row(drawn: list[Outcome], engine: str, test: str, settings: Settings
     z = np.array([auc_score(o, test, settings) for o in here])
     some = value.size > 0
     return {
-        "classifier": test, "engine": engine, "systems": value.size,
+        "classifier": test,
+        "engine": engine,
+        "systems": value.size,
         "median AUC": f"{np.median(value):.3f}" if some else "-",
         "smallest": f"{value.min():.3f}" if some else "-",
         "largest": f"{value.max():.3f}" if some else "-",
         f"beyond {_SEEN:g} errors": int((np.abs(z) > _SEEN).sum()),
         "rms z": f"{np.sqrt(np.mean(z**2)):.2f}" if some else "-",
         "chi-square p": _p(float(stats.chi2.sf(float(z @ z), z.size))) if some else "-",
-    }  # fmt: skip
+    }
 
 
 def _spread_row(drawn: list[Outcome], engine: str) -> Row:
@@ -246,10 +257,17 @@ def _worst_rows(drawn: list[Outcome], settings: Settings) -> list[Row]:
 def _csv_row(o: Outcome) -> Row:
     c = o.case
     row: dict[str, object] = {
-        "case": c.name, "random": int(o.random), "signal": c.signal, "background": c.background, "dead": c.dead,
-        "delay": c.delay, "sigma": c.sigma, "cycles": c.cycles, "engine": o.engine,
+        "case": c.name,
+        "random": int(o.random),
+        "signal": c.signal,
+        "background": c.background,
+        "dead": c.dead,
+        "delay": c.delay,
+        "sigma": c.sigma,
+        "cycles": c.cycles,
+        "engine": o.engine,
         "given_to_exact": int(o.handed),
-    }  # fmt: skip
+    }
     for test in TESTS:
         name = "auc_" + test.lower().replace(" ", "_")
         row[name], row[f"{name}_error"] = o.aucs.get(test, ("", ""))

@@ -67,10 +67,15 @@ REFERENCE = (
 SEVEN = tuple(
     Case(f"{s:g}, {b:g}, {dead:g}", s, b, dead)
     for s, b, dead in (
-        (1.0, 1.0, 0.6375), (5.0, 1.0, 0.6375), (0.1, 0.1, 0.6375), (10.0, 10.0, 0.6375), (2.0, 0.5, 0.6375),
-        (0.5, 0.5, 0.1), (2.0, 5.0, 0.1),
+        (1.0, 1.0, 0.6375),
+        (5.0, 1.0, 0.6375),
+        (0.1, 0.1, 0.6375),
+        (10.0, 10.0, 0.6375),
+        (2.0, 0.5, 0.6375),
+        (0.5, 0.5, 0.1),
+        (2.0, 5.0, 0.1),
     )
-)  # fmt: skip
+)
 # exact / (count x multinomial) in the signal window of SEVEN, as noted when the project began
 SEVEN_RATIOS = (1.10, 1.17, 1.02, 0.74, 1.14, 0.70, 0.42)
 
@@ -178,14 +183,15 @@ def score(case: str, engine: str, found: Moments, truth: Moments) -> Score:
     correlations = [(m.next[:, pairs] / scale).mean(1) for m in (found, truth)] if pairs.any() else None
     spread = float(np.sqrt(truth.window[:, 1].mean()))
     return Score(
-        case, engine,
+        case,
+        engine,
         window=_ratio(found.window[:, 1], truth.window[:, 1]),
         window_mean=_difference(found.window[:, 0] / spread, truth.window[:, 0] / spread),
         count=_ratio(found.count[:, 1], truth.count[:, 1]),
         bin=_ratio((here / known[enough]).mean(1), (there / known[enough]).mean(1)),
         neighbour=_difference(*correlations) if correlations else (np.nan, np.nan),
         bins=int(enough.sum()),
-    )  # fmt: skip
+    )
 
 
 def _mean(blocks: FloatArray) -> tuple[float, float]:

@@ -50,11 +50,16 @@ def engines(scores: Sequence[Score]) -> list[str]:
 def _text(settings: Settings, scores: list[Score], findings: list[str], quick: bool, spent: float) -> list[str]:
     cases = [
         {
-            "case": c.name, "S": f"{c.signal:g}", "B": f"{c.background:g}", "t_d / t_r": f"{c.dead:g}",
-            "tau / t_r": f"{c.delay:g}", "sigma / t_r": f"{c.sigma:g}", "cycles": c.cycles,
+            "case": c.name,
+            "S": f"{c.signal:g}",
+            "B": f"{c.background:g}",
+            "t_d / t_r": f"{c.dead:g}",
+            "tau / t_r": f"{c.delay:g}",
+            "sigma / t_r": f"{c.sigma:g}",
+            "cycles": c.cycles,
         }
         for c in settings.cases
-    ]  # fmt: skip
+    ]
     return [
         "# Joint statistics of the histogram, every engine",
         "_Quick form: a look, not for citing._" if quick else "",
@@ -63,15 +68,17 @@ def _text(settings: Settings, scores: list[Score], findings: list[str], quick: b
         "statistics at all.",
         "## Configuration",
         f"Command: `python -m studies joint-table{' --quick' if quick else ''} --out DIR`",
-        configuration({
-            "engines": "all of the registry, default settings: " + ", ".join(engines(scores)),
-            "realizations": f"{settings.realizations} a case and engine, seed {settings.seed}",
-            "histogram": f"{settings.bins} bins; single bins and neighbours compared on {COARSE}, those with a mean of "
-            f"at least {ENOUGH:g}",
-            "laser": f"t_r = {PERIOD_NS:.6g} ns, armed start",
-            "machine": machine(),
-            "run time": f"{spent:.0f} s",
-        }),
+        configuration(
+            {
+                "engines": "all of the registry, default settings: " + ", ".join(engines(scores)),
+                "realizations": f"{settings.realizations} a case and engine, seed {settings.seed}",
+                "histogram": f"{settings.bins} bins; single bins and neighbours compared on {COARSE}, those with a "
+                f"mean of at least {ENOUGH:g}",
+                "laser": f"t_r = {PERIOD_NS:.6g} ns, armed start",
+                "machine": machine(),
+                "run time": f"{spent:.0f} s",
+            }
+        ),
         table(cases),
         "S and B in photons per period.",
         "## Result",
@@ -87,7 +94,7 @@ def _text(settings: Settings, scores: list[Score], findings: list[str], quick: b
         table(_rows(scores, "count")),
         "### Mean of the window, engine - exact, in standard deviations of the window's count",
         table(_rows(scores, "window_mean")),
-    ]  # fmt: skip
+    ]
 
 
 _NONE = {"window": 1.0, "count": 1.0, "bin": 1.0, "neighbour": 0.0, "window_mean": 0.0}  # where nothing differs
@@ -122,10 +129,16 @@ def _findings(scores: Sequence[Score]) -> list[str]:
     for engine in engines(scores):
         here = [s for s in scores if s.engine == engine]
         worst = max(here, key=lambda s: abs(s.window[0] - 1.0))
-        off = ", ".join(f"{words} in {sum(beyond(s, key) for s in here)}" for key, words in (
-            ("window", "window variance"), ("bin", "bin variance"), ("neighbour", "neighbours"),
-            ("count", "count variance"), ("window_mean", "window mean"),
-        ))  # fmt: skip
+        off = ", ".join(
+            f"{words} in {sum(beyond(s, key) for s in here)}"
+            for key, words in (
+                ("window", "window variance"),
+                ("bin", "bin variance"),
+                ("neighbour", "neighbours"),
+                ("count", "count variance"),
+                ("window_mean", "window mean"),
+            )
+        )
         lines.append(
             f"- {engine}: beyond {_SCORES:g} standard errors of the exact engine, of {len(here)} cases: {off}. Window "
             f"variance furthest off in {worst.case}: {worst.window[0]:.3f} times the exact one."

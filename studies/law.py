@@ -163,18 +163,24 @@ def _cells(
         sample, size = Pmf.of_counts(counts[:, k]), settings.realizations
         noise = sampling_floor(laws["exact"], size, settings.draws, random)
         mean, variance = float(exact.mean[k]), float(exact.variance[k])
-        cells.append(Cell(
-            float(signal[k]), float(background[k]), dead, cycles, exact.cumulants[k],
-            to_simulation={name: total_variation(law, sample) for name, law in laws.items()},
-            to_exact={name: total_variation(law, laws["exact"]) for name, law in laws.items()},
-            floor=float(noise.mean()),
-            limit=float(np.quantile(noise, 0.999)),
-            p_value=g_test(laws["exact"], sample, size),
-            mean_score=mean_score(mean, variance, float(counts[:, k].mean(dtype=np.float64)), size),
-            variance_score=variance_score(exact.cumulants[k], sample, size),
-            laws=laws,
-            sample=sample,
-        ))  # fmt: skip
+        cells.append(
+            Cell(
+                float(signal[k]),
+                float(background[k]),
+                dead,
+                cycles,
+                exact.cumulants[k],
+                to_simulation={name: total_variation(law, sample) for name, law in laws.items()},
+                to_exact={name: total_variation(law, laws["exact"]) for name, law in laws.items()},
+                floor=float(noise.mean()),
+                limit=float(np.quantile(noise, 0.999)),
+                p_value=g_test(laws["exact"], sample, size),
+                mean_score=mean_score(mean, variance, float(counts[:, k].mean(dtype=np.float64)), size),
+                variance_score=variance_score(exact.cumulants[k], sample, size),
+                laws=laws,
+                sample=sample,
+            )
+        )
     return cells
 
 

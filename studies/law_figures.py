@@ -126,8 +126,9 @@ def _shown(path: Path, cells: Sequence[Cell]) -> Path:
         ax.set_title(
             f"S = {cell.signal:.3g}, B = {cell.background:.3g}, $t_d$ = {cell.dead:g} $t_r$\n"
             f"{cell.cycles} cycles, TV of the Gaussian {cell.to_exact['gaussian']:.3f}",
-            loc="left", fontsize=6.5,
-        )  # fmt: skip
+            loc="left",
+            fontsize=6.5,
+        )
     for ax in axes[-1]:
         ax.set_xlabel("registrations N")
     for row in axes:

@@ -42,9 +42,7 @@ def run(request: Request) -> list[Path]:
 
 _REGIMES: dict[str, Callable[[Cell], bool]] = {
     "few photons: E N < 10": lambda c: bool(c.cumulants[0] < FEW),
-    "locked or saturated: E N >= 10, Var N < 1": lambda c: bool(
-        c.cumulants[0] >= FEW and c.cumulants[1] < STILL
-    ),
+    "locked or saturated: E N >= 10, Var N < 1": lambda c: bool(c.cumulants[0] >= FEW and c.cumulants[1] < STILL),
     "sub-Poissonian: 1 <= Var N < E N / 4": lambda c: bool(
         c.cumulants[0] >= FEW and STILL <= c.cumulants[1] < 0.25 * c.cumulants[0]
     ),
@@ -95,23 +93,25 @@ def _text(
         "statistics of the count.",
         "## Configuration",
         f"Command: `python -m studies law{' --quick' if quick else ''} --out DIR`",
-        configuration({
-            "laser": "t_r = 133.33 ns, delay t_r / 2, armed start",
-            "pulse": f"Gaussian, sigma = {settings.sigma_ns:g} ns",
-            "dead times": ", ".join(f"{d:g}" for d in settings.dead) + " t_r",
-            "map over flux": f"S x B = {len(settings.signal)} x {len(settings.background)}, log-spaced on "
-            f"[{settings.signal[0]:g}, {settings.signal[-1]:g}] x [{settings.background[0]:g}, "
-            f"{settings.background[-1]:g}] photons per period, "
-            f"{settings.map_cycles} cycles: {len(flux)} cells",
-            "map over exposure": f"S as before, B = S / {settings.ratio:g}, "
-            f"cycles {', '.join(map(str, settings.cycles))}: {len(exposure)} cells",
-            "simulation": f"{size} realizations a cell, seed {settings.seed}",
-            "bootstrap": f"{settings.draws} samples of the exact law for each cell; *floor* is their mean, "
-            "*limit* their 99.9 % quantile",
-        }),
-        "Laws: *exact* `count_law(method=\"exact\")`; *best Gaussian* has the exact mean and variance; "
+        configuration(
+            {
+                "laser": "t_r = 133.33 ns, delay t_r / 2, armed start",
+                "pulse": f"Gaussian, sigma = {settings.sigma_ns:g} ns",
+                "dead times": ", ".join(f"{d:g}" for d in settings.dead) + " t_r",
+                "map over flux": f"S x B = {len(settings.signal)} x {len(settings.background)}, log-spaced on "
+                f"[{settings.signal[0]:g}, {settings.signal[-1]:g}] x [{settings.background[0]:g}, "
+                f"{settings.background[-1]:g}] photons per period, "
+                f"{settings.map_cycles} cycles: {len(flux)} cells",
+                "map over exposure": f"S as before, B = S / {settings.ratio:g}, "
+                f"cycles {', '.join(map(str, settings.cycles))}: {len(exposure)} cells",
+                "simulation": f"{size} realizations a cell, seed {settings.seed}",
+                "bootstrap": f"{settings.draws} samples of the exact law for each cell; *floor* is their mean, "
+                "*limit* their 99.9 % quantile",
+            }
+        ),
+        'Laws: *exact* `count_law(method="exact")`; *best Gaussian* has the exact mean and variance; '
         "*mars* "
-        "`count_law(method=\"mars\")` on 1024 bins, re-arming at the bin centre or edge; *renewal*, "
+        '`count_law(method="mars")` on 1024 bins, re-arming at the bin centre or edge; *renewal*, '
         "*Poisson*. A Gaussian on the integers "
         "is its integral from n - 1/2 to n + 1/2, what lies below 0 counted as 0.",
         "## Result",
@@ -140,7 +140,7 @@ def _text(
         "## By dead time",
         table([_dead_row(cells, dead) for dead in settings.dead]),
         "Median and largest total variation to the exact law; mars with centre and with edge re-arming.",
-    ]  # fmt: skip
+    ]
 
 
 def _law_row(cells: Sequence[Cell], name: str) -> Row:
@@ -213,7 +213,7 @@ def _findings(settings: Settings, cells: Sequence[Cell]) -> list[str]:
         f"- mars, centre, is further from the exact law than the best Gaussian by more than {VISIBLE:g} in "
         f"{sum(c > VISIBLE for c in cost)} of {len(cells)} cells, at most by {max(cost):.3f} "
         f"({cells[int(np.argmax(cost))].name()}): start and end of the exposure, and the chain's grid.",
-    ]  # fmt: skip
+    ]
 
 
 def _csv_row(name: str, cell: Cell) -> Row:

@@ -57,28 +57,33 @@ def run(request: Request) -> list[Path]:
         rows.append(compare(*_system(random), settings.items, seed=k))
         request.tell(f"{k + 1} of {settings.systems}: {rows[-1]}")
     drawn = [row for row in rows if row["cells"]]
-    text = save_text(request.out / "long_exposures.md", [
-        "# The feedback engine at long exposures",
-        "_Quick form: a look, not for citing._" if request.quick else "",
-        "Means and variances of drawn histograms against `joint_law`, which uses a grid of its own. Differences of "
-        "means are in standard deviations of what is compared; *rms* is their root mean square over the bins less "
-        f"the sample's own error, {1 / np.sqrt(settings.items):.2g}; *window*: counts within 3 sigma of the return; "
-        f"*bins*: ratio of variances, mean over the bins. The engine aims at {GOAL:g} in any bin.",
-        "## Configuration",
-        f"Command: `python -m studies long-exposures{' --quick' if request.quick else ''} --out DIR`",
-        configuration({
-            "systems": f"{settings.systems}: S 0.05-10, B 0.01-10, t_d 0.05-2.5 periods, sigma 0.002-0.02 periods, "
-            "log-uniform; 1e6, 1e7 or 1e8 cycles; 64, 256 or 1024 bins; any delay; armed start",
-            "exposures": f"{settings.items} each; seed {settings.seed}",
-            "machine": machine(),
-            "run time": f"{time.monotonic() - began:.0f} s",
-        }),
-        "## Result",
-        "\n".join(_findings(drawn, settings)),
-        table([{key: value if value is not None else "" for key, value in row.items()} for row in rows]),
-        "Rows without cells: given to the exact engine. *cells*: those of the internal grid, *cut* into how many parts "
-        "a bin is cut everywhere, and again near the pulse.",
-    ])  # fmt: skip
+    text = save_text(
+        request.out / "long_exposures.md",
+        [
+            "# The feedback engine at long exposures",
+            "_Quick form: a look, not for citing._" if request.quick else "",
+            "Means and variances of drawn histograms against `joint_law`, which uses a grid of its own. Differences of "
+            "means are in standard deviations of what is compared; *rms* is their root mean square over the bins less "
+            f"the sample's own error, {1 / np.sqrt(settings.items):.2g}; *window*: counts within 3 sigma of the "
+            f"return; *bins*: ratio of variances, mean over the bins. The engine aims at {GOAL:g} in any bin.",
+            "## Configuration",
+            f"Command: `python -m studies long-exposures{' --quick' if request.quick else ''} --out DIR`",
+            configuration(
+                {
+                    "systems": f"{settings.systems}: S 0.05-10, B 0.01-10, t_d 0.05-2.5 periods, sigma 0.002-0.02 "
+                    "periods, log-uniform; 1e6, 1e7 or 1e8 cycles; 64, 256 or 1024 bins; any delay; armed start",
+                    "exposures": f"{settings.items} each; seed {settings.seed}",
+                    "machine": machine(),
+                    "run time": f"{time.monotonic() - began:.0f} s",
+                }
+            ),
+            "## Result",
+            "\n".join(_findings(drawn, settings)),
+            table([{key: value if value is not None else "" for key, value in row.items()} for row in rows]),
+            "Rows without cells: given to the exact engine. *cells*: those of the internal grid, *cut* into how many "
+            "parts a bin is cut everywhere, and again near the pulse.",
+        ],
+    )
     return [text, save_csv(request.out / "long_exposures.csv", rows)]
 
 
@@ -86,9 +91,12 @@ def _system(random: np.random.Generator) -> tuple[float, float, ml.System, float
     signal, background, dead, sigma = 10 ** random.uniform([-1.3, -2.0, -1.3, -2.7], [1.0, 1.0, 0.4, -1.7])
     cycles, bins = int(random.choice([10**6, 10**7, 10**8])), int(random.choice([64, 256, 1024]))
     system = ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
         detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
-    )  # fmt: skip
+    )
     return float(signal), float(background), system, float(random.uniform(0.0, PERIOD_NS))
 
 
@@ -101,10 +109,15 @@ def compare(signal: float, background: float, system: ml.System, delay_ns: float
     sigma = float(getattr(system.pulse, "sigma_ns", 0.0))
     merge, parts = cell_cuts(flux, system)
     row: dict[str, Any] = {
-        "S": signal, "B": background, "t_d": system.dead_time_periods, "sigma": sigma / PERIOD_NS,
-        "cycles": f"{system.cycles:.0e}", "bins": system.bins, "cells": int(internal_cells(flux, system)[0, 0]),
+        "S": signal,
+        "B": background,
+        "t_d": system.dead_time_periods,
+        "sigma": sigma / PERIOD_NS,
+        "cycles": f"{system.cycles:.0e}",
+        "bins": system.bins,
+        "cells": int(internal_cells(flux, system)[0, 0]),
         "cut": f"{merge[0, 0]} x {parts[0, 0]}",
-    }  # fmt: skip
+    }
     keys = ("largest", "rms", "count", "window", "var count", "var window", "var bins")
     if report["refused"]:
         return row | {"cells": 0} | dict.fromkeys(keys)
@@ -118,9 +131,14 @@ def compare(signal: float, background: float, system: ml.System, delay_ns: float
     count, window = (y.mean(0) - mean) / np.sqrt(np.maximum(variance, 1e-300))
     spread = y.var(0) / np.maximum(variance, 1e-300)
     found = (
-        float(np.abs(off).max()), float(np.sqrt(max(0.0, np.mean(off**2) - 1.0 / items))), float(count), float(window),
-        float(spread[0]), float(spread[1]), float(np.mean(x.var(0) / law.variance)),
-    )  # fmt: skip
+        float(np.abs(off).max()),
+        float(np.sqrt(max(0.0, np.mean(off**2) - 1.0 / items))),
+        float(count),
+        float(window),
+        float(spread[0]),
+        float(spread[1]),
+        float(np.mean(x.var(0) / law.variance)),
+    )
     return row | dict(zip(keys, found, strict=True))
 
 

@@ -134,9 +134,7 @@ def measure(kind: str, system: System, signal: FloatArray, background: FloatArra
         matched[k] = total_variation(Pmf(window.first, window.pmf), law)
         mean, variance = float(exact.mean[k]), float(exact.variance[k])
         gaussian[k] = total_variation(Pmf.gaussian(mean, variance), law)
-    return Part(
-        kind, system, signal, background, exact.cumulants, matched, gaussian, trusted(exact.cumulants)
-    )
+    return Part(kind, system, signal, background, exact.cumulants, matched, gaussian, trusted(exact.cumulants))
 
 
 @dataclass(frozen=True)
@@ -157,8 +155,7 @@ class Share:
 def share(parts: Sequence[Part]) -> Share:
     """Summary over all cells of some parts."""
     matched, gaussian, sure = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("matched", "gaussian", "trusted")
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("matched", "gaussian", "trusted")
     )
     good = matched <= AIM
     return Share(

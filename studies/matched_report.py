@@ -45,21 +45,23 @@ def _text(settings: Settings, parts: list[Part], others: list[Part], quick: bool
         "_Quick form: a look, not for citing._" if quick else "",
         "A table that stores mean, variance, third and fourth cumulant of the number N of registrations needs "
         "a law on the integers that has them (`mars_lidar.statistics.matched.matched_pmf`). Here its total variation "
-        "to the exact law, `count_law(method=\"exact\")`, beside that of the Gaussian with the exact mean and "
+        'to the exact law, `count_law(method="exact")`, beside that of the Gaussian with the exact mean and '
         f"variance. No sampling, no noise. The aim is {AIM:g}.",
         "## Configuration",
         f"Command: `python -m studies matched{' --quick' if quick else ''} --out DIR`",
-        configuration({
-            "laser": "t_r = 133.33 ns, delay t_r / 2",
-            "grid": f"S x B = {len(settings.signal)} x {len(settings.background)}, log-spaced on [0.01, 10]^2; "
-            f"t_d = {', '.join(f'{d:g}' for d in settings.dead)} t_r; "
-            f"{', '.join(map(str, settings.cycles))} cycles; sigma = {settings.sigma_ns:g} ns; armed start",
-            "stationary start": f"the same S and B, {starts}",
-            "at random": f"{settings.systems} systems of {settings.pixels} cells, seed {settings.seed}: S and "
-            "B log-uniform on [0.01, 10], t_d uniform on [0.02, 2.5] t_r, cycles log-uniform on 30 .. 3000, "
-            "sigma log-uniform on 0.2 .. 3 ns, armed start. The thresholds of the law and of `trusted` were "
-            "set on the grid and on other systems at random, so these cells are the fair test",
-        }),
+        configuration(
+            {
+                "laser": "t_r = 133.33 ns, delay t_r / 2",
+                "grid": f"S x B = {len(settings.signal)} x {len(settings.background)}, log-spaced on [0.01, 10]^2; "
+                f"t_d = {', '.join(f'{d:g}' for d in settings.dead)} t_r; "
+                f"{', '.join(map(str, settings.cycles))} cycles; sigma = {settings.sigma_ns:g} ns; armed start",
+                "stationary start": f"the same S and B, {starts}",
+                "at random": f"{settings.systems} systems of {settings.pixels} cells, seed {settings.seed}: S and "
+                "B log-uniform on [0.01, 10], t_d uniform on [0.02, 2.5] t_r, cycles log-uniform on 30 .. 3000, "
+                "sigma log-uniform on 0.2 .. 3 ns, armed start. The thresholds of the law and of `trusted` were "
+                "set on the grid and on other systems at random, so these cells are the fair test",
+            }
+        ),
         "## Result",
         table([_share_row(name, cells) for name, cells in kinds.items() if cells]),
         f"*within*: share of cells with a total variation of at most {AIM:g}. `trusted` says from the "
@@ -102,15 +104,17 @@ def _variance_rows(parts: Sequence[Part]) -> list[Row]:
     for low, high in pairwise(_EDGES):
         here = (variance >= low) & (variance < high)
         if here.any():
-            rows.append({
-                "Var N": f"{low:g} .. {high:g}",
-                "cells": int(here.sum()),
-                "within": f"{100 * (matched[here] <= AIM).mean():.1f} %",
-                "median": float(np.median(matched[here])),
-                "worst": float(matched[here].max()),
-                "Gaussian, median": float(np.median(gaussian[here])),
-                "Gaussian, worst": float(gaussian[here].max()),
-            })
+            rows.append(
+                {
+                    "Var N": f"{low:g} .. {high:g}",
+                    "cells": int(here.sum()),
+                    "within": f"{100 * (matched[here] <= AIM).mean():.1f} %",
+                    "median": float(np.median(matched[here])),
+                    "worst": float(matched[here].max()),
+                    "Gaussian, median": float(np.median(gaussian[here])),
+                    "Gaussian, worst": float(gaussian[here].max()),
+                }
+            )
     return rows
 
 

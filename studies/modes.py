@@ -61,9 +61,7 @@ class LeadingTerms(HoldingTimeCovariance):
         return values, weights * self._unit
 
 
-def _eigenpairs(
-    product: Callable[[FloatArray], FloatArray], n: int, cell: str
-) -> tuple[ComplexArray, ComplexArray]:
+def _eigenpairs(product: Callable[[FloatArray], FloatArray], n: int, cell: str) -> tuple[ComplexArray, ComplexArray]:
     """Leading eigenvalues (MODES,) by falling magnitude and unit vectors (n, MODES), residuals checked."""
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 

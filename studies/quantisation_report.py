@@ -50,9 +50,7 @@ def run(request: Request) -> list[Path]:
     with style():
         figure = _figure(request.out / "quantisation.png", settings, costs)
     spent = time.monotonic() - began
-    text = save_text(
-        request.out / "quantisation.md", _text(settings, costs, findings, request.quick, spent)
-    )
+    text = save_text(request.out / "quantisation.md", _text(settings, costs, findings, request.quick, spent))
     return [text, figure, save_csv(request.out / "quantisation.csv", [_csv_row(cost) for cost in costs])]
 
 
@@ -65,27 +63,33 @@ def _text(settings: Settings, costs: Sequence[Cost], findings: list[str], quick:
         "in S and B; the cumulants bicubic in their logarithms.",
         "## Configuration",
         f"Command: `python -m studies quantisation{' --quick' if quick else ''} --out DIR`",
-        configuration({
-            "axes": f"S and B log-spaced on [{LOW:g}, {HIGH:g}] photons per period, and 0",
-            "system": f"t_r = {PERIOD_NS:.6g} ns, t_d = {', '.join(f'{d:g}' for d in settings.dead_ns)} ns, "
-            f"{settings.cycles} cycles, {settings.bins} bins, armed start, delay t_r / 2",
-            "pulse": f"Gaussian, sigma = {settings.sigma_ns:g} ns",
-            "pixels": f"{settings.pixels}, S and B log-uniform on the same range, seed {settings.seed}",
-            "machine": machine(),
-            "run time": f"{spent:.0f} s",
-        }),
+        configuration(
+            {
+                "axes": f"S and B log-spaced on [{LOW:g}, {HIGH:g}] photons per period, and 0",
+                "system": f"t_r = {PERIOD_NS:.6g} ns, t_d = {', '.join(f'{d:g}' for d in settings.dead_ns)} ns, "
+                f"{settings.cycles} cycles, {settings.bins} bins, armed start, delay t_r / 2",
+                "pulse": f"Gaussian, sigma = {settings.sigma_ns:g} ns",
+                "pixels": f"{settings.pixels}, S and B log-uniform on the same range, seed {settings.seed}",
+                "machine": machine(),
+                "run time": f"{spent:.0f} s",
+            }
+        ),
         "Mean: difference in standard deviations of the count. Law: total variation between the laws of the looked-up "
         "and of the pixel's own four cumulants, so that only the lookup counts. What other delays add is in the "
         "table's own report (`Table.provenance`).",
         "## Result",
         "\n".join(findings),
-        *[part for dead in settings.dead_ns for part in (
-            f"### t_d = {dead:g} ns: mean over pixels (95 % of the pixels)",
-            table([_row(cost) for cost in costs if cost.dead_ns == dead]),
-        )],
+        *[
+            part
+            for dead in settings.dead_ns
+            for part in (
+                f"### t_d = {dead:g} ns: mean over pixels (95 % of the pixels)",
+                table([_row(cost) for cost in costs if cost.dead_ns == dead]),
+            )
+        ],
         "![Errors over the number of entries](quantisation.png)",
         "Lines: mean over pixels; thin: 95 % of the pixels.",
-    ]  # fmt: skip
+    ]
 
 
 def _row(cost: Cost) -> Row:
@@ -135,9 +139,13 @@ def _panel(ax: Axes, settings: Settings, costs: Sequence[Cost], key: str) -> Non
 
 def _csv_row(cost: Cost) -> Row:
     row: dict[str, object] = {
-        "dead_time_ns": cost.dead_ns, "signal_points": cost.size[0], "background_points": cost.size[1],
-        "lookup": cost.interpolation, "megabytes": cost.megabytes, "build_seconds": cost.seconds,
-    }  # fmt: skip
+        "dead_time_ns": cost.dead_ns,
+        "signal_points": cost.size[0],
+        "background_points": cost.size[1],
+        "lookup": cost.interpolation,
+        "megabytes": cost.megabytes,
+        "build_seconds": cost.seconds,
+    }
     for key in ERRORS:
         values = cost.errors[key]
         row |= {f"{key}_mean": float(values.mean()), f"{key}_95": float(np.quantile(values, 0.95))}

@@ -149,8 +149,15 @@ def _flux_figure(path: Path, rows: Sequence[Row]) -> Path:
                 if line == len(quantities) - 1:
                     ax.set_xlabel("signal = background photons per period")
         drawn = {text: line for ax in axes[0] for line, text in zip(*ax.get_legend_handles_labels(), strict=True)}
-        figure.legend(drawn.values(), drawn.keys(), loc="outside lower center", ncols=len(drawn), frameon=False,
-                      handlelength=1.2, columnspacing=1.0)  # fmt: skip
+        figure.legend(
+            drawn.values(),
+            drawn.keys(),
+            loc="outside lower center",
+            ncols=len(drawn),
+            frameon=False,
+            handlelength=1.2,
+            columnspacing=1.0,
+        )
         axes[2, 0].set_ylim(1.0, 1e3)
         axes[3, 0].set_ylim(1e-2, 1e3)
         axes[0, 0].set_ylim(1.0, 3e2)

@@ -115,7 +115,11 @@ def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Gener
     noise = sampling_floor(laws["exact"][1], size, draws, random)
     return [
         Comparison(
-            name, key, size, float(cumulants[0]), float(cumulants[1]),
+            name,
+            key,
+            size,
+            float(cumulants[0]),
+            float(cumulants[1]),
             # what the sample's mean and variance scatter by is known from the exact law
             z_mean=mean_score(float(cumulants[0]), float(exact.variance), mean, size),
             z_variance=variance_score(exact.cumulants, sample, size, float(cumulants[1])),
@@ -125,16 +129,14 @@ def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Gener
             p_value=g_test(pmf, sample, size),
         )
         for key, (cumulants, pmf) in laws.items()
-    ]  # fmt: skip
+    ]
 
 
 def _read(path: Path) -> dict[str, Any]:
     case: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     missing = [key for key in _KEYS if key not in case]
     if missing:
-        raise ValueError(
-            f"reference case {path.name} must hold {', '.join(_KEYS)}, it lacks {', '.join(missing)}"
-        )
+        raise ValueError(f"reference case {path.name} must hold {', '.join(_KEYS)}, it lacks {', '.join(missing)}")
     return case
 
 
@@ -148,13 +150,15 @@ def _text(cases: Sequence[Row], found: list[Comparison], draws: int, quick: bool
         "evaluated at the case's own delay.",
         "## Configuration",
         f"Command: `python -m studies reference --data DIR{_FLAG[quick]} --out DIR`",
-        configuration({
-            "bootstrap": f"{draws} samples of the exact law for each case, seed {SEED}",
-            "cases": len(cases),
-        }),
+        configuration(
+            {
+                "bootstrap": f"{draws} samples of the exact law for each case, seed {SEED}",
+                "cases": len(cases),
+            }
+        ),
         table(cases),
         "S and B in photons per period; tau, sigma and the dead time in laser periods; armed start.",
-        "## `count_law(method=\"exact\")`",
+        '## `count_law(method="exact")`',
         table([_exact_row(c) for c in exact]),
         f"{sum(c.good for c in exact)} of {len(exact)} good: mean and variance within 4 standard errors, "
         "total variation (TV) below the 99.9 % quantile of "
@@ -165,7 +169,7 @@ def _text(cases: Sequence[Row], found: list[Comparison], draws: int, quick: bool
         "\\* beyond the 99.9 % limit. *best Gaussian* has the exact mean and variance.",
         "## Every law: standard errors of mean and variance",
         table([_score_row([c for c in found if c.case == name]) for name in names]),
-    ]  # fmt: skip
+    ]
 
 
 def _exact_row(c: Comparison) -> Row:

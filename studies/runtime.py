@@ -261,9 +261,7 @@ def _memory(flux: Flux, seen: System, realizations: int) -> NDArray[Any]:
     return out
 
 
-def _least(
-    runs: dict[str, Run], out: NDArray[Any], settings: Settings
-) -> dict[str, tuple[float, dict[str, float]]]:
+def _least(runs: dict[str, Run], out: NDArray[Any], settings: Settings) -> dict[str, tuple[float, dict[str, float]]]:
     """Least seconds of each run and the stages of that repeat; all in turn, so that disturbances are shared."""
     best: dict[str, tuple[float, dict[str, float]]] = {}
     spent = dict.fromkeys(runs, 0.0)

@@ -49,9 +49,15 @@ def _axes(path: Path, settings: Settings, points: Sequence[Point]) -> Path:
         for name in names:
             here = [p for p in points if p.axis == axis.name and p.contender == name and p.seconds is not None]
             ax.plot(
-                [p.value for p in here], [float(p.seconds or 0.0) for p in here], marker="o", ms=2.4, lw=1.0,
-                color=_colour(name, names), ls="--" if name == NUMPY else "-", label=name,
-            )  # fmt: skip
+                [p.value for p in here],
+                [float(p.seconds or 0.0) for p in here],
+                marker="o",
+                ms=2.4,
+                lw=1.0,
+                color=_colour(name, names),
+                ls="--" if name == NUMPY else "-",
+                label=name,
+            )
         ax.set(xscale="log", yscale="log", xlabel=axis.words)
         others = {"cycles": f"{axis.pixels} pixels", "flux": f"{axis.pixels} pixels, {axis.cycles} cycles"}
         ax.set_title(others.get(axis.name, f"{axis.cycles} cycles"), loc="left")

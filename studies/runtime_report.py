@@ -53,14 +53,23 @@ def run(request: Request) -> list[Path]:
     text = _text(settings, cubes, held, single, points, rules, request.quick, busy, spent)
     rows = [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]]
     return [
-        save_text(request.out / "runtime.md", text), *figures, save_csv(request.out / "runtime.csv", rows),
-    ]  # fmt: skip
+        save_text(request.out / "runtime.md", text),
+        *figures,
+        save_csv(request.out / "runtime.csv", rows),
+    ]
 
 
 def _text(
-    settings: Settings, cubes: Sequence[Cube], held: Table, single: Sequence[Point], points: Sequence[Point],
-    rules: Sequence[str], quick: bool, busy: Sequence[str], spent: float,
-) -> list[str]:  # fmt: skip
+    settings: Settings,
+    cubes: Sequence[Cube],
+    held: Table,
+    single: Sequence[Point],
+    points: Sequence[Point],
+    rules: Sequence[str],
+    quick: bool,
+    busy: Sequence[str],
+    spent: float,
+) -> list[str]:
     side, bins = settings.side, settings.bins
     return [
         "# Runtime (T2, T3)",
@@ -69,18 +78,21 @@ def _text(
         "of this machine; the paper's are of another.",
         "## Configuration",
         f"Command: `python -m studies runtime{' --quick' if quick else ''} --out DIR`",
-        configuration({
-            "laser": f"t_r = {PERIOD_NS:.6g} ns, t_d = {DEAD_TIME_NS:g} ns, armed start, {bins} bins",
-            "pulse": f"Gaussian, sigma = {SIGMA_NS:g} ns",
-            "flux": f"S and B uniform on [{FLUX[0]:g}, {FLUX[1]:g}] photons per period, another delay in every pixel",
-            "timing": f"least of at most {settings.repeats} repeats, contenders in turn, output memory touched before; "
-            f"repeats end after {settings.enough_s:g} s",
-            "left out": f"points predicted from the ones before to take over {settings.limit_s:g} s",
-            "threads": "all processors for the engines, one for NumPy",
-            "machine": machine(),
-            "load": f"{busy[0]} at the start, {busy[1]} at the end",
-            "run time": f"{spent:.0f} s",
-        }),
+        configuration(
+            {
+                "laser": f"t_r = {PERIOD_NS:.6g} ns, t_d = {DEAD_TIME_NS:g} ns, armed start, {bins} bins",
+                "pulse": f"Gaussian, sigma = {SIGMA_NS:g} ns",
+                "flux": f"S and B uniform on [{FLUX[0]:g}, {FLUX[1]:g}] photons per period, another delay in every "
+                f"pixel",
+                "timing": f"least of at most {settings.repeats} repeats, contenders in turn, output memory touched "
+                f"before; repeats end after {settings.enough_s:g} s",
+                "left out": f"points predicted from the ones before to take over {settings.limit_s:g} s",
+                "threads": "all processors for the engines, one for NumPy",
+                "machine": machine(),
+                "load": f"{busy[0]} at the start, {busy[1]} at the end",
+                "run time": f"{spent:.0f} s",
+            }
+        ),
         f"## One cube of {side} x {side} x {bins}, 1000 cycles",
         table([_cube_row(cube) for cube in cubes] + _paper_rows()),
         "Stages in seconds, as each simulator reports them. *before*: preparing a table "
@@ -99,7 +111,7 @@ def _text(
         "Paper, another workload: Poisson 0.2 s, MaRS 0.3 s, sequential 16.1 s.",
         "## Size of the table (T3)",
         table(_sizes(held)),
-    ]  # fmt: skip
+    ]
 
 
 def _cube_row(cube: Cube) -> Row:

@@ -75,9 +75,5 @@ def histograms(
     memory = np.empty((step, *flux.shape, system.bins), system.histogram_dtype)
     for start in range(0, realizations, step):
         cube = memory[: min(step, realizations - start)]
-        simulate(
-            flux, system, engine=engine, realizations=len(cube), first_realization=start, seed=seed, out=cube
-        )
+        simulate(flux, system, engine=engine, realizations=len(cube), first_realization=start, seed=seed, out=cube)
         yield start, cube
-
-

@@ -74,9 +74,7 @@ def simulators(sampled: int, seed: int, training: Training | None = None) -> lis
         Simulator("mars_matched", "MaRS, ours, four cumulants", _matched),
     ]
     if find_spec("torch") is not None:  # the extra "learn"
-        evaluated.append(
-            Simulator("neural", "neural, stand-in", lambda s, b, system: _neural(s, b, system, plan))
-        )
+        evaluated.append(Simulator("neural", "neural, stand-in", lambda s, b, system: _neural(s, b, system, plan)))
     others = [name for name in ENGINES if name not in _IN_CLOSED_FORM]
     return evaluated + [Simulator(name, f"{name} (sampled)", _sampler(name, sampled, seed)) for name in others]
 
@@ -116,9 +114,7 @@ def _trained(system: System, training: Training) -> NeuralMap:
     return train(system, training).map
 
 
-def _mars(
-    signal: FloatArray, background: FloatArray, system: System, rearm: Literal["centre", "edge"]
-) -> Prediction:
+def _mars(signal: FloatArray, background: FloatArray, system: System, rearm: Literal["centre", "edge"]) -> Prediction:
     shape = registration_pdf(signal, background, system, "chain", rearm=rearm)
     return of_law(count_law(signal, background, system, "mars", rearm=rearm), shape)
 

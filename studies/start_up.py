@@ -26,9 +26,15 @@ _TOLERANCE = 1e-5
 _CASES = tuple(
     {"dead_time_ns": dead, "cycles": cycles}
     for dead, cycles in (
-        (75.0, 100), (75.0, 1000), (75.0, 10_000), (85.0, 1000), (13.0, 1000), (130.2, 1000), (200.0, 1000),
+        (75.0, 100),
+        (75.0, 1000),
+        (75.0, 10_000),
+        (85.0, 1000),
+        (13.0, 1000),
+        (130.2, 1000),
+        (200.0, 1000),
     )
-)  # fmt: skip
+)
 
 
 def run(request: Request) -> list[Path]:
@@ -63,9 +69,12 @@ def run(request: Request) -> list[Path]:
 def _measure(case: Mapping[str, Any], points: int, delays: int) -> list[Row]:
     """A row for each cell: the worst delay."""
     system = System(
-        period_ns=_PERIOD_NS, cycles=case["cycles"], bins=1024, pulse=GaussianPulse(sigma_ns=0.5),
+        period_ns=_PERIOD_NS,
+        cycles=case["cycles"],
+        bins=1024,
+        pulse=GaussianPulse(sigma_ns=0.5),
         detector=Detector(dead_time_ns=case["dead_time_ns"]),
-    )  # fmt: skip
+    )
     levels = np.geomspace(*_LEVELS, points)
     shifts = np.arange(1, delays) * system.bins // delays
     canonical = exposure_moments(levels[:, None], levels, system, tolerance=_TOLERANCE)

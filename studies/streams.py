@@ -96,20 +96,31 @@ def drawn(number: int, seed: int, photons: float = 2e5) -> list[Ideal]:
             unit = period / max(round(period / unit), 1)
         found.append(
             Ideal(
-                signal=log(1e-3, 30.0), background=log(1e-4, 10.0), period_ns=period, dead_ns=log(0.02, 20.0) * period,
-                sigma_ns=log(1e-4, 0.1) * period, jitter_ns=jitter, unit_ns=unit, whole=whole,
-                photons=log(1e3, photons), delay_ns=float(random.random()) * period, seed=seed * 10_000 + k,
+                signal=log(1e-3, 30.0),
+                background=log(1e-4, 10.0),
+                period_ns=period,
+                dead_ns=log(0.02, 20.0) * period,
+                sigma_ns=log(1e-4, 0.1) * period,
+                jitter_ns=jitter,
+                unit_ns=unit,
+                whole=whole,
+                photons=log(1e3, photons),
+                delay_ns=float(random.random()) * period,
+                seed=seed * 10_000 + k,
             )
-        )  # fmt: skip
+        )
     return found
 
 
 def stream_of(ideal: Ideal) -> Timestamps:
     """The stream, by the sequential engine (every photon drawn, in double precision), blurred and clocked here."""
     system = System(
-        period_ns=ideal.period_ns, cycles=ideal.cycles, bins=16, pulse=GaussianPulse(sigma_ns=ideal.sigma_ns),
+        period_ns=ideal.period_ns,
+        cycles=ideal.cycles,
+        bins=16,
+        pulse=GaussianPulse(sigma_ns=ideal.sigma_ns),
         detector=Detector(dead_time_ns=ideal.dead_ns),
-    )  # fmt: skip
+    )
     light = Flux(ideal.signal, ideal.background, ideal.delay_ns)
     made = simulate_timestamps(light, system, seed=ideal.seed, engine="sequential", threads=1)
     return recorded(ideal, made.times_ns, made.cycles)
@@ -127,9 +138,17 @@ def recorded(ideal: Ideal, avalanches_ns: NDArray[np.float64], cycles: int) -> T
     place = np.minimum(((times / ideal.period_ns - cycle) * bins).astype(np.int64), bins - 1)
     offsets = np.array([0, times.size], np.int64)
     return Timestamps(
-        times, cycle.astype(np.int32), place.astype(np.int32), offsets, (1, 1), bins, np.dtype(np.uint32),
-        ideal.period_ns, max(cycles + 1, int(cycle[-1]) + 1), {"unit_ns": ideal.unit_ns},
-    )  # fmt: skip
+        times,
+        cycle.astype(np.int32),
+        place.astype(np.int32),
+        offsets,
+        (1, 1),
+        bins,
+        np.dtype(np.uint32),
+        ideal.period_ns,
+        max(cycles + 1, int(cycle[-1]) + 1),
+        {"unit_ns": ideal.unit_ns},
+    )
 
 
 @dataclass(frozen=True)
@@ -185,9 +204,15 @@ def outcome(ideal: Ideal) -> Outcome:
     except ValueError as error:
         refused = str(error)
     return Outcome(
-        ideal, len(times), () if seen is None else seen.problems, () if light is None else light.unknown,
-        "" if light is None else light.dead_time_by, _pulls(ideal, seen, light), refused, time.process_time() - began,
-    )  # fmt: skip
+        ideal,
+        len(times),
+        () if seen is None else seen.problems,
+        () if light is None else light.unknown,
+        "" if light is None else light.dead_time_by,
+        _pulls(ideal, seen, light),
+        refused,
+        time.process_time() - began,
+    )
 
 
 def _pulls(ideal: Ideal, seen: Inspection | None, light: Calibration | None) -> dict[str, float]:

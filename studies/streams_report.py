@@ -52,9 +52,11 @@ def _findings(found: list[Outcome], covered: list[Coverage]) -> list[str]:
         f"many: {p:.2g})."
     ]
     flat = sum(one.flat for one in found)
-    lines.append(f"In {flat} no signal is told to be seen; in none of them does it stand out."
-                 if not any("flat" in text for one in found for text in one.alarms)
-                 else f"In {flat} no signal is told to be seen, wrongly in some.")  # fmt: skip
+    lines.append(
+        f"In {flat} no signal is told to be seen; in none of them does it stand out."
+        if not any("flat" in text for one in found for text in one.alarms)
+        else f"In {flat} no signal is told to be seen, wrongly in some."
+    )
     every = {name: value for one in covered for name, value in one.p.items()}
     failed = refused_by_holm(every, FAMILY)
     lines.append(
@@ -84,14 +86,16 @@ def _text(
         "double precision); jitter and clock are put on here. Whatever `inspect` says does not fit is a false alarm. "
         "Whatever `calibrate` states a finite error of is compared with the truth; an error of NaN says that the "
         "stream cannot tell, and a sentence says why. How it is done: [calibration.md](../calibration.md).",
-        configuration({
-            "streams": f"{settings.streams}, seed {settings.seed}",
-            "light": "S 1e-3 to 30, B 1e-4 to 10 photons per period, all ranges log-uniform",
-            "times": "period 10 to 1000 ns, dead time 0.02 to 20 periods, pulse sigma 1e-4 to 0.1 period",
-            "jitter": "sigma 1e-5 to 0.1 period; none in one of five",
-            "clock": "units of 1 ps to 1 ns; in half of them a whole number of units a period, else free",
-            "photons": f"about 1,000 to {settings.photons:,.0f}",
-        }),
+        configuration(
+            {
+                "streams": f"{settings.streams}, seed {settings.seed}",
+                "light": "S 1e-3 to 30, B 1e-4 to 10 photons per period, all ranges log-uniform",
+                "times": "period 10 to 1000 ns, dead time 0.02 to 20 periods, pulse sigma 1e-4 to 0.1 period",
+                "jitter": "sigma 1e-5 to 0.1 period; none in one of five",
+                "clock": "units of 1 ps to 1 ns; in half of them a whole number of units a period, else free",
+                "photons": f"about 1,000 to {settings.photons:,.0f}",
+            }
+        ),
         f"- machine: {machine()}\n- processor time: {spent:.0f} s",
         "## What is told",
         "\n".join(f"- {line}" for line in findings),
@@ -104,15 +108,20 @@ def _text(
         table([{"sentence of `calibrate` (its beginning)": text, "streams": n} for text, n in words.most_common()]),
         "## Jitter by its share of the period",
         table(_by_share(jittered)),
-    ]  # fmt: skip
+    ]
 
 
 def _row(one: Coverage, streams: int) -> Row:
     return {
-        "estimate": one.name, "stated": one.stated, "not stated": streams - one.stated, "within 1": one.within_1,
-        "within 2": one.within_2, "largest": one.largest, "beyond 5": one.beyond_5,
+        "estimate": one.name,
+        "stated": one.stated,
+        "not stated": streams - one.stated,
+        "within 1": one.within_1,
+        "within 2": one.within_2,
+        "largest": one.largest,
+        "beyond 5": one.beyond_5,
         "smallest p": f"{min(one.p.values()):.2g}",
-    }  # fmt: skip
+    }
 
 
 def _by_share(found: list[Outcome]) -> list[Row]:
@@ -123,21 +132,37 @@ def _by_share(found: list[Outcome]) -> list[Row]:
         seen = np.array([np.isfinite(one.pulls["jitter"]) for one in some])
         dead = np.array([np.isfinite(one.pulls["dead time"]) for one in some])
         pulls = np.abs([one.pulls["jitter"] for one in some if np.isfinite(one.pulls["jitter"])])
-        rows.append({
-            "jitter (periods)": f"{low:g} to {high:g}", "streams": len(some), "found": int(seen.sum()),
-            "not seen, or hides in the error": int((dead & ~seen).sum()), "not known": int((~dead & ~seen).sum()),
-            "largest pull": float(pulls.max(initial=0.0)),
-        })  # fmt: skip
+        rows.append(
+            {
+                "jitter (periods)": f"{low:g} to {high:g}",
+                "streams": len(some),
+                "found": int(seen.sum()),
+                "not seen, or hides in the error": int((dead & ~seen).sum()),
+                "not known": int((~dead & ~seen).sum()),
+                "largest pull": float(pulls.max(initial=0.0)),
+            }
+        )
     return rows
 
 
 def _csv_row(one: Outcome) -> Row:
     ideal = one.ideal
     return {
-        "signal": ideal.signal, "background": ideal.background, "period_ns": ideal.period_ns, "dead_ns": ideal.dead_ns,
-        "sigma_ns": ideal.sigma_ns, "jitter_ns": ideal.jitter_ns, "unit_ns": ideal.unit_ns, "whole": ideal.whole,
-        "seed": ideal.seed, "registrations": one.registrations, "dead time by": one.by,
+        "signal": ideal.signal,
+        "background": ideal.background,
+        "period_ns": ideal.period_ns,
+        "dead_ns": ideal.dead_ns,
+        "sigma_ns": ideal.sigma_ns,
+        "jitter_ns": ideal.jitter_ns,
+        "unit_ns": ideal.unit_ns,
+        "whole": ideal.whole,
+        "seed": ideal.seed,
+        "registrations": one.registrations,
+        "dead time by": one.by,
         **{f"pull of {name}": float(value) for name, value in one.pulls.items()},
-        "alarms": "; ".join(one.alarms), "flat": one.flat, "unknown": "; ".join(one.unknown), "refused": one.refused,
+        "alarms": "; ".join(one.alarms),
+        "flat": one.flat,
+        "unknown": "; ".join(one.unknown),
+        "refused": one.refused,
         "seconds": one.seconds,
-    }  # fmt: skip
+    }

@@ -164,4 +164,3 @@ def _measure(case: Mapping[str, Any], grids: Mapping[str, tuple[float, float, in
         ),
         built.law_error(samples=laws, seed=_SEED),
     )
-

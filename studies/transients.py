@@ -135,8 +135,6 @@ def _panel(ax: Axes, system: System, arrivals: FloatArray, shown: list[Seen]) ->
 
 def _settings(exposures: int) -> dict[str, Any]:
     system = view(DETECTORS["non-paralyzable"])
-    told = {
-        field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"
-    }
+    told = {field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"}
     light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND}
     return told | light | {"dead_time_ns": DEAD_NS, "exposures": exposures, "engine": "exact", "seed": SEED}

@@ -28,9 +28,7 @@ def system() -> System:
 @pytest.fixture
 def flux() -> Flux:
     """A small image: dim, bright, without signal, without anything."""
-    return Flux(
-        [[0.5, 3.0, 0.0], [10.0, 0.01, 0.0]], [[0.5, 0.1, 1.0], [2.0, 0.0, 0.0]], [[10, 60, 0], [133, 90, 5]]
-    )
+    return Flux([[0.5, 3.0, 0.0], [10.0, 0.01, 0.0]], [[0.5, 0.1, 1.0], [2.0, 0.0, 0.0]], [[10, 60, 0], [133, 90, 5]])
 
 
 @pytest.fixture

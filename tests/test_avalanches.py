@@ -42,13 +42,25 @@ SAMPLED = ml.Afterpulsing(probability=0.5, delays=(0.0, 3.0, 0.0, 1.0), bin_ns=3
 
 
 def case(
-    signal: Any, background: float, start: str = "armed", *, items: int | None = None, pulse: ml.Pulse | None = None,
-    cycles: int = 60, bins: int = 64, delay: Any = 0.37, **detector: Any,
-) -> Case:  # fmt: skip
+    signal: Any,
+    background: float,
+    start: str = "armed",
+    *,
+    items: int | None = None,
+    pulse: ml.Pulse | None = None,
+    cycles: int = 60,
+    bins: int = 64,
+    delay: Any = 0.37,
+    **detector: Any,
+) -> Case:
     system = ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=bins, pulse=pulse or ml.GaussianPulse(sigma_ns=2.0), start=start,
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=bins,
+        pulse=pulse or ml.GaussianPulse(sigma_ns=2.0),
+        start=start,
         detector=ml.Detector(**detector),
-    )  # fmt: skip
+    )
     flux = waveform_flux(WAVE, background) if signal is WAVE else flux_of(signal, background, delay)
     shown = "waveform" if signal is WAVE else f"S {signal}"
     name = f"{shown}, B {background}, {start}, {sorted(detector)}, {detector.get('mode', '')}"
@@ -60,25 +72,57 @@ CASES = [
     case(2.0, 1.0, dead_time_ns=75.0, afterpulsing=EXPONENTIAL),
     case(8.0, 0.3, "stationary", dead_time_ns=99.0, afterpulsing=SAMPLED, twilight_ns=9.0),
     case(0.3, 0.1, dead_time_ns=0.0, afterpulsing=ml.Afterpulsing(probability=0.9, delay_ns=900.0)),
-    case([1.0, 0.5], 0.2, "stationary", dead_time_ns=220.0, afterpulsing=EXPONENTIAL, twilight_ns=130.0,
-         delay=[0.1, 0.93]),
+    case(
+        [1.0, 0.5],
+        0.2,
+        "stationary",
+        dead_time_ns=220.0,
+        afterpulsing=EXPONENTIAL,
+        twilight_ns=130.0,
+        delay=[0.1, 0.93],
+    ),
     # delays of hundreds of periods, whose fraction is drawn apart
-    case(0.02, 0.01, cycles=3000, items=1500, dead_time_ns=30.0, pulse=ml.GaussianPulse(sigma_ns=0.3),
-         afterpulsing=ml.Afterpulsing(probability=0.8, delay_ns=40_000.0)),
+    case(
+        0.02,
+        0.01,
+        cycles=3000,
+        items=1500,
+        dead_time_ns=30.0,
+        pulse=ml.GaussianPulse(sigma_ns=0.3),
+        afterpulsing=ml.Afterpulsing(probability=0.8, delay_ns=40_000.0),
+    ),
     case(1.0, 1.0, dead_time_ns=200.0, twilight_ns=20.0, pulse=ml.SampledPulse(two_lobes(), 0.5)),
     case(2.0, 0.5, "stationary", dead_time_ns=30.0, mode="paralyzable", afterpulsing=EXPONENTIAL),
     case(2.0, 0.5, dead_time_ns=130.0, mode="synchronous", afterpulsing=SAMPLED),
     case(3.0, 0.5, dead_time_ns=40.0, afterpulsing=EXPONENTIAL, gate_step_ns=7.0, **GATE),
-    case(3.0, 0.5, "stationary", dead_time_ns=100.0, afterpulsing=SAMPLED, electronics_dead_time_ns=170.0,
-         jitter=ml.Jitter(sigma_ns=1.5), max_events_per_exposure=31, **GATE),
+    case(
+        3.0,
+        0.5,
+        "stationary",
+        dead_time_ns=100.0,
+        afterpulsing=SAMPLED,
+        electronics_dead_time_ns=170.0,
+        jitter=ml.Jitter(sigma_ns=1.5),
+        max_events_per_exposure=31,
+        **GATE,
+    ),
     case(WAVE, 0.3, dead_time_ns=75.0, afterpulsing=EXPONENTIAL, twilight_ns=31.0),
     case(WAVE, 0.3, "stationary", dead_time_ns=220.0, afterpulsing=SAMPLED, twilight_ns=130.0),
     case(WAVE, 0.3, "stationary", dead_time_ns=30.0, mode="paralyzable", afterpulsing=EXPONENTIAL),
     case(WAVE, 0.0, dead_time_ns=0.0, afterpulsing=ml.Afterpulsing(probability=0.9, delay_ns=900.0), cycles=20),
     case(WAVE, 0.3, dead_time_ns=130.0, mode="synchronous", afterpulsing=SAMPLED, bins=50),
-    case(WAVE, 0.5, "stationary", dead_time_ns=100.0, afterpulsing=SAMPLED, electronics_dead_time_ns=170.0,
-         jitter=ml.Jitter(sigma_ns=1.5), max_events_per_exposure=31, **GATE),
-]  # fmt: skip
+    case(
+        WAVE,
+        0.5,
+        "stationary",
+        dead_time_ns=100.0,
+        afterpulsing=SAMPLED,
+        electronics_dead_time_ns=170.0,
+        jitter=ml.Jitter(sigma_ns=1.5),
+        max_events_per_exposure=31,
+        **GATE,
+    ),
+]
 
 
 @pytest.mark.parametrize("made", CASES, ids=lambda made: made.name)
@@ -105,8 +149,16 @@ def against(found: np.ndarray, expected: float, about: str) -> None:
 def test_without_a_dead_time_it_is_a_hawkes_process(engine: str):
     """Its rate solves r = lambda + p f * r: in each harmonic of the period r_k = lambda_k / (1 - p F_k)."""
     p, tau = 0.4, 0.37  # periods
-    made = case(2.0, 0.5, "stationary", dead_time_ns=0.0, items=8000, cycles=20, bins=32,
-                afterpulsing=ml.Afterpulsing(probability=p, delay_ns=tau * PERIOD_NS))  # fmt: skip
+    made = case(
+        2.0,
+        0.5,
+        "stationary",
+        dead_time_ns=0.0,
+        items=8000,
+        cycles=20,
+        bins=32,
+        afterpulsing=ml.Afterpulsing(probability=p, delay_ns=tau * PERIOD_NS),
+    )
     sample, fine = draw(ENGINES[engine], made, 3), 32
     k = np.fft.fftfreq(32 * fine, 1 / (32 * fine))
     photons = 2.0 * made.system.pulse.bin_energy(37.0, PERIOD_NS, 32 * fine) + 0.5 / (32 * fine)
@@ -117,8 +169,16 @@ def test_without_a_dead_time_it_is_a_hawkes_process(engine: str):
     for j in range(8):
         against(part[:, j].astype(float), expected[j], f"{engine}: bin {j}")
     # armed at the start: the mean relaxes from lambda to lambda / (1 - p) at the rate (1 - p) / tau
-    armed = case(0.0, 2.0, dead_time_ns=0.0, items=20_000, cycles=2, bins=4, delay=0.0,
-                 afterpulsing=ml.Afterpulsing(probability=p, delay_ns=tau * PERIOD_NS))  # fmt: skip
+    armed = case(
+        0.0,
+        2.0,
+        dead_time_ns=0.0,
+        items=20_000,
+        cycles=2,
+        bins=4,
+        delay=0.0,
+        afterpulsing=ml.Afterpulsing(probability=p, delay_ns=tau * PERIOD_NS),
+    )
     decay = (1 - p) / tau
     mean = 2.0 / (1 - p) * (2 - p * -np.expm1(-decay * 2) / decay)
     against(draw(ENGINES[engine], armed, 4).counts.astype(float), mean, f"{engine}: armed")
@@ -136,9 +196,12 @@ def test_rate_under_constant_light(engine: str, probability: float, twilight: fl
 
 def test_constant_light_rate_of_sampled_and_exponential_delays():
     exponential = ml.Detector(
-        dead_time_ns=24.0, twilight_ns=3.0, dark_count_hz=1e5, detection_efficiency=0.5,
+        dead_time_ns=24.0,
+        twilight_ns=3.0,
+        dark_count_hz=1e5,
+        detection_efficiency=0.5,
         afterpulsing=ml.Afterpulsing.after_dead_time(probability=0.05, delay_ns=40.0, dead_time_ns=24.0),
-    )  # fmt: skip
+    )
     cells = tuple(np.diff(exponential.afterpulsing.cumulative(np.arange(1401) * 0.5)))
     sampled = replace(
         exponential,
@@ -210,9 +273,7 @@ def line(shape: tuple[int, int], lit: tuple[int, int], **crosstalk: Any) -> tupl
     signal = np.zeros(shape)
     signal[lit] = 1.5
     detector = ml.Detector(dead_time_ns=45.0, crosstalk=ml.Crosstalk(**crosstalk))
-    system = ml.System(
-        period_ns=PERIOD_NS, cycles=40, bins=50, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=detector
-    )
+    system = ml.System(period_ns=PERIOD_NS, cycles=40, bins=50, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=detector)
     return ml.Flux(signal, 0.0, 37.0), system
 
 
@@ -246,9 +307,13 @@ def test_crosstalk_bits_and_whole_images():
     flux = ml.Flux(random.uniform(0, 2, (9, 7)), random.uniform(0, 1, (9, 7)), 37.0)
     detector = ml.Detector(dead_time_ns=45.0, crosstalk=ml.Crosstalk(probability=0.2), afterpulsing=SAMPLED)
     system = ml.System(
-        period_ns=PERIOD_NS, cycles=30, bins=50, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=detector,
+        period_ns=PERIOD_NS,
+        cycles=30,
+        bins=50,
+        pulse=ml.GaussianPulse(sigma_ns=2.0),
+        detector=detector,
         start="stationary",
-    )  # fmt: skip
+    )
     whole = ml.simulate(flux, system, engine="sequential", realizations=3)
     one = ml.simulate(flux, system, engine="sequential", first_realization=1, threads=1)
     assert np.array_equal(one[0], whole[1])
@@ -296,7 +361,7 @@ def test_what_has_no_law_says_so(name: str):
         (lambda: ml.Detector.preset("spad"), "excelitas-spcm-aqrh"),
         (lambda: case(1, 1, dead_time_ns=1.0, afterpulsing=replace(EXPONENTIAL, delay_ns=1e9)), "1e6 periods"),
     ],
-)  # fmt: skip
+)
 def test_refused(make: Any, told: str):
     with pytest.raises((ValueError, TypeError), match=told):
         make()
@@ -305,9 +370,11 @@ def test_refused(make: Any, told: str):
 def test_round_trip_and_preset():
     for afterpulsing in (EXPONENTIAL, SAMPLED):
         detector = ml.Detector(
-            dead_time_ns=20.0, afterpulsing=afterpulsing, twilight_ns=2.0,
+            dead_time_ns=20.0,
+            afterpulsing=afterpulsing,
+            twilight_ns=2.0,
             crosstalk=ml.Crosstalk(probability=0.1, kernel=[[0, 1, 0], [1, 0, 2], [0, 1, 0]]),
-        )  # fmt: skip
+        )
         assert ml.Detector.from_dict(detector.to_dict()) == detector
     assert ml.Crosstalk.from_dict({"probability": 0.1, "kernel": 4}) == ml.Crosstalk(probability=0.1, kernel="4")
     module = ml.Detector.preset("excelitas-spcm-aqrh")

@@ -78,13 +78,9 @@ def test_system_as_a_whole():
     refused(gaussian(5e-5), ValueError, "sigma_ns", "[0.0001, 100] ns", "got 5e-05")
     refused(gaussian(101.0), ValueError, "sigma_ns", "[0.0001, 100] ns", "got 101")
     long = ml.SampledPulse(np.ones(11), 10.0)
-    refused(
-        lambda: ml.System(**GOOD | {"pulse": long}), ValueError, "values", "100 ns", "11 samples", "110 ns"
-    )
+    refused(lambda: ml.System(**GOOD | {"pulse": long}), ValueError, "values", "100 ns", "11 samples", "110 ns")
     dead = ml.Detector(dead_time_ns=2e8)
-    refused(
-        lambda: ml.System(**GOOD | {"detector": dead}), ValueError, "dead_time_ns", "1048576 periods", "2e+08"
-    )
+    refused(lambda: ml.System(**GOOD | {"detector": dead}), ValueError, "dead_time_ns", "1048576 periods", "2e+08")
 
 
 @pytest.mark.parametrize(

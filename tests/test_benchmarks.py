@@ -37,13 +37,37 @@ TINY = Config(
     commands=1,
 )
 IN_PROCESS = (
-    "exact", "numpy", "flux", "cycles", "pixels", "paths", "effects", "waveform", "exposure", "stationary",
-)  # fmt: skip
+    "exact",
+    "numpy",
+    "flux",
+    "cycles",
+    "pixels",
+    "paths",
+    "effects",
+    "waveform",
+    "exposure",
+    "stationary",
+)
 TIMING_COLUMNS = {
-    "case", "engine", "level", "threads", "pixels", "cycles", "S + B", "registrations", "ms", "ms least",
-    "CPU ms", "ns/reg/core", "x reference", "MiB written", "write floor ms", "ops/reg least",
-    "ops floor ns/reg", "turns",
-}  # fmt: skip
+    "case",
+    "engine",
+    "level",
+    "threads",
+    "pixels",
+    "cycles",
+    "S + B",
+    "registrations",
+    "ms",
+    "ms least",
+    "CPU ms",
+    "ns/reg/core",
+    "x reference",
+    "MiB written",
+    "write floor ms",
+    "ops/reg least",
+    "ops floor ns/reg",
+    "turns",
+}
 
 
 @pytest.fixture(scope="module")

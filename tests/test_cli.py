@@ -60,13 +60,51 @@ def test_every_option_of_the_run_reaches_the_file(tmp_path, suffix):
     np.save(tmp_path / "irf.npy", np.exp(-np.arange(50) / 9.0))
     out = tmp_path / f"cube{suffix}"
     done = run(
-        "simulate", "--scene", "room", "--size", 10, "--scene-seed", 4, "--period-ns", 80,
-        "--dead-time-ns", 20,
-        "--cycles", 40, "--bins", 32, "--pulse-file", tmp_path / "irf.npy", "--pulse-bin-ns", 0.1,
-        "--pulse-origin", "centroid", "--start", "stationary", "--signal", 0.7, "--sbr", 2.5,
-        "--attenuation", "inverse_square", "--ambient", "reflectivity", "--dark-count-hz", 1e5,
-        "--engine", "sequential", "--realizations", 3, "--seed", 8, "--threads", 1, "--no-picture", "-o", out,
-    )  # fmt: skip
+        "simulate",
+        "--scene",
+        "room",
+        "--size",
+        10,
+        "--scene-seed",
+        4,
+        "--period-ns",
+        80,
+        "--dead-time-ns",
+        20,
+        "--cycles",
+        40,
+        "--bins",
+        32,
+        "--pulse-file",
+        tmp_path / "irf.npy",
+        "--pulse-bin-ns",
+        0.1,
+        "--pulse-origin",
+        "centroid",
+        "--start",
+        "stationary",
+        "--signal",
+        0.7,
+        "--sbr",
+        2.5,
+        "--attenuation",
+        "inverse_square",
+        "--ambient",
+        "reflectivity",
+        "--dark-count-hz",
+        1e5,
+        "--engine",
+        "sequential",
+        "--realizations",
+        3,
+        "--seed",
+        8,
+        "--threads",
+        1,
+        "--no-picture",
+        "-o",
+        out,
+    )
     assert done.exit_code == 0, done.output
     assert not out.with_suffix(".png").exists()
     pulse = ml.SampledPulse(np.exp(-np.arange(50) / 9.0), 0.1, "centroid")
@@ -120,9 +158,18 @@ def test_a_system_file_and_options_on_top_of_it(tmp_path):
     text = (tmp_path / "spad.yaml").read_text().replace("dead_time_ns: 75.0", "dead_time_ns: 33.0")
     (tmp_path / "spad.yaml").write_text(text)
     done = run(
-        "simulate", "--scene", "room", *SMALL, "--system", tmp_path / "spad.yaml", "--pulse-fwhm-ns", 2,
-        "--no-picture", "-o", tmp_path / "a.zarr",
-    )  # fmt: skip
+        "simulate",
+        "--scene",
+        "room",
+        *SMALL,
+        "--system",
+        tmp_path / "spad.yaml",
+        "--pulse-fwhm-ns",
+        2,
+        "--no-picture",
+        "-o",
+        tmp_path / "a.zarr",
+    )
     assert done.exit_code == 0, done.output
     with io.load(tmp_path / "a.zarr") as cube:
         assert cube.system.detector.dead_time_ns == 33.0
@@ -365,7 +412,9 @@ def test_a_pipe_without_unicode_gets_plain_text(tmp_path):
     assert run("simulate", "--scene", "room", *SMALL, "--no-picture", "-o", out).exit_code == 0
     done = subprocess.run(
         [sys.executable, "-c", "from mars_lidar.cli import main; main()", "info", str(out)],
-        env=os.environ | {"PYTHONIOENCODING": "ascii"}, capture_output=True, check=True,
-    )  # fmt: skip
+        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        check=True,
+    )
     assert b"1 ? " in done.stdout
     assert done.stderr == b""

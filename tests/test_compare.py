@@ -66,10 +66,15 @@ class Dimmed(Engine):
         flux = task.flux
         darker = ml.Flux(0.97 * flux.signal, 0.97 * flux.background, flux.delay_ns)
         ml.simulate(
-            darker, task.system, realizations=task.realizations, first_realization=task.first_realization,
-            pixel_index=task.pixel_index, seed=task.seed, threads=task.threads,
+            darker,
+            task.system,
+            realizations=task.realizations,
+            first_realization=task.first_realization,
+            pixel_index=task.pixel_index,
+            seed=task.seed,
+            threads=task.threads,
             out=out.reshape(task.realizations, *flux.shape, -1),
-        )  # fmt: skip
+        )
 
 
 class Refusing(Engine):

@@ -22,8 +22,12 @@ def test_standard_errors_are_those_of_repeated_samples():
         z = [(getattr(m, name).value - true) / getattr(m, name).error for m in many]
         assert 0.88 < np.std(z) < 1.12, name  # 0.035 by chance; the variance's own error adds some
     cumulants = np.array([mean, variance, *(_third_and_fourth(law))])
-    z = np.array([[e.z for e in vars(Moments.of(law.rvs(size=500, random_state=random), cumulants=cumulants)).values()]
-                  for _ in range(400)])  # fmt: skip
+    z = np.array(
+        [
+            [e.z for e in vars(Moments.of(law.rvs(size=500, random_state=random), cumulants=cumulants)).values()]
+            for _ in range(400)
+        ]
+    )
     assert np.all((z.std(0) > 0.8) & (z.std(0) < 1.15))
     a, b = many[0].variance, many[1].variance
     assert ratio(a, b).value == a.value / b.value

@@ -63,10 +63,18 @@ GOLDEN = {
 KINDS = [
     (mode, kind)
     for mode in DETECTORS
-    for kind in ("gaussian", "returns", "sampled", "waveform", "stationary", "stationary waveform", "whole periods",
-                 "long dead time")
+    for kind in (
+        "gaussian",
+        "returns",
+        "sampled",
+        "waveform",
+        "stationary",
+        "stationary waveform",
+        "whole periods",
+        "long dead time",
+    )
     if not (mode == "moving" and kind in ("stationary", "stationary waveform", "long dead time"))
-]  # fmt: skip
+]
 
 
 def scene(mode: str, kind: str) -> tuple[ml.Flux, ml.System]:
@@ -101,9 +109,7 @@ def test_threads_parts_and_timestamps(engine: str, mode: str, kind: str):
     whole = ml.simulate(flux, system, engine=engine, realizations=2, seed=3, threads=1)
     assert np.array_equal(whole, ml.simulate(flux, system, engine=engine, realizations=2, seed=3, threads=3))
     index = np.arange(SHAPE[0] * SHAPE[1]).reshape(SHAPE)[1:4, 3:9]
-    part = ml.simulate(
-        flux[1:4, 3:9], system, engine=engine, first_realization=1, pixel_index=index, seed=3
-    )  # fmt: skip
+    part = ml.simulate(flux[1:4, 3:9], system, engine=engine, first_realization=1, pixel_index=index, seed=3)
     assert np.array_equal(part[0], whole[1, 1:4, 3:9])
     times = ml.simulate_timestamps(flux, system, engine=engine, realization=1, seed=3)
     assert np.array_equal(times.histogram(), whole[1])

@@ -36,9 +36,13 @@ BOTH = ["exact", "sequential"]
 def gate(start: float, width: float, dead: float, step: float = 0.0, cycles: int = 1) -> Detector:
     """A gated detector, all in periods."""
     return Detector(
-        dead_time_ns=dead * PERIOD_NS, mode="gated", gate_start_ns=start * PERIOD_NS,
-        gate_width_ns=width * PERIOD_NS, gate_step_ns=step * PERIOD_NS, gate_cycles=cycles,
-    )  # fmt: skip
+        dead_time_ns=dead * PERIOD_NS,
+        mode="gated",
+        gate_start_ns=start * PERIOD_NS,
+        gate_width_ns=width * PERIOD_NS,
+        gate_step_ns=step * PERIOD_NS,
+        gate_cycles=cycles,
+    )
 
 
 def detector(mode: str, dead: float) -> Detector:
@@ -166,9 +170,7 @@ SYNCHRONOUS = {
         pulsed(0, 0, detector("synchronous", 0.0)), flux=flux_of([1.0, 0.4, 0.1], 0.5, [0.2, 0.21, 0.9])
     ),
     # photons in the first 40 % of the period only, so that a dead time of 60 % never reaches the next
-    "dead time": replace(
-        pulsed(0, 0, detector("synchronous", 0.6)), flux=waveform_flux([0.5, 0.3, 0.0, 0.0, 0.0])
-    ),
+    "dead time": replace(pulsed(0, 0, detector("synchronous", 0.6)), flux=waveform_flux([0.5, 0.3, 0.0, 0.0, 0.0])),
 }
 
 
@@ -237,9 +239,7 @@ def test_gate_without_dead_time_is_poisson(engine: str, kind: str, flux: str):
     check(ENGINES[engine], case, Law(mean, pmf, independent_poisson=True), {COUNTS, SHAPE, JOINT})
 
 
-@pytest.mark.parametrize(
-    ("step", "stay", "cycles"), [(0.05, 1, 37), (-0.11, 3, 40), (0.3, 7, 200), (1 / 640, 2, 300)]
-)
+@pytest.mark.parametrize(("step", "stay", "cycles"), [(0.05, 1, 37), (-0.11, 3, 40), (0.3, 7, 200), (1 / 640, 2, 300)])
 @pytest.mark.parametrize("engine", BOTH)
 def test_moving_gate_without_dead_time_is_poisson(engine: str, step: float, stay: int, cycles: int):
     case = pulsed(0.8, 0.5, gate(0.6, 0.2, 0.0, step, stay), cycles=cycles, items=4000)

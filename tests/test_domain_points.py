@@ -26,7 +26,7 @@ from harness import (
     flux_of,
     require,
     waveform_flux,
-)  # fmt: skip
+)
 from harness.pvalues import variance_score
 from scipy import special, stats
 
@@ -39,9 +39,13 @@ from studies.domain.systems import draw
 
 def _system(dead: float, sigma: float, bins: int, cycles: int, start: str = "armed") -> ml.System:
     return ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS), start=start,
-    )  # fmt: skip
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
+        start=start,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,10 +129,14 @@ WAVEFORMS: dict[str, tuple[np.ndarray, float, float, int, int, str]] = {
     "two spikes, a million cycles": (_spikes(48, {3: 2.0, 20: 1.5}), 0.1, 0.457, 48, 1_000_000, "armed"),
     "40 parts in 48 bins": (_spikes(40, {3: 2.0, 20: 1.5}), 0.1, 0.457, 48, 100_000, "armed"),
     "7 parts in 2 bins": (
-        0.758 * np.array([0.02, 0.4, 0.01, 0.3, 0.17, 0.0, 0.1]), 0.11653829, 5.880561209937386, 2, 3_000_000,
+        0.758 * np.array([0.02, 0.4, 0.01, 0.3, 0.17, 0.0, 0.1]),
+        0.11653829,
+        5.880561209937386,
+        2,
+        3_000_000,
         "stationary",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("engine", ["feedback", "auto"])
@@ -144,9 +152,12 @@ def test_waveforms(name: str, engine: str) -> None:
 def test_a_scene_of_long_locked_pixels() -> None:
     """The issue's own: 200 pixels of 20 and 2 photons, a million cycles; none may hold 0 or 2^31 counts."""
     system = ml.System(
-        period_ns=1e3 / 7.5, cycles=1_000_000, bins=1024, pulse=ml.GaussianPulse(sigma_ns=0.5),
+        period_ns=1e3 / 7.5,
+        cycles=1_000_000,
+        bins=1024,
+        pulse=ml.GaussianPulse(sigma_ns=0.5),
         detector=ml.Detector(dead_time_ns=0.97e3 / 7.5),
-    )  # fmt: skip
+    )
     cube = ml.simulate(ml.Flux(np.full((1, 200), 20.0), 2.0, 60.0), system, engine="auto", seed=1)
     counts = cube.sum(-1, dtype=np.int64)
     assert counts.min() >= 999_997
@@ -290,8 +301,10 @@ def test_no_time_at_the_end_of_the_exposure() -> None:
 def test_bound_of_two_bins() -> None:
     """Three unknowns in two bins: errors without bound, neither NaN nor an exception of linear algebra."""
     for signal, background, dead, sigma, cycles in (
-        (4.65, 0.2, 0.772, 0.01, 319_172), (0.0223, 1.6e-6, 1.0, 5.6e-4, 1), (3.798, 4.0805, 4.947, 0.00988, 215),
-    ):  # fmt: skip
+        (4.65, 0.2, 0.772, 0.01, 319_172),
+        (0.0223, 1.6e-6, 1.0, 5.6e-4, 1),
+        (3.798, 4.0805, 4.947, 0.00988, 215),
+    ):
         bound = ml.cramer_rao(signal, background, _system(dead, sigma, 2, cycles), delay_ns=30.0)
         for error in (bound.signal, bound.background, bound.delay_ns):
             assert not np.isnan(error)

@@ -44,9 +44,14 @@ MODES: dict[str, dict[str, Any]] = {
     "gated": {"gate_start_ns": 20.0, "gate_width_ns": 50.0},
 }
 ALL = {
-    "jitter": TAIL, "code_density": CODES, "electronics_dead_time_ns": 41.0, "max_events_per_period": 1,
-    "max_events_per_exposure": 30, "detection_efficiency": 0.6, "dark_count_hz": 2e6,
-}  # fmt: skip
+    "jitter": TAIL,
+    "code_density": CODES,
+    "electronics_dead_time_ns": 41.0,
+    "max_events_per_period": 1,
+    "max_events_per_exposure": 30,
+    "detection_efficiency": 0.6,
+    "dark_count_hz": 2e6,
+}
 EACH: dict[str, dict[str, Any]] = {
     "tail": {"jitter": TAIL},
     "sampled": {"jitter": SAMPLED},
@@ -265,9 +270,15 @@ def test_bits_do_not_depend_on_level_threads_and_parts(name: str, mode: str, wav
 
 def test_off_is_the_ideal_pixel():
     off = Detector(
-        dead_time_ns=17.0, detection_efficiency=1.0, dark_count_hz=0.0, electronics_dead_time_ns=0.0, jitter=None,
-        code_density=None, max_events_per_period=None, max_events_per_exposure=None,
-    )  # fmt: skip
+        dead_time_ns=17.0,
+        detection_efficiency=1.0,
+        dark_count_hz=0.0,
+        electronics_dead_time_ns=0.0,
+        jitter=None,
+        code_density=None,
+        max_events_per_period=None,
+        max_events_per_exposure=None,
+    )
     assert off == Detector(dead_time_ns=17.0)
     assert off.to_dict() == {"dead_time_ns": 17.0, "mode": "nonparalyzable"}
     assert off.effects == ()

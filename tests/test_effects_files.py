@@ -26,14 +26,21 @@ from mars_lidar.instrument.effects import EFFECTS, FIELDS, TIMING_EFFECTS
 from mars_lidar.plot.data import predicted_counts
 
 REAL = Detector(
-    dead_time_ns=20.0, detection_efficiency=0.3, dark_count_hz=1e4, electronics_dead_time_ns=60.0,
-    max_events_per_period=2, max_events_per_exposure=50, jitter=Jitter(sigma_ns=0.1, tail_ns=0.3, tail_fraction=0.2),
+    dead_time_ns=20.0,
+    detection_efficiency=0.3,
+    dark_count_hz=1e4,
+    electronics_dead_time_ns=60.0,
+    max_events_per_period=2,
+    max_events_per_exposure=50,
+    jitter=Jitter(sigma_ns=0.1, tail_ns=0.3, tail_fraction=0.2),
     code_density=(1.2, 0.8),
-)  # fmt: skip
+)
 ALL = dataclasses.replace(
-    REAL, afterpulsing=Afterpulsing(probability=0.1, delay_ns=30.0), twilight_ns=1.0,
+    REAL,
+    afterpulsing=Afterpulsing(probability=0.1, delay_ns=30.0),
+    twilight_ns=1.0,
     crosstalk=Crosstalk(probability=0.1),
-)  # fmt: skip
+)
 
 
 def system(detector: Detector = REAL, **changes: object) -> System:
@@ -177,10 +184,31 @@ def test_command_line(tmp_path):
     """Flags and file give the same detector; the cube remembers it, says it, and can be made again."""
     np.save(tmp_path / "codes.npy", np.array([1.2, 0.8]))
     flags = (
-        "--dead-time-ns", 20, "--detection-efficiency", 0.3, "--dark-count-hz", 1e4, "--electronics-dead-time-ns", 60,
-        "--max-events-per-period", 2, "--max-events-per-exposure", 50, "--jitter-fwhm-ns", 0.2, "--jitter-tail-ns", 0.3,
-        "--jitter-tail-fraction", 0.2, "--code-density-file", tmp_path / "codes.npy", "--cycles", 50, "--bins", 32,
-    )  # fmt: skip
+        "--dead-time-ns",
+        20,
+        "--detection-efficiency",
+        0.3,
+        "--dark-count-hz",
+        1e4,
+        "--electronics-dead-time-ns",
+        60,
+        "--max-events-per-period",
+        2,
+        "--max-events-per-exposure",
+        50,
+        "--jitter-fwhm-ns",
+        0.2,
+        "--jitter-tail-ns",
+        0.3,
+        "--jitter-tail-fraction",
+        0.2,
+        "--code-density-file",
+        tmp_path / "codes.npy",
+        "--cycles",
+        50,
+        "--bins",
+        32,
+    )
     scene = ("simulate", "--scene", "room", "--size", 8, "--no-picture", "-o")
     code, told = run(*scene, tmp_path / "a.npz", *flags)
     assert code == 0, told

@@ -57,18 +57,25 @@ RANDOM = random_cases(40, seed=2024, photons=2.5e6)
 
 def constant_rate(rate: float, dead: float, cycles: int, items: int, start: str = "armed") -> Case:
     system = System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=16, pulse=GaussianPulse(sigma_ns=1.0),
-        detector=Detector(dead_time_ns=dead * PERIOD_NS), start=start,
-    )  # fmt: skip
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=16,
+        pulse=GaussianPulse(sigma_ns=1.0),
+        detector=Detector(dead_time_ns=dead * PERIOD_NS),
+        start=start,
+    )
     name = f"constant rate {rate:g}, t_d {dead:g}, {cycles} cycles, {start}"
     return Case(name, flux_of(0.0, rate), system, items)
 
 
 def pulsed(signal: float, background: float, dead: float, *, items: int = 6000, **changes: object) -> Case:
     system = System(
-        period_ns=PERIOD_NS, cycles=200, bins=64, pulse=GaussianPulse(sigma_ns=2.0),
+        period_ns=PERIOD_NS,
+        cycles=200,
+        bins=64,
+        pulse=GaussianPulse(sigma_ns=2.0),
         detector=Detector(dead_time_ns=dead * PERIOD_NS),
-    ).replace(**changes)  # fmt: skip
+    ).replace(**changes)
     name = f"S {signal:g}, B {background:g}, t_d {dead:g}, {system.cycles} cycles, {system.start}"
     return Case(name, flux_of(signal, background, 0.37), system, items)
 
@@ -185,9 +192,7 @@ def test_constant_rate(engine: str, rate: float, dead: float, cycles: int, start
     ("signal", "background", "periods"), [(1.0, 0.2, 1), (5.0, 0.2, 3), (8.0, 0.02, 50), (0.1, 0, 2)]
 )
 @pytest.mark.parametrize("engine", WITH_DEAD_TIME)
-def test_dead_time_of_whole_periods_does_not_distort(
-    engine: str, signal: float, background: float, periods: int
-):
+def test_dead_time_of_whole_periods_does_not_distort(engine: str, signal: float, background: float, periods: int):
     """r = lambda / (1 + k Lambda), exactly, from a stationary start."""
     items = max(400, 1200 // periods) if engine == TRUTH else 12_000
     case = pulsed(signal, background, float(periods), cycles=4 * periods + 3, start="stationary", items=items)
@@ -257,9 +262,7 @@ def test_random_system_without_dead_time(engine: str, case: Case):
 
 
 @pytest.mark.parametrize("name", ["face_free_8ps", "face_free_unimodal_8ps"])
-@pytest.mark.parametrize(
-    ("origin", "start"), [("peak", "armed"), ("centroid", "stationary"), ("first", "armed")]
-)
+@pytest.mark.parametrize(("origin", "start"), [("peak", "armed"), ("centroid", "stationary"), ("first", "armed")])
 @pytest.mark.parametrize("engine", sorted(set(WITH_DEAD_TIME) - {TRUTH}))
 def test_measured_pulse(engine: str, name: str, origin: str, start: str):
     pulse = measured_pulse(name, 10.0, origin)

@@ -32,9 +32,7 @@ LONGEST = _MAX_CYCLES
 
 def system(**changes: object) -> ml.System:
     """Period 100 ns, bins of a quarter of the pulse's sigma."""
-    base = ml.System(
-        period_ns=100.0, cycles=1000, bins=400, pulse=GAUSSIAN, detector=ml.Detector(dead_time_ns=50.0)
-    )
+    base = ml.System(period_ns=100.0, cycles=1000, bins=400, pulse=GAUSSIAN, detector=ml.Detector(dead_time_ns=50.0))
     return base.replace(**changes)
 
 
@@ -68,16 +66,10 @@ def test_phases_of_a_dim_background_have_no_lattice(photons: float):
     require(
         {
             "number": 2 * stats.norm.sf(abs(n - 1.5e6) / np.sqrt(1.5e6)),
-            "phases over 4096 bins": goodness(
-                np.bincount(times.bin, minlength=4096), np.full(4096, n / 4096)
-            ),
-            "cycles": goodness(
-                np.bincount(times.cycle // (view.cycles // 500), minlength=500), np.full(500, n / 500)
-            ),
+            "phases over 4096 bins": goodness(np.bincount(times.bin, minlength=4096), np.full(4096, n / 4096)),
+            "cycles": goodness(np.bincount(times.cycle // (view.cycles // 500), minlength=500), np.full(500, n / 500)),
             # 16 cells inside each 2^-16 of a period: what a coarse wait would leave empty
-            "fine phases": goodness(
-                np.bincount((phase * 2**20).astype(int) % 16, minlength=16), np.full(16, n / 16)
-            ),
+            "fine phases": goodness(np.bincount((phase * 2**20).astype(int) % 16, minlength=16), np.full(16, n / 16)),
             "parity of the cycle": stats.binomtest(int((times.cycle % 2).sum()), n).pvalue,
         },
         f"background of {photons:g} photons per period",
@@ -100,9 +92,7 @@ def test_phases_of_a_dim_signal_have_no_lattice(name: str, photons: float):
     times = ml.simulate_timestamps(flux, view, seed=2)
     phase = times.times_ns - 100.0 * times.cycle
     if name == "waveform":
-        below = np.interp(
-            phase, np.linspace(0, 100, 121), np.concatenate([[0.0], np.cumsum(wave)]) / wave.sum()
-        )
+        below = np.interp(phase, np.linspace(0, 100, 121), np.concatenate([[0.0], np.cumsum(wave)]) / wave.sum())
     else:
         below = pulse.wrapped_cumulative(phase - 30.0, 100.0) - pulse.wrapped_cumulative(-30.0, 100.0)
     n = len(times)
@@ -123,9 +113,7 @@ def test_long_exposures(cycles: int, t_d: float):
     rate = 100.0 / cycles
     view = system(cycles=cycles, bins=8, detector=dead(t_d))
     counts = ml.simulate(ml.Flux(np.zeros((100, 200)), rate, 0.0), view, seed=4).sum(-1)
-    require(
-        {"count law": counts_against_law(counts, armed_count_pmf(rate, t_d, cycles, 220))}, f"{cycles} cycles"
-    )
+    require({"count law": counts_against_law(counts, armed_count_pmf(rate, t_d, cycles, 220))}, f"{cycles} cycles")
 
 
 @pytest.mark.parametrize("t_d", [1e-3, 0.6375, 5.0, 200.9, 1000.25])
@@ -142,9 +130,7 @@ def test_count_law_at_extreme_dead_times(rate: float, t_d: float):
 @pytest.mark.parametrize("t_d", [0.0, 0.1, 0.6375, 3.0])
 def test_a_thousand_photons_per_period(t_d: float):
     """Such a signal registers at -3 sigma and earlier, such a background within a thousandth of a period."""
-    case = Case(
-        f"flux 2000, t_d {t_d:g}", flux_of(1000.0, 1000.0), system(cycles=4, detector=dead(t_d)), 600
-    )
+    case = Case(f"flux 2000, t_d {t_d:g}", flux_of(1000.0, 1000.0), system(cycles=4, detector=dead(t_d)), 600)
     check(ENGINES["exact"], case, ENGINES["sequential"], EVERYTHING)
 
 

@@ -26,19 +26,26 @@ MODES: dict[str, dict[str, Any]] = {
     "synchronous": {"mode": "synchronous"},
     "gated": {"mode": "gated", "gate_start_ns": 30.0, "gate_width_ns": 40.0},
     "moving gate": {
-        "mode": "gated", "gate_start_ns": 30.0, "gate_width_ns": 40.0, "gate_step_ns": 0.3, "gate_cycles": 7_000_000,
+        "mode": "gated",
+        "gate_start_ns": 30.0,
+        "gate_width_ns": 40.0,
+        "gate_step_ns": 0.3,
+        "gate_cycles": 7_000_000,
     },
     "recorded": {"electronics_dead_time_ns": 45.0},  # through the recorder, which loses nothing here
     "afterpulsing": {"afterpulsing": ml.Afterpulsing(probability=1e-12, delay_ns=10.0)},  # through the traps
-}  # fmt: skip
+}
 
 
 def system(**changes: Any) -> ml.System:
     """Sigma 1 ns, bins of a quarter of it."""
     base = ml.System(
-        period_ns=PERIOD, cycles=100_000_000, bins=400, pulse=ml.GaussianPulse(sigma_ns=1.0),
+        period_ns=PERIOD,
+        cycles=100_000_000,
+        bins=400,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
         detector=ml.Detector(dead_time_ns=40.0),
-    )  # fmt: skip
+    )
     return base.replace(**changes)
 
 
@@ -71,10 +78,15 @@ def tails(hist: NDArray[np.int64], law: NDArray[np.float64], pulses: float, dela
 @pytest.mark.parametrize(
     ("signal", "pixels", "cycles"),
     [
-        (1e-6, 20_000, 100_000_000), (1e-3, 1000, 100_000_000), (0.01, 100, 100_000_000), (0.02, 64, 80_000_000),
-        (0.23, 64, 8_000_000), (1.0, 64, 2_500_000), (30.0, 64, 1_500_000),
+        (1e-6, 20_000, 100_000_000),
+        (1e-3, 1000, 100_000_000),
+        (0.01, 100, 100_000_000),
+        (0.02, 64, 80_000_000),
+        (0.23, 64, 8_000_000),
+        (1.0, 64, 2_500_000),
+        (30.0, 64, 1_500_000),
     ],
-)  # fmt: skip
+)
 def test_tails_of_a_dim_pulse(signal: float, pixels: int, cycles: int):
     """Waits of up to a million periods; before, 0.01 photons put hundreds beyond -6 sigma and none in -5.5 to -5."""
     view = system(cycles=cycles)
@@ -171,9 +183,10 @@ def test_faint_parts_of_a_sampled_pulse(signal: float):
     lit = np.flatnonzero(law > 0)
     first, last = lit[0], lit[-1]
     parts = {
-        "pre-pulse": slice(first - 1, first + 3), "fainter": slice(first + 4, peak - 30),
+        "pre-pulse": slice(first - 1, first + 3),
+        "fainter": slice(first + 4, peak - 30),
         "after-pulse": slice(last - 2, last + 2),
-    }  # fmt: skip
+    }
     outcomes = {n: poisson_p(float(hist[s].sum()), float(expected[s].sum())) for n, s in parts.items()}
     outcomes["all"] = float(2 * stats.norm.sf(abs(hist.sum() - expected.sum()) / np.sqrt(expected.sum())))
     assert all(expected[s].sum() > 5 for s in parts.values())
@@ -204,10 +217,13 @@ def test_first_phases_have_no_lattice(background: float):
 @pytest.mark.parametrize(
     ("width", "background", "pixels", "cycles"),
     [
-        (1e-5, 0.0105, 300, 100_000_000), (1.3e-5, 0.0105, 100, 100_000_000), (2e-5, 0.0105, 100, 100_000_000),
-        (1e-5, 0.6, 100, 3_000_000), (1e-5, 100.0, 100, 1_000_000),
+        (1e-5, 0.0105, 300, 100_000_000),
+        (1.3e-5, 0.0105, 100, 100_000_000),
+        (2e-5, 0.0105, 100, 100_000_000),
+        (1e-5, 0.6, 100, 3_000_000),
+        (1e-5, 100.0, 100, 1_000_000),
     ],
-)  # fmt: skip
+)
 def test_short_gates(width: float, background: float, pixels: int, cycles: int):
     """Counts behind gates of 1e-5 of a period; before, 23 % too many at B = 0.0105."""
     gate = {"mode": "gated", "gate_start_ns": 61.7, "gate_width_ns": width * PERIOD}

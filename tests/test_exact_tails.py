@@ -18,7 +18,7 @@ from harness import (
     require,
     same_law,
     two_lobes,
-)  # fmt: skip
+)
 from scipy import special, stats
 
 import mars_lidar as ml
@@ -32,9 +32,7 @@ DELAY_NS = 50.003
 
 def system(**changes: object) -> ml.System:
     """Period 100 ns, bins of a quarter of the pulse's sigma."""
-    base = ml.System(
-        period_ns=100.0, cycles=1000, bins=400, pulse=GAUSSIAN, detector=ml.Detector(dead_time_ns=50.0)
-    )
+    base = ml.System(period_ns=100.0, cycles=1000, bins=400, pulse=GAUSSIAN, detector=ml.Detector(dead_time_ns=50.0))
     return base.replace(**changes)
 
 

@@ -84,9 +84,7 @@ def test_multi_puts_returns_side_by_side():
 
 
 def test_multi_adds_waveforms():
-    both = ml.Flux.multi(
-        ml.Flux(waveform=[1.0, 0.0], background=0.1), ml.Flux(waveform=[[[0.5, 0.5]]], background=0.2)
-    )
+    both = ml.Flux.multi(ml.Flux(waveform=[1.0, 0.0], background=0.1), ml.Flux(waveform=[[[0.5, 0.5]]], background=0.2))
     assert both.waveform[0, 0].tolist() == [1.5, 0.5]
     assert both.background.item() == pytest.approx(0.3)
 
@@ -94,11 +92,16 @@ def test_multi_adds_waveforms():
 @pytest.mark.parametrize(
     ("key", "shape"),
     [
-        (0, (1, 3)), (-1, (1, 3)), ((1, 2), (1, 1)), ((1, -1), (1, 1)), (slice(0, 1), (1, 3)),
-        ((slice(None), 1), (2, 1)), ((slice(None), slice(None, None, 2)), (2, 2)),
+        (0, (1, 3)),
+        (-1, (1, 3)),
+        ((1, 2), (1, 1)),
+        ((1, -1), (1, 1)),
+        (slice(0, 1), (1, 3)),
+        ((slice(None), 1), (2, 1)),
+        ((slice(None), slice(None, None, 2)), (2, 2)),
         ((slice(None, None, -1),), (2, 3)),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("kind", ["returns", "waveform"])
 def test_parts_are_images(key, shape: tuple[int, int], kind: str):
     """Integers keep their axis."""

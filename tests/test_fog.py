@@ -13,16 +13,17 @@ from studies.__main__ import main
 
 C = 0.299792458
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=100, bins=200, pulse=ml.GaussianPulse(sigma_ns=0.4),
+    period_ns=100.0,
+    cycles=100,
+    bins=200,
+    pulse=ml.GaussianPulse(sigma_ns=0.4),
     detector=ml.Detector(dead_time_ns=30.0),
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize(("alpha", "first", "delay"), [(0.05, 0.5, 60.0), (1.0, 2.0, 33.3), (0.02, 1.0, 140.0)])
 def test_lidar_equation(alpha: float, first: float, delay: float):
-    flux = ml.Flux(0.7, 0.1, delay).in_fog(
-        SYSTEM, extinction_per_m=alpha, backscatter=1.3, nearest_m=first, parts=1000
-    )
+    flux = ml.Flux(0.7, 0.1, delay).in_fog(SYSTEM, extinction_per_m=alpha, backscatter=1.3, nearest_m=first, parts=1000)
     assert (flux.background == 0.1).all()
     target = 0.5 * C * delay
     total = integrate.quad(lambda z: np.exp(-2 * alpha * z) / z**2, first, np.inf)[0]

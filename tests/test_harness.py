@@ -51,14 +51,15 @@ MID = Case(
     "mid",
     flux_of(2.0, 1.0),
     System(
-        period_ns=PERIOD_NS, cycles=100, bins=64, pulse=GaussianPulse(sigma_ns=1.5),
+        period_ns=PERIOD_NS,
+        cycles=100,
+        bins=64,
+        pulse=GaussianPulse(sigma_ns=1.5),
         detector=Detector(dead_time_ns=63.75),
     ),
     6000,
-)  # fmt: skip
-REPELLING = replace(
-    MID, flux=flux_of(2.0, 5.0), system=MID.system.replace(detector=Detector(dead_time_ns=10.0))
 )
+REPELLING = replace(MID, flux=flux_of(2.0, 5.0), system=MID.system.replace(detector=Detector(dead_time_ns=10.0)))
 
 
 class Wrong(Engine):
@@ -89,9 +90,7 @@ class DeadTimeOff(Wrong):
 class HalfABinLate(Wrong):
     def mistake(self, task: Task) -> Task:
         flux = task.flux
-        return replace(
-            task, flux=Flux(flux.signal, flux.background, flux.delay_ns + 0.5 * task.system.bin_ns)
-        )
+        return replace(task, flux=Flux(flux.signal, flux.background, flux.delay_ns + 0.5 * task.system.bin_ns))
 
 
 class WrongStart(Wrong):
@@ -174,9 +173,7 @@ def test_wrong_engine_is_found(engine: Engine, case: Case, claims: Collection[st
     assert expected <= found(engine, case, claims)
 
 
-@pytest.mark.parametrize(
-    "case", [replace(MID, items=24_000), REPELLING], ids=["repulsion 10 %", "repulsion 60 %"]
-)
+@pytest.mark.parametrize("case", [replace(MID, items=24_000), REPELLING], ids=["repulsion 10 %", "repulsion 60 %"])
 def test_faults_of_the_joint_law_are_found_there_only(case: Case):
     """Count x multinomial has the right counts and the right mean shape: only the joint law shows it."""
     expected = {"histogram variance", "window", "lag-1 covariance"}
@@ -295,13 +292,17 @@ def test_a_variance_that_cannot_be_seen():
 def test_a_locked_pixel_is_right_and_a_wrong_one_is_found(dead: float, differ: int):
     """So bright that counts repeat: the engine agrees with the exact law, and one period less does not."""
     locked = Case(
-        "locked", flux_of(0.0, 300.0),
+        "locked",
+        flux_of(0.0, 300.0),
         System(
-            period_ns=PERIOD_NS, cycles=60, bins=16, pulse=GaussianPulse(sigma_ns=1.5),
+            period_ns=PERIOD_NS,
+            cycles=60,
+            bins=16,
+            pulse=GaussianPulse(sigma_ns=1.5),
             detector=Detector(dead_time_ns=dead * PERIOD_NS),
         ),
         2000,
-    )  # fmt: skip
+    )
     exact = count_law(0.0, 300.0, locked.system)
     pmf = np.zeros(exact.support[-1] + 1)
     pmf[exact.support] = exact.pmf

@@ -18,9 +18,13 @@ GATE = {"mode": "gated", "gate_start_ns": 0.0, "gate_width_ns": PERIOD_NS}
 def test_a_locked_pixel_starts_as_the_statistics_say(dead: float, detector: dict[str, object]):
     """A grid that blurs each turn by a part of a bin puts 0.001 registrations too many into each period."""
     system = ml.System(
-        period_ns=PERIOD_NS, cycles=12, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), start="stationary",
+        period_ns=PERIOD_NS,
+        cycles=12,
+        bins=64,
+        pulse=ml.GaussianPulse(sigma_ns=0.5),
+        start="stationary",
         detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **detector),
-    )  # fmt: skip
+    )
     law = count_law(20.0, 0.05, system, delay_ns=37.0)
     pmf = np.zeros(law.support[-1] + 1)
     pmf[law.support] = law.pmf

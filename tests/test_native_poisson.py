@@ -56,9 +56,13 @@ def test_bits_depend_on_the_stream_alone(bins: int):
     whole = case.histogram("poisson")
     assert np.array_equal(whole, case.histogram("poisson", threads=2))
     part = case.change(
-        signal=IMAGE.signal[1:], background=IMAGE.background[1:], delay=IMAGE.delay[1:],
-        pixel_index=[1, 2, 3], realizations=2, first_realization=3,
-    )  # fmt: skip
+        signal=IMAGE.signal[1:],
+        background=IMAGE.background[1:],
+        delay=IMAGE.delay[1:],
+        pixel_index=[1, 2, 3],
+        realizations=2,
+        first_realization=3,
+    )
     assert np.array_equal(whole.reshape(5, 4, -1)[3:, 1:].reshape(6, -1), part.histogram("poisson"))
     assert not np.array_equal(whole, case.change(seed=6).histogram("poisson"))
     if bins > 1:
@@ -71,8 +75,9 @@ def test_bits_depend_on_the_stream_alone(bins: int):
 @pytest.mark.parametrize("bins", [96, 1000])
 def test_bins_are_independent_poisson_numbers(per_bin: float, bins: int):
     realizations = 40_000 // bins * 10
-    case = Case(signal=0.4, background=per_bin * bins / 1000, delay=-0.001, bins=bins,
-                realizations=realizations, seed=9)  # fmt: skip
+    case = Case(
+        signal=0.4, background=per_bin * bins / 1000, delay=-0.001, bins=bins, realizations=realizations, seed=9
+    )
     mean = 400 * gaussian_energy(-0.001, 0.00375, bins) + per_bin
     cube = case.histogram("poisson", threads=2).astype(float)
     assert not cube[:, mean < 1e-9].any()
@@ -129,10 +134,16 @@ def test_nothing_arrives_and_the_dead_time_is_ignored():
     assert np.array_equal(dead, Case(dead_time=0.0).histogram("poisson"))
 
 
-@pytest.mark.parametrize(("signal", "background", "dtype"), [
-    (70.0, 0.0, np.uint16), (0.0, 70.0 * 64, np.uint16), (60.0, 20.0 * 64, np.uint16),
-    (1e6, 0.0, np.uint32), (0.0, 1e6 * 64, np.uint32),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("signal", "background", "dtype"),
+    [
+        (70.0, 0.0, np.uint16),
+        (0.0, 70.0 * 64, np.uint16),
+        (60.0, 20.0 * 64, np.uint16),
+        (1e6, 0.0, np.uint32),
+        (0.0, 1e6 * 64, np.uint32),
+    ],
+)
 def test_a_full_bin_is_an_error(signal: float, background: float, dtype: type):
     cycles = 1000 if dtype is np.uint16 else 10**6
     case = Case(signal=signal, background=background, delay=0.508, cycles=cycles)

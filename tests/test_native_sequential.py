@@ -58,9 +58,13 @@ def test_bits_depend_on_the_stream_alone(stationary: bool, dead_time: float):
     assert np.array_equal(whole, case.histogram("sequential", threads=2, dtype=np.uint16))
     assert np.array_equal(whole.sum(1), counts(case, threads=2))
     part = case.change(
-        signal=IMAGE.signal[2:], background=IMAGE.background[2:], delay=IMAGE.delay[2:],
-        pixel_index=[2, 3], realizations=2, first_realization=3,
-    )  # fmt: skip
+        signal=IMAGE.signal[2:],
+        background=IMAGE.background[2:],
+        delay=IMAGE.delay[2:],
+        pixel_index=[2, 3],
+        realizations=2,
+        first_realization=3,
+    )
     assert np.array_equal(whole.reshape(5, 4, -1)[3:, 2:].reshape(4, -1), part.histogram("sequential"))
     assert not np.array_equal(whole, case.change(seed=4).histogram("sequential"))
     assert len({row.tobytes() for row in whole[::4]}) == 5  # of pixel 0; a pulse of two bins may well repeat
@@ -165,8 +169,15 @@ def armed_survival(n: np.ndarray, rate: float, dead: float, exposure: float) -> 
 )
 def test_count_law_of_a_constant_rate(rate: float, dead: float, cycles: int, stationary: bool):
     realizations = 20000 if rate < 2.0 else 5000
-    case = Case(signal=0.0, background=rate, dead_time=dead, cycles=cycles, realizations=realizations,
-                seed=11, stationary=stationary)  # fmt: skip
+    case = Case(
+        signal=0.0,
+        background=rate,
+        dead_time=dead,
+        cycles=cycles,
+        realizations=realizations,
+        seed=11,
+        stationary=stationary,
+    )
     number = counts(case, threads=2)
     n = np.arange(number.max() + 40)
     survival = armed_survival(n, rate, dead, cycles)
@@ -184,8 +195,17 @@ def test_count_law_of_a_constant_rate(rate: float, dead: float, cycles: int, sta
 @pytest.mark.parametrize(("signal", "periods"), [(1.0, 1), (5.0, 3), (8.0, 50)])
 def test_whole_periods_of_dead_time_leave_the_shape(signal: float, periods: int):
     """r = lambda / (1 + k Lambda), from the first period on: a stationary start has to be stationary."""
-    case = Case(signal=signal, background=0.2, dead_time=float(periods), cycles=4 * periods + 3, bins=32,
-                realizations=6000 // periods, seed=3, stationary=True, delay=0.4)  # fmt: skip
+    case = Case(
+        signal=signal,
+        background=0.2,
+        dead_time=float(periods),
+        cycles=4 * periods + 3,
+        bins=32,
+        realizations=6000 // periods,
+        seed=3,
+        stationary=True,
+        delay=0.4,
+    )
     photons = signal * gaussian_energy(0.4, 0.00375, 32) + 0.2 / 32
     mean = case.cycles * photons / (1 + periods * photons.sum())
     cube = case.histogram("sequential", threads=2)
@@ -212,10 +232,16 @@ def test_agrees_with_an_independent_simulator(name: str):
     photons = (reference["S"] + reference["B"]) * reference["cycles"]
     realizations = int(min(20000, 1.5e7 / photons))
     case = Case(
-        signal=reference["S"], background=reference["B"], delay=reference["tau"], dead_time=reference["dead"],
-        cycles=reference["cycles"], bins=reference["bins"], realizations=realizations, seed=1,
+        signal=reference["S"],
+        background=reference["B"],
+        delay=reference["tau"],
+        dead_time=reference["dead"],
+        cycles=reference["cycles"],
+        bins=reference["bins"],
+        realizations=realizations,
+        seed=1,
         pulse=_core.PulseTable.gaussian(reference["sigma"]),
-    )  # fmt: skip
+    )
     cube = case.histogram("sequential", threads=2).astype(float)
     share = np.sqrt(1 / realizations + 1 / reference["reals"])
 

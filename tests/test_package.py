@@ -62,9 +62,7 @@ def test_simulation_is_light():
 def test_public_names_exist_and_are_sorted():
     assert len(set(ml.__all__)) == len(ml.__all__)
     assert all(hasattr(ml, name) for name in ml.__all__)
-    assert [n for n in ml.__all__ if not n.startswith("_")] == sorted(
-        n for n in ml.__all__ if not n.startswith("_")
-    )
+    assert [n for n in ml.__all__ if not n.startswith("_")] == sorted(n for n in ml.__all__ if not n.startswith("_"))
 
 
 @pytest.mark.parametrize("name", [n for n in ml.__all__ if n != "__version__"])

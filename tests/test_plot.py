@@ -25,9 +25,7 @@ SYSTEM = ml.System(
 )
 
 
-def cube_of(
-    flux: ml.Flux, system: ml.System = SYSTEM, engine: str = "exact", realizations: int = 1
-) -> io.Cube:
+def cube_of(flux: ml.Flux, system: ml.System = SYSTEM, engine: str = "exact", realizations: int = 1) -> io.Cube:
     counts = ml.simulate(flux, system, engine=engine, realizations=realizations)
     return io.Cube(
         histogram=counts,
@@ -47,9 +45,7 @@ def step(height: int = 9, width: int = 12) -> ml.Flux:
 FLUXES = {
     "one return": step(),
     "several returns": ml.Flux.multi(step(), ml.Flux(0.4, 0.0, 99.5)),
-    "waveform": ml.Flux(
-        waveform=np.random.default_rng(0).gamma(0.3, 0.05, (9, 12, 40)), background=0.1
-    ),
+    "waveform": ml.Flux(waveform=np.random.default_rng(0).gamma(0.3, 0.05, (9, 12, 40)), background=0.1),
     "no signal": ml.Flux(np.zeros((4, 5)), 0.3, np.nan),
     "nothing at all": ml.Flux(0.0, 0.0, np.nan),
     "one pixel": ml.Flux(2.0, 0.5, 99.9),
@@ -183,14 +179,18 @@ def test_no_prediction_where_it_would_take_too_long():
 
 def test_a_headline_names_what_is_not_plain():
     plain = ml.System(
-        period_ns=100.0, cycles=1, bins=1, pulse=ml.GaussianPulse(sigma_ns=1.0),
+        period_ns=100.0,
+        cycles=1,
+        bins=1,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
         detector=ml.Detector(dead_time_ns=50.0),
-    )  # fmt: skip
+    )
     assert data.instrument(plain) == "1 bin of 100 ns; 1 laser period of 100 ns; dead time 50 ns"
     odd = plain.replace(
-        bins=1000, cycles=2000,
+        bins=1000,
+        cycles=2000,
         detector=ml.Detector(dead_time_ns=0.0, mode="synchronous", dark_count_hz=5.0, max_events_per_exposure=4),
-    )  # fmt: skip
+    )
     assert data.instrument(odd) == (
         "1,000 bins of 100 ps; 2,000 laser periods of 100 ns; dead time 0 ns, synchronous, dark count, "
         "max events per exposure"

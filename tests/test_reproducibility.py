@@ -26,16 +26,17 @@ def image(kind: str) -> tuple[ml.Flux, ml.System]:
     background = np.where((2 * x + y) % 7 == 0, 0.0, 0.02 * 3.0 ** ((x + 5 * y) % 6))
     delay = 9.7 * x - 31.3 * y
     system = ml.System(
-        period_ns=100.0, cycles=120, bins=50, pulse=ml.GaussianPulse(sigma_ns=0.75),
+        period_ns=100.0,
+        cycles=120,
+        bins=50,
+        pulse=ml.GaussianPulse(sigma_ns=0.75),
         detector=ml.Detector(dead_time_ns=63.75),
-    )  # fmt: skip
+    )
     flux = ml.Flux(signal, background, delay)
     if kind == "sampled":
         system = system.replace(pulse=ml.SampledPulse(LOBES, 0.9))
     elif kind == "returns":
-        flux = ml.Flux.multi(
-            flux, ml.Flux(0.3 * signal, 0.0, delay + 20.0), ml.Flux(0.1 * signal, 0.1, delay - 60.0)
-        )
+        flux = ml.Flux.multi(flux, ml.Flux(0.3 * signal, 0.0, delay + 20.0), ml.Flux(0.1 * signal, 0.1, delay - 60.0))
     elif kind == "waveform":
         wave = signal[..., None] * np.roll(LOBES, 7) / LOBES.sum()
         flux = ml.Flux(waveform=wave, background=background)
@@ -53,9 +54,16 @@ def image(kind: str) -> tuple[ml.Flux, ml.System]:
 
 
 KINDS = (
-    "gaussian", "sampled", "returns", "waveform", "stationary", "stationary waveform", "whole periods",
-    "no dead time", "long dead time",
-)  # fmt: skip
+    "gaussian",
+    "sampled",
+    "returns",
+    "waveform",
+    "stationary",
+    "stationary waveform",
+    "whole periods",
+    "no dead time",
+    "long dead time",
+)
 # Start of the SHA-256 of the cubes (3 realizations, seed 2**63 + 1), as little-endian uint32.
 # A change of these bits is a change of every user's data: it belongs into the change log, as a new version.
 GOLDEN = {
@@ -131,9 +139,7 @@ def test_threads_do_not_matter(engine: str, kind: str):
     flux, system = image(kind)
     one = ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=1)
     for threads in (2, 5, None):
-        assert np.array_equal(
-            one, ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=threads)
-        )
+        assert np.array_equal(one, ml.simulate(flux, system, engine=engine, realizations=4, seed=1, threads=threads))
 
 
 @pytest.mark.parametrize("engine", ANY_SYSTEM)
@@ -147,9 +153,14 @@ def test_any_part_has_the_bits_of_the_whole(engine: str, kind: str):
     for _ in range(6):
         rows, columns, run = (slice(*np.sort(random.choice(n + 1, 2, replace=False))) for n in (*SHAPE, 5))
         part = ml.simulate(
-            flux[rows, columns], system, engine=engine, realizations=run.stop - run.start,
-            first_realization=int(run.start), pixel_index=index[rows, columns], seed=3,
-        )  # fmt: skip
+            flux[rows, columns],
+            system,
+            engine=engine,
+            realizations=run.stop - run.start,
+            first_realization=int(run.start),
+            pixel_index=index[rows, columns],
+            seed=3,
+        )
         assert np.array_equal(part, whole[run, rows, columns])
 
 
@@ -171,9 +182,7 @@ def test_seeds_pixels_and_realizations_have_their_own_streams(engine: str):
     for seed in (0, 1, 2**32, 2**63, 2**64 - 1):
         for first in (0, 1, 2**31, 2**32 - 1):
             for index in ([0, 1, 2], [65_536, 2**31, 2**32 - 1]):
-                cube = ml.simulate(
-                    flux, system, engine=engine, seed=seed, first_realization=first, pixel_index=index
-                )  # fmt: skip
+                cube = ml.simulate(flux, system, engine=engine, seed=seed, first_realization=first, pixel_index=index)
                 rows.extend(cube[0, 0])
     assert len({row.tobytes() for row in rows}) == len(rows) == 120
 
@@ -187,7 +196,7 @@ def test_timestamps_are_those_of_the_cube(engine: str, kind: str):
         for threads in (1, 3):
             times = ml.simulate_timestamps(
                 flux, system, engine=engine, realization=realization, seed=8, threads=threads
-            )  # fmt: skip
+            )
             assert np.array_equal(times.histogram(), cube[realization])
             assert times.histogram().dtype == cube.dtype
 

@@ -147,9 +147,17 @@ def test_resize_of_white_stays_white():
 
 
 @pytest.mark.parametrize(
-    ("size", "error"), [(0, ValueError), (-3, ValueError), (2.5, TypeError), ((3, 0), ValueError),
-                        ((1, 2, 3), ValueError), ("12", TypeError), (True, TypeError)]
-)  # fmt: skip
+    ("size", "error"),
+    [
+        (0, ValueError),
+        (-3, ValueError),
+        (2.5, TypeError),
+        ((3, 0), ValueError),
+        ((1, 2, 3), ValueError),
+        ("12", TypeError),
+        (True, TypeError),
+    ],
+)
 def test_bad_sizes_are_refused(size, error):
     with pytest.raises(error, match="size must be"):
         Scene([[1.0]], 1.0).resize(size)

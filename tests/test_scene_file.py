@@ -57,9 +57,29 @@ def test_effects_reach_compare(tmp_path):
     out = tmp_path / "c.json"
     effects = ["--detector", "excelitas-spcm-aqrh", "--jitter-fwhm-ns", "0.4", "--electronics-dead-time-ns", "90"]
     done = run(
-        "compare", "--scene", "room", "--size", 8, "--cycles", 20, "--bins", 64, "--engines", "exact", "--pixels", 1,
-        "--realizations", 50, "--repeats", 1, *effects, "--json", out, "-o", tmp_path / "c.png",
-    )  # fmt: skip
+        "compare",
+        "--scene",
+        "room",
+        "--size",
+        8,
+        "--cycles",
+        20,
+        "--bins",
+        64,
+        "--engines",
+        "exact",
+        "--pixels",
+        1,
+        "--realizations",
+        50,
+        "--repeats",
+        1,
+        *effects,
+        "--json",
+        out,
+        "-o",
+        tmp_path / "c.png",
+    )
     assert done.exit_code == 0, done.output
     detector = ml.Detector.from_dict(json.loads(out.read_text())["system"]["detector"])
     preset = ml.Detector.preset("excelitas-spcm-aqrh")
@@ -76,8 +96,17 @@ def test_a_scene_file_of_a_transient_is_its_options(transient):
         "light: {photons_per_unit: 2e-2, sbr: 4}\n"
     )
     out = transient / "a.npz"
-    options = ["--transient", transient / "t.npy", "--transient-bin-ns", 0.5, "--transient-start-ns", 1,
-               "--transient-channel", 1, "--no-transient-pulse"]  # fmt: skip
+    options = [
+        "--transient",
+        transient / "t.npy",
+        "--transient-bin-ns",
+        0.5,
+        "--transient-start-ns",
+        1,
+        "--transient-channel",
+        1,
+        "--no-transient-pulse",
+    ]
     by_options, source = simulated(out, *options, "--photons-per-unit", 0.02, "--sbr", 4)
     by_file, same = simulated(out, "--scene", transient / "scene.yaml")
     assert np.array_equal(by_file, by_options)
@@ -88,9 +117,23 @@ def test_a_scene_file_of_a_transient_is_its_options(transient):
     assert np.array_equal(by_file, by_options)
     png = transient / "c.png"
     done = run(
-        "compare", "--scene", transient / "scene.yaml", *SMALL, "--engines", "exact,poisson", "--realizations", 50,
-        "--repeats", 1, "--pixels", 1, "--budget-s", 600, "-o", png,
-    )  # fmt: skip
+        "compare",
+        "--scene",
+        transient / "scene.yaml",
+        *SMALL,
+        "--engines",
+        "exact,poisson",
+        "--realizations",
+        50,
+        "--repeats",
+        1,
+        "--pixels",
+        1,
+        "--budget-s",
+        600,
+        "-o",
+        png,
+    )
     assert done.exit_code == 0, done.output
     assert png.exists()
 

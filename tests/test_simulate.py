@@ -120,9 +120,13 @@ def test_progress_rises_to_the_total(system: ml.System, engine: str):
     flux = ml.Flux(np.full((40, 40), 2.0), 2.0, 50.0)
     realizations, bins = {"exact": (60, 64), "sequential": (12, 64), "poisson": (40, 1024)}[engine]
     ml.simulate(
-        flux, system.replace(cycles=1000, bins=bins), engine=engine, realizations=realizations, threads=1,
+        flux,
+        system.replace(cycles=1000, bins=bins),
+        engine=engine,
+        realizations=realizations,
+        threads=1,
         progress=lambda done, total: seen.append((done, total)),
-    )  # fmt: skip
+    )
     done = [d for d, _ in seen]
     assert len({total for _, total in seen}) == 1
     assert done == sorted(done)

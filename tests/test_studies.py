@@ -174,10 +174,14 @@ def test_reference_study(tmp_path):
     data = tmp_path / "cases"
     data.mkdir()
     case = {
-        "S": 1.0, "B": 0.2, "dead": 0.4, "cycles": 50,
-        "tau": 40.0 / system.period_ns, "sigma": 0.5 / system.period_ns,
+        "S": 1.0,
+        "B": 0.2,
+        "dead": 0.4,
+        "cycles": 50,
+        "tau": 40.0 / system.period_ns,
+        "sigma": 0.5 / system.period_ns,
         "count": {str(v): int(t) for v, t in zip(values, times, strict=True)},
-    }  # fmt: skip
+    }
     (data / "made.json").write_text(json.dumps(case))
     assert main(["reference", "--quick", "--data", str(data), "--out", str(tmp_path)]) == 0
     rows = {row["law"]: row for row in read_csv(tmp_path / "reference.csv")}
@@ -221,8 +225,11 @@ def test_help_lists_the_studies(capsys):
 
 def test_table():
     assert table([{"a": 1.23456, "b": "x"}, {"a": 123456.0, "b": 2}]).splitlines() == [
-        "| a | b |", "|---|---|", "| 1.235 | x |", "| 123456 | 2 |",
-    ]  # fmt: skip
+        "| a | b |",
+        "|---|---|",
+        "| 1.235 | x |",
+        "| 123456 | 2 |",
+    ]
     assert table([]) == ""
     assert math.isclose(law_report._PER_SKEWNESS, 0.1258, abs_tol=1e-4)
 

@@ -141,9 +141,7 @@ def test_derived_quantities(system: ml.System):
     assert system.time_ns.shape == (64,)
     assert system.time_ns[0] == pytest.approx(0.5 * system.bin_ns)
     assert system.delay_ns(1.0) == pytest.approx(6.671281904)
-    assert system.depth_m(system.delay_ns([[3.0, 25.0]])) == pytest.approx(
-        np.array([[3.0, 25.0]])
-    )  # not wrapped
+    assert system.depth_m(system.delay_ns([[3.0, 25.0]])) == pytest.approx(np.array([[3.0, 25.0]]))  # not wrapped
     assert np.isnan(system.delay_ns(np.nan))
 
 
@@ -176,9 +174,12 @@ def test_bound_on_a_bin_is_never_exceeded():
     """Blinding light: the bound is reached, not passed."""
     for dead, bins in ((30.0, 7), (12.5, 8), (0.7, 100), (250.0, 4)):
         view = ml.System(
-            period_ns=100.0, cycles=50, bins=bins, pulse=ml.GaussianPulse(sigma_ns=1.0),
+            period_ns=100.0,
+            cycles=50,
+            bins=bins,
+            pulse=ml.GaussianPulse(sigma_ns=1.0),
             detector=ml.Detector(dead_time_ns=dead),
-        )  # fmt: skip
+        )
         cube = ml.simulate(ml.Flux(np.zeros((4, 4)), 1e5, 0.0), view)
         assert cube.max() <= view.max_bin_count
 

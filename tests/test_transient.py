@@ -75,9 +75,9 @@ def test_the_pulse_is_that_of_a_return():
     # light spread over 0.01 ns instead of a flash: second order, (0.01 / 0.8)^2 / 24 = 6.5e-6
     assert np.abs(flux.waveform[0, 0] - expected).max() < 1e-5 * expected.max()
     law = ml.count_law(1.0, 0.5, SYSTEM, delay_ns=33.335)
-    counts = ml.simulate(
-        ml.Flux(waveform=flux.waveform, background=0.5), SYSTEM, realizations=4000, seed=1
-    ).sum((1, 2, 3))
+    counts = ml.simulate(ml.Flux(waveform=flux.waveform, background=0.5), SYSTEM, realizations=4000, seed=1).sum(
+        (1, 2, 3)
+    )
     z = (counts.mean() - law.mean) / np.sqrt(law.variance / counts.size)
     ledger.require({"mean count": math.erfc(abs(z) / math.sqrt(2))}, "transient of one flash")
 

@@ -16,9 +16,13 @@ from mars_lidar.engines.exact import ExactEngine
 
 def view(dead: float, cycles: int = 20, bins: int = 64, mode: str = "nonparalyzable", start: str = "armed"):
     return ml.System(
-        period_ns=100.0, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=1.0),
-        detector=ml.Detector(dead_time_ns=100.0 * dead, mode=mode), start=start,
-    )  # fmt: skip
+        period_ns=100.0,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=100.0 * dead, mode=mode),
+        start=start,
+    )
 
 
 def one_part(parts: int, at: int) -> np.ndarray:

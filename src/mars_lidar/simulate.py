@@ -103,9 +103,7 @@ def simulate(
         with ``device="cuda"``.
     """
     drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside, model=model)
-    task = _task(
-        flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress
-    )
+    task = _task(flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress)
     shape = (task.realizations, *flux.shape, system.bins)
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
         there: NDArray[Any] = _on_cuda(drawn_by, task, shape, out)
@@ -147,9 +145,7 @@ def simulate_timestamps(
         Packed times (ns), cycles and bins of all pixels.
     """
     drawn_by = find_engine(engine)
-    task = _task(
-        flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization"
-    )
+    task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
         drawn_by.check_device(device, task.flux, task.system)
         from mars_lidar.cuda import exact_records

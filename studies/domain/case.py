@@ -94,10 +94,17 @@ class Case:
         system = self.system
         pulse = system.pulse
         return {
-            "case": self.name, "family": self.family, "mode": self.mode, "start": system.start,
-            "S": self.strongest, "B": self.background, "delay": self.delay[0],
-            "dead": system.dead_time_periods, "cycles": system.cycles,
-            "bins": system.bins, "sigma": pulse.sigma_ns / PERIOD_NS if isinstance(pulse, GaussianPulse) else 0.0,
+            "case": self.name,
+            "family": self.family,
+            "mode": self.mode,
+            "start": system.start,
+            "S": self.strongest,
+            "B": self.background,
+            "delay": self.delay[0],
+            "dead": system.dead_time_periods,
+            "cycles": system.cycles,
+            "bins": system.bins,
+            "sigma": pulse.sigma_ns / PERIOD_NS if isinstance(pulse, GaussianPulse) else 0.0,
             "light": self.wave or (f"{len(self.signal)} returns" if len(self.signal) > 1 else "return"),
             "effects": " ".join(system.detector.effects),
-        }  # fmt: skip
+        }

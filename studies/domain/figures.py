@@ -64,8 +64,11 @@ def _map(rows: Sequence[dict[str, Any]], subjects: Sequence[str], x: str, y: str
 
 def _modes(rows: Sequence[dict[str, Any]], path: Path) -> Path:
     """Shares of the states, by mode and start, a bar for each subject."""
-    kinds = [(mode, start) for mode in ("nonparalyzable", "paralyzable", "synchronous", "gated", "moving gate")
-             for start in ("armed", "stationary")]  # fmt: skip
+    kinds = [
+        (mode, start)
+        for mode in ("nonparalyzable", "paralyzable", "synchronous", "gated", "moving gate")
+        for start in ("armed", "stationary")
+    ]
     kinds = [kind for kind in kinds if any((row["mode"], row["start"]) == kind for row in rows)]
     subjects = (*ENGINES, "timestamps", *LAWS)
     figure, axes = panels(3.4, 3, 4, sharex=True, sharey=True)

@@ -20,7 +20,7 @@ from studies.domain.checks import (
     rare,
     two_samples,
     variances_of,
-)  # fmt: skip
+)
 from studies.domain.predictions import TOLERANCE, Predictions
 from studies.domain.records import recorded
 from studies.domain.samples import Sample, Windows, handed, own, simulated
@@ -35,9 +35,12 @@ _NEEDS = {"cramer_rao": ("mean_histogram",), "mars": ("count_law", "mean_histogr
 _SLACK = {"feedback": 0.05, "auto": 0.05}  # standard deviations that the mean of a bin may be off (docs/feedback.md)
 _MARS_SECONDS = 0.03  # of its laws, beyond which engine "mars" is not asked for them again
 _PAIRS = (
-    ("exact", "sequential"), ("exact", "simulator"), ("sequential", "simulator"), ("feedback", "exact"),
+    ("exact", "sequential"),
+    ("exact", "simulator"),
+    ("sequential", "simulator"),
+    ("feedback", "exact"),
     ("auto", "exact"),
-)  # fmt: skip
+)
 Tell = Callable[[str, str], None]
 
 

@@ -30,10 +30,12 @@ def compare(folder: Path | None, seed: int) -> list[Check]:
 def _case(path: Path, seed: int) -> list[Check]:
     data = json.loads(path.read_text())
     system = System(
-        period_ns=PERIOD_NS, cycles=data["cycles"], bins=data["bins"],
+        period_ns=PERIOD_NS,
+        cycles=data["cycles"],
+        bins=data["bins"],
         pulse=GaussianPulse(sigma_ns=data["sigma"] * PERIOD_NS),
         detector=Detector(dead_time_ns=data["dead"] * PERIOD_NS),
-    )  # fmt: skip
+    )
     case = Case(path.stem, "reference", system, (data["S"],), (data["tau"],), data["B"])
     items = int(np.clip(4e6 / case.registrations(), 200, _EXPOSURES))
     mean, reals = np.array(data["hist_mean"]), data["reals"]
@@ -74,8 +76,9 @@ def _laws(case: Case, data: dict[str, Any]) -> list[Check]:
     histogram = mean_histogram(system=case.system, threads=1, **light)
     found = []
     for name, mean, variance in (
-        ("count_law", float(law.mean), float(law.variance)), ("joint_law", joint.count_mean, joint.count_variance),
-    ):  # fmt: skip
+        ("count_law", float(law.mean), float(law.variance)),
+        ("joint_law", joint.count_mean, joint.count_variance),
+    ):
         z = (data["count_mean"] - mean) / np.sqrt(max(variance, 1e-12) / reals)
         found.append(
             Check(f"{name}, {case.name}", "reference", "mean of the count", float(2 * stats.norm.sf(abs(z))), z)

@@ -25,7 +25,7 @@ from studies.domain.verdict import (
     SUBJECTS,
     VERIFIED,
     second_level,
-)  # fmt: skip
+)
 from studies.domain.watch import PATIENCE
 from studies.machine import load, machine
 from studies.report import configuration, number, save_text, table
@@ -34,9 +34,13 @@ _LISTED = 40  # failures that the report names; all are in domain_failures.csv
 
 
 def write(
-    request: Request, settings: Settings, judged: Sequence[Judged], failures: Sequence[dict[str, Any]],
-    outside: Sequence[Check], seconds: float,
-) -> Path:  # fmt: skip
+    request: Request,
+    settings: Settings,
+    judged: Sequence[Judged],
+    failures: Sequence[dict[str, Any]],
+    outside: Sequence[Check],
+    seconds: float,
+) -> Path:
     """Write ``domain.md``; returns its path."""
     checks = sum(one.checks for one in judged)
     suspects = sum(bool(one.suspects) for one in judged)
@@ -56,17 +60,19 @@ def write(
         f"nothing was "
         "there to compare it with; *failed*: wrong numbers, an exception that names nothing to do, or a crash.",
         "## Configuration",
-        configuration({
-            "command": command + (" --data DIR`" if request.data else "`"),
-            "systems": f"{len(judged)}, seed {settings.seed}; case `seed/n` is `systems.draw(seed, n)`",
-            "drawn": f"{settings.budget.registrations:g} registrations, {settings.budget.cells:g} bins and "
-            f"{settings.budget.exposures} exposures at most for each engine and system; {AGAIN} times as many "
-            f"where a check "
-            "looked wrong",
-            "machine": machine(),
-            "load": load(),
-            "run time": f"{seconds:.0f} s",
-        }),
+        configuration(
+            {
+                "command": command + (" --data DIR`" if request.data else "`"),
+                "systems": f"{len(judged)}, seed {settings.seed}; case `seed/n` is `systems.draw(seed, n)`",
+                "drawn": f"{settings.budget.registrations:g} registrations, {settings.budget.cells:g} bins and "
+                f"{settings.budget.exposures} exposures at most for each engine and system; {AGAIN} times as many "
+                f"where a check "
+                "looked wrong",
+                "machine": machine(),
+                "load": load(),
+                "run time": f"{seconds:.0f} s",
+            }
+        ),
         "## Levels",
         f"{checks} comparisons. One whose p-value is below {FIRST_LEVEL:g} is drawn again with fresh random "
         f"numbers and "
@@ -108,7 +114,7 @@ def write(
         "and, where "
         "arrivals are few, both against a simulator in NumPy that is part of this study. Where two disagree, "
         "the one in most disagreements is called wrong.",
-    ]  # fmt: skip
+    ]
     return save_text(request.out / "domain.md", text)
 
 
@@ -163,7 +169,7 @@ def _slow(judged: Sequence[Judged], subject: str) -> dict[str, Any]:
         "S + B up to 10": share([state for one, state in asked if one.case.photons <= 10]),
         "(S + B) t_d up to 8": share([state for _, state, x in load if x <= 8]),
         "of those verified: median, 99 %": " / ".join(f"{number(float(q))} s" for q in quantiles),
-    }  # fmt: skip
+    }
 
 
 def _drawn(judged: Sequence[Judged]) -> list[dict[str, Any]]:
@@ -172,11 +178,16 @@ def _drawn(judged: Sequence[Judged]) -> list[dict[str, Any]]:
     for family in sorted({one.case.family for one in judged}):
         some = [one for one in judged if one.case.family == family]
         engines = [state for engine in ENGINES for _, state in _states(some, engine)]
-        rows.append({
-            "family": family, "systems": len(some), "comparisons": sum(one.checks for one in some),
-            "engines verified": engines.count(VERIFIED), "engines failed": engines.count(FAILED),
-            "seconds each": float(np.mean([one.seconds for one in some])),
-        })  # fmt: skip
+        rows.append(
+            {
+                "family": family,
+                "systems": len(some),
+                "comparisons": sum(one.checks for one in some),
+                "engines verified": engines.count(VERIFIED),
+                "engines failed": engines.count(FAILED),
+                "seconds each": float(np.mean([one.seconds for one in some])),
+            }
+        )
     return rows
 
 

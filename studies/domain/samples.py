@@ -102,9 +102,15 @@ def simulated(engine: str, case: Case, items: int, seed: int, windows: Windows) 
         for start in range(0, rounds, step):
             report: dict[str, float] = {}
             cube = simulate(
-                flux, system, engine=engine, realizations=min(step, rounds - start), first_realization=start, seed=seed,
-                threads=1, report=report,
-            )  # fmt: skip
+                flux,
+                system,
+                engine=engine,
+                realizations=min(step, rounds - start),
+                first_realization=start,
+                seed=seed,
+                threads=1,
+                report=report,
+            )
             share = max(share, handed(report) / pixels)
             yield cube.reshape(-1, system.bins)
 

@@ -13,9 +13,13 @@ from mars_lidar.instrument.pulse import GaussianPulse
 from studies.domain.case import PERIOD_NS, Case
 
 ABLE = {
-    "detection_efficiency", "dark_count_hz", "electronics_dead_time_ns", "max_events_per_period",
-    "max_events_per_exposure", "twilight_ns",
-}  # fmt: skip
+    "detection_efficiency",
+    "dark_count_hz",
+    "electronics_dead_time_ns",
+    "max_events_per_period",
+    "max_events_per_exposure",
+    "twilight_ns",
+}
 FloatArray = NDArray[np.float64]
 
 

@@ -25,7 +25,7 @@ from studies.domain.verdict import (
     Outcome,
     blamed,
     second_level,
-)  # fmt: skip
+)
 from studies.domain.watch import Watched
 
 AGAIN = 4  # times as much is drawn the second time
@@ -133,12 +133,17 @@ def rows(judged: Judged) -> list[dict[str, Any]]:
     """One row of the data for each subject."""
     facts = judged.case.facts()
     return [
-        facts | {
-            "subject": o.subject, "state": o.state, "seconds": o.seconds, "checks": len(o.checks),
-            "least p": min((c.p for c in o.checks), default=1.0), "note": o.note.replace("\n", " "),
+        facts
+        | {
+            "subject": o.subject,
+            "state": o.state,
+            "seconds": o.seconds,
+            "checks": len(o.checks),
+            "least p": min((c.p for c in o.checks), default=1.0),
+            "note": o.note.replace("\n", " "),
         }
         for o in judged.outcomes
-    ]  # fmt: skip
+    ]
 
 
 def describe(check: Check) -> str:

@@ -214,7 +214,7 @@ class _Draw:
             "max_events_per_period": int(self.random.integers(1, 4)),
             "max_events_per_exposure": int(self.log(1, 1e4)),
             "afterpulsing": Afterpulsing(probability=self.log(1e-3, 0.3), delay_ns=self.log(0.05, 10.0) * PERIOD_NS),
-        }  # fmt: skip
+        }
         if bins % 4 == 0:
             possible["code_density"] = tuple(self.random.uniform(0.5, 1.5, 4).tolist())
         if mode == "nonparalyzable" and dead > 0.0:

@@ -10,16 +10,34 @@ from mars_lidar.statistics import ConvergenceError
 from studies.domain.checks import Check
 
 VERIFIED, REFUSED, HANDED, SLOW, FAILED, UNJUDGED = (
-    "verified", "refused", "given to exact", "slower than real use", "failed", "not judged",
-)  # fmt: skip
+    "verified",
+    "refused",
+    "given to exact",
+    "slower than real use",
+    "failed",
+    "not judged",
+)
 STATES = (VERIFIED, HANDED, REFUSED, SLOW, UNJUDGED, FAILED)
 ENGINES = ("exact", "feedback", "auto", "mars", "sequential")
 LAWS = ("count_law", "pmf", "mean_histogram", "stationary shape", "joint_law", "cramer_rao")
 SUBJECTS = (*ENGINES, "timestamps", *LAWS)
 _SUSPECTS = (
-    "feedback", "auto", "mars", "cramer_rao", "stationary shape", "pmf", "joint_law", "mean_histogram", "count_law",
-    "timestamps", "exact", "sequential", "reference", "simulator", "closed form",
-)  # fmt: skip
+    "feedback",
+    "auto",
+    "mars",
+    "cramer_rao",
+    "stationary shape",
+    "pmf",
+    "joint_law",
+    "mean_histogram",
+    "count_law",
+    "timestamps",
+    "exact",
+    "sequential",
+    "reference",
+    "simulator",
+    "closed form",
+)
 _ADVICE = re.compile(
     r"\b(use|engines?|instead|simulat\w*|give|take|methods?|shorter|fewer|must|at most|at least|mode)\b", re.IGNORECASE
 )

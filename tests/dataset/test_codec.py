@@ -98,5 +98,5 @@ def test_counts_beyond_their_type_are_refused():
 
 def test_zarr_finds_the_codec_of_the_installed_package():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    (name, target), = project["entry-points"]["zarr.codecs"].items()
+    ((name, target),) = project["entry-points"]["zarr.codecs"].items()
     assert (name, target) == ("mars_lidar.sparse", f"{SparseCodec.__module__}:{SparseCodec.__name__}")

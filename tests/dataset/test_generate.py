@@ -37,9 +37,12 @@ def test_every_sample_is_what_simulate_makes(tmp_path, recipe, layout):
         cube = ml.simulate(flux, system, realizations=3, seed=int(one.seed))
         np.testing.assert_array_equal(one.histogram, cube)
         for name, there in (
-            ("depth", scene.depth_m), ("reflectivity", scene.reflectivity), ("signal", flux.signal),
-            ("background", flux.background), ("delay", flux.delay_ns),
-        ):  # fmt: skip
+            ("depth", scene.depth_m),
+            ("reflectivity", scene.reflectivity),
+            ("signal", flux.signal),
+            ("background", flux.background),
+            ("delay", flux.delay_ns),
+        ):
             np.testing.assert_array_equal(one[name], there.astype(np.float32))
         sparse = read_sparse(tmp_path / "set.zarr", k, 2)
         np.testing.assert_array_equal(sparse.toarray().reshape(12, 10, 32), cube[2])
@@ -103,8 +106,9 @@ def test_bad_files_are_told_and_left_out(tmp_path, recipe):
     assert "24 × 10 pixels" in told[3]
     assert "zero at every pixel" in told[4]
     assert [Path(name).name for name in open_dataset(tmp_path / "set.zarr").scene_names()] == [
-        "a_depth.png", "c_depth.png",
-    ]  # fmt: skip
+        "a_depth.png",
+        "c_depth.png",
+    ]
     ran = CliRunner().invoke(app, ["info", str(tmp_path / "set.zarr")])
     assert ran.exit_code == 0
     assert "f_depth.png" in ran.stdout
@@ -178,11 +182,35 @@ def test_the_command(tmp_path):
 
 def test_the_command_takes_every_option_of_a_system(tmp_path):
     name = str(tmp_path / "set.zarr")
-    ran = CliRunner().invoke(app, [
-        "generate", "room", "--size", "8", "--cycles", "20", "--bins", "16", "--mode", "gated", "--gate-start-ns", "20",
-        "--gate-width-ns", "50", "--pulse-fwhm-ns", "2", "--jitter-fwhm-ns", "0.5", "--attenuation", "inverse_square",
-        "--ambient", "reflectivity", "-o", name,
-    ])  # fmt: skip
+    ran = CliRunner().invoke(
+        app,
+        [
+            "generate",
+            "room",
+            "--size",
+            "8",
+            "--cycles",
+            "20",
+            "--bins",
+            "16",
+            "--mode",
+            "gated",
+            "--gate-start-ns",
+            "20",
+            "--gate-width-ns",
+            "50",
+            "--pulse-fwhm-ns",
+            "2",
+            "--jitter-fwhm-ns",
+            "0.5",
+            "--attenuation",
+            "inverse_square",
+            "--ambient",
+            "reflectivity",
+            "-o",
+            name,
+        ],
+    )
     assert ran.exit_code == 0, ran.output
     stored = open_dataset(name)
     (system,) = stored.recipe.systems

@@ -75,9 +75,7 @@ def test_transients(tmp_path, of_transients, renders):
         system = stored.recipe.systems[int(one.system)]
         level = {"signal": float(one.signal_level), "sbr": float(one.sbr), "dark_counts_per_s": 1e5}
         flux = io.read_transient(file).flux(system, **level)
-        np.testing.assert_array_equal(
-            one.histogram, ml.simulate(flux, system, realizations=3, seed=int(one.seed))
-        )
+        np.testing.assert_array_equal(one.histogram, ml.simulate(flux, system, realizations=3, seed=int(one.seed)))
         np.testing.assert_allclose(one.signal, flux.signal, rtol=1e-6)
         np.testing.assert_array_equal(one.background, flux.background.astype(np.float32))
         assert np.isnan(one.depth[0, 0])
@@ -121,9 +119,7 @@ def test_fog_and_panes(tmp_path, recipe):
     scene = LayeredScene.behind_pane(room, **PANE)
     for k in range(8):
         system, signal, fog = stored.recipe.systems[k // 2 % 2], (0.2, 1.0)[k % 2], FOGS[k // 4]
-        clear = scene.flux(
-            system, signal=signal, sbr=2.0, attenuation="inverse_square", dark_counts_per_s=1e5
-        )
+        clear = scene.flux(system, signal=signal, sbr=2.0, attenuation="inverse_square", dark_counts_per_s=1e5)
         flux = clear.in_fog(system, **fog | {"backscatter": signal * fog["backscatter"]})
         cube = ml.simulate(flux, system, realizations=3, seed=int(stored.seeds[k]))
         np.testing.assert_array_equal(np.asarray(stored.histogram[k]), cube)

@@ -25,13 +25,23 @@ class Sampler(FeedbackEngine):
 
 
 def case(
-    signal: float, background: float, dead: float, cycles: int, *, delay: float = 0.37, sigma: float = 0.01,
-    items: int = 4000, **changes: Any,
-) -> Case:  # fmt: skip
+    signal: float,
+    background: float,
+    dead: float,
+    cycles: int,
+    *,
+    delay: float = 0.37,
+    sigma: float = 0.01,
+    items: int = 4000,
+    **changes: Any,
+) -> Case:
     system = System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=128, pulse=GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=128,
+        pulse=GaussianPulse(sigma_ns=sigma * PERIOD_NS),
         detector=Detector(dead_time_ns=dead * PERIOD_NS),
-    ).replace(**changes)  # fmt: skip
+    ).replace(**changes)
     name = f"S {signal:g}, B {background:g}, t_d {dead:g}, {cycles} cycles, {system.start}"
     return Case(name, flux_of(signal, background, delay), system, items)
 

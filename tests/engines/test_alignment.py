@@ -22,9 +22,13 @@ MOVES = np.array([0.0, 3.25, -20.5, 7.8, 127.6])  # bins
 
 def system_of(sigma_bins: float, dead: float, **changes: object) -> ml.System:
     return ml.System(
-        period_ns=PERIOD_NS, cycles=1000, bins=BINS, pulse=ml.GaussianPulse(sigma_ns=sigma_bins * BIN_NS),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS), start="stationary",
-    ).replace(**changes)  # fmt: skip
+        period_ns=PERIOD_NS,
+        cycles=1000,
+        bins=BINS,
+        pulse=ml.GaussianPulse(sigma_ns=sigma_bins * BIN_NS),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
+        start="stationary",
+    ).replace(**changes)
 
 
 def moved(system: ml.System, signal: float, background: float, moves: np.ndarray, level: str = "") -> np.ndarray:
@@ -37,15 +41,27 @@ def moved(system: ml.System, signal: float, background: float, moves: np.ndarray
     rows, weights = np.zeros((n, 4), np.int64), np.zeros((n, 4))
     weights[:, 0] = 1.0
     job = _core.ShapeJob(
-        shapes=normalised(canonical.histogram), rows=rows, weights=weights,
-        pixel_index=np.arange(n, dtype=np.uint32), place=np.arange(n), image=n, realizations=1,
-        first_realization=0, seed=1,
-    )  # fmt: skip
+        shapes=normalised(canonical.histogram),
+        rows=rows,
+        weights=weights,
+        pixel_index=np.arange(n, dtype=np.uint32),
+        place=np.arange(n),
+        image=n,
+        realizations=1,
+        first_realization=0,
+        seed=1,
+    )
     frame = alignment.frame
     job.align(
-        shift=alignment.shift, signal=alignment.signal, background=alignment.background, rate=alignment.rate,
-        dead_time=system.dead_time_periods, first=frame.first, cells=frame.cells, energy=frame.energy,
-    )  # fmt: skip
+        shift=alignment.shift,
+        signal=alignment.signal,
+        background=alignment.background,
+        rate=alignment.rate,
+        dead_time=system.dead_time_periods,
+        first=frame.first,
+        cells=frame.cells,
+        energy=frame.energy,
+    )
     out = np.empty((n, BINS))
     _core.shape_aligned(job, out, level)
     return out

@@ -19,9 +19,12 @@ from mars_lidar.table.law import distance
 
 AIM = 0.002
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=150, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=150,
+    bins=64,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=63.75),
-)  # fmt: skip
+)
 
 
 @cache

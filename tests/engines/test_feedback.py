@@ -42,9 +42,7 @@ def dense_law(request: Case, merge: int) -> tuple[FloatArray, FloatArray]:
     """
     system, flux = request.system, request.flux
     n = system.bins * merge
-    photons = flux.background[0, 0] / n + flux.signal[0, 0] * system.pulse.bin_energy(
-        flux.delay_ns[0, 0], PERIOD_NS, n
-    )
+    photons = flux.background[0, 0] / n + flux.signal[0, 0] * system.pulse.bin_energy(flux.delay_ns[0, 0], PERIOD_NS, n)
     fire = -np.expm1(-photons)
     refire = np.where(photons > 1e-5, 1 - fire / np.maximum(photons, 1e-5), photons / 2)
     whole = int(system.dead_time_periods)
@@ -135,9 +133,12 @@ def test_means_of_long_exposures_are_a_small_part_of_their_errors_off(name: str)
     """The rule of the internal grid: 1/20 of a standard deviation in any bin, beside the sample's own error."""
     request = LONG[name]
     law = joint_law(
-        float(request.flux.signal[0, 0]), float(request.flux.background[0, 0]), request.system,
-        delay_ns=float(request.flux.delay_ns[0, 0]), tolerance=1e-4,
-    )  # fmt: skip
+        float(request.flux.signal[0, 0]),
+        float(request.flux.background[0, 0]),
+        request.system,
+        delay_ns=float(request.flux.delay_ns[0, 0]),
+        tolerance=1e-4,
+    )
     x = drawn(Sampler(), request)
     off = (x.mean(0) - law.mean) / np.sqrt(law.variance)
     assert np.abs(off).max() < 0.05 + 5.5 / np.sqrt(len(x))  # 128 bins: 5e-6

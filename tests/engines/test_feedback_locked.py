@@ -56,9 +56,12 @@ def test_shadow_of_a_bright_pulse():
 
 
 SYSTEM = ml.System(
-    period_ns=PERIOD_NS, cycles=1_000_000, bins=1024, pulse=ml.GaussianPulse(sigma_ns=0.5),
+    period_ns=PERIOD_NS,
+    cycles=1_000_000,
+    bins=1024,
+    pulse=ml.GaussianPulse(sigma_ns=0.5),
     detector=ml.Detector(dead_time_ns=0.97 * PERIOD_NS),
-)  # fmt: skip
+)
 
 
 def test_a_million_cycles_with_a_count_that_cannot_vary():
@@ -87,9 +90,15 @@ def test_random_locked_systems_count_as_exact_does():
     for _ in range(24):
         signal, background = np.exp(random.uniform(np.log([4.0, 0.05]), np.log([80.0, 8.0])))
         request = locked(
-            float(signal), float(background), float(random.uniform(0.7, 0.995)), int(random.integers(20_000, 40_000)),
-            float(np.exp(random.uniform(np.log(0.002), np.log(0.02)))), 32, delay=float(random.random()), items=600,
-        )  # fmt: skip
+            float(signal),
+            float(background),
+            float(random.uniform(0.7, 0.995)),
+            int(random.integers(20_000, 40_000)),
+            float(np.exp(random.uniform(np.log(0.002), np.log(0.02)))),
+            32,
+            delay=float(random.random()),
+            items=600,
+        )
         task = task_of(request, 3)
         x = np.empty((task.items, 32), request.system.histogram_dtype)
         ENGINES["feedback"].histogram(task, x)

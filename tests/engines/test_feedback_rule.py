@@ -161,9 +161,15 @@ def test_parts_threads_and_order(engine: str):
     for threads in (1, 2, 3):
         rows, columns, run = (slice(*np.sort(random.choice(n + 1, 2, replace=False))) for n in (6, 11, 5))
         part = ml.simulate(
-            flux[rows, columns], system, engine=engine, realizations=run.stop - run.start, threads=threads,
-            first_realization=int(run.start), pixel_index=index[rows, columns], seed=3,
-        )  # fmt: skip
+            flux[rows, columns],
+            system,
+            engine=engine,
+            realizations=run.stop - run.start,
+            threads=threads,
+            first_realization=int(run.start),
+            pixel_index=index[rows, columns],
+            seed=3,
+        )
         assert np.array_equal(part, whole[run, rows, columns])
 
 

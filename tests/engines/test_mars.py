@@ -17,9 +17,12 @@ from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=300, bins=128, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=300,
+    bins=128,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=63.75),
-)  # fmt: skip
+)
 
 
 @cache
@@ -97,13 +100,9 @@ def test_any_part_alone_on_any_threads(with_table: bool):
     one = ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=5, threads=1)
     assert np.array_equal(whole, one)
     index = np.arange(35).reshape(5, 7)[1:4]
-    part = ml.simulate(
-        flux[1:4], SYSTEM, engine="mars", table=given, first_realization=1, pixel_index=index, seed=5
-    )
+    part = ml.simulate(flux[1:4], SYSTEM, engine="mars", table=given, first_realization=1, pixel_index=index, seed=5)
     assert np.array_equal(part[0], whole[1, 1:4])
-    assert not np.array_equal(
-        whole, ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=6)
-    )
+    assert not np.array_equal(whole, ml.simulate(flux, SYSTEM, engine="mars", table=given, realizations=3, seed=6))
 
 
 def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch):

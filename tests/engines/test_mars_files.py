@@ -12,9 +12,12 @@ from mars_lidar.cli import app
 from mars_lidar.table import Table
 
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=60, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=60,
+    bins=64,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=30.0),
-)  # fmt: skip
+)
 FLUX = ml.Flux(np.linspace(0.2, 1.9, 30).reshape(6, 5), 0.4, np.linspace(0.0, 99.0, 30).reshape(6, 5))
 
 
@@ -73,9 +76,21 @@ def test_command_line(tmp_path, table: Table):
     table.save(tmp_path / "table.h5")
     SYSTEM.save(tmp_path / "spad.yaml")
     arguments = [
-        "simulate", "--scene", "room", "--size", "8", "--signal", "0.5", "--system", str(tmp_path / "spad.yaml"),
-        "--no-picture", "--engine", "mars", "--count", "gaussian",
-    ]  # fmt: skip
+        "simulate",
+        "--scene",
+        "room",
+        "--size",
+        "8",
+        "--signal",
+        "0.5",
+        "--system",
+        str(tmp_path / "spad.yaml"),
+        "--no-picture",
+        "--engine",
+        "mars",
+        "--count",
+        "gaussian",
+    ]
     more = ["--table", str(tmp_path / "table.h5"), "--interpolation", "nearest", "-o", str(tmp_path / "a.zarr")]
     done = CliRunner().invoke(app, [*arguments, *more])
     assert done.exit_code == 0, done.output

@@ -24,9 +24,13 @@ SIGNALS, BACKGROUNDS = (0.2, 1.3), (0.05, 0.6)
 @cache
 def shapes_of(dead: float, signals: tuple[float, ...], backgrounds: tuple[float, ...]) -> tuple[ml.System, np.ndarray]:
     system = ml.System(
-        period_ns=PERIOD_NS, cycles=1000, bins=BINS, pulse=ml.GaussianPulse(sigma_ns=0.9),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS), start="stationary",
-    )  # fmt: skip
+        period_ns=PERIOD_NS,
+        cycles=1000,
+        bins=BINS,
+        pulse=ml.GaussianPulse(sigma_ns=0.9),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
+        start="stationary",
+    )
     s, b = np.meshgrid(signals, backgrounds, indexing="ij")
     return system, normalised(exposure_moments(s.ravel(), b.ravel(), system).histogram)
 
@@ -54,14 +58,26 @@ class Pixels:
     def job(self, realizations: int, guided: bool = True) -> _core.ShapeJob:
         move = self.alignment
         job = _core.ShapeJob(
-            shapes=self.shapes, rows=self.rows, weights=self.weights, pixel_index=np.arange(self.n, dtype=np.uint32),
-            place=np.arange(self.n), image=self.n, realizations=realizations, first_realization=0, seed=self.seed,
-        )  # fmt: skip
+            shapes=self.shapes,
+            rows=self.rows,
+            weights=self.weights,
+            pixel_index=np.arange(self.n, dtype=np.uint32),
+            place=np.arange(self.n),
+            image=self.n,
+            realizations=realizations,
+            first_realization=0,
+            seed=self.seed,
+        )
         job.align(
-            shift=move.shift, signal=move.signal, background=move.background, rate=move.rate,
-            dead_time=self.system.dead_time_periods, first=move.frame.first, cells=move.frame.cells,
+            shift=move.shift,
+            signal=move.signal,
+            background=move.background,
+            rate=move.rate,
+            dead_time=self.system.dead_time_periods,
+            first=move.frame.first,
+            cells=move.frame.cells,
             energy=move.frame.energy,
-        )  # fmt: skip
+        )
         if guided:
             job.guide(guides=self.guides, threads=2)
         return job

@@ -13,9 +13,13 @@ from mars_lidar.statistics import exposure_moments, renewal_moments
 from mars_lidar.table import Table
 
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=400, bins=128, pulse=ml.GaussianPulse(sigma_ns=1.5),
-    detector=ml.Detector(dead_time_ns=63.75), start="stationary",
-)  # fmt: skip
+    period_ns=100.0,
+    cycles=400,
+    bins=128,
+    pulse=ml.GaussianPulse(sigma_ns=1.5),
+    detector=ml.Detector(dead_time_ns=63.75),
+    start="stationary",
+)
 
 
 @pytest.mark.parametrize("with_table", [True, False])

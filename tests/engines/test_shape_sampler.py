@@ -27,9 +27,16 @@ def sample(shape: np.ndarray, counts: np.ndarray, *, seed: int = 1, level: str =
     rows, weights = np.zeros((pixels, 4), np.int64), np.zeros((pixels, 4))
     weights[:, 0] = 1.0
     job = _core.ShapeJob(
-        shapes=shape[None], rows=rows, weights=weights, pixel_index=np.arange(pixels, dtype=np.uint32),
-        place=np.arange(pixels), image=pixels, realizations=realizations, first_realization=0, seed=seed,
-    )  # fmt: skip
+        shapes=shape[None],
+        rows=rows,
+        weights=weights,
+        pixel_index=np.arange(pixels, dtype=np.uint32),
+        place=np.arange(pixels),
+        image=pixels,
+        realizations=realizations,
+        first_realization=0,
+        seed=seed,
+    )
     out = np.empty((realizations * pixels, shape.size), np.uint32)
     _core.shape_histogram(job, np.ascontiguousarray(counts, dtype=np.int64), out, threads, level, None)
     return out.reshape(realizations, pixels, shape.size)
@@ -95,9 +102,16 @@ def test_a_bin_that_is_too_full_is_an_error():
 def small(shape: np.ndarray, photons: int) -> np.ndarray:
     rows, weights = np.zeros((1, 4), np.int64), np.array([[1.0, 0, 0, 0]])
     job = _core.ShapeJob(
-        shapes=shape[None], rows=rows, weights=weights, pixel_index=np.zeros(1, np.uint32), place=np.zeros(1, np.int64),
-        image=1, realizations=1, first_realization=0, seed=1,
-    )  # fmt: skip
+        shapes=shape[None],
+        rows=rows,
+        weights=weights,
+        pixel_index=np.zeros(1, np.uint32),
+        place=np.zeros(1, np.int64),
+        image=1,
+        realizations=1,
+        first_realization=0,
+        seed=1,
+    )
     out = np.empty((1, shape.size), np.uint16)
     _core.shape_histogram(job, np.array([[photons]]), out, 1, "", None)
     return out

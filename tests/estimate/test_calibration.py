@@ -20,9 +20,13 @@ DELAY = 40.0
 
 def system(cycles: int = 4000, dead_ns: float = 85.0, sigma_ns: float = 0.5, **changes) -> ml.System:
     return ml.System(
-        period_ns=PERIOD, cycles=cycles, bins=256, pulse=ml.GaussianPulse(sigma_ns=sigma_ns),
-        detector=ml.Detector(dead_time_ns=dead_ns), **changes,
-    )  # fmt: skip
+        period_ns=PERIOD,
+        cycles=cycles,
+        bins=256,
+        pulse=ml.GaussianPulse(sigma_ns=sigma_ns),
+        detector=ml.Detector(dead_time_ns=dead_ns),
+        **changes,
+    )
 
 
 def stream(light: ml.Flux, made_by: ml.System, seed: int = 1) -> ml.Timestamps:
@@ -33,9 +37,7 @@ def bare(times: ml.Timestamps) -> ml.Timestamps:
     return dataclasses.replace(times, info={})
 
 
-@pytest.mark.parametrize(
-    ("dead_ns", "start"), [(85.0, "armed"), (0.0, "stationary"), (300.0, "stationary")]
-)
+@pytest.mark.parametrize(("dead_ns", "start"), [(85.0, "armed"), (0.0, "stationary"), (300.0, "stationary")])
 def test_unbiased_with_right_errors_at_the_bound(dead_ns, start):
     """Scores of replicates are standard normal; stated errors are the Cramer-Rao bound's to 20 %."""
     replicates = 10

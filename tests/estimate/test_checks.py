@@ -18,9 +18,12 @@ from mars_lidar.statistics import mean_histogram
 from mars_lidar.statistics.distance import Pmf, g_test
 
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=20_000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=20_000,
+    bins=64,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=65.0),
-)  # fmt: skip
+)
 LIGHT = ml.Flux(0.9, 0.4, 37.0)
 STREAMS = 20
 
@@ -29,9 +32,13 @@ STREAMS = 20
 def test_response_to_a_photon_is_that_of_the_laws(signal: float, background: float, dead: float):
     """Variance and derivatives of the count, and of a bin's mean, from h against the exact laws."""
     system = ml.System(
-        period_ns=100.0, cycles=1000, bins=1024, pulse=ml.GaussianPulse(sigma_ns=2.0),
-        detector=ml.Detector(dead_time_ns=dead), start="stationary",
-    )  # fmt: skip
+        period_ns=100.0,
+        cycles=1000,
+        bins=1024,
+        pulse=ml.GaussianPulse(sigma_ns=2.0),
+        detector=ml.Detector(dead_time_ns=dead),
+        start="stationary",
+    )
     energy = system.pulse.bin_energy(37.0, 100.0, 1024)
     rate = signal * energy + background / 1024
     one = (np.arange(1024) == 400).astype(float)
@@ -108,9 +115,7 @@ def test_slow_departures_are_seen(detector: ml.Detector, by: str):
     light = ml.Flux(0.8, 0.1, 37.0)
     times = ml.simulate_timestamps(light, SYSTEM.replace(cycles=600_000, detector=detector), seed=77)
     times = dataclasses.replace(times, info={})
-    found = ml.validate(
-        times, ml.calibrate(times, pulse=SYSTEM.pulse, dead_time_ns=65.0), cycles=2000
-    )
+    found = ml.validate(times, ml.calibrate(times, pulse=SYSTEM.pulse, dead_time_ns=65.0), cycles=2000)
     assert any(by in check.name for check in found.failed), found.checks
 
 

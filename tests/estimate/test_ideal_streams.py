@@ -22,16 +22,26 @@ from studies import streams
 
 
 def recorded(
-    signal: float, background: float, period: float, dead: float, sigma: float, cycles: int, seed: int,
-    jitter: float = 0.0, **effects: object,
-) -> ml.Timestamps:  # fmt: skip
+    signal: float,
+    background: float,
+    period: float,
+    dead: float,
+    sigma: float,
+    cycles: int,
+    seed: int,
+    jitter: float = 0.0,
+    **effects: object,
+) -> ml.Timestamps:
     """A stream of which nothing is told."""
     if jitter:
         effects["jitter"] = ml.Jitter(sigma_ns=jitter)
     made_by = ml.System(
-        period_ns=period, cycles=cycles, bins=1024, pulse=ml.GaussianPulse(sigma_ns=sigma),
+        period_ns=period,
+        cycles=cycles,
+        bins=1024,
+        pulse=ml.GaussianPulse(sigma_ns=sigma),
         detector=ml.Detector(dead_time_ns=dead, **effects),
-    )  # fmt: skip
+    )
     light = ml.Flux(signal, background, 0.3 * period)
     return dataclasses.replace(ml.simulate_timestamps(light, made_by, seed=seed), info={})
 
@@ -128,9 +138,12 @@ def test_a_photon_within_the_dead_time_is_told():
     more = np.sort(np.concatenate([times.times_ns, times.times_ns[::400] + 40.0]))
     place = np.floor(more / times.period_ns)
     wrong = dataclasses.replace(
-        times, times_ns=more, cycle=place.astype(np.int32), bin=np.zeros(more.size, np.int32),
+        times,
+        times_ns=more,
+        cycle=place.astype(np.int32),
+        bin=np.zeros(more.size, np.int32),
         offsets=np.array([0, more.size]),
-    )  # fmt: skip
+    )
     assert "shorter than the dead time" in " ".join(inspect(wrong, dead_time_ns=85.0).problems)
 
 

@@ -18,7 +18,8 @@ DETECTORS = {
     "electronics": ml.Detector(dead_time_ns=50.0, electronics_dead_time_ns=85.0),
     "paralyzable": ml.Detector(dead_time_ns=40.0, mode="paralyzable"),
     "afterpulses, jitter": ml.Detector(
-        dead_time_ns=85.0, jitter=ml.Jitter(sigma_ns=0.3),
+        dead_time_ns=85.0,
+        jitter=ml.Jitter(sigma_ns=0.3),
         afterpulsing=ml.Afterpulsing(probability=0.05, delay_ns=100.0),
     ),
 }
@@ -54,8 +55,12 @@ def test_returns(kind, name):
         assert found.converged
         assert found.simulated == 4.0
         scores.append((found.parameters - truth) / np.sqrt(np.diag(found.covariance)))
-        without = ml.calibrate(times.pixel(0, k), dead_time_ns=max(detector.dead_time_ns, 85.0 * (jitter > 0)),
-                               jitter_ns=jitter, **arguments)  # fmt: skip
+        without = ml.calibrate(
+            times.pixel(0, k),
+            dead_time_ns=max(detector.dead_time_ns, 85.0 * (jitter > 0)),
+            jitter_ns=jitter,
+            **arguments,
+        )
         plain.append((without.background - 0.5) / without.errors["background"])
     z = np.array(scores)
     outcomes = {f"bias {k}": float(2 * stats.norm.sf(abs(v) / math.sqrt(NUMBER))) for k, v in enumerate(z.sum(0))}

@@ -45,12 +45,16 @@ def test_nothing_told_nothing_biased(signal, background, jitter, cycles):
         errors = found.errors
         assert found.jitter_error_ns == pytest.approx(errors["jitter_ns"])
         assert isinstance(found.pulse, ml.GaussianPulse)
-        scores.append([
-            (found.dead_time_ns - DEAD) / found.dead_time_error_ns, (found.jitter_ns - jitter) / errors["jitter_ns"],
-            (found.background - background) / errors["background"], (found.signal - signal) / errors["signal"],
-            (found.delay_ns - DELAY) / errors["delay_ns"],
-            (found.pulse.sigma_ns - math.hypot(SIGMA, jitter)) / errors["sigma_ns"],
-        ])  # fmt: skip
+        scores.append(
+            [
+                (found.dead_time_ns - DEAD) / found.dead_time_error_ns,
+                (found.jitter_ns - jitter) / errors["jitter_ns"],
+                (found.background - background) / errors["background"],
+                (found.signal - signal) / errors["signal"],
+                (found.delay_ns - DELAY) / errors["delay_ns"],
+                (found.pulse.sigma_ns - math.hypot(SIGMA, jitter)) / errors["sigma_ns"],
+            ]
+        )
     z = np.array(scores)
     names = ("dead time", "jitter", "B", "S", "delay", "sigma")
     bias = 2.0 * stats.norm.sf(np.abs(z.sum(0)) / math.sqrt(number))
@@ -128,8 +132,12 @@ def test_the_rate_of_records_is_that_of_a_fine_simulation():
     found = Records(rate, kernel)
     assert found.rate.sum() == pytest.approx(rate.sum(), rel=1e-9)
     random = np.random.default_rng(47)
-    arrival = np.interp(random.exponential(size=400_000), np.concatenate([[0.0], np.cumsum(np.tile(rate, 4))]),
-                        np.arange(4 * bins + 1) * PERIOD / bins, right=np.inf)  # fmt: skip
+    arrival = np.interp(
+        random.exponential(size=400_000),
+        np.concatenate([[0.0], np.cumsum(np.tile(rate, 4))]),
+        np.arange(4 * bins + 1) * PERIOD / bins,
+        right=np.inf,
+    )
     record = arrival + jitter * random.standard_normal(arrival.size)
     edges = 20.0 + np.linspace(-3.0, 3.0, 31)
     seen = np.histogram(record, edges)[0]
@@ -158,10 +166,16 @@ def test_a_free_shape_gets_dead_time_and_jitter_too():
     times = streams(0.8, 0.5, 0.2, 4, 300_000, seed=49)
     found = [ml.calibrate(times.pixel(0, k), pulse="free") for k in range(4)]
     assert all(one.dead_time_by == "edge" for one in found)
-    z = np.array([
-        [(one.dead_time_ns - DEAD) / one.dead_time_error_ns, (one.jitter_ns - 0.2) / one.jitter_error_ns,
-         (one.total - 1.3) / one.total_error] for one in found
-    ])  # fmt: skip
+    z = np.array(
+        [
+            [
+                (one.dead_time_ns - DEAD) / one.dead_time_error_ns,
+                (one.jitter_ns - 0.2) / one.jitter_error_ns,
+                (one.total - 1.3) / one.total_error,
+            ]
+            for one in found
+        ]
+    )
     outcomes = {name: float(2 * stats.norm.sf(abs(v) / 2.0)) for name, v in zip("tjL", z.sum(0), strict=True)}
     ledger.require(outcomes, "free shape, jitter")
     kernel = normal_kernel(0.2, PERIOD, 1024)
@@ -204,10 +218,14 @@ def test_a_measured_pulse_holds_the_jitter():
     for k in range(number):
         found = ml.calibrate(times.pixel(0, k), pulse=response)
         errors = found.errors
-        scores.append([
-            (found.dead_time_ns - DEAD) / found.dead_time_error_ns, (found.jitter_ns - jitter) / found.jitter_error_ns,
-            (found.background - 0.5) / errors["background"], (found.signal - 0.8) / errors["signal"],
-        ])  # fmt: skip
+        scores.append(
+            [
+                (found.dead_time_ns - DEAD) / found.dead_time_error_ns,
+                (found.jitter_ns - jitter) / found.jitter_error_ns,
+                (found.background - 0.5) / errors["background"],
+                (found.signal - 0.8) / errors["signal"],
+            ]
+        )
         assert abs(found.delay_ns - DELAY) < 6.0 * errors["delay_ns"]
         assert abs(float(found.flux().delay_ns.item()) - DELAY) < 6.0 * errors["delay_ns"] + 1e-3
     z = np.array(scores)

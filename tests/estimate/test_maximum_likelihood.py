@@ -17,9 +17,12 @@ from mars_lidar.reconstruct.histogram_record import recording_of
 
 PERIOD = 100.0
 PLAIN = ml.System(
-    period_ns=PERIOD, cycles=4000, bins=500, pulse=ml.GaussianPulse(sigma_ns=0.5),
+    period_ns=PERIOD,
+    cycles=4000,
+    bins=500,
+    pulse=ml.GaussianPulse(sigma_ns=0.5),
     detector=ml.Detector(dead_time_ns=75.3),
-)  # fmt: skip
+)
 
 
 def with_dead(dead_ns: float, **more) -> ml.System:
@@ -40,9 +43,12 @@ SYSTEMS = {
     "gated": (with_dead(45.0, mode="gated", gate_start_ns=80.03, gate_width_ns=40.0), 1.0, 1.0, 97.0),
     "bright background": (with_dead(20.0, cycles=10_000), 2.0, 30.0, 37.0),
     "two lobes": (
-        PLAIN.replace(pulse=ml.SampledPulse(np.r_[np.hanning(40), 0.4 * np.hanning(60)], 0.05)), 1.0, 1.0, 37.0,
+        PLAIN.replace(pulse=ml.SampledPulse(np.r_[np.hanning(40), 0.4 * np.hanning(60)], 0.05)),
+        1.0,
+        1.0,
+        37.0,
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
@@ -147,9 +153,7 @@ def test_derivatives(name):
         scale = np.sqrt(log_likelihood(h, system, *at)[2][k, k])
         assert slope == pytest.approx(gradient[k], abs=2e-3 * scale, rel=1e-5)
     scores = np.array([log_likelihood(h, system, signal, background, delay)[1] for h in cube])
-    information = np.mean(
-        [log_likelihood(h, system, signal, background, delay)[2] for h in cube[:100]], axis=0
-    )
+    information = np.mean([log_likelihood(h, system, signal, background, delay)[2] for h in cube[:100]], axis=0)
     unit = np.sqrt(np.diag(information))
     whitened = np.linalg.solve(np.linalg.cholesky(information / np.outer(unit, unit)), (scores / unit).T)
     outcomes = {}

@@ -15,16 +15,17 @@ from mars_lidar.cli import app
 from mars_lidar.statistics.distance import Pmf, two_sample_g_test
 
 PLAIN = ml.System(
-    period_ns=100.0, cycles=100_000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=100_000,
+    bins=64,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=65.0),
-)  # fmt: skip
+)
 TRUTH = np.array([0.5, 0.9, 37.0])
 LIGHT = ml.Flux(TRUTH[1], TRUTH[0], TRUTH[2])
 DETECTORS = {
     "jitter": ml.Detector(dead_time_ns=65.0, jitter=ml.Jitter(sigma_ns=0.5)),
-    "afterpulses": ml.Detector(
-        dead_time_ns=65.0, afterpulsing=ml.Afterpulsing(probability=0.2, delay_ns=80.0)
-    ),
+    "afterpulses": ml.Detector(dead_time_ns=65.0, afterpulsing=ml.Afterpulsing(probability=0.2, delay_ns=80.0)),
     "electronics": ml.Detector(dead_time_ns=40.0, electronics_dead_time_ns=65.0),
     "paralyzable": ml.Detector(dead_time_ns=30.0, mode="paralyzable"),
 }

@@ -15,9 +15,13 @@ PERIOD = 100.0
 def system_of(dead_ns: float, *, bins: int = 500, cycles: int = 1000, sigma_ns: float = 1.0, **more) -> ml.System:
     detector = {k: more.pop(k) for k in list(more) if k.startswith("gate") or k == "mode"}
     return ml.System(
-        period_ns=PERIOD, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma_ns),
-        detector=ml.Detector(dead_time_ns=dead_ns, **detector), **more,
-    )  # fmt: skip
+        period_ns=PERIOD,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma_ns),
+        detector=ml.Detector(dead_time_ns=dead_ns, **detector),
+        **more,
+    )
 
 
 def photons(system: ml.System, signal: float, background: float, delay_ns: float) -> np.ndarray:
@@ -113,9 +117,7 @@ def test_one_cycle_of_an_armed_pixel():
     free = system_of(99.0, bins=50, cycles=1, sigma_ns=5.0)
     clock = system_of(0.0, bins=50, cycles=1, sigma_ns=5.0, mode="synchronous")
     mean = np.linspace(0.0, 0.015, 50)
-    assert generalised_coates_rates(mean, free)[:49] == pytest.approx(
-        coates_rates(mean, clock)[:49], abs=1e-12
-    )
+    assert generalised_coates_rates(mean, free)[:49] == pytest.approx(coates_rates(mean, clock)[:49], abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -125,9 +127,12 @@ def test_one_cycle_of_an_armed_pixel():
 )
 def test_what_no_method_knows_of_the_detector_is_told(effect):
     plain = ml.System(
-        period_ns=100.0, cycles=100, bins=100, pulse=ml.GaussianPulse(sigma_ns=1.0),
+        period_ns=100.0,
+        cycles=100,
+        bins=100,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
         detector=ml.Detector(dead_time_ns=50.0, detection_efficiency=0.5),
-    )  # fmt: skip
+    )
     cube = ml.simulate(ml.Flux(1.0, 0.5, 37.0), plain)
     ml.reconstruct(cube, plain)  # no word of an efficiency
     odd = plain.replace(detector=ml.Detector(dead_time_ns=50.0, **effect))

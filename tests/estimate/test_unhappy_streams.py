@@ -15,9 +15,12 @@ from mars_lidar.cli import app
 
 PERIOD = 1e3 / 7.5
 SYSTEM = ml.System(
-    period_ns=PERIOD, cycles=20_000, bins=1024, pulse=ml.GaussianPulse(sigma_ns=0.5),
+    period_ns=PERIOD,
+    cycles=20_000,
+    bins=1024,
+    pulse=ml.GaussianPulse(sigma_ns=0.5),
     detector=ml.Detector(dead_time_ns=85.0),
-)  # fmt: skip
+)
 
 
 def stream(signal: float, background: float, seed: int = 71, **changes) -> ml.Timestamps:

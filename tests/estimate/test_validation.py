@@ -16,9 +16,12 @@ from mars_lidar.cli import app
 from mars_lidar.statistics.distance import Pmf
 
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=60_000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=60_000,
+    bins=64,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=65.0),
-)  # fmt: skip
+)
 LIGHT = ml.Flux(0.9, 0.4, 37.0)
 
 
@@ -115,14 +118,20 @@ def test_inspection_tells_what_does_not_fit(times):
     half = bare.cycle % 2 == 0
     kept = half | (bare.cycle > 30_000)
     changing = dataclasses.replace(
-        bare, times_ns=bare.times_ns[kept], cycle=bare.cycle[kept], bin=bare.bin[kept],
+        bare,
+        times_ns=bare.times_ns[kept],
+        cycle=bare.cycle[kept],
+        bin=bare.bin[kept],
         offsets=np.array([0, int(kept.sum())]),
-    )  # fmt: skip
+    )
     assert "not constant" in " ".join(inspect(changing).problems)
     twice = dataclasses.replace(
-        bare, times_ns=np.repeat(bare.times_ns, 2), cycle=np.repeat(bare.cycle, 2), bin=np.repeat(bare.bin, 2),
+        bare,
+        times_ns=np.repeat(bare.times_ns, 2),
+        cycle=np.repeat(bare.cycle, 2),
+        bin=np.repeat(bare.bin, 2),
         offsets=np.array([0, 2 * len(bare)]),
-    )  # fmt: skip
+    )
     assert "exactly the time of the one before" in " ".join(inspect(twice).problems)
 
 

@@ -32,9 +32,12 @@ def test_engines_without_a_kernel_name_what_works(engine: str):
 
 def test_effects_and_waveforms_are_refused():
     jittery = ml.System(
-        period_ns=100.0, cycles=500, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5),
+        period_ns=100.0,
+        cycles=500,
+        bins=64,
+        pulse=ml.GaussianPulse(sigma_ns=0.5),
         detector=ml.Detector(dead_time_ns=63.75, jitter=ml.Jitter(sigma_ns=0.1)),
-    )  # fmt: skip
+    )
     with pytest.raises(ValueError, match=r"'cuda' does not do jitter.*use device 'cpu'"):
         ml.simulate(FLUX, jittery, device="cuda")
     wave = ml.Flux(waveform=np.full((1, 1, 8), 0.1), background=0.1)
@@ -78,9 +81,13 @@ def _device() -> Any:
 def test_bits_on_a_gpu(mode: str, start: str):
     cupy = _device()
     system = ml.System(
-        period_ns=100.0, cycles=2000, bins=1024, pulse=ml.GaussianPulse(sigma_ns=0.5), start=start,
+        period_ns=100.0,
+        cycles=2000,
+        bins=1024,
+        pulse=ml.GaussianPulse(sigma_ns=0.5),
+        start=start,
         detector=ml.Detector(dead_time_ns=63.75, mode=mode),
-    )  # fmt: skip
+    )
     there = ml.simulate(FLUX, system, realizations=50, seed=3, device="cuda")
     assert isinstance(there, cupy.ndarray)
     np.testing.assert_array_equal(there.get(), ml.simulate(FLUX, system, realizations=50, seed=3))

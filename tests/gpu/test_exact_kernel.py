@@ -21,27 +21,37 @@ MODES: dict[str, dict[str, Any]] = {
     "dead_time_zero": {"dead_time_ns": 0.0},
     "paralyzable": {"mode": "paralyzable"},
     "synchronous": {"mode": "synchronous"},
-    "moving_gate": {"mode": "gated", "gate_start_ns": 35.0, "gate_width_ns": 30.0, "gate_step_ns": 0.7,
-                    "gate_cycles": 50},
+    "moving_gate": {
+        "mode": "gated",
+        "gate_start_ns": 35.0,
+        "gate_width_ns": 30.0,
+        "gate_step_ns": 0.7,
+        "gate_cycles": 50,
+    },
     "gated": {"mode": "gated", "gate_start_ns": 35.0, "gate_width_ns": 30.0},
     "gated_whole": {"mode": "gated", "dead_time_ns": 200.0, "gate_start_ns": 80.0, "gate_width_ns": 50.0},
-}  # fmt: skip
+}
 
 
 def task(detector: dict[str, Any], pulse: str, start: str, returns: int, bins: int, cycles: int = 400) -> Task:
     detector = {"dead_time_ns": 63.75, **detector}
-    shape = ml.GaussianPulse(sigma_ns=0.7) if pulse == "gaussian" else ml.SampledPulse(
-        np.array([0.1, 0.7, 1.0, 0.4, 0.3, 0.1]), bin_ns=0.4
+    shape = (
+        ml.GaussianPulse(sigma_ns=0.7)
+        if pulse == "gaussian"
+        else ml.SampledPulse(np.array([0.1, 0.7, 1.0, 0.4, 0.3, 0.1]), bin_ns=0.4)
     )
     system = ml.System(
         period_ns=100.0, cycles=cycles, bins=bins, pulse=shape, detector=ml.Detector(**detector), start=start
     )
     rng = np.random.default_rng(5)
     echoes = [
-        ml.Flux(rng.choice([0.0, 0.2, 3.0, 30.0], (3, 17)), rng.choice([0.0, 0.01, 2.0], (3, 17)) if k == 0 else 0.0,
-                rng.uniform(0.0, 100.0, (3, 17)))
+        ml.Flux(
+            rng.choice([0.0, 0.2, 3.0, 30.0], (3, 17)),
+            rng.choice([0.0, 0.01, 2.0], (3, 17)) if k == 0 else 0.0,
+            rng.uniform(0.0, 100.0, (3, 17)),
+        )
         for k in range(returns)
-    ]  # fmt: skip
+    ]
     flux = echoes[0] if returns == 1 else ml.Flux.multi(*echoes)
     index = np.arange(1000, 1051, dtype=np.uint32)
     return Task(flux, system, 2, 3, index, 2**40 + 9, 1, None)
@@ -65,8 +75,10 @@ def expected(task: Task, dtype: Any = np.uint16) -> NDArray[Any]:
 # a gate that moves has no stationary state
 STARTS = [
     (mode, start)
-    for mode in MODES for start in ("armed", "stationary") if (mode, start) != ("moving_gate", "stationary")
-]  # fmt: skip
+    for mode in MODES
+    for start in ("armed", "stationary")
+    if (mode, start) != ("moving_gate", "stationary")
+]
 
 
 @pytest.mark.parametrize(("pulse", "returns"), [("gaussian", 1), ("gaussian", 4), ("sampled", 1), ("sampled", 3)])

@@ -15,9 +15,12 @@ from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 
 BASE = ml.System(
-    period_ns=100.0, cycles=3000, bins=128, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=3000,
+    bins=128,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=63.75),
-)  # fmt: skip
+)
 SAMPLED = ml.SampledPulse(np.array([0.1, 0.7, 1.0, 0.4, 0.3, 0.1]), bin_ns=0.9)
 
 

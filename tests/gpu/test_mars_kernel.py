@@ -16,9 +16,12 @@ from mars_lidar.engines.engine import Task
 from mars_lidar.table import Table
 
 BASE = ml.System(
-    period_ns=100.0, cycles=300, bins=128, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=300,
+    bins=128,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=63.75),
-)  # fmt: skip
+)
 SYSTEMS: dict[str, ml.System] = {
     "plain": BASE,  # the table keeps laws of its doubted entries
     "whole": BASE.replace(detector=ml.Detector(dead_time_ns=101.0)),  # the frame is cut into cells

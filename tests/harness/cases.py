@@ -34,9 +34,7 @@ def shared(path: str) -> Path:
     return file
 
 
-def flux_of(
-    signal: ArrayLike, background: float, delay: ArrayLike = 0.5, period_ns: float = PERIOD_NS
-) -> Flux:
+def flux_of(signal: ArrayLike, background: float, delay: ArrayLike = 0.5, period_ns: float = PERIOD_NS) -> Flux:
     """Alike pixels; several returns where `signal` and `delay` (periods) are rows."""
     returns = zip(np.atleast_1d(signal), np.atleast_1d(delay), strict=True)
     each = [np.full((1, _PIXELS), x) for pair in returns for x in (pair[0], pair[1] * period_ns)]
@@ -69,9 +67,7 @@ def measured_pulse(name: str, span_ns: float, origin: str = "peak") -> SampledPu
     return SampledPulse(values, span_ns / values.size, origin)
 
 
-def random_cases(
-    number: int, seed: int, photons: float = 6e6, least: int = 2000, most: int = 12_000
-) -> list[Case]:
+def random_cases(number: int, seed: int, photons: float = 6e6, least: int = 2000, most: int = 12_000) -> list[Case]:
     """Systems all over the range that the engines must cover.
 
     `photons` bounds the arrivals to draw for each, `least` and `most` the exposures. With 2000 exposures on

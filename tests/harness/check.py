@@ -183,9 +183,7 @@ def _sample_and_reference(
     p: dict[str, float] = {}
     share = 1.0 / reference.realizations
     if COUNTS in claims:
-        p["count mean"] = mean_vector(
-            sample.counts, reference.count_mean, share=share, variance=reference.count_var
-        )
+        p["count mean"] = mean_vector(sample.counts, reference.count_mean, share=share, variance=reference.count_var)
         p["count variance"] = _two_sided(variance_score(sample.counts, reference.count_var, share=share))
         span = max(reference.count.size, int(sample.counts.max()) + 1)
         theirs = np.pad(reference.count, (0, span - reference.count.size))
@@ -194,9 +192,7 @@ def _sample_and_reference(
     often = reference.mean * len(sample.cube) >= 2000
     if SHAPE in claims:
         cell = merge(reference.mean * len(sample.cube), 2000.0)
-        p["mean histogram"] = mean_vector(
-            _merged(sample.cube, cell), np.bincount(cell, reference.mean), share=share
-        )
+        p["mean histogram"] = mean_vector(_merged(sample.cube, cell), np.bincount(cell, reference.mean), share=share)
     if JOINT in claims:
         score = variance_score(sample.cube[:, often], reference.variance[often], share=share)
         p["histogram variance"] = bonferroni(_two_sided_each(score))
@@ -204,9 +200,7 @@ def _sample_and_reference(
         products = _products(sample.cube)[:, both]
         p["lag-1 covariance"] = mean_vector(products, reference.lag1[both], share=share)
         window = _reference_window(engine, case, reference, seed + 500_000)
-        p["window mean"] = mean_vector(
-            window, reference.window_mean, share=share, variance=reference.window_var
-        )
+        p["window mean"] = mean_vector(window, reference.window_mean, share=share, variance=reference.window_var)
         p["window variance"] = _two_sided(variance_score(window, reference.window_var, share=share))
     return p
 
@@ -255,9 +249,7 @@ def _profile(sample: Sample, cycles: int) -> NDArray[np.float64]:
     edges = np.unique(np.round(np.geomspace(1, cycles, 24)).astype(int))
     group = np.searchsorted(edges, sample.records.cycle, side="right")
     width = edges.size + 1
-    return (
-        np.bincount(item * width + group, minlength=len(sample.cube) * width).reshape(-1, width).astype(float)
-    )
+    return np.bincount(item * width + group, minlength=len(sample.cube) * width).reshape(-1, width).astype(float)
 
 
 def _window(total: NDArray[np.int64]) -> NDArray[np.intp]:

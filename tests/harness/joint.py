@@ -26,15 +26,11 @@ class JointLaw:
         flux, system = case.flux, case.system
         background = float(flux.background[0, 0])
         if flux.waveform is not None:
-            return cls(
-                ml.joint_law(None, background, system, waveform=flux.waveform[0, 0], tolerance=tolerance)
-            )
+            return cls(ml.joint_law(None, background, system, waveform=flux.waveform[0, 0], tolerance=tolerance))
         signals, delays = flux.returns_signal[:, 0, 0], flux.returns_delay_ns[:, 0, 0]
         if len(signals) == 1:
             return cls(
-                ml.joint_law(
-                    float(signals[0]), background, system, delay_ns=float(delays[0]), tolerance=tolerance
-                )
+                ml.joint_law(float(signals[0]), background, system, delay_ns=float(delays[0]), tolerance=tolerance)
             )
         wave = sum(
             s * np.maximum(system.pulse.bin_energy(tau, system.period_ns, _SAMPLES), 0.0)

@@ -57,9 +57,7 @@ def stationary_count_pmf(rate: float, dead: float, exposure: float, most: int) -
     return np.asarray(survival[:-1] - survival[1:])
 
 
-def constant_rate_moments(
-    rate: float, dead: float, exposure: float, *, stationary: bool
-) -> tuple[float, float]:
+def constant_rate_moments(rate: float, dead: float, exposure: float, *, stationary: bool) -> tuple[float, float]:
     """Mean and variance of N, up to terms that vanish exponentially with the exposure."""
     x = rate * dead
     mean, variance = rate * exposure / (1 + x), rate * exposure / (1 + x) ** 3

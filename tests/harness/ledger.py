@@ -14,9 +14,7 @@ def require(outcomes: Mapping[str, float], about: str = "") -> None:
     """Enter p-values into the account and fail if one is below `LEVEL`."""
     _done.extend((p, f"{about}: {name}") for name, p in outcomes.items())
     failed = {name: p for name, p in outcomes.items() if not p >= LEVEL}
-    assert not failed, f"{about}: p-values below {LEVEL:g}: " + ", ".join(
-        f"{n} {p:.2g}" for n, p in failed.items()
-    )
+    assert not failed, f"{about}: p-values below {LEVEL:g}: " + ", ".join(f"{n} {p:.2g}" for n, p in failed.items())
 
 
 def rejected(outcomes: Mapping[str, float]) -> set[str]:

@@ -35,14 +35,10 @@ def two_mean_vectors(a: ArrayLike, b: ArrayLike) -> float:
     z = _scores(difference, pooled.var(0, ddof=1) * share)
     within = np.vstack([x - x.mean(0), y - y.mean(0)])
     covariance = within.T @ within / (n + m - 2)
-    return bonferroni(
-        [_hotelling(difference, covariance * share, n + m - 2), bonferroni(2 * stats.norm.sf(z))]
-    )
+    return bonferroni([_hotelling(difference, covariance * share, n + m - 2), bonferroni(2 * stats.norm.sf(z))])
 
 
-def mean_vector(
-    a: ArrayLike, mean: ArrayLike, *, share: float = 0.0, variance: ArrayLike | None = None
-) -> float:
+def mean_vector(a: ArrayLike, mean: ArrayLike, *, share: float = 0.0, variance: ArrayLike | None = None) -> float:
     """Mean vector of a sample (realizations, components) against a known one.
 
     `share` is 1 / (realizations behind `mean`), 0 if it is exact; `variance` that of the components.
@@ -82,9 +78,7 @@ def variance_score(a: ArrayLike, variance: ArrayLike, *, share: float = 0.0) -> 
     return np.asarray(z)
 
 
-def goodness(
-    observed: ArrayLike, expected: ArrayLike, *, least: float = 40.0, fixed_total: bool = True
-) -> float:
+def goodness(observed: ArrayLike, expected: ArrayLike, *, least: float = 40.0, fixed_total: bool = True) -> float:
     """Pearson's chi-square of numbers of events against expected ones, merged up to `least`."""
     obs, exp = np.asarray(observed, float), np.asarray(expected, float)
     if np.any(obs[exp == 0] > 0):

@@ -12,9 +12,17 @@ from harness.cases import PERIOD_NS, Case, flux_of, shared
 from mars_lidar import Detector, GaussianPulse, System
 
 REFERENCE_NAMES = (
-    "s01_mid", "s02_bright", "s03_dim", "s04_saturated", "s05_shortdead", "s06_longdead", "s07_wrap",
-    "s08_fewphotons", "s09_hw_bright", "s10_resonant",
-)  # fmt: skip
+    "s01_mid",
+    "s02_bright",
+    "s03_dim",
+    "s04_saturated",
+    "s05_shortdead",
+    "s06_longdead",
+    "s07_wrap",
+    "s08_fewphotons",
+    "s09_hw_bright",
+    "s10_resonant",
+)
 
 
 @dataclass(frozen=True, eq=False)

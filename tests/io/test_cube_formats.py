@@ -22,9 +22,7 @@ from mars_lidar.plot.data import incident_rate
 FIELD_MAT = Path(__file__).resolve().parents[2].parent / "shared/data/rgbd/nyuv2_home_office_spad_0161_p1.mat"
 PTU = pytest.param(
     ".ptu",
-    marks=pytest.mark.skipif(
-        importlib.util.find_spec("ptufile") is None, reason="ptufile (extra io) is not installed"
-    ),
+    marks=pytest.mark.skipif(importlib.util.find_spec("ptufile") is None, reason="ptufile (extra io) is not installed"),
 )
 
 
@@ -83,8 +81,14 @@ def test_mat_has_the_keys_shapes_and_types_of_the_field(tmp_path):
     counts = ml.simulate(flux, SYSTEM, seed=3)[0]
     found = scipy.io.loadmat(path)
     assert {k for k in found if not k.startswith("__")} == {
-        "spad", "rates", "bin", "bin_hr", "SBR", "photons", "mars_lidar",
-    }  # fmt: skip
+        "spad",
+        "rates",
+        "bin",
+        "bin_hr",
+        "SBR",
+        "photons",
+        "mars_lidar",
+    }
     # the load of the networks: dense, (W, H, T), then turned
     spad = np.asarray(scipy.sparse.csc_matrix.todense(found["spad"])).reshape([1, 5, 6, -1])
     assert np.array_equal(np.transpose(spad, (0, 3, 2, 1))[0], counts.transpose(2, 0, 1))
@@ -115,7 +119,6 @@ def test_a_mat_tells_the_light_that_the_pixel_detects(tmp_path):
     found = scipy.io.loadmat(tmp_path / "a.mat")
     assert found["photons"].item() == pytest.approx(system.cycles * 0.5, rel=1e-12)
     assert found["SBR"].item() == pytest.approx(0.5 / (0.125 + 1e-3 * system.period_ns), rel=1e-12)
-
 
 
 @pytest.mark.parametrize("make", [several_returns, waveform])

@@ -60,9 +60,7 @@ def test_an_interrupted_file_leaves_what_was_there(tmp_path, small_blocks, suffi
     assert list(tmp_path.iterdir()) == []
     io.simulate_to(path, one_return(), SYSTEM, seed=5)
     with pytest.raises(io.Interrupted, match="is what it was before"):
-        io.simulate_to(
-            path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90), overwrite=True
-        )
+        io.simulate_to(path, one_return(), SYSTEM, realizations=4, progress=_interrupt_after(90), overwrite=True)
     assert list(tmp_path.iterdir()) == [path]
     with io.load(path) as cube:
         assert cube.seed == 5

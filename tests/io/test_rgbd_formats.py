@@ -267,8 +267,9 @@ def test_by_pattern(tmp_path):
         png(tmp_path / f"{k}-c.png", np.full((2, 2), 255, np.uint8))
     scenes, problems = io.scan(tmp_path, pattern="*-d.png", image=("-d", "-c"), depth_unit_m=1 / 5000)
     assert [(s.depth.name, s.image.name, s.depth_unit_m) for s in scenes] == [
-        ("0-d.png", "0-c.png", 1 / 5000), ("1-d.png", "1-c.png", 1 / 5000),
-    ]  # fmt: skip
+        ("0-d.png", "0-c.png", 1 / 5000),
+        ("1-d.png", "1-c.png", 1 / 5000),
+    ]
     assert scenes[1].load().depth_m[0, 0] == pytest.approx(0.4)
     assert [(p.path.name, "2-c.png is missing" in p.reason) for p in problems] == [("2-d.png", True)]
     assert io.scan(tmp_path, pattern="*.tiff") == ([], [])
@@ -284,8 +285,9 @@ def test_by_manifest(tmp_path):
     assert [(s.depth.name, s.index, s.depth_unit_m) for s in scenes] == [("nyu.mat", 1, None), ("d.npy", None, 0.001)]
     told = sorted(str(p) for p in problems)
     assert len(told) == 4
-    for part, line in zip(("d.npy: depth is uint16", "manifest.csv: line 6", "manifest.csv: line 7", "no such"), told,
-                          strict=True):  # fmt: skip
+    for part, line in zip(
+        ("d.npy: depth is uint16", "manifest.csv: line 6", "manifest.csv: line 7", "no such"), told, strict=True
+    ):
         assert part in line
     (tmp_path / "other.csv").write_text("depth,colour\nd.npy,x.png\n")
     with pytest.raises(ValueError, match=r"other\.csv: columns must be depth and any of image"):

@@ -95,9 +95,7 @@ def test_streaming_in_blocks_changes_no_count(tmp_path, monkeypatch, suffix, blo
     monkeypatch.setattr("mars_lidar.io.hdf5._CHUNK_BYTES", 1500)
     told: list[tuple[int, int]] = []
     path = tmp_path / f"cube{suffix}"
-    io.simulate_to(
-        path, flux, SYSTEM, realizations=4, pixel_index=index, seed=3, progress=lambda *at: told.append(at)
-    )
+    io.simulate_to(path, flux, SYSTEM, realizations=4, pixel_index=index, seed=3, progress=lambda *at: told.append(at))
     with io.load(path) as cube:
         assert np.array_equal(np.asarray(cube.histogram), expected)
         assert io.verify(cube)
@@ -143,9 +141,10 @@ def test_xarray_opens_a_zarr_with_names_and_units_and_no_warning(tmp_path):
             assert all("long_name" in data[name].attrs for name in data.variables)
             assert data.attrs["complete"] is True
             assert ml.System.from_json(data.attrs["system"]) == SYSTEM
-            assert data.histogram.isel(realization=0, y=0, x=0).sum() == ml.simulate(
-                flux, SYSTEM, first_realization=5
-            )[0, 0, 0].sum()
+            assert (
+                data.histogram.isel(realization=0, y=0, x=0).sum()
+                == ml.simulate(flux, SYSTEM, first_realization=5)[0, 0, 0].sum()
+            )
     photons = "photons per laser period"
     assert units | {"signal": photons, "background": photons, "returns_signal": photons} == units
     assert units | {"time": "ns", "delay": "ns", "depth": "m", "reflectivity": "1"} == units

@@ -19,9 +19,12 @@ from mars_lidar.light import stored_flux
 from mars_lidar.light.stored_flux import StoredFlux
 
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=200, bins=200, pulse=ml.GaussianPulse(sigma_ns=0.8),
+    period_ns=100.0,
+    cycles=200,
+    bins=200,
+    pulse=ml.GaussianPulse(sigma_ns=0.8),
     detector=ml.Detector(dead_time_ns=30.0),
-)  # fmt: skip
+)
 
 
 @pytest.fixture
@@ -61,9 +64,12 @@ def test_parts_are_those_of_the_flux_in_memory(transient):
 def test_effects_of_a_detector(transient, tmp_path):
     """Efficiency and dark counts of a flux on disk are those of the same in memory, and files hold what is recorded."""
     detector = ml.Detector(
-        dead_time_ns=30.0, detection_efficiency=0.4, dark_count_hz=1e6, jitter=ml.Jitter(sigma_ns=0.5),
+        dead_time_ns=30.0,
+        detection_efficiency=0.4,
+        dark_count_hz=1e6,
+        jitter=ml.Jitter(sigma_ns=0.5),
         max_events_per_period=1,
-    )  # fmt: skip
+    )
     system = SYSTEM.replace(detector=detector)
     stored, whole = transient.stored_flux(system, signal=1.0, sbr=2.0), transient.flux(system, signal=1.0, sbr=2.0)
     rate = np.linspace(0.0, 1e6, 15).reshape(5, 3)
@@ -162,7 +168,9 @@ def test_memory_does_not_grow_with_the_transient(tmp_path):
             data.attrs["bin_ns"] = 3.0
         done = subprocess.run(
             [sys.executable, "-c", _CHILD, str(path), str(tmp_path / f"{height}.zarr")],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         peaks.append(float(done.stdout))
     assert peaks[1] < peaks[0] + 24, f"peaks of {peaks[0]:.0f} and {peaks[1]:.0f} MiB"

@@ -18,9 +18,7 @@ from mars_lidar.io.photons import ptu_header
 
 def needs(library: str, suffix: str):
     missing = importlib.util.find_spec(library) is None
-    return pytest.param(
-        suffix, marks=pytest.mark.skipif(missing, reason=f"{library} (extra io) is not installed")
-    )
+    return pytest.param(suffix, marks=pytest.mark.skipif(missing, reason=f"{library} (extra io) is not installed"))
 
 
 SUFFIXES = [".npz", needs("ptufile", ".ptu"), needs("phconvert", ".h5")]

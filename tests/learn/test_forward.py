@@ -44,9 +44,12 @@ def test_gradients(dead_ns, pulse):
 def test_gradient_at_many_bins_is_that_of_the_exact_mean_histogram():
     """Differences of `mean_histogram`, which shares no code with it: central, of a step that both errors allow."""
     one = ml.System(
-        period_ns=100.0, cycles=1000, bins=512, pulse=ml.GaussianPulse(sigma_ns=0.8),
+        period_ns=100.0,
+        cycles=1000,
+        bins=512,
+        pulse=ml.GaussianPulse(sigma_ns=0.8),
         detector=ml.Detector(dead_time_ns=64.0),
-    )  # fmt: skip
+    )
     at, step = np.array([0.9, 0.4, 61.3]), np.array([1e-2, 1e-2, 1e-2])
     weights = np.cos(np.arange(512.0) / 9)
     both = at + np.concatenate([np.diag(step), -np.diag(step)])
@@ -106,9 +109,12 @@ def test_efficiency_and_dark_counts_are_those_of_the_exact_mean():
 def test_narrow_pulse_at_many_bins():
     """1024 bins, a pulse of half a bin: nothing dense would fit."""
     one = ml.System(
-        period_ns=100.0, cycles=1000, bins=1024, pulse=ml.GaussianPulse(sigma_ns=0.05),
+        period_ns=100.0,
+        cycles=1000,
+        bins=1024,
+        pulse=ml.GaussianPulse(sigma_ns=0.05),
         detector=ml.Detector(dead_time_ns=85.0),
-    )  # fmt: skip
+    )
     s, b, tau = (np.array(x) for x in ([0.5, 5.0], [1.0, 0.1], [40.03, 99.99]))
     found = expected_histogram(*point(s, b, tau), one).detach().numpy()
     exact = ml.statistics.mean_histogram(s, b, one, delay_ns=tau)

@@ -9,9 +9,13 @@ import torch
 import mars_lidar as ml
 
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=300, bins=16, pulse=ml.GaussianPulse(sigma_ns=4.0), detector=ml.Detector(dead_time_ns=40.0),
+    period_ns=100.0,
+    cycles=300,
+    bins=16,
+    pulse=ml.GaussianPulse(sigma_ns=4.0),
+    detector=ml.Detector(dead_time_ns=40.0),
     start="stationary",
-)  # fmt: skip
+)
 
 
 @pytest.fixture

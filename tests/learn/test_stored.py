@@ -22,9 +22,12 @@ SYSTEM = ml.System(
 def path(tmp_path_factory):
     """6 samples x 5 realizations; chunks of two realizations."""
     recipe = {
-        "scenes": {"example": "room", "size": [6, 8], "seeds": [0, 1, 2]}, "systems": [SYSTEM],
-        "light": {"signal": [0.5, 1]}, "realizations": 5, "store": {"chunk_mib": 0.006, "shard_mib": 0.02},
-    }  # fmt: skip
+        "scenes": {"example": "room", "size": [6, 8], "seeds": [0, 1, 2]},
+        "systems": [SYSTEM],
+        "light": {"signal": [0.5, 1]},
+        "realizations": 5,
+        "store": {"chunk_mib": 0.006, "shard_mib": 0.02},
+    }
     out = tmp_path_factory.mktemp("learn") / "set.zarr"
     ml.generate(recipe, out)
     assert ml.dataset.open_dataset(out).histogram.chunks[:2] == (1, 2)

@@ -21,9 +21,12 @@ SYSTEM = ml.System(
     period_ns=100.0, cycles=60, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
 )
 SYSTEMS = SystemRange(
-    base=SYSTEM, cycles=LogUniform(10, 200), period_ns=Uniform(80, 120), dead_time_ns=Choice([0, 20, 150.0]),
+    base=SYSTEM,
+    cycles=LogUniform(10, 200),
+    period_ns=Uniform(80, 120),
+    dead_time_ns=Choice([0, 20, 150.0]),
     sigma_ns=LogUniform(0.2, 2),
-)  # fmt: skip
+)
 
 
 def stream(systems=SYSTEMS, *scenes, **changes) -> CubeStream:
@@ -195,8 +198,10 @@ def test_ranges():
     uniform([one.period_ns for one in systems], 80, 120)
     uniform([math.log(one.pulse.sigma_ns) for one in systems], math.log(0.2) - 1e-12, math.log(2) + 1e-12)
     assert {10 <= one.cycles <= 200 for one in systems} == {True}
-    for values, allowed in (([one.sbr for one in samples], {1.0, 2.5}),
-                            ([one.detector.dead_time_ns for one in systems], {0.0, 20.0, 150.0})):  # fmt: skip
+    for values, allowed in (
+        ([one.sbr for one in samples], {1.0, 2.5}),
+        ([one.detector.dead_time_ns for one in systems], {0.0, 20.0, 150.0}),
+    ):
         counts = [values.count(one) for one in sorted(allowed)]
         assert sum(counts) == 600
         assert stats.chisquare(counts).pvalue > 1e-4

@@ -36,9 +36,13 @@ def view(mode: str, dead: float, start: str = "armed", cycles: int = 40, **chang
         opens, width = GATES[mode]
         mode, extra = "gated", {"gate_start_ns": opens * PERIOD_NS, "gate_width_ns": width * PERIOD_NS}
     return ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=50, pulse=ml.GaussianPulse(sigma_ns=2.0),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode=mode, **extra), start=start,
-    ).replace(**changes)  # fmt: skip
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=50,
+        pulse=ml.GaussianPulse(sigma_ns=2.0),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode=mode, **extra),
+        start=start,
+    ).replace(**changes)
 
 
 def law_of(case: Case, **pixel: Any) -> Law:
@@ -115,9 +119,7 @@ def test_paralyzable_without_dead_time_is_poisson():
 def test_paralyzable_long_exposures_grow_linearly():
     """Mean and variance of 1e8 periods, and what one more period adds."""
     for start in ("armed", "stationary"):
-        a, b, c = (
-            paralyzable_moments(1.0, 0.3, view("paralyzable", 2.4, start, n)) for n in (50, 51, 100_000_000)
-        )
+        a, b, c = (paralyzable_moments(1.0, 0.3, view("paralyzable", 2.4, start, n)) for n in (50, 51, 100_000_000))
         for name in ("mean", "variance"):
             x, y, z = (float(getattr(m, name)) for m in (a, b, c))
             assert z == pytest.approx(x + (y - x) * (100_000_000 - 50), rel=1e-9)
@@ -169,9 +171,14 @@ def test_synchronous_count_law(rate: float, dead: float, start: str):
 
 @pytest.mark.parametrize(
     ("signal", "background", "dead", "cycles", "start"),
-    [(1.0, 0.5, 1.5, 2000, "armed"), (0.3, 0.2, 40.3, 5000, "stationary"), (0.01, 0.01, 3.3, 20_000, "stationary"),
-     (3.0, 1.0, 0.93, 1000, "armed"), (20.0, 1.0, 2.93, 1000, "stationary")],
-)  # fmt: skip
+    [
+        (1.0, 0.5, 1.5, 2000, "armed"),
+        (0.3, 0.2, 40.3, 5000, "stationary"),
+        (0.01, 0.01, 3.3, 20_000, "stationary"),
+        (3.0, 1.0, 0.93, 1000, "armed"),
+        (20.0, 1.0, 2.93, 1000, "stationary"),
+    ],
+)
 def test_synchronous_law_by_its_transform(
     monkeypatch: pytest.MonkeyPatch, signal: float, background: float, dead: float, cycles: int, start: str
 ):
@@ -289,9 +296,7 @@ def test_what_does_not_treat_a_mode_says_so(mode: str):
 
 def test_moving_gates_are_refused():
     system = view("gate", 0.7)
-    moving = ml.Detector(
-        dead_time_ns=5.0, mode="gated", gate_start_ns=3.0, gate_width_ns=9.0, gate_step_ns=1.0
-    )
+    moving = ml.Detector(dead_time_ns=5.0, mode="gated", gate_start_ns=3.0, gate_width_ns=9.0, gate_step_ns=1.0)
     for call in (ml.count_law, mean_histogram, ml.registration_pdf, exposure_moments):
         with pytest.raises(ValueError, match=r"a gate that repeats every period, got gate_step_ns=1; .* simulated"):
             call(1.0, 1.0, system.replace(detector=moving))

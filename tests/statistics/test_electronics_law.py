@@ -15,11 +15,15 @@ from mars_lidar.statistics import electronics_moments, mean_histogram
 
 def view(dead: float, electronics: float, start: str = "armed", cycles: int = 40, **detector: Any) -> ml.System:
     return ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=50, pulse=ml.GaussianPulse(sigma_ns=3.0), start=start,
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=50,
+        pulse=ml.GaussianPulse(sigma_ns=3.0),
+        start=start,
         detector=ml.Detector(
             dead_time_ns=dead * PERIOD_NS, electronics_dead_time_ns=electronics * PERIOD_NS, **detector
         ),
-    )  # fmt: skip
+    )
 
 
 def pmf_of(law: ml.CountLaw) -> np.ndarray:
@@ -69,7 +73,7 @@ def test_law_at_a_constant_rate():
         (1.5, 0.8, 0.3, 0.9, 60, {"mode": "gated", "gate_start_ns": 20.0, "gate_width_ns": 40.0}),
         (1.5, 0.5, 0.3, 0.9, 60, {"dark_count_hz": 1e6, "jitter": ml.Jitter(sigma_ns=1.0)}),
     ],
-)  # fmt: skip
+)
 def test_law_of_the_sequential_engine(
     signal: float, background: float, dead: float, electronics: float, cycles: int, detector: dict[str, Any], start: str
 ):

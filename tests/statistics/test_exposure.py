@@ -37,17 +37,34 @@ def on_grid(signal, background, system, n, *, level="", settle=True, delay_ns=No
     whole = math.floor(system.dead_time_periods)
     position = (system.dead_time_periods - whole) * n
     grid = _core.ExposureGrid(
-        cycles=system.cycles, max_periods=10**9, whole=whole, bins=n, out_bins=1, shift=math.floor(position),
-        fraction=position % 1.0, stationary=system.start == "stationary", tolerance=1e-12 if settle else -1.0,
-    )  # fmt: skip
+        cycles=system.cycles,
+        max_periods=10**9,
+        whole=whole,
+        bins=n,
+        out_bins=1,
+        shift=math.floor(position),
+        fraction=position % 1.0,
+        stationary=system.start == "stationary",
+        tolerance=1e-12 if settle else -1.0,
+    )
     energy, row = cells.energies(n)
     cumulants, rates = np.empty((1, 4)), np.empty((1, 4))
     settled = np.empty(1, np.int64)
     _core.exposure_moments(
-        grid=grid, signal=cells.signal, background=cells.background, shape=row, shapes=energy,
-        cumulants=cumulants, cumulant_rates=rates, histogram=np.empty((1, 1)),
-        histogram_rate=np.empty((1, 1)), settled=settled, threads=1, level=level, progress=None,
-    )  # fmt: skip
+        grid=grid,
+        signal=cells.signal,
+        background=cells.background,
+        shape=row,
+        shapes=energy,
+        cumulants=cumulants,
+        cumulant_rates=rates,
+        histogram=np.empty((1, 1)),
+        histogram_rate=np.empty((1, 1)),
+        settled=settled,
+        threads=1,
+        level=level,
+        progress=None,
+    )
     return cumulants[0], int(settled[0])
 
 
@@ -162,12 +179,8 @@ def test_settling_is_not_deceived_by_long_dead_times():
 
 def test_millions_of_cycles_by_rates():
     short, long = (exposure_moments(1.0, 1.0, make_system(0.6375, cycles=n)) for n in (10**3, 10**7))
-    np.testing.assert_allclose(
-        long.cumulants, short.cumulants + (10**7 - 10**3) * short.cumulant_rates, rtol=1e-9
-    )
-    np.testing.assert_allclose(
-        long.histogram, short.histogram + (10**7 - 10**3) * short.histogram_rate, rtol=1e-9
-    )
+    np.testing.assert_allclose(long.cumulants, short.cumulants + (10**7 - 10**3) * short.cumulant_rates, rtol=1e-9)
+    np.testing.assert_allclose(long.histogram, short.histogram + (10**7 - 10**3) * short.histogram_rate, rtol=1e-9)
     assert 0 < short.settled < 100
 
 

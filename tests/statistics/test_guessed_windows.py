@@ -11,9 +11,12 @@ from mars_lidar.statistics.pmf import exact_windows, guessed_windows
 from mars_lidar.table.law import distance
 
 SYSTEM = ml.System(
-    period_ns=100.0, cycles=120, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0),
+    period_ns=100.0,
+    cycles=120,
+    bins=32,
+    pulse=ml.GaussianPulse(sigma_ns=1.0),
     detector=ml.Detector(dead_time_ns=63.75),
-)  # fmt: skip
+)
 
 
 def cells():

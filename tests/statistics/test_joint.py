@@ -21,9 +21,13 @@ PERIOD = 100.0
 
 def system(dead: float, cycles: int = 1000, bins: int = 64, sigma: float = 0.02, start: str = "armed") -> ml.System:
     return ml.System(
-        period_ns=PERIOD, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD), start=start,
-    )  # fmt: skip
+        period_ns=PERIOD,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD),
+        start=start,
+    )
 
 
 def photons(signal: float, background: float, at: ml.System, bins: int) -> np.ndarray:
@@ -111,9 +115,11 @@ def systems(number: int, seed: int, **changes: object) -> list[tuple[float, floa
         if k % 4 == 1:
             dead = 10 ** random.uniform(-5, -2)
         at = system(
-            dead, int(10 ** random.uniform(0, 3.5)), sigma=10 ** random.uniform(-2.3, -1),
+            dead,
+            int(10 ** random.uniform(0, 3.5)),
+            sigma=10 ** random.uniform(-2.3, -1),
             start="stationary" if k % 2 else "armed",
-        ).replace(**changes)  # fmt: skip
+        ).replace(**changes)
         flux = 10 ** random.uniform(-2, 1), 10 ** random.uniform(-3, 1)
         found.append((*flux, at, random.uniform(0, PERIOD)))
     return found
@@ -192,9 +198,7 @@ def plain_feedback(flux: np.ndarray, dead: int) -> tuple[np.ndarray, np.ndarray,
 )
 def test_short_exposures_by_another_recursion(signal, background, dead, cycles, start):
     """Variances of windows of unsettled exposures: generating function, plain bins, Richardson."""
-    law = joint_law(
-        signal, background, system(dead, cycles, bins=16, sigma=0.06, start=start), tolerance=1e-6
-    )
+    law = joint_law(signal, background, system(dead, cycles, bins=16, sigma=0.06, start=start), tolerance=1e-6)
     assert law.settled == -1
     random = np.random.default_rng(5)
     weights = np.vstack([np.ones(16), np.eye(16)[[7, 8, 15]], random.normal(size=(4, 16))])

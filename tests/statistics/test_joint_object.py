@@ -13,9 +13,13 @@ PERIOD = 100.0
 
 def system(dead: float, cycles: int = 1000, bins: int = 64, sigma: float = 0.02, start: str = "armed") -> ml.System:
     return ml.System(
-        period_ns=PERIOD, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD), start=start,
-    )  # fmt: skip
+        period_ns=PERIOD,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD),
+        start=start,
+    )
 
 
 @pytest.fixture(scope="module")

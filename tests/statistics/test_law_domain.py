@@ -26,9 +26,13 @@ def view(dead: float, cycles: int = 1000, sigma: float = 0.01, start: str = "arm
     """Times in periods."""
     detector = ml.Detector(dead_time_ns=dead * PERIOD_NS)
     made = ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=64, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
-        detector=detector, start=start,  # type: ignore[arg-type]
-    )  # fmt: skip
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=64,
+        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        detector=detector,
+        start=start,  # type: ignore[arg-type]
+    )
     return made.replace(**changes)
 
 
@@ -77,9 +81,13 @@ def test_warm_states_by_sweeps_and_by_the_equation(
 
 @pytest.mark.parametrize(
     ("signal", "background", "dead", "sigma"),
-    [(205.648, 6.66524, 0.999856070836575, 0.013763629840558421), (26.3463, 0.00914578, 4.988590445664314, 0.002),
-     (28.4588, 241.234, 1.99982, 0.177), (64.86, 0.45, 0.999978, 0.00446)],
-)  # fmt: skip
+    [
+        (205.648, 6.66524, 0.999856070836575, 0.013763629840558421),
+        (26.3463, 0.00914578, 4.988590445664314, 0.002),
+        (28.4588, 241.234, 1.99982, 0.177),
+        (64.86, 0.45, 0.999978, 0.00446),
+    ],
+)
 def test_stationary_shapes_of_locked_pixels(signal: float, background: float, dead: float, sigma: float):
     """Rate and shape: armed + blind = 1, each bin's registrations at least those of the pixel armed a dead time ago."""
     system = view(dead, sigma=sigma, bins=32)
@@ -108,9 +116,13 @@ def test_factors_of_the_feedback_equation(signal: float, background: float, dead
 
 @pytest.mark.parametrize(
     ("signal", "background", "dead", "sigma", "bins"),
-    [(100.233, 0.605444, 0.9920625, 0.0007026, 8192), (128.69, 0.389, 0.999986716, 0.000223, 16384),
-     (41.8, 0.49668, 0.94463536, 0.0002337, 16384), (1e-6, 1000.0, 0.5, 1.0, 1024)],
-)  # fmt: skip
+    [
+        (100.233, 0.605444, 0.9920625, 0.0007026, 8192),
+        (128.69, 0.389, 0.999986716, 0.000223, 16384),
+        (41.8, 0.49668, 0.94463536, 0.0002337, 16384),
+        (1e-6, 1000.0, 0.5, 1.0, 1024),
+    ],
+)
 def test_factors_of_locked_pixels(signal: float, background: float, dead: float, sigma: float, bins: int):
     """Where the held window is behind the pulse the residual is rounding; elsewhere it was up to 8."""
     grid = FoldedGrid.of(Cells.of(signal, background, view(dead, sigma=sigma), delay_ns=50.0), bins)
@@ -131,9 +143,14 @@ def test_stationary_shape_without_a_dead_time():
 
 @pytest.mark.parametrize(
     ("signal", "background", "dead", "cycles", "start"),
-    [(1.0, 1.0, 0.6375, 100_000, "armed"), (0.01, 0.02, 1.3, 1_000_000, "stationary"), (3.0, 3.0, 0.01, 2000, "armed"),
-     (0.3, 30.0, 0.01, 400, "stationary"), (9.0, 0.1, 2.2, 300_000, "armed")],
-)  # fmt: skip
+    [
+        (1.0, 1.0, 0.6375, 100_000, "armed"),
+        (0.01, 0.02, 1.3, 1_000_000, "stationary"),
+        (3.0, 3.0, 0.01, 2000, "armed"),
+        (0.3, 30.0, 0.01, 400, "stationary"),
+        (9.0, 0.1, 2.2, 300_000, "armed"),
+    ],
+)
 def test_wide_laws_from_few_points(
     monkeypatch: pytest.MonkeyPatch, signal: float, background: float, dead: float, cycles: int, start: str
 ):
@@ -260,9 +277,7 @@ def test_joint_law_known_to_settle(monkeypatch: pytest.MonkeyPatch):
         (1.7, 6.3, 367_230.6, 10**7, 0.001, "stationary"),
     ],
 )
-def test_refusals_say_what_to_use(
-    signal: float, background: float, dead: float, cycles: int, sigma: float, start: str
-):
+def test_refusals_say_what_to_use(signal: float, background: float, dead: float, cycles: int, sigma: float, start: str):
     system = view(dead, cycles, sigma, start)
     told = r"; use .*joint_law.*simulate it with engine 'exact'"
     for law in (ml.count_law, mean_histogram, ml.registration_pdf):
@@ -303,7 +318,7 @@ def test_a_law_that_is_refused_is_to_be_had_elsewhere(monkeypatch: pytest.Monkey
         ({"tolerance": math.nan}, ValueError, "tolerance must be"),
         ({"system": None}, TypeError, "system must be a System"),
     ],
-)  # fmt: skip
+)
 def test_bad_input(law: Any, change: dict[str, Any], error: type[Exception], told: str):
     given: dict[str, Any] = {"signal": 1.0, "background": 0.1, "system": view(0.6)} | change
     with pytest.raises(error, match=told):

@@ -38,17 +38,23 @@ def cumulants_of(window):
 
 def exact(dead, cycles, signal, background, start="armed"):
     system = ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS), start=start,
-    )  # fmt: skip
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=64,
+        pulse=ml.GaussianPulse(sigma_ns=0.5),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS),
+        start=start,
+    )
     return ml.count_law(signal, background, system)
 
 
 def distances(law):
-    return np.array([
-        total_variation(Pmf(w.first, w.pmf), Pmf(int(law.support[k, 0]), law.pmf[k]))
-        for k, w in enumerate(matched_pmf(law.cumulants))
-    ])  # fmt: skip
+    return np.array(
+        [
+            total_variation(Pmf(w.first, w.pmf), Pmf(int(law.support[k, 0]), law.pmf[k]))
+            for k, w in enumerate(matched_pmf(law.cumulants))
+        ]
+    )
 
 
 def test_close_to_the_exact_law():
@@ -117,9 +123,10 @@ def test_many_cells_on_threads_as_one_by_one():
     cells = np.array(list(FORMS.values()))[random.integers(0, len(FORMS), 3000)]
     u = random.random((3000, 2))
     together = matched_counts(cells, u, threads=2)
-    np.testing.assert_array_equal(together[::500], np.vstack([
-        matched_counts(cells[k : k + 1], u[k : k + 1], threads=1) for k in range(0, 3000, 500)
-    ]))  # fmt: skip
+    np.testing.assert_array_equal(
+        together[::500],
+        np.vstack([matched_counts(cells[k : k + 1], u[k : k + 1], threads=1) for k in range(0, 3000, 500)]),
+    )
 
 
 def test_normal_quantile():
@@ -198,9 +205,7 @@ def test_next_to_no_step_at_the_change_of_form():
     """The laws on either side of a variance of 9 and of the other thresholds are near one another."""
     steps = []
     for variance, third, fourth in ((9.0, -3.0, 1.0), (9.0, 8.0, 7.0), (0.7, -0.1, 0.02)):
-        one, other = (
-            matched_pmf([(40.3, variance * scale, third, fourth)])[0] for scale in (1 - 1e-9, 1 + 1e-9)
-        )
+        one, other = (matched_pmf([(40.3, variance * scale, third, fourth)])[0] for scale in (1 - 1e-9, 1 + 1e-9))
         steps.append(total_variation(Pmf(one.first, one.pmf), Pmf(other.first, other.pmf)))
     assert max(steps) < 0.01
 

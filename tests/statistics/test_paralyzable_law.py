@@ -16,9 +16,13 @@ from mars_lidar.statistics import exposure_moments, paralyzable_moments
 
 def view(dead: float, start: str = "armed", cycles: int = 40, *, sigma: float = 0.02, bins: int = 50) -> ml.System:
     return ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=bins, pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
-        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode="paralyzable"), start=start,
-    )  # fmt: skip
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=bins,
+        pulse=ml.GaussianPulse(sigma_ns=sigma * PERIOD_NS),
+        detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, mode="paralyzable"),
+        start=start,
+    )
 
 
 def pmf_of(law: ml.CountLaw) -> np.ndarray:
@@ -43,8 +47,13 @@ def constant_rate_pmf(rate: float, dead: float, cycles: float, start: str) -> np
         if start == "stationary":
             chance.append(ordered(k, cycles))
             continue
-        early = quad(lambda u, k=k: rate * np.exp(-rate * u) * ordered(k - 1, max(cycles - u - dead, 0.0)),
-                     0, dead, epsrel=1e-12, epsabs=1e-14)[0]  # fmt: skip
+        early = quad(
+            lambda u, k=k: rate * np.exp(-rate * u) * ordered(k - 1, max(cycles - u - dead, 0.0)),
+            0,
+            dead,
+            epsrel=1e-12,
+            epsabs=1e-14,
+        )[0]
         chance.append(early + ordered(k, cycles - dead))
     counts = range(most + 1)
     return np.array([sum((-1) ** (k - n) * comb(k, n) * chance[k] for k in counts[n:]) for n in counts])

@@ -28,9 +28,12 @@ from studies.report import MAX_FIGURE_BYTES
 
 def pixel(signal: float = 1.0, background: float = 0.5, dead: float = 0.4, cycles: int = 100, **more: object) -> Case:
     system = ml.System(
-        period_ns=PERIOD_NS, cycles=cycles, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0),
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=32,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
         detector=ml.Detector(dead_time_ns=dead * PERIOD_NS, **more),
-    )  # fmt: skip
+    )
     return Case("by hand/0", "any", system, (signal,), (0.3,), background)
 
 
@@ -80,10 +83,15 @@ def test_a_right_engine_passes_and_wrong_ones_do_not(monkeypatch: pytest.MonkeyP
     wrong = [c for o in judge(case, 1, budget, silent) for c in o.checks if c.p < 1e-9]
     kinds = {(c.b, c.what) for c in wrong if c.a == "exact"}
     assert {
-        ("count_law", "mean of the count"), ("count_law", "variance of the count"), ("pmf", "law of the count"),
-        ("mean_histogram", "mean histogram"), ("joint_law", "mean of the windows"), ("sequential", "law of the count"),
-        ("sequential", "mean histogram"), ("simulator", "law of the count"),
-    } <= kinds  # fmt: skip
+        ("count_law", "mean of the count"),
+        ("count_law", "variance of the count"),
+        ("pmf", "law of the count"),
+        ("mean_histogram", "mean histogram"),
+        ("joint_law", "mean of the windows"),
+        ("sequential", "law of the count"),
+        ("sequential", "mean histogram"),
+        ("simulator", "law of the count"),
+    } <= kinds
     assert set(verdict.blamed(wrong)) == {"exact"}
 
 

@@ -18,9 +18,12 @@ def test_quick(tmp_path):
     example = tmp_path / "decay.mat"
     flux = ml.Flux(waveform=1.5 * np.exp(-np.arange(100) / 8.0) / 8.0)
     made_by = ml.System(
-        period_ns=50.0, cycles=8000, bins=100, pulse=ml.GaussianPulse(sigma_ns=1.0),
+        period_ns=50.0,
+        cycles=8000,
+        bins=100,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
         detector=ml.Detector(dead_time_ns=80.0),
-    )  # fmt: skip
+    )
     times = ml.simulate_timestamps(flux, made_by, seed=3)
     with h5py.File(example, "w") as file:
         file["tPhoton"] = np.floor(times.times_ns / 0.064)[None]

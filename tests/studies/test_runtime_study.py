@@ -120,9 +120,7 @@ def test_points_that_would_take_too_long_are_left_out(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(
-        runtime, "contenders", lambda tables: [contenders.Contender("slow", "slow", prepare)]
-    )
+    monkeypatch.setattr(runtime, "contenders", lambda tables: [contenders.Contender("slow", "slow", prepare)])
     axis = runtime.Axis("cycles", "cycles", (10.0, 100.0, 1000.0, 10_000.0), 2)
     found = runtime.along(runtime.QUICK, axis, str)
     assert [p.seconds is not None for p in found] == [True, True, False, False]

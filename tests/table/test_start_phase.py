@@ -23,10 +23,19 @@ def corrections(signal, background, system, *, level="", cumulants=None):
     out, settled = np.zeros((cells.size, 4 * PHASES.size)), np.empty(cells.size, np.int64)
     cumulants = np.empty((cells.size, 4)) if cumulants is None else cumulants
     _core.exposure_phases(
-        grid=cells.grid(GRID, 1), signal=cells.signal, background=cells.background, shape=shape, shapes=energy,
-        phase=PHASES.astype(np.int32), cumulants=cumulants, correction=out, settled=settled, threads=2,
-        level=level, progress=None,
-    )  # fmt: skip
+        grid=cells.grid(GRID, 1),
+        signal=cells.signal,
+        background=cells.background,
+        shape=shape,
+        shapes=energy,
+        phase=PHASES.astype(np.int32),
+        cumulants=cumulants,
+        correction=out,
+        settled=settled,
+        threads=2,
+        level=level,
+        progress=None,
+    )
     return out.reshape(cells.size, PHASES.size, 4), settled
 
 
@@ -39,9 +48,7 @@ def test_one_sweep_gives_the_cumulants_at_every_delay(start, dead):
     own = np.empty((5, 4))
     found, settled = corrections(signal, background, system, cumulants=own)
     delay = system.period_ns * (0.5 - PHASES / GRID)
-    exact = exposure_moments(
-        signal[:, None], background[:, None], system, delay_ns=delay, tolerance=1e-5
-    ).cumulants
+    exact = exposure_moments(signal[:, None], background[:, None], system, delay_ns=delay, tolerance=1e-5).cumulants
     spread = np.sqrt(exact[:, :1, 1])[..., None] ** np.arange(1, 5)
     error = (found - (exact - exact[:, :1])) / spread
     assert (settled >= 0).sum() >= 3
@@ -116,9 +123,11 @@ def test_against_photon_by_photon_simulation():
     """A bright pixel armed half way up its pulse, in a table, and in the sequential engine."""
     table, shots = small_table(), 20_000
     signal, background, delay = 6.0, 0.11, 1.0
-    counts = ml.simulate(
-        ml.Flux(signal, background, delay), table.system, engine="sequential", realizations=shots, seed=3
-    ).sum(-1).ravel()  # fmt: skip
+    counts = (
+        ml.simulate(ml.Flux(signal, background, delay), table.system, engine="sequential", realizations=shots, seed=3)
+        .sum(-1)
+        .ravel()
+    )
     mean, variance, _, fourth = table.lookup(signal, background, delay_ns=delay).cumulants[0]
     noise = np.sqrt((fourth + 2 * variance**2) / shots)
     require(

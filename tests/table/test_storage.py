@@ -132,9 +132,11 @@ def test_the_cache_builds_once(own_cache, monkeypatch):
         key = cache.request_key(
             system,
             tuple(axis_values(name, (grids | other)[name]) for name in ("signal", "background")),
-            method=other.get("method", "exposure"), rearm="centre", refine=None,
+            method=other.get("method", "exposure"),
+            rearm="centre",
+            refine=None,
             tolerance=other.get("tolerance", 1e-4),
-        )  # fmt: skip
+        )
         assert not file.name.startswith(key), other
     with pytest.raises(TypeError, match="got 'grid'"):
         ml.Table.cached(system, grid=3)

@@ -45,9 +45,7 @@ def test_any_number_of_cycles(start, cycles):
     assert table.serves(cycles)
     rng = np.random.default_rng(cycles)
     i, j = rng.integers(0, table.signal.size, 30), rng.integers(0, table.background.size, 30)
-    exact = exposure_moments(
-        table.signal[i], table.background[j], table.system.replace(cycles=cycles), tolerance=1e-6
-    )
+    exact = exposure_moments(table.signal[i], table.background[j], table.system.replace(cycles=cycles), tolerance=1e-6)
     found = table.lookup(table.signal[i], table.background[j], cycles=cycles)
     assert found.cumulants == pytest.approx(exact.cumulants, rel=1e-6, abs=1e-6)
     shapes = table.shapes(cycles)[i * table.background.size + j]
@@ -154,9 +152,7 @@ def test_short_exposures_serve_no_others():
     system = make_system(0.6, cycles=3)
     table = ml.Table.build(system, [0.0, 1.0, 10.0], [0.0, 0.1, 1.0], threads=1)
     assert not table.serves(4)
-    assert table.lookup(1.0, 0.1).cumulants[0] == pytest.approx(
-        exposure_moments(1.0, 0.1, system).cumulants, rel=1e-12
-    )
+    assert table.lookup(1.0, 0.1).cumulants[0] == pytest.approx(exposure_moments(1.0, 0.1, system).cumulants, rel=1e-12)
     with pytest.raises(ValueError, match=r"cycles must be 3 at some of these pixels, got 4: .* at S = .*, B = "):
         table.lookup(1.0, 0.1, cycles=4)
     assert np.isnan(table.shapes(4)).any()
@@ -273,9 +269,7 @@ def test_bad_lookups():
 
 def test_progress_and_stopping():
     seen = []
-    ml.Table.build(
-        make_system(cycles=50), [0.1, 1.0], [0.1, 1.0], threads=1, progress=lambda *at: seen.append(at)
-    )
+    ml.Table.build(make_system(cycles=50), [0.1, 1.0], [0.1, 1.0], threads=1, progress=lambda *at: seen.append(at))
     assert seen[-1][0] == seen[-1][1] > 0
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
     assert len({total for _, total in seen}) == 1

@@ -159,4 +159,3 @@ def _matched(rate: FloatArray, pulse: Pulse, light: Light) -> tuple[FloatArray, 
     norm = float(np.sqrt((template**2).sum()))
     spectrum = np.fft.rfft(rate) * np.conj(np.fft.rfft(template))
     return np.fft.irfft(spectrum, light.bins) / norm, norm
-

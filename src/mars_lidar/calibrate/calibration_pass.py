@@ -77,9 +77,25 @@ def fitted(
         some = seen.passes > 0
         spread = float((seen.registrations[some] / seen.passes[some] ** 2).sum())
         return Calibration(
-            0.0, np.empty(0), np.empty(0), None, rate, dead, watch.dead_error_ns, hold, short, ("signal",),
-            np.array([[spread]]), rapp, seen, counted, True, watch.jitter_ns, watch.jitter_error_ns, watch.by,
-        )  # fmt: skip
+            0.0,
+            np.empty(0),
+            np.empty(0),
+            None,
+            rate,
+            dead,
+            watch.dead_error_ns,
+            hold,
+            short,
+            ("signal",),
+            np.array([[spread]]),
+            rapp,
+            seen,
+            counted,
+            True,
+            watch.jitter_ns,
+            watch.jitter_error_ns,
+            watch.by,
+        )
     free_width = shape == "gaussian"
     pulse = GaussianPulse(sigma_ns=0.01 * stream.period_ns) if isinstance(shape, str) else shape
     known = pulse if near is None or near.pulse is None else near.pulse
@@ -101,10 +117,25 @@ def fitted(
     pulse, jitter = light.pulse_of(found.theta), light.jitter_of(found.theta)
     theta, matrix = _in_order(*light.recorded(found.theta, covariance(light, found)), returns, stream.period_ns)
     found_light = Calibration(
-        float(theta[0]), theta[1 : 1 + returns], theta[1 + returns : 1 + 2 * returns], pulse, None, dead,
-        watch.dead_error_ns, hold, short, light.names, matrix, rapp, seen, counted, found.converged,
-        jitter, math.sqrt(matrix[-1, -1]) if light.fit_jitter else watch.jitter_error_ns, watch.by,
-    )  # fmt: skip
+        float(theta[0]),
+        theta[1 : 1 + returns],
+        theta[1 + returns : 1 + 2 * returns],
+        pulse,
+        None,
+        dead,
+        watch.dead_error_ns,
+        hold,
+        short,
+        light.names,
+        matrix,
+        rapp,
+        seen,
+        counted,
+        found.converged,
+        jitter,
+        math.sqrt(matrix[-1, -1]) if light.fit_jitter else watch.jitter_error_ns,
+        watch.by,
+    )
     return with_division(stream, found_light) if divided else found_light
 
 

@@ -43,9 +43,7 @@ class RappEstimate:
     background: float = math.nan
 
 
-def rapp_total(
-    times: Timestamps | Sequence[Timestamps], hold_off_ns: float, *, pooled: bool = False
-) -> RappEstimate:
+def rapp_total(times: Timestamps | Sequence[Timestamps], hold_off_ns: float, *, pooled: bool = False) -> RappEstimate:
     """Total flux Lambda from intervals: needs no pulse, no delay, and no histogram.
 
     Parameters
@@ -85,9 +83,13 @@ def split(
     from scipy.optimize import minimize_scalar
 
     system = System(
-        period_ns=stream.period_ns, cycles=1, bins=bins, pulse=pulse,
-        detector=Detector(dead_time_ns=dead_time_ns), start="stationary",
-    )  # fmt: skip
+        period_ns=stream.period_ns,
+        cycles=1,
+        bins=bins,
+        pulse=pulse,
+        detector=Detector(dead_time_ns=dead_time_ns),
+        start="stationary",
+    )
     histogram = stream.histogram(bins)
 
     def misfit(share: float) -> float:
@@ -101,5 +103,3 @@ def split(
         return found
     back = found.total * float(best.x)
     return RappEstimate(found.total, found.total_error, found.intervals, found.total - back, back)
-
-

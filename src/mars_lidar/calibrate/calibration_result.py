@@ -243,9 +243,13 @@ class Calibration:
             pulse, sigma = self._light.before_jitter(self._parameters)
         jitter = Jitter(sigma_ns=sigma) if sigma else None
         return System(
-            period_ns=self.summary.period_ns, cycles=cycles, bins=bins, pulse=pulse,
-            detector=Detector(dead_time_ns=self.dead_time_ns, jitter=jitter), start=start,
-        )  # fmt: skip
+            period_ns=self.summary.period_ns,
+            cycles=cycles,
+            bins=bins,
+            pulse=pulse,
+            detector=Detector(dead_time_ns=self.dead_time_ns, jitter=jitter),
+            start=start,
+        )
 
     def light_arguments(self) -> dict[str, Any]:
         """Signal, background and delay or waveform, as `count_law` and `joint_law` take them."""

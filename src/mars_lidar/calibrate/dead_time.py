@@ -97,15 +97,15 @@ class Unknown:
         told = self.jitter_ns is not None
         sigma = min(_width(first), _WIDEST * stream.period_ns)
         dead = max(smallest - excess, 0.0)
-        left = hidden(
-            self._ages(), self._any_width(first), stream.registrations, dead, 0.0 if told else _ALL * sigma
-        )
+        left = hidden(self._ages(), self._any_width(first), stream.registrations, dead, 0.0 if told else _ALL * sigma)
         error = max(excess, left.below_ns, 0.0 if told else left.above_ns)
         limit = 0.0 if told else math.hypot(max(left.jitter_ns, 0.0), stream.unit_ns)
         found = replace(
-            first, dead_time_ns=dead, dead_time_error_ns=math.hypot(error, stream.unit_ns, first.jitter_ns),
+            first,
+            dead_time_ns=dead,
+            dead_time_error_ns=math.hypot(error, stream.unit_ns, first.jitter_ns),
             jitter_limit_ns=0.0 if smallest < limit else limit,
-        )  # fmt: skip
+        )
         if not told and CERTAIN * left.jitter_ns > smallest:
             # a jitter as large as the dead time puts records out of order: with many of them within its reach
             near = sum(int((dt < CERTAIN * left.jitter_ns).sum()) for dt in stream.intervals())
@@ -227,9 +227,11 @@ class Unknown:
         if found.too_short:
             return None
         found = replace(
-            found, dead_time_error_ns=math.hypot(edge.dead_time_error_ns, unit), dead_time_by="edge",
+            found,
+            dead_time_error_ns=math.hypot(edge.dead_time_error_ns, unit),
+            dead_time_by="edge",
             jitter_limit_ns=max(edge.jitter_ns + 2.0 * edge.jitter_error_ns, ages.clock_ns),
-        )  # fmt: skip
+        )
         sigma = found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) else 0.0
         return self._with_hidden(found, min(found.jitter_limit_ns, _ALL * sigma))
 
@@ -299,10 +301,13 @@ class Unknown:
     def _in_the_long_run(self, rate: FloatArray, found: Calibration) -> FloatArray:
         """Phases (n,) of avalanches in light (n,), which the jitter of the records hides."""
         system = System(
-            period_ns=self.stream.period_ns, cycles=1, bins=rate.size, start="stationary",
+            period_ns=self.stream.period_ns,
+            cycles=1,
+            bins=rate.size,
+            start="stationary",
             pulse=GaussianPulse(sigma_ns=0.01 * self.stream.period_ns),
             detector=Detector(dead_time_ns=found.dead_time_ns),
-        )  # fmt: skip
+        )
         try:
             return registration_pdf(None, 0.0, system, "stationary", waveform=rate, threads=1)
         except (ConvergenceError, ValueError):  # locked to the laser, or far more light than the laws do

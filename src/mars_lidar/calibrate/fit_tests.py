@@ -71,9 +71,15 @@ class Compared:
 
     @classmethod
     def of(
-        cls, law: Prediction, counts: NDArray[np.int64], inside: NDArray[np.int64], histogram: FloatArray,
-        light: Fitted, dead_time_ns: float, cycles: int,
-    ) -> Compared:  # fmt: skip
+        cls,
+        law: Prediction,
+        counts: NDArray[np.int64],
+        inside: NDArray[np.int64],
+        histogram: FloatArray,
+        light: Fitted,
+        dead_time_ns: float,
+        cycles: int,
+    ) -> Compared:
         """With the error of the light that `law` was predicted with."""
         groups = (law.groups == np.arange(int(law.groups.max()) + 1)[:, None]).astype(np.float64)
         fit = fit_covariance(light, dead_time_ns, groups, cycles, counts.size)

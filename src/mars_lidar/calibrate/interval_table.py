@@ -145,9 +145,14 @@ def _age_edges(dt: FloatArray, dead_time_ns: float, hold_off_ns: float) -> Float
 
 
 def _count(
-    table: FloatArray, start: FloatArray, dt: FloatArray, phases: FloatArray, edges: FloatArray,
-    bright: NDArray[np.bool_], period_ns: float,
-) -> None:  # fmt: skip
+    table: FloatArray,
+    start: FloatArray,
+    dt: FloatArray,
+    phases: FloatArray,
+    edges: FloatArray,
+    bright: NDArray[np.bool_],
+    period_ns: float,
+) -> None:
     """Add intervals to `table`."""
     age = np.searchsorted(edges, dt, side="right") - 1
     kept = (age >= 0) & (age < edges.size - 1)

@@ -114,10 +114,18 @@ def predict(calibration: Calibration, system: System, realizations: int, light: 
     if not is_plain(system.detector):
         recovery, ages = _intervals(calibration, next(_streams(calibration, system, 1000)), light)
     return Prediction(
-        Pmf(int(exact.support[0]), exact.pmf), float(exact.mean), float(exact.variance), law.mean, law.variance,
-        float(law.window(window)[1]), window, groups, _law_covariance(law, groups),
-        recovery=recovery, ages=ages,
-    )  # fmt: skip
+        Pmf(int(exact.support[0]), exact.pmf),
+        float(exact.mean),
+        float(exact.variance),
+        law.mean,
+        law.variance,
+        float(law.window(window)[1]),
+        window,
+        groups,
+        _law_covariance(law, groups),
+        recovery=recovery,
+        ages=ages,
+    )
 
 
 def window_of(calibration: Calibration, system: System, mean: FloatArray) -> NDArray[np.bool_]:
@@ -195,9 +203,19 @@ def _simulated(calibration: Calibration, system: System, realizations: int, ligh
     else:
         exact.append("histogram")
     return Prediction(
-        count, *moments, mean, spread, float(inside.var(ddof=1)), window, groups, np.atleast_2d(np.cov(grouped.T)),
-        number.size, tuple(exact), recovery, ages,
-    )  # fmt: skip
+        count,
+        *moments,
+        mean,
+        spread,
+        float(inside.var(ddof=1)),
+        window,
+        groups,
+        np.atleast_2d(np.cov(grouped.T)),
+        number.size,
+        tuple(exact),
+        recovery,
+        ages,
+    )
 
 
 def _streams(calibration: Calibration, system: System, per_pixel: int) -> Iterator[Stream]:

@@ -70,9 +70,7 @@ class Edge:
         return Edge(dead, jitter_ns, matrix, self.fits)
 
 
-def edge_of(
-    ages: Ages, behind: Law, dead_time_ns: float, width_ns: float, off: Sequence[Law] = ()
-) -> Edge | None:
+def edge_of(ages: Ages, behind: Law, dead_time_ns: float, width_ns: float, off: Sequence[Law] = ()) -> Edge | None:
     """Dead time and jitter by maximum likelihood, from rough values of the dead time and of the edge's width.
 
     `behind` tells the avalanches of an edge of any width: what is known is the light as it is recorded, and the more

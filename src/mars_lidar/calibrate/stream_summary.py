@@ -67,6 +67,12 @@ def summary_of(stream: Stream) -> Summary:
     kept = np.concatenate(sample) if sample else np.empty(0)
     quantiles = np.quantile(kept, (0.01, 0.5, 0.99)) if kept.size else np.full(3, math.nan)
     return Summary(
-        stream.registrations, stream.cycles, stream.period_ns, stream.unit_ns, stream.bins, smallest, quantiles,
+        stream.registrations,
+        stream.cycles,
+        stream.period_ns,
+        stream.unit_ns,
+        stream.bins,
+        smallest,
+        quantiles,
         stream.same_time,
     )

@@ -99,9 +99,7 @@ def _dark(found: Calibration) -> Calibration:
     covariance = found.covariance.copy()
     covariance[0, :] = covariance[:, 0] = 0.0
     covariance[0, 0] = error**2 + min(found.signal, _HIDDEN * error) ** 2
-    return replace(
-        found, background=total, returns_signal=np.zeros_like(found.returns_signal), covariance=covariance
-    )
+    return replace(found, background=total, returns_signal=np.zeros_like(found.returns_signal), covariance=covariance)
 
 
 def is_seen(found: Calibration) -> bool:

@@ -200,11 +200,23 @@ def validate(
     tests += [Check(name, math.nan, math.nan, math.nan, p) for name, p in ages.p_values(light, law.ages).items()]
     floors, expected = compared.floors(), law.histogram
     return Validation(
-        calibration, system, size, counts, law, measured, total_variation(measured, law.count), floors[0],
-        _kl(measured, law.count), floors[1], histogram,
-        0.5 * float(np.abs(histogram / histogram.sum() - expected / expected.sum()).sum()), compared.shape_floor,
-        tuple(tests), recovery_of(stream, calibration.rate, dead, calibration.hold_off_ns), alpha,
-    )  # fmt: skip
+        calibration,
+        system,
+        size,
+        counts,
+        law,
+        measured,
+        total_variation(measured, law.count),
+        floors[0],
+        _kl(measured, law.count),
+        floors[1],
+        histogram,
+        0.5 * float(np.abs(histogram / histogram.sum() - expected / expected.sum()).sum()),
+        compared.shape_floor,
+        tuple(tests),
+        recovery_of(stream, calibration.rate, dead, calibration.hold_off_ns),
+        alpha,
+    )
 
 
 def _kl(measured: Pmf, predicted: Pmf) -> float:

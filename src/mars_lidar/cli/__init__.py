@@ -65,8 +65,7 @@ _EPILOG = "\n\n".join(
         "mars-lidar simulate --scene room -o room.zarr",
         "mars-lidar info room.zarr",
         "mars-lidar view room.zarr --pixel 40,64 -o pixel.png",
-        "Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted. "
-        "[bold]mars-lidar COMMAND --help[/bold] says more.",
+        "Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted. [bold]mars-lidar COMMAND --help[/bold] says more.",
     )
 )
 

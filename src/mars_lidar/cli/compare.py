@@ -30,15 +30,9 @@ COMPARE_EPILOG = "\n\n".join(
     )
 )
 
-Out = Annotated[
-    Path, _option("-o", "--out", panel=_OUTPUT, help="The picture: .png, .pdf or .svg.")
-]
-Json = Annotated[
-    Path | None, _option("--json", panel=_OUTPUT, help="All numbers as JSON, into this file.")
-]
-Overwrite = Annotated[
-    bool, _option("--overwrite", panel=_OUTPUT, help="Replace an existing picture and JSON file.")
-]
+Out = Annotated[Path, _option("-o", "--out", panel=_OUTPUT, help="The picture: .png, .pdf or .svg.")]
+Json = Annotated[Path | None, _option("--json", panel=_OUTPUT, help="All numbers as JSON, into this file.")]
+Overwrite = Annotated[bool, _option("--overwrite", panel=_OUTPUT, help="Replace an existing picture and JSON file.")]
 Engines = Annotated[
     str | None,
     _option("--engines", panel=_RUN, help="Engines, separated by commas.", default="all there are"),
@@ -49,31 +43,40 @@ Against = Annotated[
 Realizations = Annotated[
     int,
     _option(
-        "--realizations", panel=_RUN, min=50, default="10000",
+        "--realizations",
+        panel=_RUN,
+        min=50,
+        default="10000",
         help="Exposures of each representative pixel and engine.",
     ),
 ]
 Pixels = Annotated[
     int,
     _option(
-        "--pixels", panel=_RUN, min=1, max=6, default="4",
+        "--pixels",
+        panel=_RUN,
+        min=1,
+        max=6,
+        default="4",
         help="Representative pixels: bright, dim, edge, median, most and least photons, in this order.",
     ),
 ]
 Pixel = Annotated[
     list[str] | None,
     _option(
-        "--pixel", panel=_RUN, metavar="Y,X",
+        "--pixel",
+        panel=_RUN,
+        metavar="Y,X",
         help="A pixel of your own (row, column) instead; up to 6 times.",
     ),
 ]
-Repeats = Annotated[
-    int, _option("--repeats", panel=_RUN, min=1, help="Timed cubes of the whole image.", default="5")
-]
+Repeats = Annotated[int, _option("--repeats", panel=_RUN, min=1, help="Timed cubes of the whole image.", default="5")]
 BudgetS = Annotated[
     float,
     _option(
-        "--budget-s", panel=_RUN, default="4",
+        "--budget-s",
+        panel=_RUN,
+        default="4",
         help="Seconds for an engine's cubes, and again for its pixels; then it draws fewer.",
     ),
 ]
@@ -164,5 +167,3 @@ def _write(file: Path, text: str) -> None:
 
     with TemporarySibling(file).writing() as unfinished:
         unfinished.write_text(text)
-
-

@@ -112,16 +112,35 @@ def _scene_table(console: Console, found: Comparison) -> None:
     known = int(found.expected.known.sum())
     height, width = found.flux.shape
     goal = f"against the exact mean of {known:,} pixels" if known > 1 else f"against {found.against}"
-    grid = _grid(f"Whole image, {width} × {height} pixels, {found.threads} threads; bias {goal}",
-                 ("engine", "ms", "cubes", "ns/count", "registrations", "bias/sd", "bias %", "dispersion", "depth mm",
-                  "outliers %"))  # fmt: skip
+    grid = _grid(
+        f"Whole image, {width} × {height} pixels, {found.threads} threads; bias {goal}",
+        (
+            "engine",
+            "ms",
+            "cubes",
+            "ns/count",
+            "registrations",
+            "bias/sd",
+            "bias %",
+            "dispersion",
+            "depth mm",
+            "outliers %",
+        ),
+    )
     for name, s in found.scenes.items():
         percent = Estimate(100 * s.relative_bias.value, 100 * s.relative_bias.error, s.relative_bias.z)
         grid.add_row(
-            name, _number(1e3 * s.median_s), str(len(s.seconds)), _number(s.ns_per_registration),
-            f"{s.registrations:,.0f}", cell(s.bias), cell(percent), cell(s.dispersion),
-            _length(1e3 * s.depth_error_m), _number(100 * s.outliers),
-        )  # fmt: skip
+            name,
+            _number(1e3 * s.median_s),
+            str(len(s.seconds)),
+            _number(s.ns_per_registration),
+            f"{s.registrations:,.0f}",
+            cell(s.bias),
+            cell(percent),
+            cell(s.dispersion),
+            _length(1e3 * s.depth_error_m),
+            _number(100 * s.outliers),
+        )
     console.print()
     console.print(grid)
     for name, why in found.skipped.items():
@@ -135,7 +154,7 @@ def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
         f"{pixel} pixel (y {y}, x {x}): S = {found.flux.signal[y, x]:.3g}, "
         f"B = {found.flux.background[y, x]:.3g}; {_realizations(statistics)}",
         ("engine", "mean", "variance", "Fano", "window var", f"/ {found.against}", "lag-1", "TV shape", "TV count"),
-    )  # fmt: skip
+    )
     if law is not None:
         known: Moments = law.counts
         exact = [f"{e.value:.6g}" for e in (known.mean, known.variance)] + [_number(known.fano.value)]
@@ -148,9 +167,16 @@ def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
             relative = cell(Estimate(1.0))
         lag1 = Estimate(1e3 * s.lag1.value, 1e3 * s.lag1.error, s.lag1_error.z)
         grid.add_row(
-            name, cell(s.counts.mean), cell(s.counts.variance), cell(s.counts.fano), cell(s.window.variance),
-            relative, cell(lag1), cell(s.shape), cell(s.law),
-        )  # fmt: skip
+            name,
+            cell(s.counts.mean),
+            cell(s.counts.variance),
+            cell(s.counts.fano),
+            cell(s.window.variance),
+            relative,
+            cell(lag1),
+            cell(s.shape),
+            cell(s.law),
+        )
     console.print()
     console.print(grid)
     if pixel in found.unpredicted:
@@ -168,8 +194,14 @@ def _grid(title: str, columns: tuple[str, ...]) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    grid = Table(title=Text(title, style="bold"), title_justify="left", box=None, padding=(0, 1, 0, 0),
-                 pad_edge=False, header_style="dim")  # fmt: skip
+    grid = Table(
+        title=Text(title, style="bold"),
+        title_justify="left",
+        box=None,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+        header_style="dim",
+    )
     for k, name in enumerate(columns):
         grid.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")
     return grid

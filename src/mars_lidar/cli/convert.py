@@ -54,9 +54,7 @@ def convert(
     with reported():
         from mars_lidar.io.convert import convert as converted
 
-        done = converted(
-            source, target, realization=realization, period_ns=period_ns, bins=bins, overwrite=overwrite
-        )
+        done = converted(source, target, realization=realization, period_ns=period_ns, bins=bins, overwrite=overwrite)
         rows = [("wrote", str(done.path)), ("content", done.content)]
         table(rows + [("lost", text) for text in done.lost or ("nothing",)])
 

@@ -19,14 +19,19 @@ class LightEffects:
     detection_efficiency: Annotated[
         float | None,
         _option(
-            "--detection-efficiency", panel=_EFFECTS, default="1: --signal counts detectable photons",
+            "--detection-efficiency",
+            panel=_EFFECTS,
+            default="1: --signal counts detectable photons",
             help="Photon detection efficiency, fill factor included, in (0, 1].",
         ),
     ] = None
     dark_count_hz: Annotated[
         float | None,
         _option(
-            "--dark-count-hz", "--dark-counts", panel=_EFFECTS, default="0",
+            "--dark-count-hz",
+            "--dark-counts",
+            panel=_EFFECTS,
+            default="0",
             help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
         ),
     ] = None
@@ -39,7 +44,8 @@ class StreamEffects:
     afterpulse_probability: Annotated[
         float | None,
         _option(
-            "--afterpulse-probability", panel=_EFFECTS,
+            "--afterpulse-probability",
+            panel=_EFFECTS,
             help="Mean number of trapped carriers that an avalanche leaves, those lost in the dead time included ...",
             default="0",
         ),
@@ -51,14 +57,18 @@ class StreamEffects:
     twilight_ns: Annotated[
         float | None,
         _option(
-            "--twilight-ns", panel=_EFFECTS, default="0",
+            "--twilight-ns",
+            panel=_EFFECTS,
+            default="0",
             help="Arrivals this long before the end of the dead time fire at its end, ns.",
         ),
     ] = None
     electronics_dead_time_ns: Annotated[
         float | None,
         _option(
-            "--electronics-dead-time-ns", panel=_EFFECTS, default="0",
+            "--electronics-dead-time-ns",
+            panel=_EFFECTS,
+            default="0",
             help="Dead time of the electronics after an event, ns; without effect unless longer than --dead-time-ns.",
         ),
     ] = None
@@ -89,7 +99,8 @@ class StreamEffects:
     code_density_file: Annotated[
         Path | None,
         _option(
-            "--code-density-file", panel=_EFFECTS,
+            "--code-density-file",
+            panel=_EFFECTS,
             help="TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins.",
         ),
     ] = None
@@ -108,8 +119,10 @@ class StreamEffects:
 
     def _jitter(self) -> dict[str, Any] | None:
         gaussian = {
-            "fwhm_ns": self.jitter_fwhm_ns, "tail_ns": self.jitter_tail_ns, "tail_fraction": self.jitter_tail_fraction
-        }  # fmt: skip
+            "fwhm_ns": self.jitter_fwhm_ns,
+            "tail_ns": self.jitter_tail_ns,
+            "tail_fraction": self.jitter_tail_fraction,
+        }
         gaussian = {name: value for name, value in gaussian.items() if value is not None}
         if self.jitter_file is not None:
             if gaussian:
@@ -132,7 +145,9 @@ class Effects(StreamEffects, LightEffects):
     crosstalk: Annotated[
         float | None,
         _option(
-            "--crosstalk", panel=_EFFECTS, default="0",
+            "--crosstalk",
+            panel=_EFFECTS,
+            default="0",
             help="Mean number of neighbours that an avalanche triggers; with --engine sequential.",
         ),
     ] = None

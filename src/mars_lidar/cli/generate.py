@@ -53,7 +53,10 @@ def generate(
     size: Annotated[
         str | None,
         _option(
-            "--size", panel=_SCENES, metavar="SIDE", default="as it is; room: 128",
+            "--size",
+            panel=_SCENES,
+            metavar="SIDE",
+            default="as it is; room: 128",
             help="Resample every scene: the longer side, or HEIGHT,WIDTH.",
         ),
     ] = None,
@@ -69,21 +72,26 @@ def generate(
     depth_unit_m: Annotated[
         float | None,
         _option(
-            "--depth-unit-m", panel=_SCENES, help="RGB-D: metres per stored unit of depth.",
+            "--depth-unit-m",
+            panel=_SCENES,
+            help="RGB-D: metres per stored unit of depth.",
             default="0.001 for images, 1 for arrays",
         ),
     ] = None,
     focal_px: Annotated[
         float | None,
         _option(
-            "--focal-px", panel=_SCENES, default="depth as it is",
+            "--focal-px",
+            panel=_SCENES,
+            default="depth as it is",
             help="RGB-D: focal length, pixels of the file: turns depth along the axis into range along the ray.",
         ),
     ] = None,
     system: Annotated[
         list[Path] | None,
         _option(
-            "--system", panel="System",
+            "--system",
+            panel="System",
             help="YAML or JSON file (see mars-lidar init), repeated for several; single options replace its values.",
         ),
     ] = None,
@@ -92,14 +100,18 @@ def generate(
     signal: Annotated[
         list[float] | None,
         _option(
-            "--signal", panel=_LIGHT, default="1",
+            "--signal",
+            panel=_LIGHT,
+            default="1",
             help="Mean signal photons per laser period, repeated for several levels.",
         ),
     ] = None,
     sbr: Annotated[
         list[float] | None,
         _option(
-            "--sbr", panel=_LIGHT, default="1",
+            "--sbr",
+            panel=_LIGHT,
+            default="1",
             help="Mean signal / mean ambient photons, repeated for several: each with each signal.",
         ),
     ] = None,
@@ -118,15 +130,15 @@ def generate(
     ] = None,
     scheduler: Annotated[
         str | None,
-        _option(
-            "--scheduler", panel=_RUN, help="Address of a dask scheduler whose workers see --out (extra cluster)."
-        ),
+        _option("--scheduler", panel=_RUN, help="Address of a dask scheduler whose workers see --out (extra cluster)."),
     ] = None,
     out: Annotated[Path, _option("-o", "--out", panel=_OUTPUT, help="The dataset, NAME.zarr.")],
     layout: Annotated[
         str | None,
         _option(
-            "--layout", panel=_OUTPUT, default="sparse",
+            "--layout",
+            panel=_OUTPUT,
+            default="sparse",
             help="sparse (packed bins that are not zero) or dense (for other Zarr libraries).",
         ),
     ] = None,
@@ -169,9 +181,15 @@ def generate(
             return
         with progress_bar("generating") as progress:
             done = dataset.generate(
-                recipe, out, resume=resume, overwrite=overwrite, threads=threads, workers=workers,
-                scheduler=scheduler, progress=progress,
-            )  # fmt: skip
+                recipe,
+                out,
+                resume=resume,
+                overwrite=overwrite,
+                threads=threads,
+                workers=workers,
+                scheduler=scheduler,
+                progress=progress,
+            )
         tell(done)
 
 

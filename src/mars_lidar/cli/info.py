@@ -58,9 +58,7 @@ def info(
 
 def view(
     file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="The picture: .png, .pdf or .svg.", show_default=False)
-    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The picture: .png, .pdf or .svg.", show_default=False)],
     pixel: Annotated[
         list[str] | None,
         typer.Option(
@@ -70,9 +68,7 @@ def view(
             "[dim]Default: a bright, a dim and an edge pixel.[/dim]",
         ),
     ] = None,
-    realization: Annotated[
-        int, typer.Option("--realization", help="Which exposure, counted from 0 in this file.")
-    ] = 0,
+    realization: Annotated[int, typer.Option("--realization", help="Which exposure, counted from 0 in this file.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
 ) -> None:
     """Draw depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.

@@ -54,9 +54,7 @@ Cycles = Annotated[
 ]
 Simulated = Annotated[
     int,
-    _option(
-        "--simulated", panel=STREAM, help="Realizations to simulate for what no law predicts of a detector."
-    ),
+    _option("--simulated", panel=STREAM, help="Realizations to simulate for what no law predicts of a detector."),
 ]
 Picture = Annotated[Path | None, _option("-o", "--out", panel=_OUTPUT, help="A picture: .png, .pdf or .svg.")]
 SystemOut = Annotated[
@@ -160,12 +158,17 @@ def validate(
             ("realizations", f"{found.realizations:,} of {cycles:,} cycles, {found.counts.mean():,.6g} counts each"),
             ("count law", f"total variation {found.total_variation:.4g}, sampling floor {mean:.4g} (99 %: {high:.4g})"),
             ("", f"KL {found.kl:.4g} nats, sampling floor {found.kl_floor[0]:.4g} (99 %: {found.kl_floor[1]:.4g})"),
-            ("histogram", f"total variation {found.shape_variation:.4g}, sampling floor {found.shape_floor:.4g}"
-             + (" (fitted bin by bin: tells nothing)" if calibrated.waveform is not None else "")),
-        ]  # fmt: skip
+            (
+                "histogram",
+                f"total variation {found.shape_variation:.4g}, sampling floor {found.shape_floor:.4g}"
+                + (" (fitted bin by bin: tells nothing)" if calibrated.waveform is not None else ""),
+            ),
+        ]
         for check in found.checks:
-            figures = "" if check.error != check.error else (
-                f"{check.measured:.6g}, predicted {check.predicted:.6g} ± {check.error:.2g}; "
+            figures = (
+                ""
+                if check.error != check.error
+                else (f"{check.measured:.6g}, predicted {check.predicted:.6g} ± {check.error:.2g}; ")
             )
             mark = "  ✗" if check in found.failed else ""
             rows.append((check.name, f"{figures}p = {check.p:.2g}{mark}"))

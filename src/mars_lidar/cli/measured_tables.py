@@ -18,10 +18,13 @@ def clock_rows(found: Calibration) -> list[tuple[str, str]]:
     seconds = 1e-9 * counted.period_ns * counted.cycles
     unit = f", clock unit {1e3 * counted.unit_ns:.5g} ps" if counted.unit_ns else ""
     return [
-        ("laser", f"period {counted.period_ns:.7g} ns ({1e3 / counted.period_ns:.5g} MHz), {counted.cycles:,} periods, "
-         f"{seconds:.4g} s{unit}"),
+        (
+            "laser",
+            f"period {counted.period_ns:.7g} ns ({1e3 / counted.period_ns:.5g} MHz), {counted.cycles:,} periods, "
+            f"{seconds:.4g} s{unit}",
+        ),
         ("rate", f"{counted.rate_per_s:,.6g} counts/s, {counted.per_period:.5g} a period"),
-    ]  # fmt: skip
+    ]
 
 
 def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
@@ -85,11 +88,19 @@ def light_rows(found: Calibration, detector: Detector | None = None) -> list[tup
         rows.append(("by simulation", f"bias by the detector's effects taken off, by {longer}"))
     rapp = found.rapp
     split = "" if rapp.signal != rapp.signal else f"; by shape B {rapp.background:.5g}, S {rapp.signal:.5g}"
-    rows.append(("by Rapp", f"Lambda {rapp.total:.6g} ± {rapp.total_error:.2g}, above {found.total:.6g} ± "
-                 f"{found.total_error:.2g}{split}"))  # fmt: skip
+    rows.append(
+        (
+            "by Rapp",
+            f"Lambda {rapp.total:.6g} ± {rapp.total_error:.2g}, above {found.total:.6g} ± "
+            f"{found.total_error:.2g}{split}",
+        )
+    )
     if abs(found.disagreement) > _APART:
         rows.append(
-            ("does not fit", f"Rapp's Lambda is {abs(found.disagreement):.0f} standard errors off: a wrong laser "
-             "period or dead time, afterpulses, or light that is not constant: see `mars-lidar inspect`")
-        )  # fmt: skip
+            (
+                "does not fit",
+                f"Rapp's Lambda is {abs(found.disagreement):.0f} standard errors off: a wrong laser "
+                "period or dead time, afterpulses, or light that is not constant: see `mars-lidar inspect`",
+            )
+        )
     return rows

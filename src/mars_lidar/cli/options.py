@@ -23,14 +23,17 @@ def _option(*names: str, panel: str, help: str, default: str | None = None, **mo
 Out = Annotated[
     Path,
     _option(
-        "-o", "--out", panel=_OUTPUT,
+        "-o",
+        "--out",
+        panel=_OUTPUT,
         help="The cube: .zarr (any size, written as it is simulated), .h5, .hdf5, .npz, .mat or .ptu.",
     ),
 ]
 System = Annotated[
     Path | None,
     _option(
-        "--system", panel=_SYSTEM,
+        "--system",
+        panel=_SYSTEM,
         help="YAML or JSON file (see mars-lidar init); single options replace its values.",
     ),
 ]
@@ -41,7 +44,8 @@ PeriodNs = Annotated[
 DetectorPreset = Annotated[
     str | None,
     _option(
-        "--detector", panel=_SYSTEM,
+        "--detector",
+        panel=_SYSTEM,
         help=f"Detector by name, in place of the file's (docs/detectors.md): {', '.join(PRESETS)}.",
     ),
 ]
@@ -52,7 +56,9 @@ DeadTimeNs = Annotated[
 Mode = Annotated[
     str | None,
     _option(
-        "--mode", panel=_SYSTEM, default="nonparalyzable",
+        "--mode",
+        panel=_SYSTEM,
+        default="nonparalyzable",
         help="When the pixel registers: nonparalyzable, paralyzable (every arrival restarts the dead time), "
         "synchronous (armed at each pulse, first photon only) or gated (with --gate-start-ns, --gate-width-ns).",
     ),
@@ -84,14 +90,18 @@ Bins = Annotated[
 Start = Annotated[
     str | None,
     _option(
-        "--start", panel=_SYSTEM,
-        help="Pixel at the start of an exposure: armed (ready) or stationary (warmed up).", default="armed",
+        "--start",
+        panel=_SYSTEM,
+        help="Pixel at the start of an exposure: armed (ready) or stationary (warmed up).",
+        default="armed",
     ),
 ]
 Engine = Annotated[
     str,
     _option(
-        "--engine", panel=_RUN, default="exact",
+        "--engine",
+        panel=_RUN,
+        default="exact",
         help="exact; feedback (long exposures, at a cost independent of them); auto (the faster of these, pixel by "
         "pixel); mars (count law x mean histogram); sequential (slow, independent gold standard); renewal, neural, "
         "poisson (baselines).",
@@ -100,7 +110,8 @@ Engine = Annotated[
 Table = Annotated[
     Path | None,
     _option(
-        "--table", panel=_RUN,
+        "--table",
+        panel=_RUN,
         help="For --engine mars and renewal: a table of this system (mars-lidar table build).",
         default="every distinct pixel is evaluated by itself, which is slow",
     ),
@@ -108,7 +119,8 @@ Table = Annotated[
 Model = Annotated[
     Path | None,
     _option(
-        "--model", panel=_RUN,
+        "--model",
+        panel=_RUN,
         help="For --engine neural: a network of this system (mars-lidar neural train).",
         default="the package's own, for the default system",
     ),
@@ -116,7 +128,9 @@ Model = Annotated[
 Count = Annotated[
     str | None,
     _option(
-        "--count", panel=_RUN, default="exact",
+        "--count",
+        panel=_RUN,
+        default="exact",
         help="For --engine mars: the law of the count: exact, matched (to four cumulants, faster with --table) or "
         "gaussian (the paper's).",
     ),
@@ -128,7 +142,9 @@ Interpolation = Annotated[
 TableOutside = Annotated[
     str | None,
     _option(
-        "--table-outside", panel=_RUN, default="error",
+        "--table-outside",
+        panel=_RUN,
+        default="error",
         help="Of --table, for pixels beyond its range: error, or exact (each is evaluated by itself, some ms).",
     ),
 ]

@@ -38,8 +38,10 @@ class PulseOptions:
     pulse_origin: Annotated[
         str | None,
         _option(
-            "--pulse-origin", panel=_SYSTEM,
-            help="What a delay refers to in --pulse-file: peak, centroid or first.", default="peak",
+            "--pulse-origin",
+            panel=_SYSTEM,
+            help="What a delay refers to in --pulse-file: peak, centroid or first.",
+            default="peak",
         ),
     ] = None
 

@@ -30,12 +30,8 @@ RECONSTRUCT_EPILOG = "\n\n".join(
 
 
 def reconstruct(
-    cube: Annotated[
-        Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)
-    ],
-    out: Annotated[
-        Path, typer.Option("-o", "--out", help="The maps: .zarr, .h5, .hdf5 or .npz.", show_default=False)
-    ],
+    cube: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The maps: .zarr, .h5, .hdf5 or .npz.", show_default=False)],
     method: Annotated[
         str,
         typer.Option("--method", help="One or more methods, separated by commas, or all that suit the detector."),
@@ -143,9 +139,11 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     for name, each in found.items():
         flags = each.found.flags
         line = [
-            name, f"{each.seconds:.3g}", f"{100.0 * each.found.seen.mean():.4g}",
+            name,
+            f"{each.seconds:.3g}",
+            f"{100.0 * each.found.seen.mean():.4g}",
             f"{100.0 * ((flags & Flags.SATURATED) > 0).mean():.3g}",
-        ]  # fmt: skip
+        ]
         for kind in kinds:
             off, scale = errors[name][kind], 1e3 if kind == "depth" else 1.0
             values = (scale * off.rmse, scale * off.median, off.psnr, off.ssim)

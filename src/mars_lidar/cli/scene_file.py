@@ -51,18 +51,29 @@ def _flag(name: str, value: Any, folder: Path) -> bool:
 _KINDS: dict[str, dict[str, tuple[str, Check]]] = {
     "example": {"example": ("scene", _text), "size": ("size", _size), "seed": ("scene_seed", _whole)},
     "depth": {
-        "depth": ("depth", _file), "image": ("image", _file), "size": ("size", _size),
-        "depth_unit_m": ("depth_unit_m", _number), "focal_px": ("focal_px", _number), "index": ("index", _whole),
+        "depth": ("depth", _file),
+        "image": ("image", _file),
+        "size": ("size", _size),
+        "depth_unit_m": ("depth_unit_m", _number),
+        "focal_px": ("focal_px", _number),
+        "index": ("index", _whole),
     },
     "transient": {
-        "transient": ("transient", _file), "bin_ns": ("transient_bin_ns", _number),
-        "start_ns": ("transient_start_ns", _number), "name": ("transient_name", _text),
-        "channel": ("transient_channel", _whole), "pulse": ("transient_pulse", _flag),
+        "transient": ("transient", _file),
+        "bin_ns": ("transient_bin_ns", _number),
+        "start_ns": ("transient_start_ns", _number),
+        "name": ("transient_name", _text),
+        "channel": ("transient_channel", _whole),
+        "pulse": ("transient_pulse", _flag),
     },
-}  # fmt: skip
+}
 _LIGHT: dict[str, Check] = {
-    "signal": _number, "photons_per_unit": _number, "sbr": _number, "attenuation": _text, "ambient": _text
-}  # fmt: skip
+    "signal": _number,
+    "photons_per_unit": _number,
+    "sbr": _number,
+    "attenuation": _text,
+    "ambient": _text,
+}
 
 
 def with_file(file: Path, scene: SceneOptions, light: LightOptions) -> tuple[SceneOptions, LightOptions]:

@@ -19,22 +19,29 @@ _SCENE, _LIGHT = "Scene (one of --scene, --depth and --transient)", "Light"
 _TRANSIENT = "Rendered transient (with --transient)"
 _OF_DEPTH = ("image", "depth_unit_m", "focal_px", "index")
 _OF_TRANSIENT = (
-    "transient_bin_ns", "transient_start_ns", "transient_name", "transient_channel", "transient_pulse",
+    "transient_bin_ns",
+    "transient_start_ns",
+    "transient_name",
+    "transient_channel",
+    "transient_pulse",
     "photons_per_unit",
-)  # fmt: skip
+)
 
 
 Attenuation = Annotated[
     str | None,
     _option(
-        "--attenuation", panel=_LIGHT, default="none",
+        "--attenuation",
+        panel=_LIGHT,
+        default="none",
         help="Signal against depth z: none or inverse_square (1 / z^2).",
     ),
 ]
 Ambient = Annotated[
     str | None,
     _option(
-        "--ambient", panel=_LIGHT,
+        "--ambient",
+        panel=_LIGHT,
         help="Ambient light over the image: uniform, reflectivity, or map (of the scene).",
         default="map where there is one, else uniform",
     ),
@@ -48,7 +55,8 @@ class SceneOptions:
     scene: Annotated[
         str | None,
         _option(
-            "--scene", panel=_SCENE,
+            "--scene",
+            panel=_SCENE,
             help="A built-in scene: room, or random (another for each --scene-seed). "
             "Or a .yaml file of scene or transient, and light (docs/formats.md).",
         ),
@@ -56,7 +64,9 @@ class SceneOptions:
     size: Annotated[
         int | None,
         _option(
-            "--size", panel=_SCENE, min=1,
+            "--size",
+            panel=_SCENE,
+            min=1,
             help="Image size in pixels: square for --scene; the longer side, resampled, for --depth.",
             default="128 for --scene, the file's own for --depth",
         ),
@@ -68,7 +78,8 @@ class SceneOptions:
     depth: Annotated[
         Path | None,
         _option(
-            "--depth", panel=_SCENE,
+            "--depth",
+            panel=_SCENE,
             help="Depth: 16-bit PNG or TIFF in mm, .pfm, .exr, .npy or .npz in m, NYUv2's .mat, "
             "or a Middlebury folder.",
         ),
@@ -80,14 +91,17 @@ class SceneOptions:
     depth_unit_m: Annotated[
         float | None,
         _option(
-            "--depth-unit-m", panel=_SCENE, help="Metres per stored unit of --depth.",
+            "--depth-unit-m",
+            panel=_SCENE,
+            help="Metres per stored unit of --depth.",
             default="0.001 for images, 1 for arrays",
         ),
     ] = None
     focal_px: Annotated[
         float | None,
         _option(
-            "--focal-px", panel=_SCENE,
+            "--focal-px",
+            panel=_SCENE,
             help="Focal length, pixels: turns depth along the axis into range along the ray.",
             default="depth as it is",
         ),
@@ -99,7 +113,8 @@ class SceneOptions:
     transient: Annotated[
         Path | None,
         _option(
-            "--transient", panel=_SCENE,
+            "--transient",
+            panel=_SCENE,
             help="Rendered transient (y, x, time), read in bands: .npy, .npz, .h5, .hdf5 (tal and mitransient too), "
             ".mat.",
         ),
@@ -113,7 +128,9 @@ class SceneOptions:
     transient_start_ns: Annotated[
         float | None,
         _option(
-            "--transient-start-ns", panel=_TRANSIENT, help="Travel time at its first bin, ns.",
+            "--transient-start-ns",
+            panel=_TRANSIENT,
+            help="Travel time at its first bin, ns.",
             default="what the file says, else 0",
         ),
     ] = None
@@ -128,14 +145,17 @@ class SceneOptions:
     transient_pulse: Annotated[
         bool | None,
         _option(
-            "--transient-pulse/--no-transient-pulse", panel=_TRANSIENT, default="yes",
+            "--transient-pulse/--no-transient-pulse",
+            panel=_TRANSIENT,
+            default="yes",
             help="Convolve with the system's pulse; no where the transient contains it already.",
         ),
     ] = None
     photons_per_unit: Annotated[
         float | None,
         _option(
-            "--photons-per-unit", panel=_TRANSIENT,
+            "--photons-per-unit",
+            panel=_TRANSIENT,
             help="Instead of --signal: detectable photons per period for one unit of its light.",
         ),
     ] = None
@@ -148,7 +168,9 @@ class LightOptions:
     signal: Annotated[
         float | None,
         _option(
-            "--signal", panel=_LIGHT, default="1",
+            "--signal",
+            panel=_LIGHT,
+            default="1",
             help="Mean signal S over the pixels with a return or light, detectable photons per laser period.",
         ),
     ] = None
@@ -212,9 +234,13 @@ def _scene(given: SceneOptions) -> tuple[Scene, str]:
     source = f"depth {given.depth}" + ("" if given.index is None else f", frame {given.index}")
     source += "" if given.image is None else f", image {given.image}"
     scene = Scene.from_rgbd(
-        given.depth, given.image, size=given.size, depth_unit_m=given.depth_unit_m, focal_px=given.focal_px,
+        given.depth,
+        given.image,
+        size=given.size,
+        depth_unit_m=given.depth_unit_m,
+        focal_px=given.focal_px,
         index=given.index,
-    )  # fmt: skip
+    )
     return scene, source
 
 
@@ -227,13 +253,19 @@ def _transient(given: SceneOptions, light: LightOptions, sbr: float, system: Sys
 
     assert given.transient is not None
     rendered = read_transient(
-        given.transient, bin_ns=given.transient_bin_ns, start_ns=given.transient_start_ns, name=given.transient_name,
+        given.transient,
+        bin_ns=given.transient_bin_ns,
+        start_ns=given.transient_start_ns,
+        name=given.transient_name,
         channel=given.transient_channel,
-    )  # fmt: skip
+    )
     signal = 1.0 if light.signal is None and given.photons_per_unit is None else light.signal
     make = rendered.stored_flux if in_parts else rendered.flux
     flux = make(
-        system, signal=signal, photons_per_unit=given.photons_per_unit, sbr=sbr,
+        system,
+        signal=signal,
+        photons_per_unit=given.photons_per_unit,
+        sbr=sbr,
         pulse=given.transient_pulse is not False,
-    )  # fmt: skip
+    )
     return View(flux, None, None, f"transient {given.transient}")

@@ -32,9 +32,7 @@ PeriodNs = Annotated[
 Bins = Annotated[
     int | None, _option("--bins", panel=STREAM, help="Histogram bins of the period.", default="the file's clock")
 ]
-UnitNs = Annotated[
-    float | None, _option("--unit-ns", panel=STREAM, help="Unit of the times in a .mat or .npz, ns.")
-]
+UnitNs = Annotated[float | None, _option("--unit-ns", panel=STREAM, help="Unit of the times in a .mat or .npz, ns.")]
 Variable = Annotated[
     str | None, _option("--variable", panel=STREAM, help="Variable of a .mat or .npz that holds the times.")
 ]
@@ -42,28 +40,36 @@ Variable = Annotated[
 DeadTimeNs = Annotated[
     float | None,
     _option(
-        "--dead-time-ns", panel=_SYSTEM, help="Dead time of the pixel, ns.",
+        "--dead-time-ns",
+        panel=_SYSTEM,
+        help="Dead time of the pixel, ns.",
         default="of --system or a simulated stream, else by the edge of the recovery",
     ),
 ]
 HoldOffNs = Annotated[
     float | None,
     _option(
-        "--hold-off-ns", panel=_SYSTEM, default="the dead time; with dead electronics the sum of both",
+        "--hold-off-ns",
+        panel=_SYSTEM,
+        default="the dead time; with dead electronics the sum of both",
         help="Leave out this long after each photon, ns: keeps out afterpulses and dead electronics.",
     ),
 ]
 System = Annotated[
     Path | None,
     _option(
-        "--system", panel=_SYSTEM, help="YAML or JSON file with pulse and detector; single options replace its values.",
+        "--system",
+        panel=_SYSTEM,
+        help="YAML or JSON file with pulse and detector; single options replace its values.",
         default="that of a simulated stream",
     ),
 ]
 Mode = Annotated[
     str | None,
     _option(
-        "--mode", panel=_SYSTEM, default="nonparalyzable",
+        "--mode",
+        panel=_SYSTEM,
+        default="nonparalyzable",
         help="nonparalyzable, or paralyzable: every arrival restarts the dead time.",
     ),
 ]
@@ -150,9 +156,13 @@ class FitOptions:
         if known is not None:
             return known.replace(detector=detector, pulse=pulse)
         return SystemOf(
-            period_ns=times.period_ns, cycles=max(times.cycles, 1), bins=times.bins, pulse=pulse, detector=detector,
+            period_ns=times.period_ns,
+            cycles=max(times.cycles, 1),
+            bins=times.bins,
+            pulse=pulse,
+            detector=detector,
             start="armed",
-        )  # fmt: skip
+        )
 
     def calibrate(self, times: Timestamps, effects: StreamEffects) -> tuple[Calibration, Detector | None]:
         """The light of the stream by maximum likelihood, and the detector where it is more than a dead time."""
@@ -176,9 +186,14 @@ class FitOptions:
         dead = self.dead_time_ns if told is None else None
         jitter = jitter_sigma(with_given(Detector(dead_time_ns=0.0), given)) if told is None and given else None
         found = fitted(
-            times, told, pulse=shape, dead_time_ns=dead, hold_off_ns=self.hold_off_ns, returns=self.returns,
+            times,
+            told,
+            pulse=shape,
+            dead_time_ns=dead,
+            hold_off_ns=self.hold_off_ns,
+            returns=self.returns,
             jitter_ns=jitter,
-        )  # fmt: skip
+        )
         if not found.converged:
             say("warning: the likelihood was not maximised; what is printed is where it stopped")
         return found, None if told is None or is_plain(told.detector) else told.detector

@@ -27,35 +27,47 @@ _PAPER_BYTES = "105 MB, 108 GB with delays"
 Signal = Annotated[
     str,
     typer.Option(
-        "--signal", metavar="LOW,HIGH,POINTS", rich_help_panel=_GRID, show_default=False,
+        "--signal",
+        metavar="LOW,HIGH,POINTS",
+        rich_help_panel=_GRID,
+        show_default=False,
         help="Signal axis, photons per period, log-spaced; 0 is added. [dim]Default: 0.01,10,256.[/dim]",
     ),
 ]
 Background = Annotated[
     str,
     typer.Option(
-        "--background", metavar="LOW,HIGH,POINTS", rich_help_panel=_GRID, show_default=False,
+        "--background",
+        metavar="LOW,HIGH,POINTS",
+        rich_help_panel=_GRID,
+        show_default=False,
         help="Background axis, likewise. [dim]Default: 0.01,10,100.[/dim]",
     ),
 ]
 Method = Annotated[
     str,
     typer.Option(
-        "--method", rich_help_panel=_GRID, show_default=False,
+        "--method",
+        rich_help_panel=_GRID,
+        show_default=False,
         help="exposure (exact, start-up included) or mars (the paper's). [dim]Default: exposure.[/dim]",
     ),
 ]
 Rearm = Annotated[
     str,
     typer.Option(
-        "--rearm", rich_help_panel=_GRID, show_default=False,
+        "--rearm",
+        rich_help_panel=_GRID,
+        show_default=False,
         help="For mars: re-arming at the centre or the edge of a bin. [dim]Default: centre.[/dim]",
     ),
 ]
 Refine = Annotated[
     float | None,
     typer.Option(
-        "--refine", rich_help_panel=_GRID, show_default=False,
+        "--refine",
+        rich_help_panel=_GRID,
+        show_default=False,
         help="Insert points until the error between them, in total variation, is below this.",
     ),
 ]
@@ -65,9 +77,7 @@ CheckLaw = Annotated[
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(
-        "-o", "--out", show_default=False, help="The table: .h5 or .hdf5. [dim]Default: the cache.[/dim]"
-    ),
+    typer.Option("-o", "--out", show_default=False, help="The table: .h5 or .hdf5. [dim]Default: the cache.[/dim]"),
 ]
 
 
@@ -97,8 +107,12 @@ def build(
         from mars_lidar.table import Table, cache
 
         chosen: dict[str, Any] = {
-            "method": method, "rearm": rearm, "refine": refine, "check_law": check_law, "threads": threads
-        }  # fmt: skip
+            "method": method,
+            "rearm": rearm,
+            "refine": refine,
+            "check_law": check_law,
+            "threads": threads,
+        }
         with progress_bar("building") as progress:
             if out is None:
                 path = cache.cached_path(system, *axes, progress=progress, **chosen)

@@ -194,9 +194,19 @@ def compare(
         statistics[pixel] = found
     order = [name for name in _names(engines, against) if name in runs]
     return Comparison(
-        flux, system, against, seed, team, expected, {name: scenes[name] for name in order}, places, laws,
-        {pixel: {name: found[name] for name in order} for pixel, found in statistics.items()}, skipped, unpredicted,
-    )  # fmt: skip
+        flux,
+        system,
+        against,
+        seed,
+        team,
+        expected,
+        {name: scenes[name] for name in order},
+        places,
+        laws,
+        {pixel: {name: found[name] for name in order} for pixel, found in statistics.items()},
+        skipped,
+        unpredicted,
+    )
 
 
 def _names(engines: Sequence[str | Engine], against: str) -> list[str]:

@@ -73,9 +73,7 @@ class Expected:
         return image[..., :: self.step, :: self.step]
 
 
-def pixel_law(
-    flux: Flux, system: System, y: int, x: int, window: NDArray[np.bool_], threads: int
-) -> PixelLaw | str:
+def pixel_law(flux: Flux, system: System, y: int, x: int, window: NDArray[np.bool_], threads: int) -> PixelLaw | str:
     """Exact law of pixel (y, x), or why there is none: no convergence, a detector without exact statistics."""
     try:
         arguments = law_arguments(flux, system, y, x)
@@ -87,9 +85,7 @@ def pixel_law(
     return PixelLaw(law.cumulants, pmf, histogram, *_joint(arguments, system, window))
 
 
-def _joint(
-    arguments: dict[str, Any], system: System, window: NDArray[np.bool_]
-) -> tuple[FloatArray | None, float]:
+def _joint(arguments: dict[str, Any], system: System, window: NDArray[np.bool_]) -> tuple[FloatArray | None, float]:
     """`PixelLaw.window` and `.lag1`, as far as the closed form has them in a second or so."""
     try:
         joint = joint_law(system=system, **arguments)
@@ -122,9 +118,11 @@ def expected_counts(flux: Flux, system: System, threads: int, budget_s: float) -
         try:
             in_time(first, y.size)
             cumulants[part] = exposure_moments(
-                system=system.replace(bins=1), threads=threads, progress=in_time,
+                system=system.replace(bins=1),
+                threads=threads,
+                progress=in_time,
                 **_arguments(flux, system, y[part], x[part], shaped),
-            ).cumulants  # fmt: skip
+            ).cumulants
         except ConvergenceError:
             continue
         except (_OutOfTimeError, ValueError):  # ValueError: a detector without exact statistics
@@ -133,9 +131,7 @@ def expected_counts(flux: Flux, system: System, threads: int, budget_s: float) -
     return Expected(step, mean, variance, time.perf_counter() - began)
 
 
-def _arguments(
-    flux: Flux, system: System, y: NDArray[np.intp], x: NDArray[np.intp], shaped: bool
-) -> dict[str, Any]:
+def _arguments(flux: Flux, system: System, y: NDArray[np.intp], x: NDArray[np.intp], shaped: bool) -> dict[str, Any]:
     """Some pixels as `exposure_moments` takes them; one only where each has a shape of its own."""
     if shaped:
         return law_arguments(flux, system, int(y[0]), int(x[0]))

@@ -129,9 +129,16 @@ def draw_pixel(
     while made < n:
         part = out[made : made + batch].reshape(-1, 1, 1, system.bins)
         simulate(
-            alone, system, engine=engine, realizations=len(part), first_realization=made, pixel_index=place,
-            seed=seed, threads=team, out=part,
-        )  # fmt: skip
+            alone,
+            system,
+            engine=engine,
+            realizations=len(part),
+            first_realization=made,
+            pixel_index=place,
+            seed=seed,
+            threads=team,
+            out=part,
+        )
         made += len(part)
         each = (time.perf_counter() - began) / made
         batch = min(2 * batch, n - made, int((budget_s - each * made) / each))

@@ -88,9 +88,15 @@ def scene_statistics(
     while len(seconds) < repeats and sum(seconds) < budget_s:
         began = time.perf_counter()
         simulate(
-            flux, system, engine=engine, first_realization=len(seconds), seed=seed, threads=threads,
-            out=cube, report=report,
-        )  # fmt: skip
+            flux,
+            system,
+            engine=engine,
+            first_realization=len(seconds),
+            seed=seed,
+            threads=threads,
+            out=cube,
+            report=report,
+        )
         seconds.append(time.perf_counter() - began)
         total = cube[0].sum(-1, dtype=np.int64)
         counts.append(total)
@@ -144,9 +150,7 @@ def _mean(values: FloatArray, goal: float) -> Estimate:
     return Estimate(mean, error, score(mean - goal, error))
 
 
-def _depth_errors(
-    cube: NDArray[Any], total: NDArray[np.int64], system: System, depth_m: FloatArray
-) -> FloatArray:
+def _depth_errors(cube: NDArray[Any], total: NDArray[np.int64], system: System, depth_m: FloatArray) -> FloatArray:
     span = system.unambiguous_range_m
     found = np.where(total > 0, bin_depth_m(system, cube.argmax(-1)), np.nan)
     return np.asarray((found - depth_m + 0.5 * span) % span - 0.5 * span, dtype=np.float64)

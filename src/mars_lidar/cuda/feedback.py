@@ -26,9 +26,7 @@ _STREAMS_EACH = 4  # batches for each warp in flight, where there are realizatio
 Draw = Callable[[Task, Any], None]
 
 
-def feedback_histogram(
-    task: Task, out: Any, machine: Machine, draw_exactly: Draw, *, warps: int | None = None
-) -> None:
+def feedback_histogram(task: Task, out: Any, machine: Machine, draw_exactly: Draw, *, warps: int | None = None) -> None:
     """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor.
 
     What the sweeps are not tried on, what they refuse, and single exposures that do not settle are drawn by
@@ -47,9 +45,14 @@ def feedback_histogram(
             draw_exactly(task, out)
             continue
         part = replace(
-            task, flux=part_of(task.flux, pixels), pixel_index=task.pixel_index[pixels], progress=None, report={},
-            realizations=number, first_realization=task.first_realization + first,
-        )  # fmt: skip
+            task,
+            flux=part_of(task.flux, pixels),
+            pixel_index=task.pixel_index[pixels],
+            progress=None,
+            report={},
+            realizations=number,
+            first_realization=task.first_realization + first,
+        )
         rows = machine.empty((part.items, task.system.bins), out.dtype)
         draw_exactly(part, rows)
         cube[first : first + number, machine.array(pixels)] = rows.reshape(number, pixels.size, task.system.bins)
@@ -85,10 +88,13 @@ def _launch(
     held = min(held, -(-streams // _LANES))
     arrays = common | {name: machine.array(array) for name, array in cells.items()}
     arrays |= {
-        "pixels": machine.array(pixels), "status": machine.empty((task.realizations, pixels.size), np.uint8),
-        "out": out, "queue": machine.zeros((_LANES,), np.uint32), "full": machine.zeros((1,), np.uint32),
+        "pixels": machine.array(pixels),
+        "status": machine.empty((task.realizations, pixels.size), np.uint8),
+        "out": out,
+        "queue": machine.zeros((_LANES,), np.uint32),
+        "full": machine.zeros((1,), np.uint32),
         "work": machine.empty((held * work,), np.uint8),
-    }  # fmt: skip
+    }
     addresses = {name: machine.address(array) for name, array in arrays.items()}
     numbers = {"streams": streams, "splits": splits, "number": pixels.size, "work_bytes": work}
     argument = _core.feedback_task(task.job, task.pulse, *on, addresses, numbers)

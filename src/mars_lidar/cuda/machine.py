@@ -118,7 +118,9 @@ def compiled(kernel: Kernel, device: int) -> Any:
     import cupy
 
     module = cupy.RawModule(
-        code=source(kernel.header), options=(*OPTIONS, f"-I{HEADERS}"), backend="nvrtc",
+        code=source(kernel.header),
+        options=(*OPTIONS, f"-I{HEADERS}"),
+        backend="nvrtc",
         name_expressions=(kernel.expression,),
-    )  # fmt: skip
+    )
     return module.get_function(kernel.expression)

@@ -109,9 +109,13 @@ class _Launches:
         phase = (0.5 * period - delay_ns) / period  # as Table.lookup
         phase -= np.floor(phase)
         here: dict[str, NDArray[Any]] = {
-            "signal": signal, "background": background, "shift": shift, "phase": phase, "place": pixels,
+            "signal": signal,
+            "background": background,
+            "shift": shift,
+            "phase": phase,
+            "place": pixels,
             "pixel_index": np.ascontiguousarray(task.pixel_index[pixels]),
-        }  # fmt: skip
+        }
         self.arrays |= {name: machine.array(array) for name, array in here.items()}
         for name, width in (("rows", np.int64), ("weights", np.float64), ("cumulants", np.float64)):
             self.arrays[name] = machine.empty((n, 4), width)
@@ -124,9 +128,11 @@ class _Launches:
         if doubts:
             self.arrays["doubted"] = machine.empty((n,), np.uint8)
         numbers = {
-            "pixels": n, "cycles": self.cycles, "nearest": int(self.reader.interpolation == "nearest"),
+            "pixels": n,
+            "cycles": self.cycles,
+            "nearest": int(self.reader.interpolation == "nearest"),
             "phases": self.reader.table.start_phases.phase.size,
-        }  # fmt: skip
+        }
         argument = _core.mars_law_task(self._addresses(), self.there.axes, numbers)
         machine.launch(MARS_LAWS, -(-n // _LAW_LANES), _LAW_LANES, argument)
         if doubts or not self.reader.table.serves(self.cycles):  # else nothing has to be waited for
@@ -150,9 +156,11 @@ class _Launches:
         which = np.full(pixels.size, -1, np.int32)
         which[np.searchsorted(pixels, entries.pixels)] = laws.law
         there: dict[str, NDArray[Any]] = {
-            "exact": which, "law_first": laws.first, "law_offsets": laws.offsets,
+            "exact": which,
+            "law_first": laws.first,
+            "law_offsets": laws.offsets,
             "law_cumulative": np.ascontiguousarray(laws.cumulative),
-        }  # fmt: skip
+        }
         self.arrays |= {name: self.machine.array(array) for name, array in there.items()}
         run.count("pixels_exact_count", doubted.size)
 
@@ -183,12 +191,22 @@ class _Launches:
         if not shared:
             self.arrays["work"] = machine.empty((blocks * (work + 63) // 64 * 64,), np.uint8)
         numbers = {
-            "pixels": pixels.size, "realizations": task.realizations, "first_realization": task.first_realization,
-            "seed": task.seed, "bins": bins, "dead_time": dead, "image": task.pixel_index.size,
-            "frame_first": frame.first, "frame_size": frame.energy.shape[1], "frame_parts": len(frame.energy) - 1,
-            "frame_cells": frame.cells, "runs": runs, "parts": parts, "deep": deep,
+            "pixels": pixels.size,
+            "realizations": task.realizations,
+            "first_realization": task.first_realization,
+            "seed": task.seed,
+            "bins": bins,
+            "dead_time": dead,
+            "image": task.pixel_index.size,
+            "frame_first": frame.first,
+            "frame_size": frame.energy.shape[1],
+            "frame_parts": len(frame.energy) - 1,
+            "frame_cells": frame.cells,
+            "runs": runs,
+            "parts": parts,
+            "deep": deep,
             "work_bytes": (work + 63) // 64 * 64,
-        }  # fmt: skip
+        }
         machine.launch(kernel, blocks, LANES, _core.mars_task(self._addresses(), numbers), shared)
         if out.dtype.itemsize == 2 and self._may_overflow() and int(machine.host(self.arrays["full"])[0]):
             raise overflow(out.dtype.itemsize)
@@ -212,9 +230,11 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
         return kept[key]
     entries, phases, own = table.entries, table.start_phases, cycles == table.entries.cycles
     axes = {
-        "signal_axis": table.signal, "background_axis": table.background,
-        "sub_signal": phases.signal, "sub_background": phases.background,
-    }  # fmt: skip
+        "signal_axis": table.signal,
+        "background_axis": table.background,
+        "sub_signal": phases.signal,
+        "sub_background": phases.background,
+    }
     axes = {name: np.ascontiguousarray(axis, np.float64) for name, axis in axes.items()}
     here: dict[str, NDArray[Any]] = {
         "entries": np.ascontiguousarray(entries.cumulants_at(cycles)),
@@ -223,9 +243,7 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
         "shapes": np.ascontiguousarray(table.shapes(cycles)),
         "energy": frame.energy,
     }
-    guides: Any = _core.shape_guides(
-        here["shapes"], dead_time=dead_time, first=frame.first, size=frame.energy.shape[1]
-    )
+    guides: Any = _core.shape_guides(here["shapes"], dead_time=dead_time, first=frame.first, size=frame.energy.shape[1])
     here["guides"] = guides
     for name, axis in axes.items():
         here |= {f"{name}.{part}": array for part, array in _core.table_axis(axis).items()}
@@ -247,9 +265,14 @@ def _on_host(engine: MarsEngine, task: Task, out: Any, machine: Machine, pixels:
     for first in range(0, task.realizations, number):
         some = min(number, task.realizations - first)
         part = replace(
-            task, flux=part_of(task.flux, pixels), realizations=some, report={}, progress=None,
-            first_realization=task.first_realization + first, pixel_index=task.pixel_index[pixels],
-        )  # fmt: skip
+            task,
+            flux=part_of(task.flux, pixels),
+            realizations=some,
+            report={},
+            progress=None,
+            first_realization=task.first_realization + first,
+            pixel_index=task.pixel_index[pixels],
+        )
         rows = np.empty((part.items, bins), out.dtype)
         alone.histogram(part, rows)
         cube[first : first + some, where] = machine.array(rows.reshape(some, pixels.size, bins))

@@ -75,9 +75,12 @@ def histogram_array(
 
     kept: dict[str, Any] = {}
     array = zarr.create_array(
-        zarr.storage.MemoryStore(kept), shape=(1, *shape), dtype=dtype, chunks=(1, *shape),
+        zarr.storage.MemoryStore(kept),
+        shape=(1, *shape),
+        dtype=dtype,
+        chunks=(1, *shape),
         **packing(recipe.layout, dtype),
-    )  # fmt: skip
+    )
     return with_zeros(array), lambda: sum(len(value) for name, value in kept.items() if not name.endswith(".json"))
 
 

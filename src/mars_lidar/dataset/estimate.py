@@ -112,9 +112,7 @@ def estimate(
     )
 
 
-def _looked_at(
-    found: list[Candidate], plan: DatasetRecipe, problems: list[Problem]
-) -> tuple[list[Shown], float]:
+def _looked_at(found: list[Candidate], plan: DatasetRecipe, problems: list[Problem]) -> tuple[list[Shown], float]:
     """Some scenes of one size, and the seconds that reading one took."""
     began = time.perf_counter()
     chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, _SCENES)})

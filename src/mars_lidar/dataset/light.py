@@ -51,9 +51,7 @@ def read_light(data: Any) -> Light:
         ambient = values.choice((*key, "ambient"), ambient, ("uniform", "reflectivity", "map"))
     return Light(
         levels=tuple(levels),
-        attenuation=values.choice(
-            (*key, "attenuation"), known.get("attenuation", "none"), ("none", "inverse_square")
-        ),
+        attenuation=values.choice((*key, "attenuation"), known.get("attenuation", "none"), ("none", "inverse_square")),
         ambient=ambient,
         dark_counts_per_s=values.real((*key, "dark_counts_per_s"), known.get("dark_counts_per_s", 0.0), low=0.0),
     )

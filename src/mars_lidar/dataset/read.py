@@ -15,9 +15,7 @@ from mars_lidar._base import checks
 from mars_lidar.dataset.store import Dataset, open_dataset
 
 
-def read_sparse(
-    dataset: Dataset | str | Path, sample: int, realization: int = 0
-) -> scipy.sparse.coo_array:
+def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0) -> scipy.sparse.coo_array:
     """One exposure as a sparse matrix: pixel y W + x in rows, bins in columns.
 
     Parameters
@@ -54,9 +52,7 @@ def read_sparse(
     if columns < width:
         order = np.lexsort((column, row))
         row, column, count = row[order], column[order], count[order]
-    return scipy.sparse.coo_array(
-        (count.astype(array.dtype), (row, column)), shape=(height * width, bins)
-    )
+    return scipy.sparse.coo_array((count.astype(array.dtype), (row, column)), shape=(height * width, bins))
 
 
 def _packed(dataset: Dataset, place: tuple[int, ...]) -> NDArray[np.uint8]:

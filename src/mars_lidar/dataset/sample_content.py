@@ -117,9 +117,12 @@ class Rendered:
     def flux(self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None) -> Flux:
         """Photons, made row by row as they are used."""
         return self.transient.stored_flux(
-            system, signal=signal, sbr=sbr, pulse=self.pulse,
+            system,
+            signal=signal,
+            sbr=sbr,
+            pulse=self.pulse,
             dark_counts_per_s=light.dark_counts_per_s if dark is None else dark,
-        )  # fmt: skip
+        )
 
 
 Shown = Surfaces | Rendered

@@ -214,8 +214,11 @@ def _kind(scene: Shown) -> str:
     if isinstance(scene, Rendered):
         light = scene.transient
         told["transient"] = {
-            "bins": light.values.shape[2], "bin_ns": light.bin_ns, "start_ns": light.start_ns, "pulse": scene.pulse
-        }  # fmt: skip
+            "bins": light.values.shape[2],
+            "bin_ns": light.bin_ns,
+            "start_ns": light.start_ns,
+            "pulse": scene.pulse,
+        }
     else:
         if len(scene.layers) > 1:
             told["layers"] = len(scene.layers)

@@ -79,9 +79,7 @@ def candidates(recipe: DatasetRecipe, folder: Path) -> tuple[list[Candidate], li
     return found, problems
 
 
-def scenes(
-    candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] | None
-) -> Iterator[Named | Problem]:
+def scenes(candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] | None) -> Iterator[Named | Problem]:
     """What a candidate gives: itself or its crops, checked against all levels and systems; or what is wrong.
 
     `shape` is that of the dataset, None while it is not known.

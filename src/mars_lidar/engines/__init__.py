@@ -16,8 +16,14 @@ from mars_lidar.engines.sequential import SequentialEngine
 ENGINES: dict[str, Engine] = {
     engine.name: engine
     for engine in (
-        ExactEngine(), FeedbackEngine(), AutoEngine(), SequentialEngine(), MarsEngine(), RenewalEngine(),
-        NeuralEngine(), PoissonEngine(),
+        ExactEngine(),
+        FeedbackEngine(),
+        AutoEngine(),
+        SequentialEngine(),
+        MarsEngine(),
+        RenewalEngine(),
+        NeuralEngine(),
+        PoissonEngine(),
     )
 }
 

@@ -91,9 +91,13 @@ class FeedbackEngine(Engine):
         draw_rest(ExactEngine(self.level), replace(task, progress=stage(task.progress, share, 1.0)), out, rest)
 
     def sample(
-        self, task: Task, out: NDArray[Any], pixels: NDArray[np.int64], plan: Plan | None = None,
+        self,
+        task: Task,
+        out: NDArray[Any],
+        pixels: NDArray[np.int64],
+        plan: Plan | None = None,
         worth: NDArray[np.float64] | None = None,
-    ) -> Rest:  # fmt: skip
+    ) -> Rest:
         """Fill the rows of `pixels` (n,) and return those that this engine cannot do, whose rows are not filled.
 
         `worth` (n,): cells of all laps beyond which another engine is quicker for a pixel.
@@ -105,9 +109,19 @@ class FeedbackEngine(Engine):
         def sweep(group: NDArray[np.int64], grid: Grid, progress: Progress | None) -> NDArray[np.uint8]:
             status = np.empty((task.realizations, group.size), np.uint8)
             _core.feedback_histogram(
-                task.job, task.pulse, out, group, status, grid.merge, grid.parts, near_pulse(task.system, grid.merge),
-                grid.laps, task.threads, self.level, progress,
-            )  # fmt: skip
+                task.job,
+                task.pulse,
+                out,
+                group,
+                status,
+                grid.merge,
+                grid.parts,
+                near_pulse(task.system, grid.merge),
+                grid.laps,
+                task.threads,
+                self.level,
+                progress,
+            )
             return status
 
         return sweep_pixels(task, plan or Plan.of(task.flux, task.system), pixels, sweep, worth)

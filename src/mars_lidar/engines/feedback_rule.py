@@ -49,11 +49,17 @@ class Reason(IntEnum):
 
 
 _WORDS = {
-    Reason.SLOW: "slow sweeps", Reason.LOCKED: "narrow count law", Reason.FEW: "locked, short exposure",
-    Reason.UNSETTLED: "unsettled", Reason.NEGATIVE: "negative armed", Reason.UNLIKELY: "unlikely count",
-    Reason.SHORT: "short exposure", Reason.ECHO: "bright echo", Reason.CELLS: "too many cells",
+    Reason.SLOW: "slow sweeps",
+    Reason.LOCKED: "narrow count law",
+    Reason.FEW: "locked, short exposure",
+    Reason.UNSETTLED: "unsettled",
+    Reason.NEGATIVE: "negative armed",
+    Reason.UNLIKELY: "unlikely count",
+    Reason.SHORT: "short exposure",
+    Reason.ECHO: "bright echo",
+    Reason.CELLS: "too many cells",
     Reason.DEAR: "quicker exactly",
-}  # fmt: skip
+}
 
 
 class Grid(NamedTuple):

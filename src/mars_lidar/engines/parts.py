@@ -59,10 +59,14 @@ def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[n
         some = pixels[first_pixel : first_pixel + wide]
         number = min(deep, task.realizations - first)
         part = replace(
-            task, flux=part_of(task.flux, some), realizations=number, first_realization=task.first_realization + first,
-            pixel_index=task.pixel_index[some], report={},
+            task,
+            flux=part_of(task.flux, some),
+            realizations=number,
+            first_realization=task.first_realization + first,
+            pixel_index=task.pixel_index[some],
+            report={},
             progress=stage(task.progress, k / len(steps), (k + 1) / len(steps)),
-        )  # fmt: skip
+        )
         rows = np.empty((part.items, task.system.bins), out.dtype)
         engine.histogram(part, rows)
         cube[first : first + number, some] = rows.reshape(number, some.size, task.system.bins)

@@ -59,9 +59,7 @@ def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Fl
     return np.stack([signal, background, np.where(signal > 0.0, phase - np.floor(phase), 0.5)], axis=-1)
 
 
-def _kept(
-    run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray
-) -> list[Window | None]:
+def _kept(run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray) -> list[Window | None]:
     """Laws that the table keeps: of its entries, for its own number of cycles, at its delay."""
     table = reader.table
     if run.task.system.cycles != table.entries.cycles:

@@ -88,8 +88,9 @@ class TableReader:
         """Every pixel lies on the grid, or has no return, of which nothing but its background has to be known."""
         beyond, told = np.zeros(signal.size, dtype=bool), []
         for name, photons, axis in (
-            ("signal", signal, self.table.signal), ("background", background, self.table.background)
-        ):  # fmt: skip
+            ("signal", signal, self.table.signal),
+            ("background", background, self.table.background),
+        ):
             out = (photons < axis[0]) | (photons > axis[-1])
             if name == "signal":
                 out &= photons > 0.0

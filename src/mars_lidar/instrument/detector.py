@@ -120,13 +120,9 @@ class Detector:
             "gate_start_ns",
             checks.real("gate_start_ns", self.gate_start_ns, low=-_MAX_GATE_NS, high=_MAX_GATE_NS),
         )
-        set_field(
-            self, "gate_width_ns", checks.real("gate_width_ns", self.gate_width_ns, low=0.0, strict_low=True)
-        )
+        set_field(self, "gate_width_ns", checks.real("gate_width_ns", self.gate_width_ns, low=0.0, strict_low=True))
         step = 0.0 if self.gate_step_ns is None else self.gate_step_ns
-        set_field(
-            self, "gate_step_ns", checks.real("gate_step_ns", step, low=-_MAX_GATE_NS, high=_MAX_GATE_NS)
-        )
+        set_field(self, "gate_step_ns", checks.real("gate_step_ns", step, low=-_MAX_GATE_NS, high=_MAX_GATE_NS))
         cycles = 1 if self.gate_cycles is None else self.gate_cycles
         set_field(self, "gate_cycles", checks.integer("gate_cycles", cycles, low=1, high=_MAX_GATE_CYCLES))
         if self.gate_cycles != 1 and self.gate_step_ns == 0.0:

@@ -89,9 +89,7 @@ FIELDS: dict[str, Field] = {
     "twilight_ns": Field(0.0, lambda v: checks.real("twilight_ns", v, low=0.0)),
     "crosstalk": Field(None, lambda v: _instance("crosstalk", v, Crosstalk), Crosstalk.from_dict),
     "electronics_dead_time_ns": Field(0.0, lambda v: checks.real("electronics_dead_time_ns", v, low=0.0)),
-    "max_events_per_period": Field(
-        None, lambda v: checks.integer("max_events_per_period", v, low=1, high=_MAX_EVENTS)
-    ),
+    "max_events_per_period": Field(None, lambda v: checks.integer("max_events_per_period", v, low=1, high=_MAX_EVENTS)),
     "max_events_per_exposure": Field(
         None, lambda v: checks.integer("max_events_per_exposure", v, low=1, high=_MAX_EVENTS)
     ),

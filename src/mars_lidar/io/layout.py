@@ -158,9 +158,7 @@ def recipe_from(
     elif "returns_signal" in names:
         returns = zip(read("returns_signal"), read("returns_delay"), strict=True)
         zero = np.zeros_like(background)
-        flux = Flux.multi(
-            *[Flux(s, zero if k else background, tau) for k, (s, tau) in enumerate(returns)], info=info
-        )
+        flux = Flux.multi(*[Flux(s, zero if k else background, tau) for k, (s, tau) in enumerate(returns)], info=info)
     else:
         flux = Flux(read("signal"), background, read("delay"), info=info)
     return Recipe(
@@ -178,9 +176,7 @@ def recipe_from(
     )
 
 
-def _stored_flux(
-    waveforms: Any, signal: NDArray[Any], background: NDArray[Any], info: dict[str, Any]
-) -> StoredFlux:
+def _stored_flux(waveforms: Any, signal: NDArray[Any], background: NDArray[Any], info: dict[str, Any]) -> StoredFlux:
     def make(rows: slice) -> Flux:
         return Flux(waveform=np.asarray(waveforms[rows]), background=background[rows], info=info)
 

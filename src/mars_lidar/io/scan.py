@@ -169,9 +169,7 @@ def _listed(path: Path, unit: float | None, focal: float | None, problems: list[
             problems.append(Problem(path, f"line {number}: {error}"))
 
 
-def _matching(
-    root: Path, pattern: str, image: tuple[str, str] | None, problems: list[Problem]
-) -> Iterator[SceneFile]:
+def _matching(root: Path, pattern: str, image: tuple[str, str] | None, problems: list[Problem]) -> Iterator[SceneFile]:
     for path in sorted(root.glob(pattern)):
         if image is None:
             yield from _frames(path, None, problems)

@@ -220,7 +220,6 @@ def _krylov(apply: Callable[[Rows], Rows], rest: Rows, enough: torch.Tensor) -> 
 
 
 class _Registered(torch.autograd.Function):
-
     @staticmethod
     def forward(ctx: Any, photons: Rows, source: Rows, delay: Delay, tolerance: float, known: Rows | None) -> Rows:
         ctx.delay, ctx.tolerance = delay, tolerance
@@ -241,9 +240,7 @@ class _Registered(torch.autograd.Function):
             light = photons.detach().requires_grad_()
             p, q = fired(light)
             # of A h = s with s held: A dh = -dp G h + dq L h
-            (moved,) = torch.autograd.grad(
-                (worth * (q * ctx.delay.rearmed(h) - p * ctx.delay.blind(h))).sum(), light
-            )
+            (moved,) = torch.autograd.grad((worth * (q * ctx.delay.rearmed(h) - p * ctx.delay.blind(h))).sum(), light)
         return moved, worth, None, None, None
 
 

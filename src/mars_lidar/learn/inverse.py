@@ -50,9 +50,14 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
     """
 
     def __init__(
-        self, system: System, *, table: Table | None = None, engine: str | Engine = "exact", seed: int = 0,
+        self,
+        system: System,
+        *,
+        table: Table | None = None,
+        engine: str | Engine = "exact",
+        seed: int = 0,
         threads: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
         if not isinstance(system, System):
             raise TypeError(f"system must be a System, got {type(system).__name__}")
@@ -83,8 +88,14 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         """
         cubes = y.detach().cpu().double().permute(0, 2, 3, 1).contiguous().numpy()
         found = reconstruct(cubes, self.system, threads=self._threads)
-        maps = [torch.from_numpy(one).nan_to_num(fill) for one, fill in (
-            (found.signal, 0.0), (found.background, 0.0), (found.delay_ns, 0.5 * self.system.period_ns))]  # fmt: skip
+        maps = [
+            torch.from_numpy(one).nan_to_num(fill)
+            for one, fill in (
+                (found.signal, 0.0),
+                (found.background, 0.0),
+                (found.delay_ns, 0.5 * self.system.period_ns),
+            )
+        ]
         return torch.stack(maps, 1).to(y)
 
     def forward(self, x: torch.Tensor, **kwargs: Any) -> torch.Tensor:
@@ -92,10 +103,17 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         _check(x)
         images = x.detach().cpu().double().numpy()
         drawn = [
-            simulate(Flux(*image), self.system, engine=self._engine, seed=self._seed, realizations=1,
-                     first_realization=number, threads=self._threads)[0]
+            simulate(
+                Flux(*image),
+                self.system,
+                engine=self._engine,
+                seed=self._seed,
+                realizations=1,
+                first_realization=number,
+                threads=self._threads,
+            )[0]
             for number, image in enumerate(images)
-        ]  # fmt: skip
+        ]
         self._seed += 1
         out = torch.stack([torch.from_numpy(cube.astype("float64")) for cube in drawn])
         return out.permute(0, 3, 1, 2).to(x)

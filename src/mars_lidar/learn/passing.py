@@ -110,9 +110,17 @@ _mapped: dict[tuple[int, int], mmap.mmap] = {}  # in the receiving process: memo
 
 
 def _arrived(
-    process: int, key: int, size: int, word: int, file: Any, kept: tuple[int, ...],
-    dtype: torch.dtype, shape: tuple[int, ...], stride: tuple[int, ...], offset: int,
-) -> torch.Tensor:  # fmt: skip
+    process: int,
+    key: int,
+    size: int,
+    word: int,
+    file: Any,
+    kept: tuple[int, ...],
+    dtype: torch.dtype,
+    shape: tuple[int, ...],
+    stride: tuple[int, ...],
+    offset: int,
+) -> torch.Tensor:
     if file is not None:
         opened = file.detach()
         _mapped[process, key] = mmap.mmap(opened, word + 8)

@@ -58,9 +58,13 @@ class Recipe:
         with warnings.catch_warnings():  # pixels without return or beyond the range: told by the maps, not every time
             warnings.simplefilter("ignore", UserWarning)
             flux = scene.flux(
-                system, signal=level, sbr=sbr, attenuation=self.attenuation, ambient=self.ambient,
+                system,
+                signal=level,
+                sbr=sbr,
+                attenuation=self.attenuation,
+                ambient=self.ambient,
                 dark_counts_per_s=self.dark_counts_per_s,
-            )  # fmt: skip
+            )
         seed = int(generator(6, self.seed, epoch, index).integers(2**63))
         return Sample(index, scene, system, flux, level, sbr, seed)
 

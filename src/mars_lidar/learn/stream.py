@@ -141,12 +141,18 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         if ambient is not None:
             checks.choice("ambient", ambient, ("uniform", "reflectivity", "map"))
         self._recipe = Recipe(
-            source=as_source(scenes, shape, reuse), systems=drawn, size=shape, flips=bool(flips),
-            signal=as_range("signal", signal), sbr=as_range("sbr", sbr, infinite=True),
-            depth_scale=as_range("depth_scale", depth_scale), attenuation=attenuation, ambient=ambient,
+            source=as_source(scenes, shape, reuse),
+            systems=drawn,
+            size=shape,
+            flips=bool(flips),
+            signal=as_range("signal", signal),
+            sbr=as_range("sbr", sbr, infinite=True),
+            depth_scale=as_range("depth_scale", depth_scale),
+            attenuation=attenuation,
+            ambient=ambient,
             dark_counts_per_s=checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0),
             seed=checks.integer("seed", seed, low=0, high=2**63 - 1),
-        )  # fmt: skip
+        )
         self._size = None if epoch_size is None else checks.integer("epoch_size", epoch_size, low=1, high=_LAST)
         self._batch = None if batch_size is None else checks.integer("batch_size", batch_size, low=1, high=2**20)
         self._threads = None if threads is None else checks.integer("threads", threads, low=1, high=1024)

@@ -106,9 +106,13 @@ class _Block(nn.Module):
     def __init__(self, inside: int, outside: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.GroupNorm(8, inside), nn.SiLU(), nn.Conv2d(inside, outside, 3, padding=1),
-            nn.GroupNorm(8, outside), nn.SiLU(), nn.Conv2d(outside, outside, 3, padding=1),
-        )  # fmt: skip
+            nn.GroupNorm(8, inside),
+            nn.SiLU(),
+            nn.Conv2d(inside, outside, 3, padding=1),
+            nn.GroupNorm(8, outside),
+            nn.SiLU(),
+            nn.Conv2d(outside, outside, 3, padding=1),
+        )
         self.past = nn.Identity() if inside == outside else _Pointwise(inside, outside)
 
     def forward(self, x: Tensor) -> Tensor:

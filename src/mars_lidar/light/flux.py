@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from mars_lidar.instrument.system import System
 
 
-
 @dataclass(frozen=True, eq=False, init=False)
 class Flux:
     """Expected *detectable* photons per laser period at each pixel (photon detection efficiency included).

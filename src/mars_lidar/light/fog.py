@@ -65,8 +65,10 @@ class Fog:
             return Flux(waveform=waveform, background=flux.background[wanted], info=info)
 
         info = flux.info | {
-            "extinction_per_m": self.extinction_per_m, "backscatter": photons, "nearest_m": self.nearest_m
-        }  # fmt: skip
+            "extinction_per_m": self.extinction_per_m,
+            "backscatter": photons,
+            "nearest_m": self.nearest_m,
+        }
         lit, depth = _depths(flux)
         left = (flux.returns_signal * np.exp(-2.0 * self.extinction_per_m * depth)).sum(axis=0)
         cloud = photons * _share(_farthest(lit, depth), self.extinction_per_m, self.nearest_m)

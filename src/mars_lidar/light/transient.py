@@ -228,9 +228,15 @@ class Transient:
 
         def make(rows: slice) -> Flux:
             return self.flux(
-                system, signal=signal, photons_per_unit=photons_per_unit, sbr=sbr,
-                dark_counts_per_s=dark_counts_per_s, pulse=pulse, parts=parts, rows=rows,
-            )  # fmt: skip
+                system,
+                signal=signal,
+                photons_per_unit=photons_per_unit,
+                sbr=sbr,
+                dark_counts_per_s=dark_counts_per_s,
+                pulse=pulse,
+                parts=parts,
+                rows=rows,
+            )
 
         first = make(slice(0, 1))
         assert first.waveform is not None

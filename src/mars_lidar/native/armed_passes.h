@@ -60,7 +60,7 @@ struct ArmedPasses {
         const int64_t n = r.bins;
         const double periods = static_cast<double>(r.cycles), f = r.fraction;
         const double early = (1.0 - f) * (1.0 - f), late = f * (2.0 - f);  // (R2)
-        double turns[2], whole[2], edge[3];  // for p = whole (+ 1, + 2)
+        double turns[2], whole[2], edge[3];                                // for p = whole (+ 1, + 2)
         for (int64_t k = 0; k < 2; ++k) {
             turns[k] = static_cast<double>(r.whole + k);
             whole[k] = within_sum(r, r.whole + k - 1);
@@ -146,8 +146,7 @@ struct Expected {
         silent = armed * pass.quiet + rearmed * pass.none;
     }
 
-    Expected(double photons, double armed, double rearmed)
-        : Expected(Pass(photons, rearmed != 0.0), armed, rearmed) {}
+    Expected(double photons, double armed, double rearmed) : Expected(Pass(photons, rearmed != 0.0), armed, rearmed) {}
 };
 
 // Photons per period of a bin with which it registers as often as it did (R8); infinite where it always did.

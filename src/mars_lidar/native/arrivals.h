@@ -24,14 +24,10 @@ constexpr int kPhaseBits = 52;
 constexpr uint64_t kPhaseMask = (uint64_t{1} << kPhaseBits) - 1;
 constexpr int64_t kMaxBlockCycles = 1024;
 
-inline double phase_of(uint64_t time) {
-    return static_cast<double>(static_cast<int64_t>(time & kPhaseMask)) * 0x1p-52;
-}
+inline double phase_of(uint64_t time) { return static_cast<double>(static_cast<int64_t>(time & kPhaseMask)) * 0x1p-52; }
 
 // Phase in units of 2^-52 period of a time t, |t| < 512 periods: two's complement wraps it into the period.
-inline uint64_t wrapped_phase(double t) {
-    return static_cast<uint64_t>(static_cast<int64_t>(t * 0x1p52)) & kPhaseMask;
-}
+inline uint64_t wrapped_phase(double t) { return static_cast<uint64_t>(static_cast<int64_t>(t * 0x1p52)) & kPhaseMask; }
 
 // The first sample whose upper edge in `cumulative` (samples + 1 values, ascending) exceeds `level`.
 inline size_t sample_at(const double* cumulative, size_t samples, double level) {
@@ -47,7 +43,7 @@ inline size_t sample_at(const double* cumulative, size_t samples, double level) 
 // The independent Poisson processes that make up one pixel's flux. By independent increments, blocks of
 // periods may be drawn one after the other.
 class Arrivals {
-public:
+ public:
     Arrivals(const Job& job, const PulseShape& pulse, int64_t pixel) : pulse_(pulse) {
         for (int64_t k = 0; k < job.returns; ++k) {
             const double photons = job.signal[k * job.pixels + pixel];
@@ -69,8 +65,7 @@ public:
 
     // A block length that holds about `photons` arrivals.
     int64_t block_cycles(double photons) const {
-        return std::max<int64_t>(1,
-                                 static_cast<int64_t>(std::min<double>(kMaxBlockCycles, photons / photons_)));
+        return std::max<int64_t>(1, static_cast<int64_t>(std::min<double>(kMaxBlockCycles, photons / photons_)));
     }
 
     // Replaces `times` by all arrivals of `cycles` (at most kMaxBlockCycles) periods, in no order.
@@ -99,15 +94,15 @@ public:
                     break;
                 case Shape::waveform:
                     draw_samples(waveform_.data(), waveform_.size() - 1, 0.0,
-                                 1.0 / static_cast<double>(waveform_.size() - 1), static_cast<double>(cycles),
-                                 local, first, last);
+                                 1.0 / static_cast<double>(waveform_.size() - 1), static_cast<double>(cycles), local,
+                                 first, last);
                     break;
             }
             random = local;
         }
     }
 
-private:
+ private:
     enum class Shape { uniform, gaussian, sampled, waveform };
     using Number = std::poisson_distribution<int64_t>;
 
@@ -131,13 +126,11 @@ private:
 
     static void draw_uniform(double cycles, Xoshiro256& random, uint64_t* first, uint64_t* last) {
         const double span = cycles * 0x1p52;
-        for (; first != last; ++first)
-            *first = static_cast<uint64_t>(static_cast<int64_t>(random.uniform() * span));
+        for (; first != last; ++first) *first = static_cast<uint64_t>(static_cast<int64_t>(random.uniform() * span));
     }
 
     // The polar method of Marsaglia and Bray, SIAM Review 6 (1964): two normal numbers at a time.
-    void draw_gaussian(const Source& source, double cycles, Xoshiro256& random, uint64_t* first,
-                       uint64_t* last) const {
+    void draw_gaussian(const Source& source, double cycles, Xoshiro256& random, uint64_t* first, uint64_t* last) const {
         while (first != last) {
             double a, b, s;
             do {
@@ -147,14 +140,13 @@ private:
             } while (s >= 1.0 || s == 0.0);
             const double scale = pulse_.sigma * std::sqrt(-2.0 * std::log(s) / s);
             *first++ = random_cycle(cycles, random) | wrapped_phase(source.delay + a * scale);
-            if (first != last)
-                *first++ = random_cycle(cycles, random) | wrapped_phase(source.delay + b * scale);
+            if (first != last) *first++ = random_cycle(cycles, random) | wrapped_phase(source.delay + b * scale);
         }
     }
 
     // A rate that is constant on samples: pick the sample by its energy, then a place inside it.
-    static void draw_samples(const double* cumulative, size_t samples, double start, double width,
-                             double cycles, Xoshiro256& random, uint64_t* first, uint64_t* last) {
+    static void draw_samples(const double* cumulative, size_t samples, double start, double width, double cycles,
+                             Xoshiro256& random, uint64_t* first, uint64_t* last) {
         for (; first != last; ++first) {
             const size_t k = sample_at(cumulative, samples, random.uniform() * cumulative[samples]);
             const double place = static_cast<double>(k) + random.uniform();
@@ -170,7 +162,7 @@ private:
 
 // Sorts the arrival times of blocks; holds the memory that this takes.
 class ArrivalSorter {
-public:
+ public:
     // Arranges `times`, of a block of `cycles` periods, in ascending order: radix sort on as many leading
     // bits as tell most arrivals apart, then insertion. Where a narrow, bright pulse crowds too many into one
     // cell of the radix, and for very large blocks (single periods of a blinding flux): std::sort, in place.
@@ -195,7 +187,7 @@ public:
         }
     }
 
-private:
+ private:
     static constexpr size_t kSmallest = 16, kLargest = size_t{1} << 17;
     static constexpr int kMostBits = 12;  // of a digit; the counters of two digits fit in a first-level cache
 
@@ -205,8 +197,7 @@ private:
         const size_t n = times.size();
         const bool dim = static_cast<int64_t>(n) <= 2 * cycles && n <= size_t{1} << (kMostBits - 1);
         int digit = 5;
-        while (digit < kMostBits && (dim ? size_t{1} << digit < 2 * n : size_t{1} << 2 * digit < 64 * n))
-            ++digit;
+        while (digit < kMostBits && (dim ? size_t{1} << digit < 2 * n : size_t{1} << 2 * digit < 64 * n)) ++digit;
         const int leading = dim ? digit : 2 * digit;
         const uint64_t last = (static_cast<uint64_t>(cycles) << kPhaseBits) - 1;
         int shift = kPhaseBits - leading;

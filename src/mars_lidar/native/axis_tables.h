@@ -10,7 +10,7 @@ namespace mars {
 
 // An axis and the tables that go with it.
 class AxisTables {
-public:
+ public:
     explicit AxisTables(const Vector<const double>& values) {
         Axis& axis = axis_;
         axis.value = values.data();
@@ -36,7 +36,7 @@ public:
     const std::vector<double>& scale() const { return scale_; }
     const std::vector<int64_t>& start() const { return start_; }
 
-private:
+ private:
     void set_cells(double range) {
         const int64_t cells = 2 * axis_.size;
         axis_.cells_per_log = static_cast<double>(cells) / range;

@@ -38,7 +38,7 @@ inline double start_uniform(const Pair<uint32_t>& key) {
 
 // Draws residual dead times. `place(choice, words)` turns random words into the phase in [0, 1) of an arrival.
 class GapSearch {
-public:
+ public:
     // Time from t = 0 to re-arming of a pixel that sees `photons` per period; 0 if it is armed.
     template <class Place>
     double residual(double photons, double dead_time, const Pair<uint32_t>& key, const Place& place) {
@@ -78,7 +78,7 @@ public:
         return std::max(until, 0.0);
     }
 
-private:
+ private:
     std::vector<double> arrivals_;  // latest first
 };
 

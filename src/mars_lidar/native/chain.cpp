@@ -37,10 +37,10 @@ void cyclic_recursion(Vector<const double> keep, Vector<const double> in, double
 }
 
 struct Feedback {
-    const double* fire;   // p: fires in a bin when armed at its start
-    const double* refire; // p': fires in the bin in which it re-arms
+    const double* fire;    // p: fires in a bin when armed at its start
+    const double* refire;  // p': fires in the bin in which it re-arms
     const double* rhs;
-    int64_t n, shift;     // 0 < shift < n
+    int64_t n, shift;  // 0 < shift < n
 };
 
 // x <- rhs - p G x + p' S x, bin after bin with the newest values (Gauss-Seidel); returns the largest change.

@@ -9,7 +9,6 @@ namespace mars {
 
 class ChainCorrection {
  public:
-
     ChainCorrection(const HistogramRecord& recording, int steps, double tolerance)
         : r_(recording), steps_(steps), tolerance_(tolerance), rearmed_(recording.bins), armed_(recording.bins) {}
 
@@ -20,7 +19,8 @@ class ChainCorrection {
         if (!(passes.total > 0.0)) return true;
         for (int64_t j = 0; j < n; ++j) {  // where registrations re-arm the pixel, each with its bin's share
             const int64_t q = j - r_.shift + (j < r_.shift ? n : 0);
-            const double mass = (1.0 - r_.fraction) * passes.count[q] + r_.fraction * passes.count[q == 0 ? n - 1 : q - 1];
+            const double mass =
+                (1.0 - r_.fraction) * passes.count[q] + r_.fraction * passes.count[q == 0 ? n - 1 : q - 1];
             rearmed_[j] = mass / passes.total;
         }
         for (int64_t j = 0; j < n; ++j) l[j] = total * passes.count[j] / passes.total;
@@ -28,12 +28,13 @@ class ChainCorrection {
             arm(l);
             double sum = 0.0;
             for (int64_t j = 0; j < n; ++j) {
-                const double next = passes.count[j] > 0.0 ? passes.count[j] / passes.total / armed_[j] : 0.0;  // f / s (R14)
+                const double next =
+                    passes.count[j] > 0.0 ? passes.count[j] / passes.total / armed_[j] : 0.0;  // f / s (R14)
                 armed_[j] = next;
                 sum += next;
             }
             if (!std::isfinite(sum)) return false;  // no armed time is left for a bin that registered: keep `l`
-            const double scale = total / sum;  // (R15)
+            const double scale = total / sum;       // (R15)
             double moved = 0.0;
             for (int64_t j = 0; j < n; ++j) {
                 moved += std::fabs(scale * armed_[j] - l[j]);

@@ -26,7 +26,9 @@ struct Settings {
 class Corrector {
  public:
     Corrector(const HistogramRecord& recording, const Settings& settings)
-        : r_(recording), settings_(settings), passes_(recording.bins),
+        : r_(recording),
+          settings_(settings),
+          passes_(recording.bins),
           chain_(recording, settings.steps, settings.tolerance) {}
 
     std::vector<double> rate, variance;

@@ -57,9 +57,8 @@ void matched(Matrix<const double> cumulants, Vector<const uint32_t> pixel_index,
     if (cumulants.shape(0) != out.shape(1) || cumulants.shape(1) != 4)
         throw nb::value_error("cumulants must be (pixels, 4)");
     const double* k = cumulants.data();
-    draw({pixel_index, first_realization, seed, out}, threads, [=](int64_t p) {
-        return Matched{MatchedLaw(Cumulants{k[4 * p], k[4 * p + 1], k[4 * p + 2], k[4 * p + 3]})};
-    });
+    draw({pixel_index, first_realization, seed, out}, threads,
+         [=](int64_t p) { return Matched{MatchedLaw(Cumulants{k[4 * p], k[4 * p + 1], k[4 * p + 2], k[4 * p + 3]})}; });
 }
 
 void poisson(Vector<const double> mean, Vector<const uint32_t> pixel_index, uint32_t first_realization, uint64_t seed,
@@ -71,8 +70,8 @@ void poisson(Vector<const double> mean, Vector<const uint32_t> pixel_index, uint
 }
 
 void tabulated(Vector<const int64_t> first, Vector<const int64_t> offsets, Vector<const double> cumulative,
-               Vector<const int64_t> law, Vector<const uint32_t> pixel_index, uint32_t first_realization,
-               uint64_t seed, Matrix<int64_t> out, int threads) {
+               Vector<const int64_t> law, Vector<const uint32_t> pixel_index, uint32_t first_realization, uint64_t seed,
+               Matrix<int64_t> out, int threads) {
     const int64_t laws = static_cast<int64_t>(first.shape(0));
     if (static_cast<int64_t>(offsets.shape(0)) != laws + 1 || law.shape(0) != out.shape(1))
         throw nb::value_error("offsets must be (laws + 1), law (pixels)");

@@ -6,7 +6,7 @@
 namespace mars {
 
 constexpr uint64_t kCountDomain = 0x436f756e74730000u;  // "Counts": not another engine's numbers at one seed
-constexpr double kMostCounts = 9007199254740992.0;  // 2^53
+constexpr double kMostCounts = 9007199254740992.0;      // 2^53
 
 // The normal law rounded to integers, what lies below 0 put at 0.
 struct RoundedNormal {

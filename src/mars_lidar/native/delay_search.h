@@ -60,7 +60,8 @@ class DelaySearch {
         const double least = 0.5 / likelihood.time();
         double back = std::max((likelihood.count() - inside) / std::max(likelihood.time() - time, 1.0), least);
         if (taps >= n) back = 0.5 * flat;
-        const double signal = std::max((inside - back * time) / std::max(weighted, 1e-9), 1.0 / std::max(weighted, 1e-9));
+        const double signal =
+            std::max((inside - back * time) / std::max(weighted, 1e-9), 1.0 / std::max(weighted, 1e-9));
         // Gain of the likelihood for that S and B at every delay (R12).
         for (int64_t i = 0; i < taps; ++i) gain_[i] = static_cast<float>(std::log1p(signal * energy_[i] / back));
         correlate(count_.data(), gain_.data(), score_.data());
@@ -70,7 +71,8 @@ class DelaySearch {
         most = std::min(most, kMost);
         for (int64_t g = 0; g < points_; ++g) {
             const float here = score_[g];
-            if (points_ > 2 && (here < score_[(g + points_ - 1) % points_] || here <= score_[(g + 1) % points_])) continue;
+            if (points_ > 2 && (here < score_[(g + points_ - 1) % points_] || here <= score_[(g + 1) % points_]))
+                continue;
             int place = found < most ? found++ : most;
             while (place > 0 && score_[at[place - 1]] < here) {
                 if (place < most) at[place] = at[place - 1];

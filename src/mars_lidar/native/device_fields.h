@@ -12,7 +12,7 @@ namespace mars {
 
 // Addresses of a task's arrays by name, 0 where there is none; and its numbers, which have to be there.
 class DeviceFields {
-public:
+ public:
     DeviceFields(const nb::dict& addresses, const nb::dict& numbers) : addresses_(addresses), numbers_(numbers) {}
 
     template <class T>
@@ -24,7 +24,7 @@ public:
     uint64_t word(const char* name) const { return nb::cast<uint64_t>(numbers_[name]); }
     double real(const char* name) const { return nb::cast<double>(numbers_[name]); }
 
-private:
+ private:
     const nb::dict &addresses_, &numbers_;
 };
 

@@ -63,12 +63,18 @@ using Kernel = void (*)(DeviceTask);
 template <int32_t mode, bool gaussian, bool whole, bool single>
 Kernel of_sink(DeviceSink sink) {
     switch (sink) {
-        case DeviceSink::kCounts: return exact_items<mode, gaussian, whole, single, 0, kAhead>;
-        case DeviceSink::kBlock16: return exact_items<mode, gaussian, whole, single, 1, kAhead>;
-        case DeviceSink::kBlock32: return exact_items<mode, gaussian, whole, single, 2, kAhead>;
-        case DeviceSink::kRows16: return exact_items<mode, gaussian, whole, single, 3, kAhead>;
-        case DeviceSink::kRows32: return exact_items<mode, gaussian, whole, single, 4, kAhead>;
-        case DeviceSink::kTimestamps: return exact_items<mode, gaussian, whole, single, 5, kAhead>;
+        case DeviceSink::kCounts:
+            return exact_items<mode, gaussian, whole, single, 0, kAhead>;
+        case DeviceSink::kBlock16:
+            return exact_items<mode, gaussian, whole, single, 1, kAhead>;
+        case DeviceSink::kBlock32:
+            return exact_items<mode, gaussian, whole, single, 2, kAhead>;
+        case DeviceSink::kRows16:
+            return exact_items<mode, gaussian, whole, single, 3, kAhead>;
+        case DeviceSink::kRows32:
+            return exact_items<mode, gaussian, whole, single, 4, kAhead>;
+        case DeviceSink::kTimestamps:
+            return exact_items<mode, gaussian, whole, single, 5, kAhead>;
     }
     return nullptr;
 }
@@ -78,9 +84,12 @@ Kernel of_mode(DetectorMode mode, bool whole, DeviceSink sink) {
     switch (mode) {
         case DetectorMode::kNonparalyzable:
             return whole ? of_sink<0, gaussian, true, single>(sink) : of_sink<0, gaussian, false, single>(sink);
-        case DetectorMode::kParalyzable: return of_sink<1, gaussian, true, single>(sink);
-        case DetectorMode::kSynchronous: return of_sink<2, gaussian, false, single>(sink);
-        case DetectorMode::kGated: return of_sink<3, gaussian, true, single>(sink);
+        case DetectorMode::kParalyzable:
+            return of_sink<1, gaussian, true, single>(sink);
+        case DetectorMode::kSynchronous:
+            return of_sink<2, gaussian, false, single>(sink);
+        case DetectorMode::kGated:
+            return of_sink<3, gaussian, true, single>(sink);
     }
     return nullptr;
 }
@@ -95,8 +104,9 @@ void run_on_host(const BoundJob& job, const PulseTable& pulse, const nb::dict& a
     const DeviceTask task = task_of(job, pulse, addresses, first, items);
     const bool whole = is_whole(job, pulse), single = job.returns <= 1, gaussian = pulse.shape.gaussian();
     const DeviceSink to = static_cast<DeviceSink>(sink);
-    const Kernel kernel = gaussian ? (single ? of_mode<true, true>(job.mode, whole, to) : of_mode<true, false>(job.mode, whole, to))
-                                   : (single ? of_mode<false, true>(job.mode, whole, to) : of_mode<false, false>(job.mode, whole, to));
+    const Kernel kernel =
+        gaussian ? (single ? of_mode<true, true>(job.mode, whole, to) : of_mode<true, false>(job.mode, whole, to))
+                 : (single ? of_mode<false, true>(job.mode, whole, to) : of_mode<false, false>(job.mode, whole, to));
     run_chunks((items + lanes - 1) / lanes, 1, progress, [&](int64_t block, const std::atomic<bool>&) {
         // shared memory holds anything when a block begins
         std::vector<uint32_t> memory(static_cast<size_t>((job.bins + 3) / 4 * lanes), 0xdeadbeefu);
@@ -155,8 +165,7 @@ void bind_device(nb::module_& module) {
             });
         },
         nb::arg("job"), nb::arg("pulse"), nb::arg("cycle").noconvert(), nb::arg("phase").noconvert(),
-        nb::arg("threads"), nb::arg("progress").none() = nb::none(),
-        "Where the items of a stationary exposure begin.");
+        nb::arg("threads"), nb::arg("progress").none() = nb::none(), "Where the items of a stationary exposure begin.");
     module.def("device_run_on_host", &run_on_host, nb::arg("job"), nb::arg("pulse"), nb::arg("addresses"),
                nb::arg("first"), nb::arg("items"), nb::arg("sink"), nb::arg("lanes"),
                nb::arg("progress").none() = nb::none(),

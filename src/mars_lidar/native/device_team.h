@@ -43,7 +43,7 @@ MARS_INLINE float warp_highest(float x) { return x; }
 #endif
 
 class BlockTeam {
-public:
+ public:
     static constexpr bool kAlone = false;
     static constexpr int32_t kWarp = 32;
 #if defined(__CUDACC__)
@@ -114,7 +114,7 @@ public:
         return all;
     }
 
-private:
+ private:
     template <class F>
     MARS_INLINE void share(int64_t n, const F& f) const {
 #if defined(__CUDACC__)

@@ -6,7 +6,7 @@ namespace mars {
 
 // Counter-based words: every pair of (event, step) names 64 bits.
 class EventStream {
-public:
+ public:
     // `domain` keeps the streams of different uses of one seed apart.
     EventStream(uint64_t seed, uint64_t domain, uint32_t realization, uint32_t pixel)
         : key_(stream_key(seed ^ domain, realization, pixel)) {}
@@ -16,7 +16,7 @@ public:
         return static_cast<uint64_t>(x.first) << 32 | x.second;
     }
 
-private:
+ private:
     Pair<uint32_t> key_;
 };
 

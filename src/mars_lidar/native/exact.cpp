@@ -29,8 +29,8 @@ struct Level {
 // Widest first.
 std::vector<Level> levels() {
     std::vector<Level> found;
-#define MARS_ADD_LEVEL(level, runs)                                                                               \
-    if (runs)                                                                                                     \
+#define MARS_ADD_LEVEL(level, runs)                                                                                \
+    if (runs)                                                                                                      \
         found.push_back({#level, exact_kernel_##level, exact_modes_kernel_##level, exact_recording_kernel_##level, \
                          exact_avalanche_kernel_##level});
     MARS_EACH_LEVEL(MARS_ADD_LEVEL)
@@ -110,11 +110,14 @@ uint64_t addition_chain(int64_t rounds) {
 }  // namespace
 
 void bind_exact(nb::module_& module) {
-    module.def("levels", [] {
-        std::vector<std::string> names;
-        for (const Level& level : levels()) names.emplace_back(level.name);
-        return names;
-    }, "Vector levels that this processor runs, widest first; all give the same bits.");
+    module.def(
+        "levels",
+        [] {
+            std::vector<std::string> names;
+            for (const Level& level : levels()) names.emplace_back(level.name);
+            return names;
+        },
+        "Vector levels that this processor runs, widest first; all give the same bits.");
     module.def("exact_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
                nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none());
     module.def("exact_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),

@@ -9,10 +9,14 @@ template <bool gaussian>
 void run(const ExactBlock& block) {
     constexpr Stage stage = Stage::kAvalanches;
     switch (block.job->mode) {
-        case DetectorMode::kNonparalyzable: return run<DetectorMode::kNonparalyzable, gaussian, false, stage>(block);
-        case DetectorMode::kParalyzable: return run<DetectorMode::kParalyzable, gaussian, true, stage>(block);
-        case DetectorMode::kSynchronous: return run<DetectorMode::kSynchronous, gaussian, false, stage>(block);
-        case DetectorMode::kGated: return run<DetectorMode::kGated, gaussian, true, stage>(block);
+        case DetectorMode::kNonparalyzable:
+            return run<DetectorMode::kNonparalyzable, gaussian, false, stage>(block);
+        case DetectorMode::kParalyzable:
+            return run<DetectorMode::kParalyzable, gaussian, true, stage>(block);
+        case DetectorMode::kSynchronous:
+            return run<DetectorMode::kSynchronous, gaussian, false, stage>(block);
+        case DetectorMode::kGated:
+            return run<DetectorMode::kGated, gaussian, true, stage>(block);
     }
 }
 

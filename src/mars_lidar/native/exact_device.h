@@ -54,9 +54,10 @@ MARS_INLINE void count_in_row(Count* row, int32_t bin, uint32_t number) {
 
 template <class Count, bool block>
 class DeviceHistogram {
-public:
+ public:
     MARS_INLINE DeviceHistogram(const DeviceTask& task, int64_t item, int32_t lane, int32_t lanes)
-        : row_(static_cast<Count*>(task.out) + item * task.system.bins), bins_(task.system.bins),
+        : row_(static_cast<Count*>(task.out) + item * task.system.bins),
+          bins_(task.system.bins),
           counters_{block_memory() + 4 * lane, lanes} {
         if constexpr (block)
             for (int32_t b = 0; b < bins_; b += 4) *reinterpret_cast<uint32_t*>(counters_.at(b)) = 0;
@@ -88,7 +89,8 @@ public:
                     row_[b] = static_cast<Count>(*counters_.at(b) + (spilled_ ? row_[b] : 0u));
         }
     }
-private:
+
+ private:
     struct alignas(16) Words {
         uint32_t word[4];
     };
@@ -118,19 +120,19 @@ private:
 };
 
 class DeviceCounts {
-public:
+ public:
     MARS_INLINE DeviceCounts(const DeviceTask& task, int64_t item, int32_t, int32_t)
         : out_(static_cast<int64_t*>(task.out) + item) {}
     MARS_INLINE void take(const Registration& r, int32_t) { number_ += r.lost ? 0 : 1; }
     MARS_INLINE void end() { *out_ = number_; }
 
-private:
+ private:
     int64_t* out_;
     int64_t number_ = 0;
 };
 
 class DeviceTimestamps {
-public:
+ public:
     MARS_INLINE DeviceTimestamps(const DeviceTask& task, int64_t item, int32_t, int32_t)
         : task_(task), next_(task.offsets[item]) {}
     MARS_INLINE void take(const Registration& r, int32_t bin) {
@@ -142,7 +144,7 @@ public:
     }
     MARS_INLINE void end() {}
 
-private:
+ private:
     const DeviceTask& task_;
     int64_t next_;
 };
@@ -150,17 +152,29 @@ private:
 template <DeviceSink sink>
 struct DeviceWriter;
 template <>
-struct DeviceWriter<DeviceSink::kCounts> { using Type = DeviceCounts; };
+struct DeviceWriter<DeviceSink::kCounts> {
+    using Type = DeviceCounts;
+};
 template <>
-struct DeviceWriter<DeviceSink::kBlock16> { using Type = DeviceHistogram<uint16_t, true>; };
+struct DeviceWriter<DeviceSink::kBlock16> {
+    using Type = DeviceHistogram<uint16_t, true>;
+};
 template <>
-struct DeviceWriter<DeviceSink::kBlock32> { using Type = DeviceHistogram<uint32_t, true>; };
+struct DeviceWriter<DeviceSink::kBlock32> {
+    using Type = DeviceHistogram<uint32_t, true>;
+};
 template <>
-struct DeviceWriter<DeviceSink::kRows16> { using Type = DeviceHistogram<uint16_t, false>; };
+struct DeviceWriter<DeviceSink::kRows16> {
+    using Type = DeviceHistogram<uint16_t, false>;
+};
 template <>
-struct DeviceWriter<DeviceSink::kRows32> { using Type = DeviceHistogram<uint32_t, false>; };
+struct DeviceWriter<DeviceSink::kRows32> {
+    using Type = DeviceHistogram<uint32_t, false>;
+};
 template <>
-struct DeviceWriter<DeviceSink::kTimestamps> { using Type = DeviceTimestamps; };
+struct DeviceWriter<DeviceSink::kTimestamps> {
+    using Type = DeviceTimestamps;
+};
 
 MARS_INLINE Rate device_rate(double photons) {
     Rate flux;
@@ -192,8 +206,8 @@ MARS_KERNEL exact_items(const DeviceTask task) {
     Time armed;
     start_in_frames(task.start_cycle ? task.start_cycle[item] : 0, task.start_cycle ? task.start_phase[item] : 0.0f,
                     delay, armed.frame, armed.phase);
-    const Pair<uint32_t> key = stream_key(task.seed, task.first_realization + static_cast<uint32_t>(turn),
-                                          task.pixel_index[pixel]);
+    const Pair<uint32_t> key =
+        stream_key(task.seed, task.first_realization + static_cast<uint32_t>(turn), task.pixel_index[pixel]);
     Memory memory = {false, 0, 0.0f};
     typename DeviceWriter<static_cast<DeviceSink>(sink_number)>::Type writer(task, item, place.lane, place.lanes);
 

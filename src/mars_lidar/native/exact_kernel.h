@@ -38,7 +38,7 @@ struct ExactBlock {
 
 using ExactKernel = void (*)(const ExactBlock&);
 
-#define MARS_DECLARE_EXACT(level)                             \
+#define MARS_DECLARE_EXACT(level)                                 \
     void exact_kernel_##level(const ExactBlock& block);           \
     void exact_modes_kernel_##level(const ExactBlock& block);     \
     void exact_recording_kernel_##level(const ExactBlock& block); \

@@ -8,11 +8,15 @@ namespace {
 template <bool gaussian>
 void run(const ExactBlock& block) {
     switch (block.job->mode) {
-        case DetectorMode::kNonparalyzable: return;  // exact_kernel.cpp
+        case DetectorMode::kNonparalyzable:
+            return;  // exact_kernel.cpp
         // the search goes on from the last arrival, as after a dead time of 0 periods
-        case DetectorMode::kParalyzable: return run<DetectorMode::kParalyzable, gaussian, true>(block);
-        case DetectorMode::kSynchronous: return run<DetectorMode::kSynchronous, gaussian, false>(block);
-        case DetectorMode::kGated: return run<DetectorMode::kGated, gaussian, true>(block);
+        case DetectorMode::kParalyzable:
+            return run<DetectorMode::kParalyzable, gaussian, true>(block);
+        case DetectorMode::kSynchronous:
+            return run<DetectorMode::kSynchronous, gaussian, false>(block);
+        case DetectorMode::kGated:
+            return run<DetectorMode::kGated, gaussian, true>(block);
     }
 }
 

@@ -47,7 +47,8 @@ struct FrameClock {
     };
 
     explicit FrameClock(const Job& job)
-        : bins(job.bins), dead_whole(static_cast<int32_t>(job.recording->electronics_dead_time)),
+        : bins(job.bins),
+          dead_whole(static_cast<int32_t>(job.recording->electronics_dead_time)),
           dead_fraction(static_cast<float>(job.recording->electronics_dead_time - dead_whole)) {}
 
     MARS_INLINE Time recovered(const Time& hit) const { return later(hit, splat(dead_whole), splat(dead_fraction)); }

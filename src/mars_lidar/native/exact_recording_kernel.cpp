@@ -13,9 +13,12 @@ void run(const ExactBlock& block) {
             if (view(*block.job, *block.pulse).dead_fraction == 0.0f)
                 return run<DetectorMode::kNonparalyzable, gaussian, true, stage>(block);
             return run<DetectorMode::kNonparalyzable, gaussian, false, stage>(block);
-        case DetectorMode::kParalyzable: return run<DetectorMode::kParalyzable, gaussian, true, stage>(block);
-        case DetectorMode::kSynchronous: return run<DetectorMode::kSynchronous, gaussian, false, stage>(block);
-        case DetectorMode::kGated: return run<DetectorMode::kGated, gaussian, true, stage>(block);
+        case DetectorMode::kParalyzable:
+            return run<DetectorMode::kParalyzable, gaussian, true, stage>(block);
+        case DetectorMode::kSynchronous:
+            return run<DetectorMode::kSynchronous, gaussian, false, stage>(block);
+        case DetectorMode::kGated:
+            return run<DetectorMode::kGated, gaussian, true, stage>(block);
     }
 }
 

@@ -29,9 +29,7 @@ struct RateArray {
     void set(int lane, double photons) { plain_rate(photons, rate[lane], inverse[lane]); }
 };
 
-MARS_INLINE Rate load_rate(const RateArray& from) {
-    return {load<Float>(from.rate), load<Float>(from.inverse)};
-}
+MARS_INLINE Rate load_rate(const RateArray& from) { return {load<Float>(from.rate), load<Float>(from.inverse)}; }
 
 // `timed` runners can tell the times of registrations; those with a recorder always can.
 template <DetectorMode mode, bool gaussian, bool whole, Stage stage, bool timed>
@@ -39,12 +37,17 @@ class Runner {
     static constexpr bool kRecords = stage != Stage::kPlain, kTraps = stage == Stage::kAvalanches;
     static_assert(!(kTraps && whole && mode == DetectorMode::kNonparalyzable), "twilight moves the search");
 
-public:
+ public:
     explicit Runner(const ExactBlock& block)
-        : block_(block), job_(*block.job), system_(view(job_, *block.pulse)), recorder_(job_), traps_(job_),
+        : block_(block),
+          job_(*block.job),
+          system_(view(job_, *block.pulse)),
+          recorder_(job_),
+          traps_(job_),
           twilight_(mode == DetectorMode::kNonparalyzable && job_.twilight > 0.0),
           twilight_whole_(static_cast<int32_t>(job_.twilight)),
-          twilight_fraction_(static_cast<float>(job_.twilight - twilight_whole_)), log_(block.output, job_) {}
+          twilight_fraction_(static_cast<float>(job_.twilight - twilight_whole_)),
+          log_(block.output, job_) {}
 
     void run() {
         for (int lane = 0; lane < kLanes; ++lane) take(lane);
@@ -62,7 +65,7 @@ public:
         }
     }
 
-private:
+ private:
     MARS_INLINE void step(int k) {
         const UInt event = event_ + static_cast<uint32_t>(k);
         Registration next;
@@ -81,8 +84,10 @@ private:
             next = register_next<mode, gaussian, whole>(system_, returns_, delay_, ahead_[k], key0_, key1_, event,
                                                         armed_, memory_);
         }
-        if constexpr (kRecords) seen_[k] = {next.hit, next.cycle, next.phase, next.lost, splat(0)};
-        else log(k, next.lost, bin_of(next.phase, system_.bins), next.cycle, next.phase);
+        if constexpr (kRecords)
+            seen_[k] = {next.hit, next.cycle, next.phase, next.lost, splat(0)};
+        else
+            log(k, next.lost, bin_of(next.phase, system_.bins), next.cycle, next.phase);
     }
 
     MARS_INLINE void log(int k, Mask lost, Int bin, Int cycle, Float phase) {
@@ -207,9 +212,12 @@ private:
 template <DetectorMode mode, bool gaussian, bool whole, Stage stage = Stage::kPlain>
 void run(const ExactBlock& block) {
     const bool timed = block.output.sink == Sink::kTimestamps;
-    if constexpr (stage != Stage::kPlain) Runner<mode, gaussian, whole, stage, true>(block).run();
-    else if (timed) Runner<mode, gaussian, whole, stage, true>(block).run();
-    else Runner<mode, gaussian, whole, stage, false>(block).run();
+    if constexpr (stage != Stage::kPlain)
+        Runner<mode, gaussian, whole, stage, true>(block).run();
+    else if (timed)
+        Runner<mode, gaussian, whole, stage, true>(block).run();
+    else
+        Runner<mode, gaussian, whole, stage, false>(block).run();
 }
 
 }  // namespace

@@ -57,7 +57,7 @@ inline double photons_between(const Job& job, const PulseShape& shape, int64_t p
 
 // The photons of one pixel, drawn one by one.
 class Photons {
-public:
+ public:
     Photons(const Job& job, const PulseTable& pulse, int64_t pixel)
         : gaussian_(pulse.shape.gaussian()), view_(pulse_view(pulse)), background_(job.background[pixel]) {
         total_ = background_;
@@ -86,13 +86,13 @@ public:
         while (k + 1 < returns_ && photon >= until_[k]) ++k;
         const float energy = static_cast<float>(u < view_.split ? u : u - 1.0);
         const float size = magnitude(energy);
-        const double time = centre_[k] + (gaussian_ ? quantile<true>(view_, energy, size)
-                                                    : quantile<false>(view_, energy, size));
+        const double time =
+            centre_[k] + (gaussian_ ? quantile<true>(view_, energy, size) : quantile<false>(view_, energy, size));
         const double phase = time - std::floor(time);
         return phase < 1.0 ? phase : 0.0;
     }
 
-private:
+ private:
     bool gaussian_;
     PulseView view_;
     double background_, total_;
@@ -102,7 +102,7 @@ private:
 
 // What a pixel that has been running for long is doing at the start of a period.
 class WarmedUp {
-public:
+ public:
     WarmedUp(const Job& job, const PulseTable& pulse, int64_t pixel) : job_(job), photons_(job, pulse, pixel) {
         const PulseShape& shape = pulse.shape;
         const double dead = job.dead_time;
@@ -130,11 +130,10 @@ public:
 
     // Cycle and phase from which on the arrivals of an item matter.
     void draw(int64_t item, GapSearch& search, int32_t& cycle, float& phase) const {
-        const Pair<uint32_t> key =
-            stream_key(job_.seed, job_.realization(item), job_.pixel_index[job_.pixel(item)]);
+        const Pair<uint32_t> key = stream_key(job_.seed, job_.realization(item), job_.pixel_index[job_.pixel(item)]);
         const double u = start_uniform(key);
-        const double residual = gaps_                   ? search.residual(photons_.total(), job_.dead_time, key, photons_)
-                                : !blind_.empty()       ? blind_.front().residual(u)
+        const double residual = gaps_             ? search.residual(photons_.total(), job_.dead_time, key, photons_)
+                                : !blind_.empty() ? blind_.front().residual(u)
                                 : !synchronous_.empty() ? static_cast<double>(synchronous_.front().periods(u))
                                                         : 0.0;
         const double whole = std::floor(residual);
@@ -143,7 +142,7 @@ public:
         phase = fraction >= 1.0f ? 0.0f : fraction;
     }
 
-private:
+ private:
     const Job& job_;
     Photons photons_;
     bool gaps_ = false;

@@ -7,7 +7,7 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-constexpr int kAhead = 8;                  // registrations drawn ahead
+constexpr int kAhead = 8;  // registrations drawn ahead
 constexpr int kMaxReturns = 16;
 constexpr int32_t kIdleFrame = 100000001;  // every exposure has ended; + kAhead (kForever + t_d) fits 32 bits
 

@@ -29,15 +29,19 @@ struct Level {
 };
 
 #define MARS_EXPOSURE_LEVEL(level, lanes) \
-    {#level, lanes, exposure_moments_##level, exposure_phases_##level, exposure_stationary_##level,  \
+    {#level,                              \
+     lanes,                               \
+     exposure_moments_##level,            \
+     exposure_phases_##level,             \
+     exposure_stationary_##level,         \
      exposure_characteristic_##level}
 
 // Widest first.
 std::vector<Level> levels() {
     std::vector<Level> found;
 #if defined(MARS_HAS_avx512)
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512vl"))
         found.push_back(MARS_EXPOSURE_LEVEL(avx512, 8));
 #endif
 #if defined(MARS_HAS_avx2)
@@ -127,8 +131,16 @@ void run_moments(const ExposureGrid& grid, const ExposureFlux* flux, const Expos
     const int64_t batches = (entries + level.lanes - 1) / level.lanes;
     run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
-        MomentsBlock block{&grid, flux, first, std::min<int64_t>(level.lanes, entries - first), cumulants.data(),
-                           cumulant_rates.data(), histogram.data(), histogram_rate.data(), settled.data(), &stop};
+        MomentsBlock block{&grid,
+                           flux,
+                           first,
+                           std::min<int64_t>(level.lanes, entries - first),
+                           cumulants.data(),
+                           cumulant_rates.data(),
+                           histogram.data(),
+                           histogram_rate.data(),
+                           settled.data(),
+                           &stop};
         block.rate = rate;
         level.moments(block);
     });
@@ -174,9 +186,19 @@ void phases(const ExposureGrid& grid, Vector<const double> signal, Vector<const 
     const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
     run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
-        const MomentsBlock forward{&grid, &flux, first, std::min<int64_t>(level.lanes, flux.entries - first),
-                                   cumulants.data(), rates.data(), histogram.data(), rate.data(), settled.data(),
-                                   &stop, phase.data(), edges, correction.data()};
+        const MomentsBlock forward{&grid,
+                                   &flux,
+                                   first,
+                                   std::min<int64_t>(level.lanes, flux.entries - first),
+                                   cumulants.data(),
+                                   rates.data(),
+                                   histogram.data(),
+                                   rate.data(),
+                                   settled.data(),
+                                   &stop,
+                                   phase.data(),
+                                   edges,
+                                   correction.data()};
         level.phases({forward, edges, correction.data()});
     });
 }
@@ -191,8 +213,8 @@ void stationary(const ExposureGrid& grid, Vector<const double> signal, Vector<co
     const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
     run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
-        level.stationary({&grid, &flux, first, std::min<int64_t>(level.lanes, flux.entries - first),
-                          histogram.data(), settled.data(), &stop});
+        level.stationary({&grid, &flux, first, std::min<int64_t>(level.lanes, flux.entries - first), histogram.data(),
+                          settled.data(), &stop});
     });
 }
 
@@ -211,8 +233,8 @@ void run_characteristic(const ExposureGrid& grid, const ExposureFlux* flux, cons
     run_chunks(entries * batches, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
         const int64_t entry = chunk / batches, first = chunk % batches * level.lanes, at = entry * points + first;
         level.characteristic({&grid, flux, entry, std::min<int64_t>(level.lanes, points - first), tilted,
-                              z_re.data() + at, z_im.data() + at, re.data() + at, im.data() + at,
-                              settled.data() + at, &stop, rate});
+                              z_re.data() + at, z_im.data() + at, re.data() + at, im.data() + at, settled.data() + at,
+                              &stop, rate});
     });
 }
 
@@ -230,8 +252,8 @@ void characteristic(const ExposureGrid& grid, Vector<const double> signal, Vecto
 // The same of paralyzable pixels.
 void paralyzable_characteristic(const ExposureGrid& grid, Vector<const double> photons, Matrix<const double> rates,
                                 bool tilted, Matrix<const double> z_re, Matrix<const double> z_im, Matrix<double> re,
-                                Matrix<double> im, Matrix<int64_t> settled, int threads,
-                                const std::string& level_name, const nb::object& progress) {
+                                Matrix<double> im, Matrix<int64_t> settled, int threads, const std::string& level_name,
+                                const nb::object& progress) {
     const ExposureRate rate = make_rate(grid, photons, rates);
     run_characteristic(grid, nullptr, &rate, rate.entries, tilted, z_re, z_im, re, im, settled, threads, level_name,
                        progress);
@@ -247,11 +269,11 @@ void bind_exposure(nb::module_& module) {
                int32_t shift, double fraction, bool stationary_start, double tolerance, int64_t warm_periods) {
                 if (cycles < 1 || whole < 0 || bins < 1 || out_bins < 1 || bins % out_bins != 0 || shift < 0 ||
                     shift >= bins || !(fraction >= 0.0 && fraction < 1.0))
-                    throw nb::value_error("exposure grid: need 0 <= shift < bins, 0 <= fraction < 1, bins a "
-                                          "multiple of out_bins");
-                new (self) ExposureGrid{cycles,  max_periods, whole,    bins,
-                                        out_bins, shift,      fraction, stationary_start, tolerance,
-                                        warm_periods};
+                    throw nb::value_error(
+                        "exposure grid: need 0 <= shift < bins, 0 <= fraction < 1, bins a "
+                        "multiple of out_bins");
+                new (self) ExposureGrid{cycles,   max_periods,      whole,     bins,        out_bins, shift,
+                                        fraction, stationary_start, tolerance, warm_periods};
             },
             nb::kw_only(), nb::arg("cycles"), nb::arg("max_periods"), nb::arg("whole"), nb::arg("bins"),
             nb::arg("out_bins"), nb::arg("shift"), nb::arg("fraction"), nb::arg("stationary"), nb::arg("tolerance"),
@@ -263,9 +285,8 @@ void bind_exposure(nb::module_& module) {
                nb::arg("histogram_rate"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"),
                nb::arg("progress").none());
     module.def("paralyzable_characteristic", &paralyzable_characteristic, nb::kw_only(), nb::arg("grid"),
-               nb::arg("photons"), nb::arg("rates"), nb::arg("tilted"), nb::arg("z_re"), nb::arg("z_im"),
-               nb::arg("re"), nb::arg("im"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"),
-               nb::arg("progress").none());
+               nb::arg("photons"), nb::arg("rates"), nb::arg("tilted"), nb::arg("z_re"), nb::arg("z_im"), nb::arg("re"),
+               nb::arg("im"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"), nb::arg("progress").none());
     module.def("exposure_moments", &moments, nb::kw_only(), nb::arg("grid"), nb::arg("signal"), nb::arg("background"),
                nb::arg("shape"), nb::arg("shapes"), nb::arg("cumulants"), nb::arg("cumulant_rates"),
                nb::arg("histogram"), nb::arg("histogram_rate"), nb::arg("settled"), nb::arg("threads"),
@@ -278,8 +299,8 @@ void bind_exposure(nb::module_& module) {
                nb::arg("threads"), nb::arg("level"), nb::arg("progress").none());
     module.def("exposure_characteristic", &characteristic, nb::kw_only(), nb::arg("grid"), nb::arg("signal"),
                nb::arg("background"), nb::arg("shape"), nb::arg("shapes"), nb::arg("tilted"), nb::arg("z_re"),
-               nb::arg("z_im"), nb::arg("re"), nb::arg("im"), nb::arg("settled"), nb::arg("threads"),
-               nb::arg("level"), nb::arg("progress").none(), nb::arg("history") = nb::none());
+               nb::arg("z_im"), nb::arg("re"), nb::arg("im"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"),
+               nb::arg("progress").none(), nb::arg("history") = nb::none());
 }
 
 }  // namespace mars

@@ -18,8 +18,14 @@ struct Values {
 class BackwardRun {
  public:
     BackwardRun(const PhasesBlock& block, const std::vector<Response<Real>>& response, const Stationary* start)
-        : block_(block), grid_(*block.moments.grid), response_(response), start_(start), shift_(grid_.fraction),
-          delay_(grid_.delay()), ring_(delay_ > 0 ? grid_.memory() : 0), begun_(grid_.bins + 1),
+        : block_(block),
+          grid_(*block.moments.grid),
+          response_(response),
+          start_(start),
+          shift_(grid_.fraction),
+          delay_(grid_.delay()),
+          ring_(delay_ > 0 ? grid_.memory() : 0),
+          begun_(grid_.bins + 1),
           increments_(std::min(grid_.whole + 1, grid_.cycles)) {
         armed_.c[0] = running_.c[0] = splat(1.0);
     }
@@ -164,9 +170,9 @@ class BackwardRun {
     const Stationary* start_;
     Shift shift_;
     int64_t delay_;
-    std::vector<Values> ring_;     // by bins from the end of the exposure
-    Values last_{{}, {}};          // with a dead time below one bin: the bin after
-    std::vector<Moments> begun_;   // value of an exposure that begins at each edge of the period
+    std::vector<Values> ring_;    // by bins from the end of the exposure
+    Values last_{{}, {}};         // with a dead time below one bin: the bin after
+    std::vector<Moments> begun_;  // value of an exposure that begins at each edge of the period
     std::vector<Moments> increments_;
     Moments armed_{}, running_{};
 };

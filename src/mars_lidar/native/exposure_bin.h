@@ -81,9 +81,9 @@ MARS_INLINE Response<Real> respond(const Real (&photons)[kExposureParts]) {
     const Real halves[2] = {photons[0] + photons[1], photons[2] + photons[3]};
     const Response<Real> fine = respond<4>(photons), coarse = respond<2>(halves);
     auto limit = [](Real f, Real c) { return f + (f - c) * (1.0 / 3.0); };
-    return {limit(fine.mass_armed, coarse.mass_armed),     limit(fine.mass_in, coarse.mass_in),
-            limit(fine.mass_slope, coarse.mass_slope),     limit(fine.moment_armed, coarse.moment_armed),
-            limit(fine.moment_in, coarse.moment_in),       limit(fine.moment_slope, coarse.moment_slope)};
+    return {limit(fine.mass_armed, coarse.mass_armed), limit(fine.mass_in, coarse.mass_in),
+            limit(fine.mass_slope, coarse.mass_slope), limit(fine.moment_armed, coarse.moment_armed),
+            limit(fine.moment_in, coarse.moment_in),   limit(fine.moment_slope, coarse.moment_slope)};
 }
 
 // Re-arming f bins later: what of a bin's registrations stays in the bin (`near`) and what goes on to the next

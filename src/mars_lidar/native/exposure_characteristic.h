@@ -13,8 +13,8 @@ namespace {
 
 // Sum over the sampled state of conj(a) b, and sum of absolute values: per lane.
 struct Projection {
-    Complex ratio;   // best w in now = w * before
-    Real rest, size; // of now - w * before; of now
+    Complex ratio;    // best w in now = w * before
+    Real rest, size;  // of now - w * before; of now
 };
 
 MARS_INLINE Real length1(const Complex& x) { return absolute(x.re) + absolute(x.im); }

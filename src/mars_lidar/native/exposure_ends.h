@@ -12,8 +12,8 @@ namespace mars {
 
 class ExposureEnds {
  public:
-    static constexpr int kMost = 5;          // possible numbers of passes
-    static constexpr double kFew = 50.0;     // passes at the pulse, for each that is uncertain, above which it is nothing
+    static constexpr int kMost = 5;       // possible numbers of passes
+    static constexpr double kFew = 50.0;  // passes at the pulse, for each that is uncertain, above which it is nothing
 
     // For a pulse around `delay`; empty (`count` 0) where the numbers do not matter, or are too many.
     void set(const HistogramRecord& r, const ArmedPasses& passes, double delay) {
@@ -124,7 +124,8 @@ class ExposureEnds {
             const int64_t j = (first + k) % r.bins;
             const double h = passes.count[j], b = passes.rearmed[j];
             if (!(h > 0.0)) continue;
-            const double mean = log_choices(passes.armed[j] + b, h) + h * std::log((passes.armed[j] + 0.5 * b) / (passes.armed[j] + b));
+            const double mean =
+                log_choices(passes.armed[j] + b, h) + h * std::log((passes.armed[j] + 0.5 * b) / (passes.armed[j] + b));
             for (int c = 0; c < count; ++c)
                 choices_[k * kMost + c] = log_choices(armed(passes, j, shift[c]) + b, h) - mean;
         }

@@ -19,7 +19,7 @@ struct ExposureGrid {
     int32_t shift = 0;        // d
     double fraction = 0.0;    // f in [0, 1)
     bool stationary = false;
-    double tolerance = 0.0;   // relative change per period below which a state counts as repeated
+    double tolerance = 0.0;        // relative change per period below which a state counts as repeated
     int64_t warm_periods = 20000;  // sweeps round the period after which the search for a warm state is given up
 
     int64_t delay() const { return whole * bins + shift; }  // whole bins of dead time
@@ -80,7 +80,7 @@ struct MomentsBlock {
     const std::atomic<bool>* stop;
     const int32_t* phase = nullptr;  // (phases) edges of the grid, for PhasesBlock
     int64_t phases = 0;
-    double* ends = nullptr;          // (entries, phases, 4) what ending at that phase adds to the cumulants, or null
+    double* ends = nullptr;  // (entries, phases, 4) what ending at that phase adds to the cumulants, or null
     const ExposureRate* rate = nullptr;  // instead of `flux`: a paralyzable pixel
 };
 
@@ -117,10 +117,10 @@ struct CharacteristicBlock {
     const ExposureRate* rate = nullptr;  // instead of `flux`: a paralyzable pixel
 };
 
-#define MARS_DECLARE_EXPOSURE(level)                                 \
-    void exposure_moments_##level(const MomentsBlock& block);        \
-    void exposure_phases_##level(const PhasesBlock& block);          \
-    void exposure_stationary_##level(const StationaryBlock& block);  \
+#define MARS_DECLARE_EXPOSURE(level)                                \
+    void exposure_moments_##level(const MomentsBlock& block);       \
+    void exposure_phases_##level(const PhasesBlock& block);         \
+    void exposure_stationary_##level(const StationaryBlock& block); \
     void exposure_characteristic_##level(const CharacteristicBlock& block);
 
 MARS_DECLARE_EXPOSURE(scalar)

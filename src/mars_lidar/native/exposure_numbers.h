@@ -40,7 +40,7 @@ MARS_INLINE Real exp_minus(Real x) {
     const Real k = shifted - magic;
     const Real r = (k * 0.693145751953125 - x) + k * 1.4286068203094172e-06;  // k ln 2 - x, |r| <= 0.35
     Real p = splat(1.0 / 479001600.0);
-    constexpr double factorial[] = {1.0,     1.0,      1.0 / 2,     1.0 / 6,      1.0 / 24,      1.0 / 120,
+    constexpr double factorial[] = {1.0,       1.0,        1.0 / 2,     1.0 / 6,      1.0 / 24,      1.0 / 120,
                                     1.0 / 720, 1.0 / 5040, 1.0 / 40320, 1.0 / 362880, 1.0 / 3628800, 1.0 / 39916800};
     for (int m = 11; m >= 0; --m) p = p * r + factorial[m];
     RealBits bits;
@@ -86,9 +86,8 @@ template <int T>
 MARS_INLINE Series<T> weighted(const Series<T>& factor, const Series<T>& a) {
     Series<T> out = a;
     MARS_UNROLL
-    for (int k = 1; k < T; ++k)
-        MARS_UNROLL
-        for (int i = 1; i <= k; ++i) out.c[k] += factor.c[i] * a.c[k - i];
+    for (int k = 1; k < T; ++k) MARS_UNROLL
+    for (int i = 1; i <= k; ++i) out.c[k] += factor.c[i] * a.c[k - i];
     return out;
 }
 

@@ -67,9 +67,8 @@ template <int T>
 MARS_INLINE Series<T> risen(const Series<T>& rise, const Series<T>& x) {
     Series<T> out{};
     MARS_UNROLL
-    for (int k = 1; k < T; ++k)
-        MARS_UNROLL
-        for (int i = 1; i <= k; ++i) out.c[k] += rise.c[i] * x.c[k - i];
+    for (int k = 1; k < T; ++k) MARS_UNROLL
+    for (int i = 1; i <= k; ++i) out.c[k] += rise.c[i] * x.c[k - i];
     return out;
 }
 
@@ -82,12 +81,11 @@ MARS_INLINE void solve_rise(const Complex& rise, const C (&b)[2][2], Complex& me
 template <int T, class C>
 MARS_INLINE void solve_rise(const Series<T>& rise, const C (&b)[2][2], Series<T>& mean, Series<T>& moment) {
     MARS_UNROLL
-    for (int k = 1; k < T; ++k)
-        MARS_UNROLL
-        for (int i = 1; i <= k; ++i) {
-            mean.c[k] += rise.c[i] * (b[0][0] * mean.c[k - i] + b[0][1] * moment.c[k - i]);
-            moment.c[k] += rise.c[i] * (b[1][0] * mean.c[k - i] + b[1][1] * moment.c[k - i]);
-        }
+    for (int k = 1; k < T; ++k) MARS_UNROLL
+    for (int i = 1; i <= k; ++i) {
+        mean.c[k] += rise.c[i] * (b[0][0] * mean.c[k - i] + b[0][1] * moment.c[k - i]);
+        moment.c[k] += rise.c[i] * (b[1][0] * mean.c[k - i] + b[1][1] * moment.c[k - i]);
+    }
 }
 
 MARS_INLINE double exp_of(double x) { return std::exp(x); }
@@ -99,8 +97,13 @@ template <class N, class C>
 class ParalyzableRecursion {
  public:
     ParalyzableRecursion(const ExposureGrid& grid, const RateResponses<C>& response, const N& rise)
-        : grid_(grid), response_(response), rise_(rise), shift_(grid.fraction), delay_(grid.delay()),
-          ring_(grid.memory()), marks_(std::min<int32_t>(kMarks, grid.bins)) {
+        : grid_(grid),
+          response_(response),
+          rise_(rise),
+          shift_(grid.fraction),
+          delay_(grid.delay()),
+          ring_(grid.memory()),
+          marks_(std::min<int32_t>(kMarks, grid.bins)) {
         repeated.resize(2 * marks_);
     }
 

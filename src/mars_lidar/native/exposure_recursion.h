@@ -19,7 +19,11 @@ class Recursion {
     // `keep_period`: the registrations of the last period can be read back by `last_period`.
     Recursion(const ExposureGrid& grid, const std::vector<Response<C>>& response, const Registrations<Real>* history,
               bool keep_period = false)
-        : grid_(grid), response_(response), history_(history), shift_(grid.fraction), delay_(grid.delay()),
+        : grid_(grid),
+          response_(response),
+          history_(history),
+          shift_(grid.fraction),
+          delay_(grid.delay()),
           ring_(std::max<int64_t>(delay_ > 0 ? grid.memory() : 0, keep_period ? grid.bins : 0)) {
         const int32_t n = grid.bins;
         const int marks = std::min<int32_t>(kMarks, n);
@@ -32,10 +36,10 @@ class Recursion {
         repeated.resize(2 * marks);
     }
 
-    N armed{};               // at the start of the period, then at its end
-    N total{};               // registrations of the period
-    N tail{};                // and of its last d + f bins
-    std::vector<N> repeated; // registrations between marks and armed probabilities at marks, last period
+    N armed{};                // at the start of the period, then at its end
+    N total{};                // registrations of the period
+    N tail{};                 // and of its last d + f bins
+    std::vector<N> repeated;  // registrations between marks and armed probabilities at marks, last period
 
     // Dead time below one bin and a stationary start: the bin before the exposure.
     void set_last(const Registrations<N>& last) { last_ = last; }

@@ -9,9 +9,9 @@
 
 #include "bindings.h"
 #include "feedback_grid.h"
-#include "pulse_energy.h"
 #include "histogram_output.h"
 #include "parallel.h"
+#include "pulse_energy.h"
 #include "pulse_table.h"
 
 namespace mars {
@@ -71,8 +71,8 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
             const int64_t stream = std::min(chunk * kTeam + i, streams - 1), pixel = pixels.data()[stream / splits];
             const int64_t part = stream % splits;
             lane_pixel[i] = pixel;
-            draws[i] = chunk * kTeam + i < streams
-                           ? static_cast<int32_t>((job.realizations - part + splits - 1) / splits) : 0;
+            draws[i] =
+                chunk * kTeam + i < streams ? static_cast<int32_t>((job.realizations - part + splits - 1) / splits) : 0;
             index[i] = job.pixel_index[pixel];
             realization[i] = job.first_realization + static_cast<uint32_t>(part);
             rows[i] = cube + (part * job.pixels + pixel) * job.bins;
@@ -112,16 +112,17 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
 template <class Count>
 void define(nb::module_& module, const char* about) {
     module.def("feedback_histogram", &histogram<Count>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("parts"),
-               nb::arg("narrow"), nb::arg("laps"), nb::arg("threads"), nb::arg("level") = "",
-               nb::arg("progress").none() = nb::none(), about);
+               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("parts"), nb::arg("narrow"),
+               nb::arg("laps"), nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none(),
+               about);
 }
 
 void bind_feedback(nb::module_& module) {
     const char* about =
         "Histograms out (realizations * pixels, bins) of some pixels by cyclic feedback on bins * merge internal "
         "cells, cut into parts again where narrow (bins * merge) is not 0 (counted from half a period before the "
-        "pixel's strongest return on), in pieces of some laps. status (realizations, pixels) tells what became of each: "
+        "pixel's strongest return on), in pieces of some laps. status (realizations, pixels) tells what became of "
+        "each: "
         "0 drawn, else why its row is not written; 64 and more: it needs that many laps less 64.";
     define<uint16_t>(module, about);
     define<uint32_t>(module, about);

@@ -16,7 +16,7 @@ constexpr int kLinearSweeps = 60, kLapSweeps = 16;
 constexpr float kFewArmed = 32.0f, kFewCounts = 0.03f, kLikely = 0.02f;
 
 class Batch : private BatchPixels {
-public:
+ public:
     explicit Batch(const FeedbackBatch& batch) : BatchPixels(batch) {}
 
     bool run() {
@@ -43,7 +43,7 @@ public:
                 }
             }
             start_history();
-            const bool done = grid_.whole > 0      ? sweep_integers<true, true>()
+            const bool done = grid_.whole > 0    ? sweep_integers<true, true>()
                               : grid_.stationary ? sweep_integers<false, true>()
                                                  : sweep_integers<false, false>();
             if (!done) return true;
@@ -54,7 +54,7 @@ public:
         return true;
     }
 
-private:
+ private:
     FeedbackStatus& status(int i, int32_t draw) const { return batch_.status[i][draw * batch_.status_step]; }
 
     // Everything random of one draw: the quantiles of all cells, and the state at the ends of the exposure.
@@ -112,8 +112,7 @@ private:
         int32_t some = 0;
         for (int i = 0; i < kTeam; ++i) {
             number_[i] = grid_.pieces * share_[i] * total_[i];
-            slow[i] = active[i] =
-                drawing_[i] && grid_.laps == 1 && (grid_.whole > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
+            slow[i] = active[i] = drawing_[i] && grid_.laps == 1 && (grid_.whole > 0 || rate_[i] > kLinearFrom) ? 1 : 0;
             some |= active[i];
         }
         float *old = work_.spare_sums, *fresh = work_.more_sums;
@@ -187,8 +186,9 @@ private:
                     number_[i] += step;
                 }
                 const float moved = static_cast<float>(change[i]);
-                const bool settled = grid_.laps > 1 ? moved == 0.0f && sweep > 1
-                                                    : moved <= still_[i] || (sweep > 1 && moved * moved <= 0.25f * last[i]);
+                const bool settled = grid_.laps > 1
+                                         ? moved == 0.0f && sweep > 1
+                                         : moved <= still_[i] || (sweep > 1 && moved * moved <= 0.25f * last[i]);
                 last[i] = moved;
                 const bool still = turn <= 0.5 * static_cast<double>(still_[i]);
                 exposure_.active[i] = settled && still && sweep >= least_[i] ? 0 : -1;
@@ -209,9 +209,12 @@ private:
             const double mean = mean_[i] - floor_of(mean_[i] * 0x1p-32) * 0x1p32;
             const int32_t off = static_cast<int32_t>(static_cast<uint32_t>(total[i]) - static_cast<uint32_t>(mean));
             const int32_t size = off < 0 ? -1 - off : off;
-            if (exposure_.active[i]) status(i, draw) = FeedbackStatus::kUnsettled;
-            else if (overdrawn_[i]) status(i, draw) = FeedbackStatus::kNegative;
-            else if (size > allowed_[i]) status(i, draw) = FeedbackStatus::kUnlikely;
+            if (exposure_.active[i])
+                status(i, draw) = FeedbackStatus::kUnsettled;
+            else if (overdrawn_[i])
+                status(i, draw) = FeedbackStatus::kNegative;
+            else if (size > allowed_[i])
+                status(i, draw) = FeedbackStatus::kUnlikely;
             drawing_[i] = status(i, draw) == FeedbackStatus::kDrawn;
         }
     }

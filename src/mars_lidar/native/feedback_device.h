@@ -17,14 +17,14 @@ struct FeedbackTask {
     Job job;
     PulseEnergy energy;
     FeedbackGrid grid;
-    const int64_t* pixels;     // to draw, of the job
-    int64_t streams, splits;   // a stream: every `splits`-th realization of one of the pixels
-    int64_t number;            // of pixels to draw
-    uint8_t* status;           // (realizations, number) FeedbackStatus
-    void* out;                 // (realizations, pixels of the job, bins)
-    uint32_t* queue;           // 0 at first: the next batch of streams. On the processor one for each lane
-    uint32_t* full;            // 0 at first: 1 where a bin exceeded the output's type
-    uint8_t* work;             // `work_bytes` of each warp
+    const int64_t* pixels;    // to draw, of the job
+    int64_t streams, splits;  // a stream: every `splits`-th realization of one of the pixels
+    int64_t number;           // of pixels to draw
+    uint8_t* status;          // (realizations, number) FeedbackStatus
+    void* out;                // (realizations, pixels of the job, bins)
+    uint32_t* queue;          // 0 at first: the next batch of streams. On the processor one for each lane
+    uint32_t* full;           // 0 at first: 1 where a bin exceeded the output's type
+    uint8_t* work;            // `work_bytes` of each warp
     int64_t work_bytes;
 };
 
@@ -52,7 +52,8 @@ MARS_KERNEL feedback_histograms(const FeedbackTask task) {
         const int64_t pixel = task.pixels[stream / task.splits], part = stream % task.splits;
         const LanePhotons photons(job, task.energy, task.grid, &pixel, lit, kRow);
         const int32_t draws = static_cast<int32_t>((job.realizations - part + task.splits - 1) / task.splits);
-        const uint32_t index = job.pixel_index[pixel], realization = job.first_realization + static_cast<uint32_t>(part);
+        const uint32_t index = job.pixel_index[pixel],
+                       realization = job.first_realization + static_cast<uint32_t>(part);
         const int64_t at = (part * job.pixels + pixel) * job.bins;
         void* const row = wide ? static_cast<void*>(static_cast<uint32_t*>(task.out) + at)
                                : static_cast<void*>(static_cast<uint16_t*>(task.out) + at);

@@ -10,7 +10,7 @@
 namespace mars {
 
 class CellGrid {
-public:
+ public:
     FeedbackGrid grid;
 
     // `narrow` (bins * merge): base cells that are cut into `parts`; `laps` of the integer sweeps.
@@ -63,7 +63,7 @@ public:
     const std::vector<FeedbackEdge>& edge() const { return edge_; }
     const std::vector<FeedbackEdge>& lap_edge() const { return lap_edge_; }
 
-private:
+ private:
     void set_edges(int32_t base, double rest) {
         grid.watch = grid.cells;
         for (int32_t e = 0; e <= grid.cells; ++e) {

@@ -31,20 +31,20 @@ struct FeedbackEdge {
 // The integer sweeps run round a circle of L laser periods (laps), which pieces of the exposure go through together,
 // L > 1 for K = 0 only. What the pieces leave of the exposure, less than L periods, is drawn photon by photon.
 struct FeedbackGrid {
-    int32_t cells;             // n
-    int32_t bins;              // of the histogram
-    int32_t whole;             // K
-    int32_t watch, lap_watch;  // cells from here on are within one dead time of the end of the period, of the laps
+    int32_t cells;                 // n
+    int32_t bins;                  // of the histogram
+    int32_t whole;                 // K
+    int32_t watch, lap_watch;      // cells from here on are within one dead time of the end of the period, of the laps
     const FeedbackEdge* edge;      // (n + 1)
     const FeedbackEdge* lap_edge;  // (L n + 1) of the laps
-    const double* place;       // (n + 1) of the edges, in periods
-    const int32_t* bin_cell;   // (bins + 1) cell that each bin of the histogram begins with
-    const uint8_t* narrow;     // (n) 1: a cell of the finer kind
-    double width[2];           // of the wide and the narrow cells, in periods
-    double dead_time;          // in periods
-    int32_t laps;              // L
-    int32_t pieces;            // floor(N_r / L)
-    int32_t remainder;         // N_r - L pieces
+    const double* place;           // (n + 1) of the edges, in periods
+    const int32_t* bin_cell;       // (bins + 1) cell that each bin of the histogram begins with
+    const uint8_t* narrow;         // (n) 1: a cell of the finer kind
+    double width[2];               // of the wide and the narrow cells, in periods
+    double dead_time;              // in periods
+    int32_t laps;                  // L
+    int32_t pieces;                // floor(N_r / L)
+    int32_t remainder;             // N_r - L pieces
     bool stationary;
 
     int32_t path() const { return cells * laps; }  // cells of all laps
@@ -79,13 +79,13 @@ struct FeedbackBatch {
     uint32_t realization_step;    // from draw to draw
     const int32_t* draws;         // (kTeam): of each lane; 0 is an idle lane
     uint64_t seed;
-    void* const* rows;            // (kTeam): histogram of the first draw
-    int64_t row_step;             // counts from draw to draw
-    bool wide;                    // uint32 counts, else uint16
+    void* const* rows;              // (kTeam): histogram of the first draw
+    int64_t row_step;               // counts from draw to draw
+    bool wide;                      // uint32 counts, else uint16
     FeedbackStatus* const* status;  // (kTeam): of the first draw
-    int64_t status_step;          // from draw to draw
-    unsigned char* memory;        // `feedback_bytes` of scratch
-    int32_t lane;                 // of the rows in there: the batch's first
+    int64_t status_step;            // from draw to draw
+    unsigned char* memory;          // `feedback_bytes` of scratch
+    int32_t lane;                   // of the rows in there: the batch's first
 #if defined(__CUDACC_RTC__)
     bool stopped() const { return false; }
 #else

@@ -11,10 +11,10 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-constexpr float kFewestArmed = 32.0f;     // in any cell, for one lap
+constexpr float kFewestArmed = 32.0f;        // in any cell, for one lap
 constexpr double kGhostsOfDeviation = 0.05;  // expected with one lap, in standard deviations of the count
-constexpr float kForgotten = 3e-3f;       // of the first sweep's change of the mean, with several laps
-constexpr float kModes = 3.0f;            // that a lap remembers, where ghosts are not counted (dead times up to 1/2)
+constexpr float kForgotten = 3e-3f;          // of the first sweep's change of the mean, with several laps
+constexpr float kModes = 3.0f;  // that a lap remembers, where ghosts are not counted (dead times up to 1/2)
 constexpr double kFewestLapCycles = 1e4, kFewestPieces = 1000.0;
 constexpr int32_t kFewestLaps = 3;
 
@@ -47,7 +47,8 @@ MARS_NOINLINE void expected_ghosts(const FeedbackGrid& grid, const Rates& rates,
         const float* const here = photons + static_cast<int64_t>(e) * kRow;
         for (int i = 0; i < kTeam; ++i) {
             const float before = rearmed_before(source, edge.part, i), rearmed = rearmed_before(past, edge.part, i);
-            const float gap = here[i] - before - light.less[1][i];  // less photons from there to a period after `before`
+            const float gap =
+                here[i] - before - light.less[1][i];  // less photons from there to a period after `before`
             const float x = gap < 0.0f ? (gap > -80.0f ? gap : -80.0f) : 0.0f, now = exp_of(x);
             const float all = registered.less[1][i] > 1e-30f ? registered.less[1][i] : 1e-30f;
             const float more = (before - from[i]) * 0.5f * (now + chance[i]) - (rearmed - seen[i]) / all;

@@ -42,10 +42,10 @@ MARS_NOINLINE void set_rates(const double* photons, float* fire, float* refire) 
 }
 
 // A row of lanes of MeanLaw: arrays that do not overlap, for the loop to vectorise.
-MARS_NOINLINE void mean_row(const float* __restrict__ p, const float* __restrict__ q,
-                            const History<float>::Rows& back, float part, const float* __restrict__ here,
-                            const float* __restrict__ scale, float* __restrict__ re, float* __restrict__ mean,
-                            float* __restrict__ variance, float* __restrict__ armed_now) {
+MARS_NOINLINE void mean_row(const float* __restrict__ p, const float* __restrict__ q, const History<float>::Rows& back,
+                            float part, const float* __restrict__ here, const float* __restrict__ scale,
+                            float* __restrict__ re, float* __restrict__ mean, float* __restrict__ variance,
+                            float* __restrict__ armed_now) {
     const float *late = back.late, *early = back.early, *gone = back.gone;
     for (int i = 0; i < kTeam; ++i) {
         const float then = late[i] - gone[i] - part * (late[i] - early[i]);
@@ -61,7 +61,7 @@ MARS_NOINLINE void mean_row(const float* __restrict__ p, const float* __restrict
 
 // Mean and variance of every cell's count given its past, at the means; cells in order.
 class MeanLaw {
-public:
+ public:
     alignas(64) float mean[kTeam], variance[kTeam], armed[kTeam];
 
     // `sums`: prefix sums of the mean at K = 0; `scale`: N_r / (1 + K sum w), what it is to be multiplied by.
@@ -72,15 +72,17 @@ public:
 
     MARS_INLINE void next(int32_t j) {
         const FeedbackEdge& edge = edge_[j + 1];
-        mean_row(rates_.fire(j), rates_.refire(j), history_.at(edge), edge.part,
-                 sums_ + static_cast<int64_t>(j) * kRow, scale_, re_, mean, variance, armed);
+        mean_row(rates_.fire(j), rates_.refire(j), history_.at(edge), edge.part, sums_ + static_cast<int64_t>(j) * kRow,
+                 scale_, re_, mean, variance, armed);
     }
 
     // A bit per lane of cell j that has fewer than `few` exposures armed and a mean above `counts`, or fires with a
     // probability above `likely`.
     MARS_INLINE uint32_t rare(int32_t j, float few, float counts, float likely) const {
         const float* p = rates_.fire(j);
-        auto is_rare = [&](int i) { return (armed[i] < few ? 1 : 0) & ((mean[i] > counts ? 1 : 0) | (p[i] > likely ? 1 : 0)); };
+        auto is_rare = [&](int i) {
+            return (armed[i] < few ? 1 : 0) & ((mean[i] > counts ? 1 : 0) | (p[i] > likely ? 1 : 0));
+        };
         int32_t some = 0;
         for (int i = 0; i < kTeam; ++i) some |= is_rare(i);
         if (!some) return 0u;
@@ -89,7 +91,7 @@ public:
         return bits;
     }
 
-private:
+ private:
     const FeedbackEdge* edge_;
     const Rates& rates_;
     const float *sums_, *scale_;
@@ -131,8 +133,7 @@ MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const Rates& rates, c
             const float keep = 1.0f - grid.edge[here].part;
             const float *p = rates.fire(here), *q_here = rates.refire(here), *q_ahead = rates.refire(ahead);
             const float *y_here = row(values, here), *y_ahead = row(values, ahead);
-            for (int i = 0; i < kTeam; ++i)
-                y[i] += keep * ((p[i] - q_here[i]) * y_here[i] + q_ahead[i] * y_ahead[i]);
+            for (int i = 0; i < kTeam; ++i) y[i] += keep * ((p[i] - q_here[i]) * y_here[i] + q_ahead[i] * y_ahead[i]);
         }
         const float* p = rates.fire(j);
         float *value = row(values, j), *after = row(fresh, j);

@@ -91,8 +91,7 @@ MARS_INLINE float tail_of(uint32_t word) {
 MARS_INLINE float normal_size(float tail) {
     const float q = 0.5f - tail;
     const float c = 0.180625f - q * q;
-    const float over =
-        q * (((5.9109374720e1f * c + 1.5929113202e2f) * c + 5.0434271938e1f) * c + 3.3871327179f);
+    const float over = q * (((5.9109374720e1f * c + 1.5929113202e2f) * c + 5.0434271938e1f) * c + 3.3871327179f);
     const float under = ((6.7187563600e1f * c + 7.8757757664e1f) * c + 1.7895169469e1f) * c + 1.0f;
     const float t = root(-log_of(tail)) - 1.6f;
     const float far_over = ((1.7023821103e-1f * t + 1.3067284816f) * t + 2.7568153900f) * t + 1.4234372777f;

@@ -36,7 +36,7 @@ struct PulseEnergy {
         return below_to - below_from + (gaussian() && from < 0.0 && to >= 0.0 ? 1.0 : 0.0);
     }
 
-private:
+ private:
     double above(double x) const {
         if (x >= kReach) return 0.0;
         const double place = x * kCells;
@@ -49,7 +49,7 @@ private:
 
 // The lanes' photons as FeedbackBatch wants them. Each lane begins half a period before its strongest return.
 class LanePhotons {
-public:
+ public:
     int32_t first_bin[kTeam];
     double dark[2 * kTeam];
     int32_t lit_begin, lit_end;
@@ -77,7 +77,7 @@ public:
         }
     }
 
-private:
+ private:
     static double phase(double periods) { return periods - std::floor(periods); }
 
     static int32_t place(const Job& job, int64_t pixel) {

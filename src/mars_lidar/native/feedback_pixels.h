@@ -9,14 +9,14 @@ inline namespace MARS_LEVEL {
 namespace {
 
 constexpr int kMeanSweeps = 40, kIntegerSweeps = 40;
-constexpr double kSettled = 0.04;      // a move of the history that ends a lane, in standard deviations of the count
-constexpr double kMeanError = 8e-6;    // of the mean per period: float32 sums, and the last sweep's change
-constexpr float kSlowest = 0.85f;      // contraction of a sweep beyond which a pixel is refused
-constexpr float kLinearFrom = 0.2f;    // and from which the linear response is worth its sweeps
+constexpr double kSettled = 0.04;        // a move of the history that ends a lane, in standard deviations of the count
+constexpr double kMeanError = 8e-6;      // of the mean per period: float32 sums, and the last sweep's change
+constexpr float kSlowest = 0.85f;        // contraction of a sweep beyond which a pixel is refused
+constexpr float kLinearFrom = 0.2f;      // and from which the linear response is worth its sweeps
 constexpr double kLeastVariance = 12.0;  // of the count, for each whole period of dead time: 0.2 to 0.5 are added
 
 class BatchPixels {
-protected:
+ protected:
     explicit BatchPixels(const FeedbackBatch& batch)
         : batch_(batch), grid_(*batch.grid), n_(batch.grid->cells), work_(batch) {
         for (int i = 0; i < kTeam; ++i) refused_[i] = FeedbackStatus::kDrawn;
@@ -117,8 +117,9 @@ protected:
         }
         for (int i = 0; i < kTeam; ++i) {
             mean_[i] = cycles() * share_[i] * total_[i];
-            const double law = variance_matters(i) ? variance[i] * grid_.laps * share_[i] * share_[i]
-                                                   : mean_[i] * static_cast<double>((1.0f + rate_[i]) / (1.0f - rate_[i]));
+            const double law = variance_matters(i)
+                                   ? variance[i] * grid_.laps * share_[i] * share_[i]
+                                   : mean_[i] * static_cast<double>((1.0f + rate_[i]) / (1.0f - rate_[i]));
             if (grid_.whole > 0 && law < kLeastVariance * grid_.whole) refuse(i, FeedbackStatus::kLocked);
             deviation_[i] = root(law > 0.0 ? law : 0.0);
             const double error = kMeanError * mean_[i] / static_cast<double>(1.0f - lesser(rate_[i], kSlowest));
@@ -158,7 +159,7 @@ protected:
             if (laps == grid_.laps) continue;
             const bool short_of = cycles() < kFewestLapCycles || cycles() < kFewestPieces * laps;
             refused_[i] = laps > kMostLaps ? FeedbackStatus::kSlow
-                          : short_of       ? FeedbackStatus::kFew
+                          : short_of ? FeedbackStatus::kFew
                                      : static_cast<FeedbackStatus>(static_cast<int>(FeedbackStatus::kLaps) + laps);
         }
     }
@@ -167,17 +168,17 @@ protected:
     const FeedbackGrid& grid_;
     const int32_t n_;
     Workspace work_;
-    FeedbackStatus refused_[kTeam];    // all draws of a lane
-    alignas(64) float rate_[kTeam];    // contraction of a sweep
-    alignas(64) float scale_[kTeam];   // M / (1 + K sum w): exposures for each unit of w
-    int32_t forgotten_[kTeam];         // sweep by which the mean has forgotten its start
-    int32_t least_[kTeam];             // integer sweeps, at least
-    double total_[kTeam];              // sum w
-    double share_[kTeam];              // 1 / (1 + K sum w)
-    double mean_[kTeam];               // of the count of the exposure
-    double deviation_[kTeam];          // its standard deviation, or a bound
-    int32_t allowed_[kTeam];           // by how much a count may differ
-    float still_[kTeam];               // a move of the history that ends a lane's sweeps
+    FeedbackStatus refused_[kTeam];   // all draws of a lane
+    alignas(64) float rate_[kTeam];   // contraction of a sweep
+    alignas(64) float scale_[kTeam];  // M / (1 + K sum w): exposures for each unit of w
+    int32_t forgotten_[kTeam];        // sweep by which the mean has forgotten its start
+    int32_t least_[kTeam];            // integer sweeps, at least
+    double total_[kTeam];             // sum w
+    double share_[kTeam];             // 1 / (1 + K sum w)
+    double mean_[kTeam];              // of the count of the exposure
+    double deviation_[kTeam];         // its standard deviation, or a bound
+    int32_t allowed_[kTeam];          // by how much a count may differ
+    float still_[kTeam];              // a move of the history that ends a lane's sweeps
 };
 
 }  // namespace

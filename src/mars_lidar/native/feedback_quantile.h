@@ -42,9 +42,9 @@ MARS_INLINE float excess(float mean, float variance, float z, float& growth) {
 
 // Terms of the binomial up to the one that the uniform number falls into.
 struct Terms {
-    alignas(64) float term[kTeam], before[kTeam];    // P(H = k), P(H = k - 1)
-    alignas(64) float beyond[kTeam], above[kTeam];   // P(H > k), P(H > k - 1)
-    alignas(64) float count[kTeam];                  // k
+    alignas(64) float term[kTeam], before[kTeam];   // P(H = k), P(H = k - 1)
+    alignas(64) float beyond[kTeam], above[kTeam];  // P(H > k), P(H > k - 1)
+    alignas(64) float count[kTeam];                 // k
 
     // A function of its own, of arrays that do not overlap, or not all compilers vectorise its loops.
     MARS_NOINLINE void sum(const float* __restrict__ mean, const float* __restrict__ variance,
@@ -80,7 +80,7 @@ struct Terms {
         for (int first = 0; first < kTeam; first += kLanes) add_terms(first, trials, odds, limit);
     }
 
-private:
+ private:
     MARS_INLINE void add_terms(int first, const float* trials, const float* odds, const float* limit) {
         const Float number = load<Float>(trials + first), ratio = load<Float>(odds + first);
         const Float u = load<Float>(limit + first);
@@ -115,8 +115,7 @@ MARS_INLINE bool any_few(const float* mean) {
 // The steepest line that a count may follow: one exposure more armed (p of mu), or re-armed (q), adds at most one count.
 // Beyond it deviations could grow from sweep to sweep (docs/feedback.md). The count at the mean stays.
 MARS_NOINLINE void limit_slopes(const float* __restrict__ p, const float* __restrict__ q,
-                                const float* __restrict__ mean, float* __restrict__ alpha,
-                                float* __restrict__ beta) {
+                                const float* __restrict__ mean, float* __restrict__ alpha, float* __restrict__ beta) {
     for (int i = 0; i < kTeam; ++i) {
         const float most = p[i] > q[i] ? p[i] : q[i], limit = 1.0f / (most > 1e-30f ? most : 1e-30f);
         const float slope = alpha[i] < limit ? alpha[i] : limit;
@@ -156,7 +155,8 @@ MARS_INLINE void follow_quantile(const float* mean, const float* variance, const
                 up = k == 1.0f && mean[i] < kFarBelowOne && second > up ? second : up;
             }
             up = up > 1e-6f ? (up < 1e3f ? up : 1e3f) : 1e-6f;
-            float down = short_of / (1.0f - 0.5f * ((k - 1.0f) / (mean[i] > 1e-3f ? mean[i] : 1e-3f) - 1.0f) * short_of);
+            float down =
+                short_of / (1.0f - 0.5f * ((k - 1.0f) / (mean[i] > 1e-3f ? mean[i] : 1e-3f) - 1.0f) * short_of);
             down = down > 0.0f ? (down < 1e3f ? down : 1e3f) : 0.0f;
             const float slope = none ? 1.0f : 1.0f / (up + down), most = p[i] > q[i] ? p[i] : q[i];
             const bool few = mean[i] < kInversionBelow;

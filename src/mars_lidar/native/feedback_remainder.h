@@ -13,7 +13,7 @@ constexpr uint32_t kRemainderStage = 3u;  // of the counter: not the numbers of 
 
 // One lane of a batch; rows of kRow.
 class Remainder {
-public:
+ public:
     Remainder(const FeedbackGrid& grid, const int32_t* history, const double* photons, int32_t edge, int32_t rank,
               Pair<uint32_t> key)
         : grid_(grid), history_(history), photons_(photons), edge_(edge), rank_(rank), key_(key) {}
@@ -42,7 +42,7 @@ public:
         }
     }
 
-private:
+ private:
     double before(int32_t j) const { return photons_[static_cast<int64_t>(j) * kRow]; }
     uint32_t count(int32_t t) const { return static_cast<uint32_t>(history_[static_cast<int64_t>(t) * kRow]); }
     double uniform(uint32_t event) const {

@@ -19,7 +19,7 @@ struct Rates {
     MARS_INLINE const float* fire(int32_t j) const { return pick(j, dark_fire, lit_fire); }
     MARS_INLINE const float* refire(int32_t j) const { return pick(j, dark_refire, lit_refire); }
 
-private:
+ private:
     MARS_INLINE const float* pick(int32_t j, const float* dark, const float* lit) const {
         return j >= lit_begin && j < lit_end ? lit + static_cast<int64_t>(j - lit_begin) * kRow
                                              : dark + static_cast<int64_t>(narrow[j]) * kRow;
@@ -184,9 +184,8 @@ constexpr float kLargest = 2147483520.0f;  // the largest float that an integer 
 // `periods`: K > 0; `warm`: lanes may be blind at the start.
 template <bool periods, bool warm>
 MARS_NOINLINE void integer_sweep(const FeedbackGrid& grid, const Rates& rates, const Quantiles& quantiles,
-                                 const Exposure& exposure, const int32_t* __restrict__ old,
-                                 int32_t* __restrict__ fresh, int32_t* __restrict__ change,
-                                 int32_t* __restrict__ negative) {
+                                 const Exposure& exposure, const int32_t* __restrict__ old, int32_t* __restrict__ fresh,
+                                 int32_t* __restrict__ change, int32_t* __restrict__ negative) {
     const int32_t path = grid.path();
     const History<int32_t> history(old, fresh, path);
     alignas(64) int32_t c[kTeam], re[kTeam], mark[kTeam];

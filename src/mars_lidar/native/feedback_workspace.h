@@ -6,9 +6,13 @@ namespace mars {
 inline namespace MARS_LEVEL {
 
 template <class T>
-struct Plain { using Type = T; };
+struct Plain {
+    using Type = T;
+};
 template <class T>
-struct Plain<T&> { using Type = T; };
+struct Plain<T&> {
+    using Type = T;
+};
 template <class T>
 using Pointer = typename Plain<T>::Type;
 
@@ -55,7 +59,7 @@ struct Workspace {
         if (batch.grid->laps > 1) sum_photons(batch);
     }
 
-private:
+ private:
     MARS_NOINLINE void sum_photons(const FeedbackBatch& batch) {
         for (int i = 0; i < kTeam; ++i) photons[i] = 0.0;
         for (int32_t j = 0; j < batch.grid->cells; ++j) {

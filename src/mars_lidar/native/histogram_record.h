@@ -37,8 +37,8 @@ struct HistogramRecord {
     int64_t whole = 0, shift = 0;  // t_d = whole + (shift + fraction) / bins
     double fraction = 0.0;
     bool stationary = false, synchronous = false;
-    double peak = 0.0;             // of the pulse, relative to the delay
-    double width = 0.0;            // of the pulse: 1 / integral of s^2, over 2 sqrt(pi): sigma of a Gaussian
+    double peak = 0.0;                       // of the pulse, relative to the delay
+    double width = 0.0;                      // of the pulse: 1 / integral of s^2, over 2 sqrt(pi): sigma of a Gaussian
     double core_low = 0.0, core_high = 0.0;  // the part of the pulse that is counted as its window
     PulseCurve pulse;
     std::vector<double> low, high;  // (bins) the open part of each bin, in periods; empty without a gate

@@ -33,24 +33,24 @@ struct Recording;
 
 struct Job {
     int64_t pixels = 0;
-    int64_t returns = 0;       // 0 with a waveform
+    int64_t returns = 0;  // 0 with a waveform
     int64_t realizations = 1;
     uint32_t first_realization = 0;
     uint64_t seed = 0;
     int32_t cycles = 1;
     int32_t bins = 1;
     double dead_time = 0.0;
-    bool stationary = false;   // warmed up at t = 0, else armed
+    bool stationary = false;  // warmed up at t = 0, else armed
     DetectorMode mode = DetectorMode::kNonparalyzable;
-    Gate gate;                 // of kGated
+    Gate gate;  // of kGated
     Traps traps;
-    double twilight = 0.0;     // arrivals this long before the end of a dead time fire at its end
+    double twilight = 0.0;  // arrivals this long before the end of a dead time fire at its end
     Crosstalk crosstalk;
     const Recording* recording = nullptr;  // of the registrations, or null: as they are
-    const double* signal = nullptr;       // (returns, pixels)
-    const double* delay = nullptr;        // (returns, pixels), finite, any number of periods
-    const double* background = nullptr;   // (pixels)
-    const double* waveform = nullptr;     // (pixels, samples): photons per sample, or null
+    const double* signal = nullptr;        // (returns, pixels)
+    const double* delay = nullptr;         // (returns, pixels), finite, any number of periods
+    const double* background = nullptr;    // (pixels)
+    const double* waveform = nullptr;      // (pixels, samples): photons per sample, or null
     int64_t samples = 0;
     const uint32_t* pixel_index = nullptr;  // (pixels): names the random streams
 

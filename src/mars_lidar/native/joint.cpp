@@ -165,7 +165,8 @@ int64_t settle(Matrix<const double> response, int64_t whole, int32_t shift, doub
                 const size_t last = worst.size() - 2, half = last / 2;  // the last one may not be full
                 const double fall = std::log(worst[half] / worst[last]) / static_cast<double>(last - half);
                 if (!(worst[last] < 0.5 * worst[half])) return;
-                const double more = std::log(worst[last] / (tolerance * sum)) / fall * static_cast<double>(grid.whole + 2);
+                const double more =
+                    std::log(worst[last] / (tolerance * sum)) / fall * static_cast<double>(grid.whole + 2);
                 const double end = static_cast<double>(period) + std::fmax(more, 0.0);
                 if (3.0 * end < static_cast<double>(cycles)) result = static_cast<int64_t>(end) + 1;
                 return;
@@ -201,8 +202,7 @@ void bind_joint(nb::module_& module) {
                nb::arg("fraction"), nb::arg("cycles"), nb::arg("state"), nb::arg("tolerance"), nb::arg("max_steps"),
                nb::arg("total"));
     module.def("joint_exposure", &exposure, nb::kw_only(), nb::arg("response"), nb::arg("whole"), nb::arg("shift"),
-               nb::arg("fraction"), nb::arg("cycles"), nb::arg("state").none(), nb::arg("weights"),
-               nb::arg("columns"));
+               nb::arg("fraction"), nb::arg("cycles"), nb::arg("state").none(), nb::arg("weights"), nb::arg("columns"));
 }
 
 }  // namespace mars

@@ -33,10 +33,10 @@ class Convergence {
 // mass_slope, moment_armed, moment_in, moment_slope (4.1).
 struct FeedbackGrid {
     const double* response;
-    int64_t whole;   // K
-    int32_t bins;    // n
-    int32_t shift;   // d
-    double fraction; // f
+    int64_t whole;    // K
+    int32_t bins;     // n
+    int32_t shift;    // d
+    double fraction;  // f
 
     const double* row(int k) const { return response + static_cast<int64_t>(k) * bins; }
 };

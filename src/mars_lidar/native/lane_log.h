@@ -17,7 +17,7 @@ constexpr int kLog = 128;  // rows
 // when the log is written, so one kernel serves them all.
 template <class Phase, bool timed>
 class LaneLog {
-public:
+ public:
     LaneLog(const Output& output, const Job& job)
         : output_(output), bins_(static_cast<size_t>(job.bins)), cycles_(job.cycles) {
         for (int lane = 0; lane < kLanes; ++lane) items_[lane] = -1;
@@ -30,10 +30,15 @@ public:
     // An item of the job without any registration yet.
     void clear(int64_t item) {
         switch (output_.sink) {
-            case Sink::kCounts: static_cast<int64_t*>(output_.out)[item] = 0; return;
-            case Sink::kHistogram16: return clear_row<uint16_t>(item);
-            case Sink::kHistogram32: return clear_row<uint32_t>(item);
-            case Sink::kTimestamps: return;
+            case Sink::kCounts:
+                static_cast<int64_t*>(output_.out)[item] = 0;
+                return;
+            case Sink::kHistogram16:
+                return clear_row<uint16_t>(item);
+            case Sink::kHistogram32:
+                return clear_row<uint32_t>(item);
+            case Sink::kTimestamps:
+                return;
         }
     }
     // From now on a lane is at an item that has been cleared, or at none (-1).
@@ -47,10 +52,12 @@ public:
     // Row k after those that are complete: the registrations of all lanes, some of them outside of the exposure.
     MARS_INLINE void put(int k, Mask lost, Int bin) { store(bin_[rows_ + k], select(lost, splat(-1), bin)); }
     MARS_INLINE void put_cycle(int k, Int cycle) { store(cycle_[rows_ + k], cycle); }
-    MARS_INLINE Phase (&phase(int k))[kLanes] { return phase_[rows_ + k]; }
+    MARS_INLINE Phase (&phase(int k)) [kLanes] { return phase_[rows_ + k]; }
 
     // `n` rows, a divisor of kLog, are complete.
-    void advance(int n) { rows_ += n; }
+    void advance(int n) {
+        rows_ += n;
+    }
     bool full() const { return rows_ == kLog; }
 
     // Several lanes at once, where all have work: the processor is busy while a bin that was just counted is still on
@@ -73,7 +80,7 @@ public:
         rows_ = 0;
     }
 
-private:
+ private:
     template <class Count>
     Count* row(int64_t item) const {
         return static_cast<Count*>(output_.out) + static_cast<size_t>(item) * bins_;
@@ -95,9 +102,12 @@ private:
     template <int n>
     void write(int lane, int from, int to) {
         switch (output_.sink) {
-            case Sink::kCounts: return count<n>(lane, from, to);
-            case Sink::kHistogram16: return count_bins<n, uint16_t>(lane, from, to);
-            case Sink::kHistogram32: return count_bins<n, uint32_t>(lane, from, to);
+            case Sink::kCounts:
+                return count<n>(lane, from, to);
+            case Sink::kHistogram16:
+                return count_bins<n, uint16_t>(lane, from, to);
+            case Sink::kHistogram32:
+                return count_bins<n, uint32_t>(lane, from, to);
             case Sink::kTimestamps:
                 if constexpr (timed)
                     for (int i = lane; i < lane + n; ++i) tell_times(i, from, to);

@@ -37,9 +37,9 @@ MARS_INLINE Float splat(float x) { return {HardFloat{} + x, HardFloat{} + x}; }
 MARS_INLINE Int splat(int32_t x) { return {HardInt{} + x, HardInt{} + x}; }
 MARS_INLINE UInt splat(uint32_t x) { return {HardUInt{} + x, HardUInt{} + x}; }
 
-#define MARS_BINARY(T, S, op)                                                                       \
-    MARS_INLINE T operator op(T a, T b) { return {a.low op b.low, a.high op b.high}; }              \
-    MARS_INLINE T operator op(T a, S b) { return a op splat(b); }                                   \
+#define MARS_BINARY(T, S, op)                                                          \
+    MARS_INLINE T operator op(T a, T b) { return {a.low op b.low, a.high op b.high}; } \
+    MARS_INLINE T operator op(T a, S b) { return a op splat(b); }                      \
     MARS_INLINE T operator op(S a, T b) { return splat(a) op b; }
 MARS_BINARY(Float, float, +)
 MARS_BINARY(Float, float, -)
@@ -60,12 +60,12 @@ MARS_INLINE UInt operator>>(UInt a, int n) { return {a.low >> n, a.high >> n}; }
 MARS_INLINE Int operator>>(Int a, int n) { return {a.low >> n, a.high >> n}; }
 
 #if defined(MARS_LEVEL_avx512)
-#define MARS_COMPARE_HARD(name, op, f, i)                                                                           \
-    MARS_INLINE HardMask name(HardFloat a, HardFloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, f); }      \
-    MARS_INLINE HardMask name(HardInt a, HardInt b) { return _mm512_cmp_epi32_mask((__m512i)a, (__m512i)b, i); }     \
+#define MARS_COMPARE_HARD(name, op, f, i)                                                                        \
+    MARS_INLINE HardMask name(HardFloat a, HardFloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, f); }  \
+    MARS_INLINE HardMask name(HardInt a, HardInt b) { return _mm512_cmp_epi32_mask((__m512i)a, (__m512i)b, i); } \
     MARS_INLINE HardMask name(HardUInt a, HardUInt b) { return _mm512_cmp_epu32_mask((__m512i)a, (__m512i)b, i); }
 #else
-#define MARS_COMPARE_HARD(name, op, f, i)                                         \
+#define MARS_COMPARE_HARD(name, op, f, i)                                              \
     MARS_INLINE HardMask name(HardFloat a, HardFloat b) { return (HardMask)(a op b); } \
     MARS_INLINE HardMask name(HardInt a, HardInt b) { return (HardMask)(a op b); }     \
     MARS_INLINE HardMask name(HardUInt a, HardUInt b) { return (HardMask)(a op b); }
@@ -75,16 +75,16 @@ MARS_COMPARE_HARD(compare_at_least, >=, _CMP_GE_OQ, _MM_CMPINT_NLT)
 MARS_COMPARE_HARD(compare_equal, ==, _CMP_EQ_OQ, _MM_CMPINT_EQ)
 #undef MARS_COMPARE_HARD
 
-#define MARS_COMPARE(T, S)                                                                                          \
-    MARS_INLINE Mask operator<(T a, T b) { return {compare_less(a.low, b.low), compare_less(a.high, b.high)}; }      \
-    MARS_INLINE Mask operator>(T a, T b) { return b < a; }                                                          \
-    MARS_INLINE Mask operator>=(T a, T b) {                                                                         \
-        return {compare_at_least(a.low, b.low), compare_at_least(a.high, b.high)};                                  \
-    }                                                                                                               \
-    MARS_INLINE Mask operator==(T a, T b) { return {compare_equal(a.low, b.low), compare_equal(a.high, b.high)}; }   \
-    MARS_INLINE Mask operator<(T a, S b) { return a < splat(b); }                                                   \
-    MARS_INLINE Mask operator>(T a, S b) { return a > splat(b); }                                                   \
-    MARS_INLINE Mask operator>=(T a, S b) { return a >= splat(b); }                                                 \
+#define MARS_COMPARE(T, S)                                                                                         \
+    MARS_INLINE Mask operator<(T a, T b) { return {compare_less(a.low, b.low), compare_less(a.high, b.high)}; }    \
+    MARS_INLINE Mask operator>(T a, T b) { return b < a; }                                                         \
+    MARS_INLINE Mask operator>=(T a, T b) {                                                                        \
+        return {compare_at_least(a.low, b.low), compare_at_least(a.high, b.high)};                                 \
+    }                                                                                                              \
+    MARS_INLINE Mask operator==(T a, T b) { return {compare_equal(a.low, b.low), compare_equal(a.high, b.high)}; } \
+    MARS_INLINE Mask operator<(T a, S b) { return a < splat(b); }                                                  \
+    MARS_INLINE Mask operator>(T a, S b) { return a > splat(b); }                                                  \
+    MARS_INLINE Mask operator>=(T a, S b) { return a >= splat(b); }                                                \
     MARS_INLINE Mask operator==(T a, S b) { return a == splat(b); }
 MARS_COMPARE(Float, float)
 MARS_COMPARE(Int, int32_t)
@@ -135,14 +135,14 @@ MARS_INLINE Float select(Mask m, Float yes, Float no) {
 }
 
 #if defined(MARS_LEVEL_avx512)
-#define MARS_IF(name, intrinsic_i, intrinsic_f)                                                                   \
-    MARS_INLINE Int name(Int x, Mask m) {                                                                         \
-        const __m512i one = _mm512_set1_epi32(1), low = (__m512i)x.low, high = (__m512i)x.high;                   \
-        return {(HardInt)intrinsic_i(low, m.low, low, one), (HardInt)intrinsic_i(high, m.high, high, one)};       \
-    }                                                                                                             \
-    MARS_INLINE Float name(Float x, Mask m) {                                                                     \
-        const __m512 one = _mm512_set1_ps(1.0f), low = (__m512)x.low, high = (__m512)x.high;                      \
-        return {(HardFloat)intrinsic_f(low, m.low, low, one), (HardFloat)intrinsic_f(high, m.high, high, one)};   \
+#define MARS_IF(name, intrinsic_i, intrinsic_f)                                                                 \
+    MARS_INLINE Int name(Int x, Mask m) {                                                                       \
+        const __m512i one = _mm512_set1_epi32(1), low = (__m512i)x.low, high = (__m512i)x.high;                 \
+        return {(HardInt)intrinsic_i(low, m.low, low, one), (HardInt)intrinsic_i(high, m.high, high, one)};     \
+    }                                                                                                           \
+    MARS_INLINE Float name(Float x, Mask m) {                                                                   \
+        const __m512 one = _mm512_set1_ps(1.0f), low = (__m512)x.low, high = (__m512)x.high;                    \
+        return {(HardFloat)intrinsic_f(low, m.low, low, one), (HardFloat)intrinsic_f(high, m.high, high, one)}; \
     }
 MARS_IF(plus_if, _mm512_mask_add_epi32, _mm512_mask_add_ps)
 MARS_IF(minus_if, _mm512_mask_sub_epi32, _mm512_mask_sub_ps)

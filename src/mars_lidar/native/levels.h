@@ -3,8 +3,8 @@
 #pragma once
 
 #if defined(MARS_HAS_avx512)
-#define MARS_LEVEL_OF_512(each)                                                                            \
-    each(avx512, (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&               \
+#define MARS_LEVEL_OF_512(each)                                                              \
+    each(avx512, (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && \
                   __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")))
 #else
 #define MARS_LEVEL_OF_512(each)

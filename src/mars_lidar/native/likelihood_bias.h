@@ -15,7 +15,7 @@ class LikelihoodBias {
     void operator()(const HistogramRecord& r, const ArmedPasses& passes, const double* at, const double inverse[3][3],
                     double* bias) {
         set_bins(r, at);
-        double weight[3] = {};  // sum over the bins of (R19), for each parameter
+        double weight[3] = {};             // sum over the bins of (R19), for each parameter
         double armed = 0.0, drop[3] = {};  // expected passes that are still armed, and their derivatives (R20)
         for (size_t k = 0; k < bins_.size(); ++k) {
             const Bin& bin = bins_[k];
@@ -42,7 +42,8 @@ class LikelihoodBias {
  private:
     struct Bin {
         int64_t j;
-        double l, dl[3], cross, curve;  // photons of the bin, first derivatives, that by S and delay, that by delay twice
+        double l, dl[3], cross,
+            curve;  // photons of the bin, first derivatives, that by S and delay, that by delay twice
     };
 
     // The bins of the pulse; second derivatives are differences, over a part of the pulse that smooths what is sampled.

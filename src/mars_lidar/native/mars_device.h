@@ -27,10 +27,10 @@ struct MarsLawTask {
 };
 
 struct MarsTask {
-    ShapeJob shapes;            // of one image of the output
-    const MatchedLaw* laws;     // (pixels), or null
-    const double* cumulants;    // (pixels, 4): without laws the rounded normal numbers of mean and variance
-    const int32_t* exact;       // (pixels) which tabulated law it is in place of that, or -1; null: none has one
+    ShapeJob shapes;          // of one image of the output
+    const MatchedLaw* laws;   // (pixels), or null
+    const double* cumulants;  // (pixels, 4): without laws the rounded normal numbers of mean and variance
+    const int32_t* exact;     // (pixels) which tabulated law it is in place of that, or -1; null: none has one
     const int64_t *law_first, *law_offsets;  // of the tabulated laws, as in `Tabulated`
     const double* law_cumulative;
     void* out;                  // (realizations, image, bins)
@@ -63,7 +63,7 @@ namespace {
 
 // Photons one by one, shared among a block's threads.
 class BlockPhotons : public PhotonPlan<BlockTeam> {
-public:
+ public:
     BlockPhotons(const ShapeJob& job, Alignment<BlockTeam>& alignment, uint32_t* counts, Bump& memory,
                  const BlockTeam& team)
         : PhotonPlan(job, alignment, memory, team), counts_(counts) {
@@ -78,7 +78,7 @@ public:
         place(framed, key);
     }
 
-private:
+ private:
     // Words are used in blocks of 64: the first words of 32 events, then their second words.
     static MARS_INLINE Pair<uint32_t> words(int64_t event, uint32_t step, Pair<uint32_t> key) {
         return threefry<13, uint32_t>(static_cast<uint32_t>(event), step, key.first, key.second);
@@ -169,8 +169,8 @@ MARS_INLINE int64_t mars_count(const MarsTask& task, int64_t pixel, int64_t turn
     const EventStream stream(job.seed, kCountDomain, realization, job.pixel_index[pixel]);
     if (task.exact && task.exact[pixel] >= 0) {
         const int64_t law = task.exact[pixel];
-        const Tabulated exact{task.law_cumulative + task.law_offsets[law], task.law_cumulative + task.law_offsets[law + 1],
-                              task.law_first[law]};
+        const Tabulated exact{task.law_cumulative + task.law_offsets[law],
+                              task.law_cumulative + task.law_offsets[law + 1], task.law_first[law]};
         return exact(stream);
     }
     if (task.laws) return task.laws[pixel].draw(open_uniform(stream.word(0, 0)));
@@ -181,7 +181,8 @@ MARS_INLINE int64_t mars_count(const MarsTask& task, int64_t pixel, int64_t turn
 // What a block works in.
 struct MarsBlock {
     MarsBlock(const ShapeJob& job, Bump& memory, const BlockTeam& team)
-        : alignment(job, memory, team), rounds(job, memory, team),
+        : alignment(job, memory, team),
+          rounds(job, memory, team),
           photons(job, alignment, rounds.counts, memory, team) {}
 
     Alignment<BlockTeam> alignment;
@@ -192,9 +193,13 @@ struct MarsBlock {
 }  // namespace
 
 template <bool wide>
-struct CountOf { using Type = uint16_t; };
+struct CountOf {
+    using Type = uint16_t;
+};
 template <>
-struct CountOf<true> { using Type = uint32_t; };
+struct CountOf<true> {
+    using Type = uint32_t;
+};
 
 template <bool wide>
 MARS_KERNEL mars_histograms(const MarsTask task) {

@@ -30,8 +30,8 @@ void for_cells(int64_t cells, int threads, const Work& work) {
                });
 }
 
-void support(Matrix<const double> cumulants, Vector<int64_t> first, Vector<int64_t> last,
-             Vector<bool> trusted, int threads) {
+void support(Matrix<const double> cumulants, Vector<int64_t> first, Vector<int64_t> last, Vector<bool> trusted,
+             int threads) {
     const int64_t cells = check_cells(cumulants);
     if (static_cast<int64_t>(first.shape(0)) != cells || first.shape(0) != last.shape(0) ||
         first.shape(0) != trusted.shape(0))

@@ -23,7 +23,7 @@ struct GainLoss {
 
 namespace atoms {
 
-constexpr int kMost = 64;        // integers of a window
+constexpr int kMost = 64;             // integers of a window
 constexpr double kLeastRatio = 0.45;  // a binomial of p > 1/2 is the mirror image of one of p < 1/2
 constexpr double kMostRatio = 1.2;
 
@@ -32,8 +32,8 @@ inline void judge(const Cumulants& k, GainLoss& law) {
     const double second = v - (x * r + y);
     const double third = law.sign * k.third - (x * r * (2.0 * r - 1.0) - y);
     const double fourth = k.fourth - (x * r * (1.0 - 6.0 * r * (1.0 - r)) + y);
-    law.misfit = second * second / (2.0 * v * v) + third * third / (6.0 * v * v * v) +
-                 fourth * fourth / (24.0 * v * v * v * v);
+    law.misfit =
+        second * second / (2.0 * v * v) + third * third / (6.0 * v * v * v) + fourth * fourth / (24.0 * v * v * v * v);
 }
 
 // X and Y for N = offset + sign (X - Y) from three cumulants: gain - loss = D, gain ratio + loss = v and
@@ -105,8 +105,7 @@ MARS_APART inline void base(const GainLoss& law, double first, int size, double*
         double sum = 0.0;
         if (net <= most_gain && net >= -most_loss) {
             const int j = static_cast<int>(net);
-            for (int y = std::max(0, -j); y <= std::min(most_loss, most_gain - j); ++y)
-                sum += losses[y] * gains[j + y];
+            for (int y = std::max(0, -j); y <= std::min(most_loss, most_gain - j); ++y) sum += losses[y] * gains[j + y];
         }
         weight[i] = sum;
     }

@@ -11,7 +11,7 @@
 namespace mars {
 
 class MatchedLaw {
-public:
+ public:
     enum class Form { pair, atoms, smooth };
 
     MatchedLaw() = default;
@@ -85,18 +85,18 @@ public:
         }
     }
 
-private:
-    static constexpr double kAtomsBelow = 9.0;    // variance
-    static constexpr double kBare = 1e-5;         // variance, below which there is nothing to mend
-    static constexpr double kNarrow = 0.3;        // variance, below which a normal base is as good as any
-    static constexpr double kSheppard = 0.7;      // variance, from where his corrections are right
+ private:
+    static constexpr double kAtomsBelow = 9.0;  // variance
+    static constexpr double kBare = 1e-5;       // variance, below which there is nothing to mend
+    static constexpr double kNarrow = 0.3;      // variance, below which a normal base is as good as any
+    static constexpr double kSheppard = 0.7;    // variance, from where his corrections are right
     static constexpr double kOneSided = 1e-5, kTwoSided = 0.05;  // misfits
     // thresholds of `trusted`, set by the study
     static constexpr double kSureReach = 4.0;   // standard deviations over which the quantile rises
     static constexpr double kSureRatio = 0.93;  // of gains that are rare, on top of losses
     static constexpr double kSureFit = 3e-6, kSureSmooth = 3.5, kSureVariance = 0.19, kSureFive = 0.16;
-    static constexpr double kReach = 8.3;         // no word of 52 bits is beyond
-    static constexpr double kNeeded = 1.5;        // where the quantile must rise for the law to be any good
+    static constexpr double kReach = 8.3;   // no word of 52 bits is beyond
+    static constexpr double kNeeded = 1.5;  // where the quantile must rise for the law to be any good
 
     void choose(const Cumulants& k) {
         if (!(k.mean > 0.0)) {
@@ -192,8 +192,7 @@ private:
         // of a variance so small five integers hold all, and any base with them will do
         if (one_sided || two_sided || (k.variance < kSureVariance && law.misfit < HUGE_VAL)) {
             if (set_atoms(k, 4, [&](double first) { atoms::base(law, first, size_, below_); })) {
-                trusted_ = one_sided || (law.misfit < kSureFit && law.ratio > kSureRatio) ||
-                           k.variance < kSureFive;
+                trusted_ = one_sided || (law.misfit < kSureFit && law.ratio > kSureRatio) || k.variance < kSureFive;
                 return;
             }
         }

@@ -10,13 +10,13 @@
 namespace mars {
 namespace trust {
 
-constexpr double kAtomsAgree = 3e-4;                // of integers with normal bases
+constexpr double kAtomsAgree = 3e-4;                        // of integers with normal bases
 constexpr double kAtomsWide = 7.0, kAtomsWideAgree = 6e-3;  // variance from which a look at one of these is enough
 constexpr double kFree = 0.25, kFreeAgree = 1.5e-3;  // variance / mean of a count that is not locked; gains and losses
 // sums of many parts: a skewness that explains the kurtosis, a quantile that rises well, many registrations
 constexpr double kKurtosis = 0.02, kSlope = 0.3, kSlopeReach = 4.0, kLeastMean = 16.0;
 constexpr double kNarrow = 1.5, kNarrowAgree = 1e-3, kWideAgree = 3e-3;  // variance; of laws with three cumulants
-constexpr double kCloseKurtosis = 0.01, kCloseAgree = 1.5e-3;             // below that variance, a little more room
+constexpr double kCloseKurtosis = 0.01, kCloseAgree = 1.5e-3;            // below that variance, a little more room
 
 // The window of a narrow law (variance below 9), its probabilities, and other laws on the same window.
 struct Window {

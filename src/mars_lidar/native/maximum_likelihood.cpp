@@ -10,11 +10,11 @@
 namespace mars {
 namespace {
 
-constexpr int64_t kChunk = 64;      // pixels
+constexpr int64_t kChunk = 64;  // pixels
 constexpr int kMostSteps = 80;
-constexpr double kGain = 5e-7;      // of the log likelihood that a further step promises: 1e-3 of a standard error
+constexpr double kGain = 5e-7;  // of the log likelihood that a further step promises: 1e-3 of a standard error
 constexpr double kMostPhotons = 1e4;
-constexpr int kColumns = 8;         // of the output
+constexpr int kColumns = 8;  // of the output
 
 // Solves A x = b, A symmetric 3 x 3 and positive definite where `free`; x = 0 elsewhere. False where it is singular.
 bool solve(const double a[3][3], const double* b, const bool* free, double* x) {
@@ -51,7 +51,8 @@ void known_information(const Likelihood& likelihood, const bool* free, double kn
     double none[3] = {}, x[3];
     for (int a = 0; a < 3; ++a)
         for (int b = 0; b < 3; ++b) known[a][b] = likelihood.information[a][b] - likelihood.hidden[a][b];
-    if (!solve(known, none, free, x)) std::copy(&likelihood.information[0][0], &likelihood.information[0][0] + 9, &known[0][0]);
+    if (!solve(known, none, free, x))
+        std::copy(&likelihood.information[0][0], &likelihood.information[0][0] + 9, &known[0][0]);
 }
 
 struct Fit {
@@ -81,7 +82,8 @@ Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, c
         const Likelihood& now = fit.likelihood;
         fit.free[0] = with_signal && (fit.at[0] > 0.0 || now.gradient[0] > 0.0) &&
                       (fit.at[0] < kMostPhotons || now.gradient[0] < 0.0);
-        fit.free[1] = (fit.at[1] > least || now.gradient[1] > 0.0) && (fit.at[1] < kMostPhotons || now.gradient[1] < 0.0);
+        fit.free[1] =
+            (fit.at[1] > least || now.gradient[1] > 0.0) && (fit.at[1] < kMostPhotons || now.gradient[1] < 0.0);
         fit.free[2] = with_signal && fit.at[0] > 0.0 && now.information[2][2] > 0.0;
         double move[3], known[3][3];
         known_information(now, fit.free, known);
@@ -271,9 +273,10 @@ void log_likelihood(const HistogramRecord& recording, Vector<const double> histo
 void bind_maximum_likelihood(nb::module_& module) {
     constexpr const char* kText = "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).";
     auto add = [&](auto* function) {
-        module.def("maximum_likelihood", function, nb::arg("recording"), nb::arg("histogram").noconvert(), nb::kw_only(),
-                   nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"), nb::arg("out").noconvert(),
-                   nb::arg("flags").noconvert(), nb::arg("threads"), nb::arg("progress").none(), kText);
+        module.def("maximum_likelihood", function, nb::arg("recording"), nb::arg("histogram").noconvert(),
+                   nb::kw_only(), nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"),
+                   nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"),
+                   nb::arg("progress").none(), kText);
     };
     add(&maximum_likelihood<uint16_t>);
     add(&maximum_likelihood<uint32_t>);

@@ -24,7 +24,7 @@ inline int64_t paralyzable_warm_up(double dead_time, double photons) {
 // if the photon comes after 1 - f. This renewal process of whole periods M has the equilibrium
 // P(residual = r) = P(M > r) / E M.
 class SynchronousStart {
-public:
+ public:
     // `photons` in a period, `early` of them before 1 - f.
     SynchronousStart(double dead_time, double photons, double early) : whole_(static_cast<int64_t>(dead_time)) {
         const double seen = StationaryState::one_minus_exp(photons);
@@ -41,7 +41,7 @@ public:
         return std::min(whole_ + 1, 1 + static_cast<int64_t>((place - 1.0) / seen_));
     }
 
-private:
+ private:
     int64_t whole_;
     double seen_ = 0.0, mean_ = 1.0;
 };
@@ -89,8 +89,10 @@ void apply_gate(const Gate& gate, std::vector<double>& photons, const Inside& in
         double open = 0.0;
         for (int k = 0; k < 2; ++k) {
             const double a = std::max(low, from[k]), b = std::min(high, to[k]);
-            if (a <= low && b >= high) open = photons[j];
-            else if (a < b) open += inside(a, b);
+            if (a <= low && b >= high)
+                open = photons[j];
+            else if (a < b)
+                open += inside(a, b);
         }
         photons[j] = open;
     }

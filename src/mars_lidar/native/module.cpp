@@ -27,22 +27,20 @@ void bind_recording(nb::module_& module) {
                 if (code_edges) self->codes.set({code_edges->data(), code_edges->data() + code_edges->shape(0)});
                 self->tables = nb::cast(jitter);
             },
-            nb::kw_only(), nb::arg("electronics_dead_time"), nb::arg("most_per_period"),
-            nb::arg("most_per_exposure"), nb::arg("jitter").none(), nb::arg("tail"), nb::arg("tail_fraction"),
-            nb::arg("code_edges").none());
+            nb::kw_only(), nb::arg("electronics_dead_time"), nb::arg("most_per_period"), nb::arg("most_per_exposure"),
+            nb::arg("jitter").none(), nb::arg("tail"), nb::arg("tail_fraction"), nb::arg("code_edges").none());
 }
 
 void bind_job(nb::module_& module) {
     nb::class_<BoundJob>(module, "Job", "Flux and system of one call, in laser periods.")
         .def(
             "__init__",
-            [](BoundJob* self, Matrix<const double> signal, Matrix<const double> delay,
-               Vector<const double> background, std::optional<Matrix<const double>> waveform,
-               Vector<const uint32_t> pixel_index, int64_t realizations, uint32_t first_realization,
-               uint64_t seed, int32_t cycles, int32_t bins, double dead_time, bool stationary, int32_t mode,
-               double gate_start, double gate_width, double gate_step, int32_t gate_cycles, double traps,
-               double trap_delay, std::optional<Vector<const double>> trap_delays, double trap_sample,
-               int32_t generations, double twilight, std::optional<Matrix<const double>> crosstalk,
+            [](BoundJob* self, Matrix<const double> signal, Matrix<const double> delay, Vector<const double> background,
+               std::optional<Matrix<const double>> waveform, Vector<const uint32_t> pixel_index, int64_t realizations,
+               uint32_t first_realization, uint64_t seed, int32_t cycles, int32_t bins, double dead_time,
+               bool stationary, int32_t mode, double gate_start, double gate_width, double gate_step,
+               int32_t gate_cycles, double traps, double trap_delay, std::optional<Vector<const double>> trap_delays,
+               double trap_sample, int32_t generations, double twilight, std::optional<Matrix<const double>> crosstalk,
                int64_t height, int64_t width, const BoundRecording* recording) {
                 const size_t pixels = background.shape(0);
                 if (signal.shape(1) != pixels || delay.shape(0) != signal.shape(0) || delay.shape(1) != pixels ||
@@ -84,18 +82,16 @@ void bind_job(nb::module_& module) {
                 self->samples = waveform ? static_cast<int64_t>(waveform->shape(1)) : 0;
                 self->pixel_index = pixel_index.data();
                 self->recording = recording;
-                self->arrays =
-                    nb::make_tuple(signal, delay, background, waveform, pixel_index, trap_delays, recording);
+                self->arrays = nb::make_tuple(signal, delay, background, waveform, pixel_index, trap_delays, recording);
             },
-            nb::kw_only(), nb::arg("signal"), nb::arg("delay"), nb::arg("background"),
-            nb::arg("waveform").none(), nb::arg("pixel_index"), nb::arg("realizations"),
-            nb::arg("first_realization"), nb::arg("seed"), nb::arg("cycles"), nb::arg("bins"),
-            nb::arg("dead_time"), nb::arg("stationary"), nb::arg("mode") = 0, nb::arg("gate_start") = 0.0,
-            nb::arg("gate_width") = 1.0, nb::arg("gate_step") = 0.0, nb::arg("gate_cycles") = 1,
-            nb::arg("traps") = 0.0, nb::arg("trap_delay") = 0.0, nb::arg("trap_delays").none() = nb::none(),
-            nb::arg("trap_sample") = 0.0, nb::arg("generations") = INT32_MAX, nb::arg("twilight") = 0.0,
-            nb::arg("crosstalk").none() = nb::none(), nb::arg("height") = 0, nb::arg("width") = 0,
-            nb::arg("recording").none() = nb::none())
+            nb::kw_only(), nb::arg("signal"), nb::arg("delay"), nb::arg("background"), nb::arg("waveform").none(),
+            nb::arg("pixel_index"), nb::arg("realizations"), nb::arg("first_realization"), nb::arg("seed"),
+            nb::arg("cycles"), nb::arg("bins"), nb::arg("dead_time"), nb::arg("stationary"), nb::arg("mode") = 0,
+            nb::arg("gate_start") = 0.0, nb::arg("gate_width") = 1.0, nb::arg("gate_step") = 0.0,
+            nb::arg("gate_cycles") = 1, nb::arg("traps") = 0.0, nb::arg("trap_delay") = 0.0,
+            nb::arg("trap_delays").none() = nb::none(), nb::arg("trap_sample") = 0.0,
+            nb::arg("generations") = INT32_MAX, nb::arg("twilight") = 0.0, nb::arg("crosstalk").none() = nb::none(),
+            nb::arg("height") = 0, nb::arg("width") = 0, nb::arg("recording").none() = nb::none())
         .def_prop_ro("items", [](const BoundJob& self) { return self.items(); });
 }
 

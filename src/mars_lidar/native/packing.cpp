@@ -25,7 +25,7 @@ namespace {
 
 constexpr int kEscape = 24;  // a quotient of this many zeros or more: the value follows in 32 plain bits
 constexpr size_t kHeader = 16, kPadding = 8;
-constexpr size_t kMostBytes = 14;  // of one element: two escapes
+constexpr size_t kMostBytes = 14;   // of one element: two escapes
 constexpr size_t kKept = 16 << 20;  // bytes that a thread keeps between calls
 
 void store64(uint8_t* to, uint64_t value) {

@@ -41,9 +41,13 @@ MARS_INLINE int64_t framed_photons(double share, int64_t photons, const Ones& on
 
 template <class Team>
 class PhotonPlan {
-public:
+ public:
     PhotonPlan(const ShapeJob& job, Alignment<Team>& alignment, Bump& memory, const Team& team)
-        : job_(job), alignment_(alignment), team_(team), n_(job.bins), outside_(job.bins - job.frame.size),
+        : job_(job),
+          alignment_(alignment),
+          team_(team),
+          n_(job.bins),
+          outside_(job.bins - job.frame.size),
           shift_(guide_shift(outside_)) {
         frame_ = memory.take<double>(job.frame.size + 1);
         until_ = memory.take<uint32_t>(job.frame.size + 1);
@@ -130,7 +134,7 @@ public:
         return v < here ? (bin >= n ? bin - n : bin) : n;
     }
 
-protected:
+ protected:
     // Least and largest values of the mixture in each part.
     void mix(int64_t pixel) {
         float *const low = low_, *const high = high_;
@@ -172,9 +176,9 @@ protected:
     const Team team_;
     const int64_t n_, outside_;  // bins; of them outside of the frame
     const int shift_;
-    double* frame_;              // (size + 1) what each bin of the frame, moved, holds
-    uint32_t* until_;            // its distribution function, in units of 2^-31
-    float *low_, *high_;         // (32), of the largest value of all
+    double* frame_;       // (size + 1) what each bin of the frame, moved, holds
+    uint32_t* until_;     // its distribution function, in units of 2^-31
+    float *low_, *high_;  // (32), of the largest value of all
     const float* row_[4];
     float weight_[4];
     int used_ = 0;

@@ -53,7 +53,8 @@ class PixelLikelihood {
     double time() const { return time_; }    // their armed time, bins x periods
 
     // With `ends`, mixed over what they leave of the bins that these cover. `whole`: bin by bin round the period.
-    Likelihood operator()(double signal, double background, double delay, const ExposureEnds& ends, bool whole = false) const {
+    Likelihood operator()(double signal, double background, double delay, const ExposureEnds& ends,
+                          bool whole = false) const {
         Likelihood out, each[ExposureEnds::kMost];
         const double flat = background / static_cast<double>(r_.bins);
         whole = whole || whole_ || (series_ && flat > 2.0 * BackgroundSeries::kMost);
@@ -83,7 +84,8 @@ class PixelLikelihood {
             const Pass pass(l, passes_.rearmed[j] != 0.0);
             const double* choices = ends.choices(k);
             for (int c = 0; c < ends.count; ++c) {
-                const double armed = ExposureEnds::armed(passes_, j, ends.shift[c]), quiet = armed + passes_.rearmed[j] - h;
+                const double armed = ExposureEnds::armed(passes_, j, ends.shift[c]),
+                             quiet = armed + passes_.rearmed[j] - h;
                 if (!(armed + passes_.rearmed[j] > 1e-9)) continue;
                 const Expected e(pass, armed, passes_.rearmed[j]);
                 passed(each[c], h, quiet, e, 1.0 / (armed + passes_.rearmed[j]), dl);

@@ -36,7 +36,7 @@ double gaussian_energy(double from, double to, double sigma) {
 // Expected counts of a pixel's bins over the exposure: a uniform background, and the signal where there is
 // any.
 class Means {
-public:
+ public:
     explicit Means(const Job& job) : signal(job.bins, 0.0), job_(job) {}
 
     double background = 0.0;     // per bin
@@ -58,7 +58,7 @@ public:
         if (job_.waveform) add_waveform(job_.waveform + pixel * job_.samples);
     }
 
-private:
+ private:
     void add(int64_t bin, double photons) {
         if (!(photons > 0.0)) return;
         if (signal[bin] == 0.0) lit.push_back(static_cast<int32_t>(bin));
@@ -184,8 +184,7 @@ bool use_table(double mean, int32_t bins) {
 }
 
 template <class Count>
-void fill(const EventStream& stream, const Means& means, const PoissonTable* table, int32_t bins,
-          Count* row) {
+void fill(const EventStream& stream, const Means& means, const PoissonTable* table, int32_t bins, Count* row) {
     std::fill_n(row, bins, Count{0});
     if (means.background < kPlacedBelow) {
         if (means.background > 0.0) scatter_background(stream, means.background, bins, row);
@@ -244,17 +243,16 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
 
 void bind_poisson(nb::module_& module) {
     const char* about = "Histograms out (realizations * pixels, bins) without dead time.";
-    module.def("poisson_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("pulse"),
-               nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("progress").none(), about);
-    module.def("poisson_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"),
-               nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("progress").none(), about);
+    module.def("poisson_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
+               nb::arg("threads"), nb::arg("progress").none(), about);
+    module.def("poisson_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
+               nb::arg("threads"), nb::arg("progress").none(), about);
     module.def(
         "poisson_sample",
         [](uint64_t seed, double mean, Vector<int64_t> out) {
             const EventStream stream(seed, kDomain, 0, 0);
             PoissonSampler sampler(mean);
-            for (size_t k = 0; k < out.shape(0); ++k)
-                out.data()[k] = sampler(stream, static_cast<uint32_t>(k));
+            for (size_t k = 0; k < out.shape(0); ++k) out.data()[k] = sampler(stream, static_cast<uint32_t>(k));
         },
         nb::arg("seed"), nb::arg("mean"), nb::arg("out").noconvert(),
         "Independent Poisson numbers out (n): the sampler by itself, for its tests.");

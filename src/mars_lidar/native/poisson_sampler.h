@@ -42,7 +42,7 @@ inline double log_poisson_density(double k, double mean) {
 }
 
 class PoissonSampler {
-public:
+ public:
     explicit PoissonSampler(double mean) : mean_(mean) {
         if (mean < kInversionBelow) return;
         b_ = 0.931 + 2.53 * std::sqrt(mean);
@@ -55,7 +55,7 @@ public:
         return mean_ < kInversionBelow ? invert(stream.word(event, 0)) : transform(stream, event);
     }
 
-private:
+ private:
     static constexpr double kInversionBelow = 10.0;
 
     // The number of k with v < P(N > k), v uniform. From the upper tail, because v is fine near 0: right for
@@ -92,13 +92,13 @@ private:
     }
 
     double mean_;
-    double none_ = -1.0, some_ = 0.0;  // inversion: P(N = 0), P(N > 0), when needed
+    double none_ = -1.0, some_ = 0.0;                                 // inversion: P(N = 0), P(N > 0), when needed
     double b_ = 0.0, a_ = 0.0, inverse_alpha_ = 0.0, squeeze_ = 0.0;  // rejection
 };
 
 // Inversion by table, for many draws of one mean from 1e-3 to 1e4: an eighth of the time of the rejection.
 class PoissonTable {
-public:
+ public:
     // Steps that setting up takes, to weigh against the number of draws.
     static double effort(double mean) { return 20.0 * std::sqrt(mean) + 280.0; }
 
@@ -113,8 +113,7 @@ public:
         below_.resize(static_cast<size_t>(high - low));
         // Thresholds 2^64 P(N <= k). From either end up to the mode: both tails keep their digits.
         double sum = 0.0, p = lowest;
-        for (double k = low; k < mode; p *= mean / ++k)
-            below_[index(k)] = static_cast<uint64_t>((sum += p) * 0x1p64);
+        for (double k = low; k < mode; p *= mean / ++k) below_[index(k)] = static_cast<uint64_t>((sum += p) * 0x1p64);
         sum = 0.0;
         p = density;
         for (double k = high; k > mode; p *= k-- / mean)
@@ -133,7 +132,7 @@ public:
         return first_ + static_cast<int64_t>(at);
     }
 
-private:
+ private:
     size_t index(double k) const { return static_cast<size_t>(static_cast<int64_t>(k) - first_); }
 
     int64_t first_ = 0;

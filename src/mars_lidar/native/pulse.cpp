@@ -11,7 +11,7 @@
 namespace mars {
 namespace {
 
-constexpr double kGaussianReach = 8.5;    // half support in sigma: 1e-17 = 2^-56.4 of the energy lies outside
+constexpr double kGaussianReach = 8.5;  // half support in sigma: 1e-17 = 2^-56.4 of the energy lies outside
 constexpr int kForwardCellsPerSigma = 256;
 
 }  // namespace
@@ -64,7 +64,7 @@ void build_forward(PulseTable& table, const std::vector<double>& early, const st
     const int cells = static_cast<int>(early.size()) - 1;
     table.cells = cells;
     table.split = static_cast<float>(early[split]);
-    table.late_cell = split + 1;  // behind the guard cell
+    table.late_cell = split + 1;                  // behind the guard cell
     table.forward.assign(2 * (cells + 2), 0.0f);  // one guard cell without energy at either end
     for (int k = 0; k < cells; ++k) {
         const double begin = k < split ? early[k] : late[k];
@@ -163,7 +163,8 @@ void build_sampled(PulseTable& table) {
     std::vector<double> knots = shape.knots;
     double width = shape.width;
     int split = median_edge(knots);
-    if (std::fabs(knots[split] - 0.5) > 0.25) {  // most of the energy in one sample: both halves need some for their tails
+    if (std::fabs(knots[split] - 0.5) >
+        0.25) {  // most of the energy in one sample: both halves need some for their tails
         knots = halved(knots);
         width *= 0.5;
         split = median_edge(knots);
@@ -236,10 +237,12 @@ void bind_pulse(nb::module_& module) {
                 return PulseTable::sampled({knots.data(), knots.data() + knots.shape(0)}, width, start);
             },
             nb::arg("knots"), nb::arg("width"), nb::arg("start"))
-        .def("periodic", [](const PulseTable& self, double t) { return self.shape.periodic(t); },
-             "Energy of the pulse train up to t.")
-        .def("cumulative", [](const PulseTable& self, double t) { return self.shape.cumulative(t); },
-             "Energy of one pulse up to t.");
+        .def(
+            "periodic", [](const PulseTable& self, double t) { return self.shape.periodic(t); },
+            "Energy of the pulse train up to t.")
+        .def(
+            "cumulative", [](const PulseTable& self, double t) { return self.shape.cumulative(t); },
+            "Energy of one pulse up to t.");
 }
 
 }  // namespace mars

@@ -8,7 +8,7 @@
 namespace mars {
 
 class PulseEnergyTables {
-public:
+ public:
     explicit PulseEnergyTables(const PulseShape& shape) {
         energy.low = shape.low();
         energy.high = shape.high();
@@ -32,7 +32,7 @@ public:
     PulseEnergy energy{};
     std::vector<double> tail, density;
 
-private:
+ private:
     // e^-x without libm: Taylor series at x / 2^k, squared k times.
     static double exponential(double x) {
         int halvings = 0;

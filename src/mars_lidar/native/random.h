@@ -57,8 +57,7 @@ MARS_INLINE Pair<U> threefry(U c0, U c1, U k0, U k1) {
 // The key of one pixel's stream in one realization. For a given seed this is a bijection of
 // (pixel, realization): no two streams share a key.
 MARS_INLINE Pair<uint32_t> stream_key(uint64_t seed, uint32_t realization, uint32_t pixel) {
-    return threefry<20, uint32_t>(pixel, realization, static_cast<uint32_t>(seed),
-                                  static_cast<uint32_t>(seed >> 32));
+    return threefry<20, uint32_t>(pixel, realization, static_cast<uint32_t>(seed), static_cast<uint32_t>(seed >> 32));
 }
 
 // A uniform number on (0, 1), both ends open, 31 bits: relatively fine near 0.

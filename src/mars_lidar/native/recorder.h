@@ -12,11 +12,13 @@ inline namespace MARS_LEVEL {
 // of exact_recorder.h, PartClock of waveform_recorder.h.
 template <class Clock>
 class Recorder {
-public:
+ public:
     using Registration = typename Clock::Registration;
 
     explicit Recorder(const Job& job)
-        : recording_(*job.recording), jitter_(jitter_view(recording_)), clock_(job),
+        : recording_(*job.recording),
+          jitter_(jitter_view(recording_)),
+          clock_(job),
           dead_(recording_.electronics_dead_time > job.dead_time),
           limited_(recording_.most_per_period != INT32_MAX || recording_.most_per_exposure != INT32_MAX) {
         for (int lane = 0; lane < kLanes; ++lane) begin(lane);
@@ -65,7 +67,7 @@ public:
     MARS_INLINE Mask full() const { return in_exposure_ >= recording_.most_per_exposure; }
     bool fills() const { return recording_.most_per_exposure != INT32_MAX; }
 
-private:
+ private:
     MARS_INLINE void lose_to_dead_time(Registration& r) {
         r.lost = r.lost | before(r.hit, ready_);
         ready_ = earlier(r.lost, ready_, clock_.recovered(r.hit));
@@ -83,8 +85,7 @@ private:
     MARS_INLINE void jitter(Registration (&registrations)[n], UInt key0, UInt key1, UInt event) {
         const bool tail = jitter_.tail_below != 0;
         if (!jitter_.gaussian) return move<false, false>(registrations, key0, key1, event);
-        tail ? move<true, true>(registrations, key0, key1, event)
-             : move<true, false>(registrations, key0, key1, event);
+        tail ? move<true, true>(registrations, key0, key1, event) : move<true, false>(registrations, key0, key1, event);
     }
 
     // Two registrations share the words of a draw.

@@ -37,7 +37,7 @@ struct CodeTable {
         }
     }
 
-private:
+ private:
     static constexpr size_t kCells = 4;  // a bin
 };
 

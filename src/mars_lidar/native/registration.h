@@ -14,22 +14,22 @@ namespace mars {
 inline namespace MARS_LEVEL {
 
 // Streams of draws of one pixel: the second counter word; the first is the number of the registration.
-constexpr uint32_t kStageArrival = 0;     // background and first return
+constexpr uint32_t kStageArrival = 0;      // background and first return
 constexpr uint32_t kStageArrivalFine = 1;  // fresh fractions for long waits of those two
-constexpr uint32_t kStageStart = 2;       // arrivals before a stationary exposure: waits and components; + 1: phases
-constexpr uint32_t kStageJitter = 4;      // first word of the counter: half the number; + 1: tails
-constexpr uint32_t kStageReturns = 16;    // + 2 k: returns 2 k + 1 and 2 k + 2; + 2 k + 1: their fractions
+constexpr uint32_t kStageStart = 2;        // arrivals before a stationary exposure: waits and components; + 1: phases
+constexpr uint32_t kStageJitter = 4;       // first word of the counter: half the number; + 1: tails
+constexpr uint32_t kStageReturns = 16;     // + 2 k: returns 2 k + 1 and 2 k + 2; + 2 k + 1: their fractions
 
-constexpr uint32_t kStageTails = 64;         // + k: place of an arrival in the tails of return k
+constexpr uint32_t kStageTails = 64;          // + k: place of an arrival in the tails of return k
 constexpr uint32_t kStageTraps = 0x40000000;  // afterpulses, by the number of the avalanche that leaves carriers (+ k)
 
 constexpr float kLongWait = 256.0f;       // periods; `split_wait` resolves 2^-24 of one up to here
 constexpr float kForever = 134217728.0f;  // 2^27 periods: beyond every exposure
-constexpr float kDarkInverse = 1e30f;           // 1 / rate of a component without photons: every wait is kForever
+constexpr float kDarkInverse = 1e30f;     // 1 / rate of a component without photons: every wait is kForever
 
 // Energies nearer to 0 than this are drawn afresh: between two numbers of the lattice of 2^-24 of energies near 1.
 constexpr float kTail = 0x1p-14f - 0x1p-25f;
-constexpr int kEnergyShift = 16;          // the leading bits of an energy name its cell in the tables
+constexpr int kEnergyShift = 16;  // the leading bits of an energy name its cell in the tables
 
 // Tables of the pulse, see pulse_table.h.
 struct PulseView {
@@ -123,8 +123,8 @@ MARS_INLINE void refresh(Wait& wait, Mask lanes, UInt word, Float rate) {
 }
 
 // Of waits beyond kLongWait, where cells grow longer than a period: whole periods of float32, fractions of their own.
-MARS_INLINE void refresh_long(Float wait_a, Float wait_b, const Rate& a, const Rate& b, UInt key0, UInt key1, UInt event,
-                              uint32_t stage, Wait& split_a, Wait& split_b) {
+MARS_INLINE void refresh_long(Float wait_a, Float wait_b, const Rate& a, const Rate& b, UInt key0, UInt key1,
+                              UInt event, uint32_t stage, Wait& split_a, Wait& split_b) {
     const Mask long_a = wait_a >= kLongWait, long_b = wait_b >= kLongWait;
     split_a = {select(long_a, truncate(wait_a), split_a.whole), select(long_a, splat(0.5f), split_a.fraction)};
     split_b = {select(long_b, truncate(wait_b), split_b.whole), select(long_b, splat(0.5f), split_b.fraction)};
@@ -227,7 +227,8 @@ MARS_INLINE Time finely_later(Time time, Int frames, Float fraction) {
 
 // The same instant in the laser period that holds it, of frames around `delay` in [0, 1): phases in [0, 1].
 MARS_INLINE Time in_period(Time time, Float delay) {
-    const Float here = time.phase + delay, next = time.phase + (delay - 1.0f);  // no sum above 1: its lattice is coarser
+    const Float here = time.phase + delay,
+                next = time.phase + (delay - 1.0f);  // no sum above 1: its lattice is coarser
     const Mask before_it = here < 0.0f, after_it = next >= 0.0f;
     return {minus_if(plus_if(time.frame, after_it), before_it), select(after_it, next, plus_if(here, before_it))};
 }
@@ -242,7 +243,7 @@ MARS_INLINE Time shifted(Time time, Float offset) {
 // What the last registration was, for dead times of whole periods: the pixel then re-arms at the same phase of
 // the pulse, whose energy is known without rounding.
 struct Memory {
-    Mask known;    // the last registration came from return `source`
+    Mask known;  // the last registration came from return `source`
     Int source;
     Float energy;  // its signed energy
 };
@@ -264,8 +265,9 @@ MARS_INLINE Time next_registration(const SystemView& system, const Return* retur
                                    UInt key0, UInt key1, UInt event, Memory& memory) {
     Time first = finely_later(from, drawn.background.whole, drawn.background.fraction);
     Float energy = memory.energy;
-    const Time echo = next_return<gaussian, whole>(system.pulse, from, drawn.signal, memory.known & (memory.source == 0),
-                                                   returns[0].flux, {key0, key1, event, kStageTails}, energy);
+    const Time echo =
+        next_return<gaussian, whole>(system.pulse, from, drawn.signal, memory.known & (memory.source == 0),
+                                     returns[0].flux, {key0, key1, event, kStageTails}, energy);
     const Mask wins = before(echo, first);
     first = earlier(wins, echo, first);
     Memory next = {wins, splat(0), energy};
@@ -278,9 +280,9 @@ MARS_INLINE Time next_registration(const SystemView& system, const Return* retur
         for (int32_t i = k; i <= partner; ++i) {
             energy = memory.energy;
             const Source source = {key0, key1, event, kStageTails + static_cast<uint32_t>(i)};
-            const Time frames = next_return<gaussian, whole>(system.pulse, shifted(from, returns[i].offset), waits[i - k],
-                                                             memory.known & (memory.source == i), returns[i].flux, source,
-                                                             energy);
+            const Time frames =
+                next_return<gaussian, whole>(system.pulse, shifted(from, returns[i].offset), waits[i - k],
+                                             memory.known & (memory.source == i), returns[i].flux, source, energy);
             const Time other = shifted(frames, negative(returns[i].offset));
             const Mask sooner = before(other, first);
             first = earlier(sooner, other, first);

@@ -10,8 +10,8 @@
 #include "parallel.h"
 #include "pulse_table.h"  // nanobind wants the complete type; only the shape inside is used
 #include "sequential_events.h"
-#include "sequential_recorder.h"
 #include "sequential_pixel.h"
+#include "sequential_recorder.h"
 
 namespace mars {
 namespace {
@@ -30,7 +30,7 @@ constexpr double kSpread = 64.0;
 // One item (a pixel in a realization) after the other; one of these per thread and chunk.
 template <class Pixel>
 class Simulator {
-public:
+ public:
     Simulator(const Job& job, const PulseShape& pulse, const std::atomic<bool>& stop)
         : job_(job), pulse_(pulse), stop_(stop) {}
 
@@ -43,7 +43,7 @@ public:
         walk(item, [&](int64_t cycle, double phase) { recorder.take(cycle, phase, recorded); });
     }
 
-private:
+ private:
     template <class Registered>
     void walk(int64_t item, const Registered& registered) {
         const int64_t index = job_.pixel(item);
@@ -53,8 +53,7 @@ private:
         Pixel pixel(job_);
         if (job_.stationary && job_.dead_time > 0.0) warm_up(arrivals, random, pixel);
         const int64_t block = arrivals.block_cycles(kBlockPhotons);
-        for (int64_t start = 0; start < job_.cycles && !stop_.load(std::memory_order_relaxed);
-             start += block) {
+        for (int64_t start = 0; start < job_.cycles && !stop_.load(std::memory_order_relaxed); start += block) {
             const int64_t cycles = std::min<int64_t>(block, job_.cycles - start);
             draw(arrivals, cycles, random);
             pixel.pass(times_, start, registered);
@@ -87,8 +86,7 @@ private:
         pixel.ready = Time{0, 0}.plus(-length);
         int64_t start = pixel.ready.cycle;
         const double x = arrivals.photons_per_period() * job_.dead_time;
-        if (random.uniform() * (1.0 + x) < x)
-            pixel.ready = pixel.ready.plus(random.uniform() * job_.dead_time);
+        if (random.uniform() * (1.0 + x) < x) pixel.ready = pixel.ready.plus(random.uniform() * job_.dead_time);
         pixel.ready = pixel.armed(pixel.ready);
         const int64_t block = arrivals.block_cycles(kWarmUpBlockPhotons);
         while (!stop_.load(std::memory_order_relaxed)) {
@@ -115,28 +113,24 @@ private:
 
 // Calls work(simulator, item, stop) for all items, in chunks of about equal work.
 template <template <class> class Simulation, class Pixel, class Work>
-void for_pixels(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
-               const Work& work) {
+void for_pixels(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress, const Work& work) {
     double photons = 0.0;
     const int64_t looks = std::min<int64_t>(job.pixels, 64);  // a sample of the image will do
-    for (int64_t k = 0; k < looks; ++k)
-        photons += Arrivals(job, pulse, k * job.pixels / looks).photons_per_period();
+    for (int64_t k = 0; k < looks; ++k) photons += Arrivals(job, pulse, k * job.pixels / looks).photons_per_period();
     const double per_item = 1.0 + photons / static_cast<double>(looks) * job.cycles;
-    const int64_t size =
-        job.crosstalk.width ? job.pixels  // an image at a time, since its pixels influence each other
-                            : std::max<int64_t>(1, static_cast<int64_t>(std::min(kChunkPhotons / per_item, 4096.0)));
+    const int64_t size = job.crosstalk.width
+                             ? job.pixels  // an image at a time, since its pixels influence each other
+                             : std::max<int64_t>(1, static_cast<int64_t>(std::min(kChunkPhotons / per_item, 4096.0)));
     const int64_t items = job.items();
-    run_chunks(
-        (items + size - 1) / size, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-            Simulation<Pixel> simulator(job, pulse, stop);
-            for (int64_t item = chunk * size; item < std::min(items, (chunk + 1) * size) && !stop; ++item)
-                work(simulator, item, stop);
-        });
+    run_chunks((items + size - 1) / size, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+        Simulation<Pixel> simulator(job, pulse, stop);
+        for (int64_t item = chunk * size; item < std::min(items, (chunk + 1) * size) && !stop; ++item)
+            work(simulator, item, stop);
+    });
 }
 
 template <template <class> class Simulation, class Work>
-void for_modes(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
-               const Work& work) {
+void for_modes(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress, const Work& work) {
     switch (job.mode) {
         case DetectorMode::kNonparalyzable:
             return for_pixels<Simulation, FreePixel>(job, pulse, threads, progress, work);
@@ -150,48 +144,41 @@ void for_modes(const Job& job, const PulseShape& pulse, int threads, const nb::o
 }
 
 template <class Work>
-void for_items(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress,
-               const Work& work) {
+void for_items(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress, const Work& work) {
     job.avalanches_matter() ? for_modes<EventSimulator>(job, pulse, threads, progress, work)
                             : for_modes<Simulator>(job, pulse, threads, progress, work);
 }
 
-inline int32_t bin_of(double phase, int32_t bins) {
-    return std::min(static_cast<int32_t>(phase * bins), bins - 1);
-}
+inline int32_t bin_of(double phase, int32_t bins) { return std::min(static_cast<int32_t>(phase * bins), bins - 1); }
 
 template <class Count>
 void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, int threads,
                const nb::object& progress) {
     check_histogram(job, out);
     Count* const cube = out.data();
-    for_items(job, shape_of(pulse), threads, progress,
-              [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
-                  Count* const row = cube + item * job.bins;
-                  std::fill_n(row, job.bins, Count{0});
-                  simulator.run(item, [&](int64_t, double phase) {
-                      Count& count = row[bin_of(phase, job.bins)];
-                      if (++count == 0) throw_full<Count>();
-                  });
-              });
+    for_items(job, shape_of(pulse), threads, progress, [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
+        Count* const row = cube + item * job.bins;
+        std::fill_n(row, job.bins, Count{0});
+        simulator.run(item, [&](int64_t, double phase) {
+            Count& count = row[bin_of(phase, job.bins)];
+            if (++count == 0) throw_full<Count>();
+        });
+    });
 }
 
 void counts(const BoundJob& job, const PulseTable& pulse, Vector<int64_t> out, int threads,
             const nb::object& progress) {
-    if (static_cast<int64_t>(out.shape(0)) != job.items())
-        throw nb::value_error("out must have one count per item");
+    if (static_cast<int64_t>(out.shape(0)) != job.items()) throw nb::value_error("out must have one count per item");
     int64_t* const total = out.data();
-    for_items(job, shape_of(pulse), threads, progress,
-              [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
-                  int64_t count = 0;
-                  simulator.run(item, [&](int64_t, double) { ++count; });
-                  total[item] = count;
-              });
+    for_items(job, shape_of(pulse), threads, progress, [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
+        int64_t count = 0;
+        simulator.run(item, [&](int64_t, double) { ++count; });
+        total[item] = count;
+    });
 }
 
-void timestamps(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> offsets,
-                Vector<double> times_ns, Vector<int32_t> cycle, Vector<int32_t> bin, double period_ns,
-                int threads, const nb::object& progress) {
+void timestamps(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> offsets, Vector<double> times_ns,
+                Vector<int32_t> cycle, Vector<int32_t> bin, double period_ns, int threads, const nb::object& progress) {
     const int64_t* const offset = offsets.data();
     const size_t total = offsets.shape(0) == 0 ? 0 : static_cast<size_t>(offset[offsets.shape(0) - 1]);
     if (static_cast<int64_t>(offsets.shape(0)) != job.items() + 1 || times_ns.shape(0) != total ||
@@ -208,8 +195,7 @@ void timestamps(const BoundJob& job, const PulseTable& pulse, Vector<const int64
                       bin.data()[k] = bin_of(phase, job.bins);
                       ++k;
                   });
-                  if (k != end && !stop)
-                      throw std::invalid_argument("offsets are not those of this job's counts");
+                  if (k != end && !stop) throw std::invalid_argument("offsets are not those of this job's counts");
               });
 }
 
@@ -222,13 +208,11 @@ void bind_sequential(nb::module_& module) {
     module.def("sequential_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"),
                nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("progress").none(), about);
     module.def("sequential_counts", &counts, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("threads"), nb::arg("progress").none(),
-               "Registrations out (items) by the sequential engine.");
-    module.def(
-        "sequential_timestamps", &timestamps, nb::arg("job"), nb::arg("pulse"),
-        nb::arg("offsets").noconvert(), nb::arg("times_ns").noconvert(), nb::arg("cycle").noconvert(),
-        nb::arg("bin").noconvert(), nb::arg("period_ns"), nb::arg("threads"), nb::arg("progress").none(),
-        "Registrations item after item, item i in [offsets[i], offsets[i + 1]): the draws of the histogram.");
+               nb::arg("threads"), nb::arg("progress").none(), "Registrations out (items) by the sequential engine.");
+    module.def("sequential_timestamps", &timestamps, nb::arg("job"), nb::arg("pulse"), nb::arg("offsets").noconvert(),
+               nb::arg("times_ns").noconvert(), nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(),
+               nb::arg("period_ns"), nb::arg("threads"), nb::arg("progress").none(),
+               "Registrations item after item, item i in [offsets[i], offsets[i + 1]): the draws of the histogram.");
 }
 
 }  // namespace mars

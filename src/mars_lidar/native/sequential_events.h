@@ -30,7 +30,7 @@ struct Arrival {
 
 template <class Pixel>
 class EventSimulator {
-public:
+ public:
     EventSimulator(const Job& job, const PulseShape& pulse, const std::atomic<bool>& stop)
         : job_(job), pulse_(pulse), stop_(stop), twilight_(Time{0, 0}.plus(job.twilight)) {}
 
@@ -42,7 +42,7 @@ public:
         walk(item, [&](int64_t cycle, double phase) { recorder.take(cycle, phase, recorded); });
     }
 
-private:
+ private:
     template <class Registered>
     void walk(int64_t item, const Registered& registered) {
         if (job_.crosstalk.width == 0) {
@@ -72,7 +72,8 @@ private:
 
         Member(const Job& job, const PulseShape& pulse, int64_t item)
             : arrivals(job, pulse, job.pixel(item)),
-              random(job.seed, job.realization(item), job.pixel_index[job.pixel(item)]), pixel(job) {}
+              random(job.seed, job.realization(item), job.pixel_index[job.pixel(item)]),
+              pixel(job) {}
     };
 
     // The `number` items from `first` on, which influence each other where they are neighbours: all pixels of one

@@ -13,16 +13,13 @@ struct Time {
     Time plus(double periods) const {
         const double whole = std::floor(periods);
         const uint64_t sum = phase + static_cast<uint64_t>(static_cast<int64_t>((periods - whole) * 0x1p52));
-        return {cycle + static_cast<int64_t>(whole) + static_cast<int64_t>(sum >> kPhaseBits),
-                sum & kPhaseMask};
+        return {cycle + static_cast<int64_t>(whole) + static_cast<int64_t>(sum >> kPhaseBits), sum & kPhaseMask};
     }
     Time plus(const Time& other) const {
         const uint64_t sum = phase + other.phase;
         return {cycle + other.cycle + static_cast<int64_t>(sum >> kPhaseBits), sum & kPhaseMask};
     }
-    bool operator<(const Time& other) const {
-        return cycle != other.cycle ? cycle < other.cycle : phase < other.phase;
-    }
+    bool operator<(const Time& other) const { return cycle != other.cycle ? cycle < other.cycle : phase < other.phase; }
     // In the units of a block that starts at cycle `start`; beyond every arrival if later than the block.
     uint64_t after(int64_t start) const {
         if (cycle < start) return 0;
@@ -33,7 +30,7 @@ struct Time {
 
 // Free running, non-paralyzable; what the other modes have in common with it.
 class FreePixel {
-public:
+ public:
     static constexpr bool kForgets = false;  // what was before the last dead time has no effect
 
     explicit FreePixel(const Job& job) : dead_time_(Time{0, 0}.plus(job.dead_time)) {}
@@ -57,13 +54,13 @@ public:
         }
     }
 
-protected:
+ protected:
     Time dead_time_;
 };
 
 // Every arrival begins the dead time anew, seen or not.
 class ParalyzablePixel : public FreePixel {
-public:
+ public:
     static constexpr bool kForgets = true;
 
     using FreePixel::FreePixel;
@@ -79,13 +76,13 @@ public:
         }
     }
 
-private:
+ private:
     bool fired_ = false;
 };
 
 // Armed at the start of a period, for one registration; a dead time that is not over by then costs that period.
 class SynchronousPixel : public FreePixel {
-public:
+ public:
     using FreePixel::FreePixel;
 
     Time armed(Time time) const { return time.phase == 0 ? time : Time{time.cycle + 1, 0}; }
@@ -104,7 +101,7 @@ public:
 
 // Free running, but arrivals outside of the gate do not exist.
 class GatedPixel : public FreePixel {
-public:
+ public:
     explicit GatedPixel(const Job& job) : FreePixel(job), gate_(job.gate) {}
 
     template <class Registered>
@@ -117,7 +114,7 @@ public:
         }
     }
 
-private:
+ private:
     // The gate of a period stays within it: where it wraps, its end is at the beginning of that same period.
     bool open(int64_t cycle, double phase) const {
         const double turns = std::floor(static_cast<double>(cycle) / gate_.cycles);

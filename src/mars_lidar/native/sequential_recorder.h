@@ -15,10 +15,12 @@ namespace mars {
 namespace {
 
 class SequentialRecorder {
-public:
+ public:
     // A second stream of the pixel: another seed.
     SequentialRecorder(const Job& job, int64_t item)
-        : rule_(*job.recording), cycles_(job.cycles), bins_(job.bins),
+        : rule_(*job.recording),
+          cycles_(job.cycles),
+          bins_(job.bins),
           random_(job.seed ^ 0x5851f42d4c957f2du, job.realization(item), job.pixel_index[job.pixel(item)]) {}
 
     // Calls recorded(cycle, phase) if the registration is recorded.
@@ -43,7 +45,7 @@ public:
         recorded(moved < 0 ? moved + cycles_ : moved, rule_.codes.edges.empty() ? time : converted(time));
     }
 
-private:
+ private:
     double jitter() {
         const PulseShape& shape = rule_.jitter->shape;
         double time;

@@ -16,7 +16,7 @@ inline namespace MARS_LEVEL {
 namespace {
 
 constexpr double kLeastArmed = 1e-9;  // of a saturated pixel, where the difference leaves nothing but rounding
-constexpr float kFewPhotons = 0.01f;    // in a bin, below which A is as good as straight in it
+constexpr float kFewPhotons = 0.01f;  // in a bin, below which A is as good as straight in it
 constexpr double kBright = 2.0;       // photons per period from which the slope inside a bin shows
 constexpr int kSweeps = 12;           // of the fixed point where registrations re-arm inside the pulse
 
@@ -32,7 +32,7 @@ struct Bump {  // hands out parts of a block of memory
 
 template <class Team>
 class Alignment {
-public:
+ public:
     Alignment(const ShapeJob& job, Bump& memory, const Team& team) : job_(job), team_(team), n_(job.bins) {
         mixture_ = memory.take<float>(padded_bins(n_) + 32) + 16;  // room for the bins before and behind
         past_ = memory.take<float>(padded_bins(n_) + 16) + 16;
@@ -138,7 +138,7 @@ public:
         });
     }
 
-private:
+ private:
     bool has_pulse(int64_t pixel) const {
         return job_.frame.size > 0 && job_.signal[pixel] > 0.0 && job_.rate[pixel] > 0.0;
     }
@@ -397,11 +397,11 @@ private:
     const int64_t n_;
     int64_t wide_;
     double* sums_ = nullptr;
-    float *mixture_, *past_;  // (-1 .. bins]; what leaves each bin for the next
-    float *here_, *old_;     // the mixture in the frame; a dead time before it
-    float *armed_, *moved_;  // A at its edges; moved to the next bin
+    float *mixture_, *past_;                                       // (-1 .. bins]; what leaves each bin for the next
+    float *here_, *old_;                                           // the mixture in the frame; a dead time before it
+    float *armed_, *moved_;                                        // A at its edges; moved to the next bin
     double *mass_ = nullptr, *below_ = nullptr, *fine_ = nullptr;  // its cells, with `reach_` bins on either side
-    double whole_, part_ = 0.0, nearest_ = 0.0, offset_ = 0.0;  // of the dead time: periods; bins
+    double whole_, part_ = 0.0, nearest_ = 0.0, offset_ = 0.0;     // of the dead time: periods; bins
     int64_t back_ = 0, reach_ = 0;
 };
 

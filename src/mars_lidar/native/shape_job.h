@@ -6,11 +6,11 @@ namespace mars {
 
 // Flux of the pulse at the table's own delay, in the bins that it reaches: the frame.
 struct PulseFrame {
-    int32_t first = 0;               // bin, of the period
-    int32_t size = 0;                // bins; at most all of them
-    int32_t parts = 1;               // of a bin
-    int32_t cells = 1;               // of a bin, a divisor of `parts`: where registrations re-arm in the pulse
-    const float* energy = nullptr;   // (parts + 1, size): of the pulse, from a bin's start to part p of it
+    int32_t first = 0;              // bin, of the period
+    int32_t size = 0;               // bins; at most all of them
+    int32_t parts = 1;              // of a bin
+    int32_t cells = 1;              // of a bin, a divisor of `parts`: where registrations re-arm in the pulse
+    const float* energy = nullptr;  // (parts + 1, size): of the pulse, from a bin's start to part p of it
 };
 
 // What the photons drawn one by one need of a row: its bins outside of the frame, in cyclic order from the frame's end,
@@ -26,20 +26,20 @@ struct ShapeJob {
     uint32_t first_realization = 0;
     uint64_t seed = 0;
     int32_t bins = 1;
-    double dead_time = 0.0;                  // periods
-    const uint32_t* pixel_index = nullptr;   // (pixels): names the random streams
-    const int64_t* place = nullptr;          // (pixels): of the pixel in an image of the output
-    int64_t image = 0;                       // pixels of an image of the output
-    const float* shapes = nullptr;           // (rows, bins), each summing to 1
-    const int64_t* rows = nullptr;           // (pixels, 4)
-    const double* weights = nullptr;         // (pixels, 4)
-    const double* shift = nullptr;           // (pixels) periods, [0, 1); null: rows are at the pixels' own delays
-    const double* signal = nullptr;          // (pixels) photons per period; with `shift` only; likewise below
+    double dead_time = 0.0;                 // periods
+    const uint32_t* pixel_index = nullptr;  // (pixels): names the random streams
+    const int64_t* place = nullptr;         // (pixels): of the pixel in an image of the output
+    int64_t image = 0;                      // pixels of an image of the output
+    const float* shapes = nullptr;          // (rows, bins), each summing to 1
+    const int64_t* rows = nullptr;          // (pixels, 4)
+    const double* weights = nullptr;        // (pixels, 4)
+    const double* shift = nullptr;          // (pixels) periods, [0, 1); null: rows are at the pixels' own delays
+    const double* signal = nullptr;         // (pixels) photons per period; with `shift` only; likewise below
     const double* background = nullptr;
-    const double* rate = nullptr;            // (pixels) mean registrations per period
+    const double* rate = nullptr;  // (pixels) mean registrations per period
     PulseFrame frame;
-    const RowGuide* guides = nullptr;        // (rows); null: no photons one by one
-    const int64_t* counts = nullptr;         // (realizations, pixels)
+    const RowGuide* guides = nullptr;  // (rows); null: no photons one by one
+    const int64_t* counts = nullptr;   // (realizations, pixels)
 };
 
 constexpr uint64_t kShapeDomain = 0x5368617065730000u;  // "Shapes": not another engine's numbers at one seed

@@ -14,14 +14,14 @@ namespace mars {
 struct ShapeBlock {
     const ShapeJob* job;
     int64_t pixel, pixels, realization, realizations;
-    bool wide;    // the output is uint32, not uint16
-    void* out;    // (realizations, image, bins)
+    bool wide;        // the output is uint32, not uint16
+    void* out;        // (realizations, image, bins)
     double* aligned;  // (pixels, bins): not histograms, but the shapes that they would be drawn from; or null
-    void* memory; // `shape_memory` bytes, aligned to 64
+    void* memory;     // `shape_memory` bytes, aligned to 64
     // Poisson number of a mean beyond those of the lanes
     int64_t (*large_poisson)(uint64_t key, uint32_t event, uint32_t step, double mean);
     const std::atomic<bool>* stop;
-    bool full;    // result: a bin would have exceeded the output's type
+    bool full;  // result: a bin would have exceeded the output's type
 };
 
 // Functions of this header have internal linkage: one compiled for AVX-512 must not be linked in place of another.

@@ -24,7 +24,7 @@ MARS_INLINE int lowest_bit(uint64_t x) { return __builtin_ctzll(x); }
 #endif
 
 class Photons : public PhotonPlan<OneThread> {
-public:
+ public:
     Photons(const ShapeJob& job, Alignment<OneThread>& alignment, Bump& memory)
         : PhotonPlan(job, alignment, memory, OneThread()), first_old_(alignment.first_old()) {
         counts_ = memory.take<uint16_t>(n_ + kSlots);
@@ -72,14 +72,14 @@ public:
 #endif
     }
 
-private:
+ private:
     // 64 words of 32 events.
     MARS_INLINE static void words(uint32_t event, uint32_t step, Pair<uint32_t> key, uint32_t* to) {
         for (int k = 0; k < kBlock / 2; k += kLanes) {
             const UInt number = numbered(event + static_cast<uint32_t>(k));
             const Pair<UInt> word = threefry<13, UInt>(number, splat(step), splat(key.first), splat(key.second));
-            spill(reinterpret_cast<uint32_t(&)[kLanes]>(to[k]), word.first);
-            spill(reinterpret_cast<uint32_t(&)[kLanes]>(to[k + kBlock / 2]), word.second);
+            spill(reinterpret_cast<uint32_t (&)[kLanes]>(to[k]), word.first);
+            spill(reinterpret_cast<uint32_t (&)[kLanes]>(to[k + kBlock / 2]), word.second);
         }
     }
 
@@ -212,9 +212,9 @@ private:
         }
     }
 
-    const int64_t first_old_;    // bin, a dead time before the frame
-    uint16_t* counts_;           // (n + slots) zeros between exposures
-    uint16_t* framed_;           // of the frame's bins, zeros between exposures
+    const int64_t first_old_;  // bin, a dead time before the frame
+    uint16_t* counts_;         // (n + slots) zeros between exposures
+    uint16_t* framed_;         // of the frame's bins, zeros between exposures
     uint32_t *place_, *word_;
     uint16_t start_[(1 << kGuideBits) + kStride + 1];
 };

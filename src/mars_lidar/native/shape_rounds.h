@@ -25,7 +25,7 @@ using LargePoisson = int64_t (*)(uint64_t key, uint32_t event, uint32_t step, do
 
 template <class Team>
 class Rounds {
-public:
+ public:
     Rounds(const ShapeJob& job, Bump& memory, const Team& team)
         : team_(team), n_(job.bins), padded_(padded_bins(n_)), classes_(shape_classes(n_)) {
         counts = memory.take<uint32_t>(padded_);
@@ -118,7 +118,7 @@ public:
         }
     }
 
-private:
+ private:
     void scatter(int64_t photons, Pair<uint32_t> key, LargePoisson large) {
         int64_t left = photons;
         // one by one as long as a photon's search costs less than its share of a round
@@ -199,8 +199,7 @@ private:
             float rest[kLanes];
             int64_t at[kLanes];
             const UInt event = numbered(static_cast<uint32_t>(k));
-            const Pair<UInt> word =
-                threefry<13, UInt>(event, splat(kPlaceStep), splat(key.first), splat(key.second));
+            const Pair<UInt> word = threefry<13, UInt>(event, splat(kPlaceStep), splat(key.first), splat(key.second));
             spill(high, word.first);
             spill(low, word.second);
             const int here = photons - k < kLanes ? static_cast<int>(photons - k) : kLanes;
@@ -211,8 +210,7 @@ private:
             for (int64_t half = classes_ / 2; half > 0; half /= 2)  // the last class that begins below
                 for (int lane = 0; lane < here; ++lane)
                     at[lane] += half & -static_cast<int64_t>(below_[at[lane] + half] <= energy[lane]);  // no branch
-            for (int lane = 0; lane < here; ++lane)
-                rest[lane] = static_cast<float>(energy[lane] - below_[at[lane]]);
+            for (int lane = 0; lane < here; ++lane) rest[lane] = static_cast<float>(energy[lane] - below_[at[lane]]);
             for (int64_t size = padded_ / classes_; size > 1; size -= size / 2) {
                 const int64_t half = size / 2 * classes_;
                 for (int lane = 0; lane < here; ++lane)
@@ -278,8 +276,8 @@ private:
     const Team team_;
     const int64_t n_, padded_, classes_;
     const float* shape_ = nullptr;
-    float* until_;    // the shape's sum in a bin's class up to the bin
-    double* below_;   // and that of all classes before
+    float* until_;   // the shape's sum in a bin's class up to the bin
+    double* below_;  // and that of all classes before
     double* eighths_;
     uint32_t *sums_ = nullptr, *parts_ = nullptr;  // counts in 64 bins and in 8, to remove by
     double total_ = 0.0;

@@ -39,8 +39,8 @@ struct Level {
 std::vector<Level> levels() {
     std::vector<Level> found;
 #if defined(MARS_HAS_avx512)
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512vl"))
         found.push_back({"avx512", shape_kernel_avx512});
 #endif
 #if defined(MARS_HAS_avx2)
@@ -66,14 +66,14 @@ int64_t large_poisson(uint64_t key, uint32_t event, uint32_t step, double mean) 
 
 // Memory of one thread, aligned to a cache line.
 class WorkArea {
-public:
+ public:
     explicit WorkArea(int64_t bytes) : memory_(::operator new(static_cast<size_t>(bytes), std::align_val_t(64))) {}
     ~WorkArea() { ::operator delete(memory_, std::align_val_t(64)); }
     WorkArea(const WorkArea&) = delete;
     WorkArea& operator=(const WorkArea&) = delete;
     void* get() const { return memory_; }
 
-private:
+ private:
     void* memory_;
 };
 
@@ -275,9 +275,12 @@ void bind_shape_sampler(nb::module_& module) {
             "Move the rows by `shift`, in [0, 1), to the pixels' own delays.")
         .def(
             "guide",
-            [](BoundShapeJob& self, Matrix<float> guides, int threads) { guide(self, guides, self.row_count, threads); },
+            [](BoundShapeJob& self, Matrix<float> guides, int threads) {
+                guide(self, guides, self.row_count, threads);
+            },
             nb::kw_only(), nb::arg("guides").noconvert(), nb::arg("threads"),
-            "Let moderate counts be drawn photon by photon: `guides` (rows, 64), zeros at first, are filled as needed.");
+            "Let moderate counts be drawn photon by photon: `guides` (rows, 64), zeros at first, are filled as "
+            "needed.");
     module.def("shape_guides", &all_guides, nb::arg("shapes"), nb::kw_only(), nb::arg("dead_time"), nb::arg("first"),
                nb::arg("size"), "Guides (rows, 64) to all rows of canonical delay, as `ShapeJob.guide` fills them.");
     module.def("shape_aligned", &aligned, nb::arg("job"), nb::arg("out").noconvert(), nb::arg("level"),

@@ -12,11 +12,17 @@
 namespace std {
 
 template <class T>
-const T& max(const T& a, const T& b) { return a < b ? b : a; }
+const T& max(const T& a, const T& b) {
+    return a < b ? b : a;
+}
 template <class T>
-const T& min(const T& a, const T& b) { return b < a ? b : a; }
+const T& min(const T& a, const T& b) {
+    return b < a ? b : a;
+}
 template <class T>
-const T& clamp(const T& x, const T& low, const T& high) { return x < low ? low : high < x ? high : x; }
+const T& clamp(const T& x, const T& low, const T& high) {
+    return x < low ? low : high < x ? high : x;
+}
 template <class T>
 void swap(T& a, T& b) {
     const T kept = a;

@@ -18,7 +18,7 @@
 namespace mars {
 
 class StationaryState {
-public:
+ public:
     // `photons`: expected photons in each of n equal parts of the period. `dead_time` in periods.
     StationaryState(const std::vector<double>& photons, double dead_time)
         : dead_time_(dead_time), whole_(static_cast<int64_t>(dead_time)) {
@@ -27,7 +27,9 @@ public:
 
     // From registrations per period and bin that are known.
     StationaryState(double dead_time, const std::vector<double>& registrations)
-        : dead_time_(dead_time), whole_(static_cast<int64_t>(dead_time)), below_(registrations.size() + 1, 0.0),
+        : dead_time_(dead_time),
+          whole_(static_cast<int64_t>(dead_time)),
+          below_(registrations.size() + 1, 0.0),
           converged_(true) {
         for (size_t j = 0; j < registrations.size(); ++j) below_[j + 1] = below_[j] + std::max(0.0, registrations[j]);
     }
@@ -73,7 +75,7 @@ public:
         return p;
     }
 
-private:
+ private:
     // One sweep round the circle: h is replaced by what follows from it.
     void sweep(std::vector<double>& h) const {
         const int64_t n = static_cast<int64_t>(h.size());
@@ -217,9 +219,9 @@ private:
     }
 
     double dead_time_;
-    int64_t whole_;              // of the dead time, in periods; the rest is
-    int64_t delay_ = 0;          // ... whole bins
-    double spill_ = 0.0;         // ... and a part of one
+    int64_t whole_;       // of the dead time, in periods; the rest is
+    int64_t delay_ = 0;   // ... whole bins
+    double spill_ = 0.0;  // ... and a part of one
     bool converged_ = false;
     std::vector<double> p_, q_;  // 1 - e^-l, and 1 - p / l: the same for a photon that re-arms inside the bin
     std::vector<double> below_;  // registrations per period before the edge of each part

@@ -17,15 +17,23 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
             Vector<const double> at, bool nearest, Matrix<int64_t> rows, Matrix<double> weights,
             Matrix<double> cumulants, int threads) {
     const AxisTables s(signal_axis), b(background_axis), x(sub_signal), y(sub_background);
-    const TableLookup table{s.axis(), b.axis(), x.axis(), y.axis(), entries.data(), phase.data(),
-                            static_cast<int64_t>(phase.shape(0)), correction.data(), nearest ? 1 : 0, 0};
+    const TableLookup table{s.axis(),
+                            b.axis(),
+                            x.axis(),
+                            y.axis(),
+                            entries.data(),
+                            phase.data(),
+                            static_cast<int64_t>(phase.shape(0)),
+                            correction.data(),
+                            nearest ? 1 : 0,
+                            0};
     const int64_t pixels = static_cast<int64_t>(signal.shape(0));
     const size_t sub = sub_signal.shape(0) * sub_background.shape(0);
     if (table.signal.size < 1 || table.background.size < 1 || entries.shape(1) != kCumulants ||
         entries.shape(0) != signal_axis.shape(0) * background_axis.shape(0))
         throw nb::value_error("entries must be (signal * background, 4)");
     if (table.phases == 1 || (table.phases > 1 && (sub == 0 || correction.shape(0) != sub ||
-                                                    correction.shape(1) != phase.shape(0) * kCumulants)))
+                                                   correction.shape(1) != phase.shape(0) * kCumulants)))
         throw nb::value_error("correction must be (sub_signal * sub_background, phases * 4)");
     if (background.shape(0) != signal.shape(0) || at.shape(0) != signal.shape(0))
         throw nb::value_error("signal, background and at must agree");

@@ -32,7 +32,7 @@ struct Axis {
     int64_t size, starts;
     int64_t lowest;  // the first that has a logarithm
     double cells_per_log;
-    int32_t count;   // nodes of a cubic in the logarithm
+    int32_t count;  // nodes of a cubic in the logarithm
     int32_t padding;
 
     // The last node at or below x; the first for what is below that.
@@ -49,11 +49,11 @@ struct Axis {
 
 // Nodes of one axis around a value: two for the mean histogram, up to four for the cumulants.
 struct Stencil {
-    int64_t low, high;        // cell
-    double fraction;          // of the cell, linear in the photons (L1)
-    int count;                // nodes of the cumulants
+    int64_t low, high;  // cell
+    double fraction;    // of the cell, linear in the photons (L1)
+    int count;          // nodes of the cumulants
     int64_t node[4];
-    double weight[4];         // Lagrange, in log photons (L2)
+    double weight[4];  // Lagrange, in log photons (L2)
 };
 
 // Cubic through up to four nodes at coordinates `at`.

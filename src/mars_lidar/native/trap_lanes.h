@@ -16,7 +16,7 @@ inline namespace MARS_LEVEL {
 
 template <class Clock>
 class TrapLanes {
-public:
+ public:
     using Time = typename Clock::Time;
 
     explicit TrapLanes(const Job& job) : clock_(job), law_(job), last_(job.cycles + 1) {}
@@ -64,14 +64,15 @@ public:
     }
 
     // Avalanches of some lanes at `time`, of generation 0 (photons), 1 (releases of their carriers), ...
-    MARS_INLINE void avalanche(Mask lanes, const Time& time, const Int& generation, const UInt& key0, const UInt& key1) {
+    MARS_INLINE void avalanche(Mask lanes, const Time& time, const Int& generation, const UInt& key0,
+                               const UInt& key1) {
         if (!law_.on()) return;
         countdown_ = minus_if(countdown_, lanes & (generation < law_.generations));
         const Mask due = countdown_ == 0;
         if (any(due)) fill(due, time, generation, key0, key1);
     }
 
-private:
+ private:
     using Moment = typename Clock::Moment;
 
     struct Carrier {
@@ -139,8 +140,7 @@ private:
         const Mask far = lanes & (beyond >= kLongWait);
         if (any(far)) {
             wait.whole = select(far, truncate(beyond), wait.whole);
-            const UInt fine =
-                threefry<13>(as_uint(number_), splat(kStageTraps + TrapLaw::kFine), key0, key1).first;
+            const UInt fine = threefry<13>(as_uint(number_), splat(kStageTraps + TrapLaw::kFine), key0, key1).first;
             refresh(wait, far, fine, splat(law_.rate));
         }
         const Float rest = wait.fraction + law_.least_rest;
@@ -233,13 +233,14 @@ private:
     const TrapLaw law_;
     const int32_t last_;  // period that no release matters in or after
 
-    Time next_;  // release of each lane, or never
+    Time next_;                // release of each lane, or never
     Int generation_, behind_;  // of it, and the number of those behind it
     Int countdown_, number_;   // avalanches to the next one that leaves carriers; how many have done so
 
     // the same as plain numbers, for changing single lanes
     typename Clock::TimeArray next_array_;
-    alignas(64) int32_t generation_array_[kLanes], behind_array_[kLanes], countdown_array_[kLanes], number_array_[kLanes];
+    alignas(64) int32_t generation_array_[kLanes], behind_array_[kLanes], countdown_array_[kLanes],
+        number_array_[kLanes];
     std::vector<Carrier> waiting_[kLanes];
 };
 

@@ -55,14 +55,15 @@ int TrapLaw::draw_several(const uint32_t (&key)[2], uint32_t number, uint32_t wo
         share *= mean_ / (carriers + 1.0);
     }
     for (int k = 0; k < carriers; ++k)
-        delays[k] = delay(unit(threefry<13, uint32_t>(number, kStageTraps + 1u + static_cast<uint32_t>(k), key[0],
-                                                      key[1])));
+        delays[k] =
+            delay(unit(threefry<13, uint32_t>(number, kStageTraps + 1u + static_cast<uint32_t>(k), key[0], key[1])));
     return carriers;
 }
 
 double TrapLaw::delay(double u) const {
     if (exponential())
-        return least_ + traps_.mean_delay * mars::exponential(static_cast<uint32_t>(std::min(u * 0x1p32, 0x1.fffffffep31)));
+        return least_ +
+               traps_.mean_delay * mars::exponential(static_cast<uint32_t>(std::min(u * 0x1p32, 0x1.fffffffep31)));
     const double level = hidden_ + u * (1.0 - hidden_);
     const double* const edge = std::upper_bound(traps_.below + 1, traps_.below + traps_.samples, level);
     const double before = *(edge - 1), step = *edge - before;

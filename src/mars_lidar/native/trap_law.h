@@ -17,7 +17,7 @@ namespace mars {
 // The law of one job's carriers that matter, and what is rare to draw. Avalanches that leave some are numbered from 1;
 // their words are those of stage kStageTraps (the next one, and how many), + 1, + 2, ... (delays of several), + kFine.
 class TrapLaw {
-public:
+ public:
     static constexpr int kMostCarriers = 64;  // of one avalanche: more come with probability < 1e-89
     static constexpr uint32_t kFine = kMostCarriers + 1;
 
@@ -33,15 +33,15 @@ public:
     // Delay for a uniform number u in (0, 1).
     double delay(double u) const;
 
-    int32_t generations;            // avalanches of generation 0 (photons), 1, ... leave carriers below this one
-    float avalanches_per_carrier;   // 1 / mean
-    uint32_t one_below;             // avalanches with a second word below this leave one carrier, and others several
-    float stretch;                  // spreads the words below that over all
-    int32_t least_periods;          // no delay matters that is shorter than this
-    float least_rest;               // and the rest of a period
-    float scale, rate;              // mean of exponential delays beyond that, and its inverse
+    int32_t generations;           // avalanches of generation 0 (photons), 1, ... leave carriers below this one
+    float avalanches_per_carrier;  // 1 / mean
+    uint32_t one_below;            // avalanches with a second word below this leave one carrier, and others several
+    float stretch;                 // spreads the words below that over all
+    int32_t least_periods;         // no delay matters that is shorter than this
+    float least_rest;              // and the rest of a period
+    float scale, rate;             // mean of exponential delays beyond that, and its inverse
 
-private:
+ private:
     const Traps& traps_;
     double mean_, none_, some_;  // carriers of an avalanche; e^-mean, the probability of none, and 1 - e^-mean
     double least_, hidden_;      // shortest delay that matters; P(delay < least)

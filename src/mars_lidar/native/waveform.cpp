@@ -140,8 +140,7 @@ void bind_waveform(nb::module_& module) {
             run_waveform(job, block, threads, level, progress);
         },
         nb::arg("job"), nb::arg("offsets"), nb::arg("times").noconvert(), nb::arg("cycle").noconvert(),
-        nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("level") = "",
-        nb::arg("progress").none() = nb::none());
+        nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none());
 }
 
 }  // namespace mars

@@ -93,7 +93,8 @@ MARS_INLINE WaveWait draw_wave(const WaveRates& rates, UInt key0, UInt key1, UIn
         for (int lane = 0; lane < kLanes; ++lane) {  // all of a cell or none of it
             if (!(static_cast<double>(cells[lane]) * rates.inverse[lane] >= static_cast<double>(kLongWait))) continue;
             const double wait = static_cast<double>(exponentials[lane]) * rates.inverse[lane];
-            whole[lane] = static_cast<int32_t>(wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever));
+            whole[lane] =
+                static_cast<int32_t>(wait < static_cast<double>(kForever) ? wait : static_cast<double>(kForever));
             const double v = (fresh[lane] + 0.5) * 0x1p-32, total = rates.total[lane];
             const double x = v - 0.5 * total * v * (1.0 - v) * (1.0 - total * (1.0 - 2.0 * v) * (1.0 / 3.0));
             energy[lane] = static_cast<int32_t>(x * 0x1p31);

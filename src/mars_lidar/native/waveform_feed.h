@@ -19,7 +19,7 @@ struct WaveItem {
 };
 
 class WaveFeed {
-public:
+ public:
     explicit WaveFeed(const WaveformBlock& block) : block_(block), job_(*block.job), layout_(job_.samples) {
         fetch_from(0);
     }
@@ -63,7 +63,7 @@ public:
         fetch_ += kLines * kLine;
     }
 
-private:
+ private:
     // The table of the next pixel, in a slot that no lane uses.
     void prepare(int64_t pixel) {
         latest_ = 0;
@@ -84,11 +84,11 @@ private:
     const WaveformBlock& block_;
     const Job& job_;
     const TableLayout layout_;
-    int64_t pixel_ = 0, realization_ = 0;  // the next item
+    int64_t pixel_ = 0, realization_ = 0;                   // the next item
     const double *fetch_ = nullptr, *fetch_end_ = nullptr;  // of the waveforms, what has not been asked for
-    int32_t latest_ = 0;                     // slot of the latest pixel's table ...
-    double photons_ = 0.0;                   // ... and its photons per period
-    int users_[kMostWaveLanes + 1] = {};     // lanes that use each slot
+    int32_t latest_ = 0;                                    // slot of the latest pixel's table ...
+    double photons_ = 0.0;                                  // ... and its photons per period
+    int users_[kMostWaveLanes + 1] = {};                    // lanes that use each slot
     int running_ = 0;
 };
 

@@ -22,8 +22,9 @@ MARS_NOINLINE inline void place_groups(const int32_t* edge, int64_t parts, int g
 // Each of `count` numbers becomes the greatest one up to it; up to kSpareCells beyond them may change.
 MARS_NOINLINE inline void running_maximum(uint16_t* numbers, int64_t count) {
 #if defined(MARS_LEVEL_avx512)
-    alignas(64) static constexpr uint16_t kPlaces[32] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
-                                                         16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
+    alignas(64) static constexpr uint16_t kPlaces[32] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10,
+                                                         11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21,
+                                                         22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
     const __m512i here = _mm512_load_si512(kPlaces), none = _mm512_setzero_si512();
     const __m512i back = _mm512_sub_epi16(here, _mm512_set1_epi16(1)), last = _mm512_set1_epi16(31);
     __m512i before = none;

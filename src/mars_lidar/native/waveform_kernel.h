@@ -16,10 +16,10 @@ struct WaveformBlock {
     const Job* job;
     int64_t first_pixel, pixels;
     int64_t first_realization, realizations;  // relative to the job's first
-    const int32_t* start_cycle;  // (pixels, realizations) where the search begins, or null: armed at 0
-    const double* start_phase;   // in periods, [0, 1)
+    const int32_t* start_cycle;               // (pixels, realizations) where the search begins, or null: armed at 0
+    const double* start_phase;                // in periods, [0, 1)
     Output output;
-    int64_t team;            // tables that there is memory for: waveform_table.h
+    int64_t team;  // tables that there is memory for: waveform_table.h
     int32_t* edges;
     uint16_t* guides;
     const std::atomic<bool>* stop;
@@ -27,7 +27,7 @@ struct WaveformBlock {
 
 using WaveformKernel = void (*)(const WaveformBlock&);
 
-#define MARS_DECLARE_WAVEFORM(level)                                 \
+#define MARS_DECLARE_WAVEFORM(level)                                    \
     void waveform_kernel_##level(const WaveformBlock& block);           \
     void waveform_recording_kernel_##level(const WaveformBlock& block); \
     void waveform_avalanche_kernel_##level(const WaveformBlock& block);

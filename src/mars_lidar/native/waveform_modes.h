@@ -21,8 +21,14 @@ inline WaveSystem wave_system(const Job& job) {
         return static_cast<uint64_t>(static_cast<uint32_t>(upper)) << 32 | static_cast<uint32_t>(lower);
     };
     const int32_t parts = static_cast<int32_t>(job.samples);
-    return {job.cycles, job.bins, parts, wave_span(job.dead_time, parts), fixed_point(job.gate.start),
-            fixed_point(job.gate.step), static_cast<uint32_t>(job.gate.cycles), wave_span(job.gate.width, parts)};
+    return {job.cycles,
+            job.bins,
+            parts,
+            wave_span(job.dead_time, parts),
+            fixed_point(job.gate.start),
+            fixed_point(job.gate.step),
+            static_cast<uint32_t>(job.gate.cycles),
+            wave_span(job.gate.width, parts)};
 }
 
 // Where the gates of periods open.
@@ -51,8 +57,7 @@ MARS_INLINE Mask shut(const WaveSystem& system, const WaveTime& at, const WaveTi
     const Int parts = minus_if(at.part - opening.part, borrow);
     const Int round = select(parts < 0, parts + system.parts, parts);
     const Float rest = plus_if(apart, borrow);
-    return (round > system.gate_width.parts) |
-           ((round == system.gate_width.parts) & (rest >= system.gate_width.rest));
+    return (round > system.gate_width.parts) | ((round == system.gate_width.parts) & (rest >= system.gate_width.rest));
 }
 
 // The last arrival's dead time of a paralyzable pixel.
@@ -86,8 +91,8 @@ MARS_INLINE Mask advance(const WaveSystem& system, const WaveTime& hit, WaveTime
         const Mask wait = shut(system, next, opening), past = wait & before(opening, next);
         WaveTime open = gate_openings(system, plus_if(next.cycle, past));
         // a gate that wraps is open from the beginning of the period
-        const WaveTime end = later({splat(0), open.part, open.inside}, {0, system.gate_width.parts, system.gate_width.rest},
-                                   system.parts);
+        const WaveTime end = later({splat(0), open.part, open.inside},
+                                   {0, system.gate_width.parts, system.gate_width.rest}, system.parts);
         const Mask wraps = (end.cycle > 0) & ((end.part > 0) | (end.inside > 0.0f));
         const Mask at_once = past & wraps;
         open = {open.cycle, select(at_once, splat(0), open.part), select(at_once, splat(0.0f), open.inside)};

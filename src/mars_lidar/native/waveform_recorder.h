@@ -11,7 +11,8 @@ inline namespace MARS_LEVEL {
 // Where times lie in the period: their phases in double precision, and bins.
 struct WavePlaces {
     explicit WavePlaces(const Job& job)
-        : bins(job.bins), parts(static_cast<int32_t>(job.samples)),
+        : bins(job.bins),
+          parts(static_cast<int32_t>(job.samples)),
           bins_per_part(static_cast<double>(bins) / static_cast<double>(parts)),
           inverse((parts & (parts - 1)) == 0 ? 1.0 / static_cast<double>(parts) : 0.0) {}
 
@@ -90,7 +91,9 @@ struct PartClock {
     };
 
     explicit PartClock(const Job& job)
-        : places(job), bins(job.bins), parts(static_cast<int32_t>(job.samples)),
+        : places(job),
+          bins(job.bins),
+          parts(static_cast<int32_t>(job.samples)),
           dead(wave_span(job.recording->electronics_dead_time, parts)) {}
 
     MARS_INLINE Time recovered(const Time& hit) const { return later(hit, dead, parts); }
@@ -152,7 +155,7 @@ struct PartClock {
     int32_t bins, parts;
     WaveSpan dead;
 
-private:
+ private:
     double converted(const CodeTable& codes, double phase, int32_t& bin) const {
         const int32_t n = static_cast<int32_t>(codes.edges.size()) - 1;
         const double x = phase * static_cast<double>(bins);

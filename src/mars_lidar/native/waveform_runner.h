@@ -27,11 +27,18 @@ template <DetectorMode mode, Stage stage, bool timed>
 class WaveRunner {
     static constexpr bool kRecords = stage != Stage::kPlain, kTraps = stage == Stage::kAvalanches;
 
-public:
+ public:
     explicit WaveRunner(const WaveformBlock& block)
-        : block_(block), job_(*block.job), system_(wave_system(job_)), feed_(block), places_(job_), recorder_(job_),
-          traps_(job_), twilight_(mode == DetectorMode::kNonparalyzable && job_.twilight > 0.0),
-          twilight_span_(wave_span(job_.twilight, system_.parts)), log_(block.output, job_) {
+        : block_(block),
+          job_(*block.job),
+          system_(wave_system(job_)),
+          feed_(block),
+          places_(job_),
+          recorder_(job_),
+          traps_(job_),
+          twilight_(mode == DetectorMode::kNonparalyzable && job_.twilight > 0.0),
+          twilight_span_(wave_span(job_.twilight, system_.parts)),
+          log_(block.output, job_) {
         tables_.edge = block.edges;
         tables_.guide = block.guides;
         tables_.parts = system_.parts;
@@ -64,7 +71,7 @@ public:
         }
     }
 
-private:
+ private:
     MARS_INLINE WaveWait draw(int k) const {
         return draw_wave(rates_, key0_, key1_, event_ + static_cast<uint32_t>(k));
     }
@@ -231,18 +238,25 @@ private:
 template <DetectorMode mode, Stage stage>
 void run(const WaveformBlock& block) {
     const bool timed = block.output.sink == Sink::kTimestamps;
-    if constexpr (stage != Stage::kPlain) WaveRunner<mode, stage, true>(block).run();
-    else if (timed) WaveRunner<mode, stage, true>(block).run();
-    else WaveRunner<mode, stage, false>(block).run();
+    if constexpr (stage != Stage::kPlain)
+        WaveRunner<mode, stage, true>(block).run();
+    else if (timed)
+        WaveRunner<mode, stage, true>(block).run();
+    else
+        WaveRunner<mode, stage, false>(block).run();
 }
 
 template <Stage stage>
 void run(const WaveformBlock& block) {
     switch (block.job->mode) {
-        case DetectorMode::kNonparalyzable: return run<DetectorMode::kNonparalyzable, stage>(block);
-        case DetectorMode::kParalyzable: return run<DetectorMode::kParalyzable, stage>(block);
-        case DetectorMode::kSynchronous: return run<DetectorMode::kSynchronous, stage>(block);
-        case DetectorMode::kGated: return run<DetectorMode::kGated, stage>(block);
+        case DetectorMode::kNonparalyzable:
+            return run<DetectorMode::kNonparalyzable, stage>(block);
+        case DetectorMode::kParalyzable:
+            return run<DetectorMode::kParalyzable, stage>(block);
+        case DetectorMode::kSynchronous:
+            return run<DetectorMode::kSynchronous, stage>(block);
+        case DetectorMode::kGated:
+            return run<DetectorMode::kGated, stage>(block);
     }
 }
 

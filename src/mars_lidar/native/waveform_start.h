@@ -53,7 +53,7 @@ inline double integrate(const double* photons, int64_t parts, double* edge) {
 
 // C of one pixel and its inverse, by phase in [0, 1), in double precision.
 class PixelWaveform {
-public:
+ public:
     PixelWaveform(const Job& job, int64_t pixel) : parts_(job.samples), edges_(job.samples + 1) {
         total_ = integrate(job.waveform + pixel * parts_, parts_, edges_.data()) + job.background[pixel];
         const double each = job.background[pixel] / static_cast<double>(parts_);
@@ -88,14 +88,14 @@ public:
         return photons;
     }
 
-private:
+ private:
     int64_t parts_;
     double total_;
     std::vector<double> edges_;
 };
 
 class WaveformWarmedUp {
-public:
+ public:
     WaveformWarmedUp(const Job& job, int64_t pixel) : job_(job), pixel_(job.pixel_index[pixel]), wave_(job, pixel) {
         const double dead = job.dead_time, total = wave_.total();
         if (job.mode == DetectorMode::kParalyzable) {
@@ -130,7 +130,7 @@ public:
         phase = residual - periods;
     }
 
-private:
+ private:
     const Job& job_;
     uint32_t pixel_;
     PixelWaveform wave_;

@@ -9,7 +9,7 @@
 namespace mars {
 
 class Xoshiro256 {
-public:
+ public:
     using result_type = uint64_t;
 
     // The stream of one pixel in one realization. Each word of the state is a bijection of (realization,
@@ -39,7 +39,7 @@ public:
     // Uniform on [0, 1), 53 bits.
     double uniform() { return static_cast<double>(static_cast<int64_t>((*this)() >> 11)) * 0x1p-53; }
 
-private:
+ private:
     static uint64_t rotate(uint64_t x, int k) { return x << k | x >> (64 - k); }
 
     static uint64_t mix(uint64_t x) {

@@ -50,9 +50,15 @@ def comparison(found: Comparison) -> Figure:
             boxes.append((top / height, (top - h) / height))
             top -= h + _GAP
         grid = figure.add_gridspec(
-            rows, across, left=0.008, right=1.0 - 0.82 / _WIDTH, top=boxes[0][0], bottom=boxes[0][1],
-            wspace=0.85 / (wide - 0.85), hspace=0.25 / tall,
-        )  # fmt: skip
+            rows,
+            across,
+            left=0.008,
+            right=1.0 - 0.82 / _WIDTH,
+            top=boxes[0][0],
+            bottom=boxes[0][1],
+            wspace=0.85 / (wide - 0.85),
+            hspace=0.25 / tall,
+        )
         _draw_maps(list(grid.subplots(squeeze=False).flat), found, colours)
         _draw_histograms(figure, boxes[1], found, colours)
         _draw_laws(figure, boxes[2], found, colours)
@@ -76,8 +82,17 @@ def _draw_maps(axes: list[Axes], found: Comparison, colours: dict[str, str]) -> 
         at, left = (x / scale, y / scale), x > 0.7 * found.flux.shape[1]
         axes[0].plot(*at, "o", ms=5, mfc="none", mec=INK, mew=2.0)
         axes[0].plot(*at, "o", ms=5, mfc="none", mec="white", mew=1.0)
-        axes[0].annotate(name, at, (-5 if left else 5, 0), textcoords="offset points", color="white", fontsize=6.5,
-                         ha="right" if left else "left", va="center", path_effects=shadow)  # fmt: skip
+        axes[0].annotate(
+            name,
+            at,
+            (-5 if left else 5, 0),
+            textcoords="offset points",
+            color="white",
+            fontsize=6.5,
+            ha="right" if left else "left",
+            va="center",
+            path_effects=shadow,
+        )
     for ax, (engine, scene) in zip(axes[1:], found.scenes.items(), strict=False):
         if expected.known.any():
             error = np.sqrt(np.where(expected.variance > 0, expected.variance, np.nan) / len(scene.seconds))
@@ -95,12 +110,11 @@ def _draw_maps(axes: list[Axes], found: Comparison, colours: dict[str, str]) -> 
         ax.set_visible(False)
 
 
-def _draw_histograms(
-    figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]
-) -> None:
+def _draw_histograms(figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]) -> None:
     """Mean histogram of the first pixel: the whole period, and the signal close up."""
-    grid = figure.add_gridspec(1, 2, left=0.056, right=0.99, top=box[0], bottom=box[1], wspace=0.1,
-                               width_ratios=(2.2, 1.0))  # fmt: skip
+    grid = figure.add_gridspec(
+        1, 2, left=0.056, right=0.99, top=box[0], bottom=box[1], wspace=0.1, width_ratios=(2.2, 1.0)
+    )
     whole, zoom = grid.subplots(squeeze=False)[0]
     name, (y, x) = next(iter(found.pixels.items()))
     system, flux = found.system, found.flux
@@ -148,8 +162,7 @@ def _draw_histograms(
 
 def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]) -> None:
     """Frequencies of the count at each pixel; the exact law on top, and what lies off the scale in words."""
-    grid = figure.add_gridspec(1, len(found.pixels), left=0.056, right=0.99, top=box[0], bottom=box[1],
-                               wspace=0.3)  # fmt: skip
+    grid = figure.add_gridspec(1, len(found.pixels), left=0.056, right=0.99, top=box[0], bottom=box[1], wspace=0.3)
     axes = list(grid.subplots(squeeze=False).flat)
     for ax, name in zip(axes, found.pixels, strict=True):
         statistics, law = found.statistics[name], found.laws[name]
@@ -173,9 +186,16 @@ def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colo
             ax.plot(inside, law.pmf.on(low, last), color=INK, lw=0.8, ls=(0, (4, 1.5)))
         for k, (engine, mean) in enumerate(away):
             right = mean > moments.mean.value
-            ax.text(0.99 if right else 0.01, 0.97 - 0.12 * k, f"{engine}: {mean:,.0f} →" if right else
-                    f"← {engine}: {mean:,.0f}", transform=ax.transAxes, color=colours[engine],
-                    ha="right" if right else "left", va="top", fontsize=6.5)  # fmt: skip
+            ax.text(
+                0.99 if right else 0.01,
+                0.97 - 0.12 * k,
+                f"{engine}: {mean:,.0f} →" if right else f"← {engine}: {mean:,.0f}",
+                transform=ax.transAxes,
+                color=colours[engine],
+                ha="right" if right else "left",
+                va="top",
+                fontsize=6.5,
+            )
         ax.set_title(f"Law of the count, {name}", loc="left")
         ax.set_xlabel("registrations")
         ax.set_xlim(edges[0], edges[-1])
@@ -186,14 +206,18 @@ def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colo
 
 
 def _draw_joint(figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]) -> None:
-    grid = figure.add_gridspec(1, 4, left=0.056, right=0.985, top=box[0], bottom=box[1], wspace=0.3,
-                               width_ratios=(1.3, 1.3, 1.3, 1.0))  # fmt: skip
+    grid = figure.add_gridspec(
+        1, 4, left=0.056, right=0.985, top=box[0], bottom=box[1], wspace=0.3, width_ratios=(1.3, 1.3, 1.3, 1.0)
+    )
     ratios, lags, shapes, times = grid.subplots(squeeze=False)[0]
     table, against = found.statistics, found.against
     window = {p: {e: s.window_ratio for e, s in row.items()} for p, row in table.items()}
     variances = {p: row[against].window.variance.value for p, row in table.items()}
-    known = {p: float(law.window[1]) / variances[p] for p, law in found.laws.items()
-             if law is not None and law.window is not None and variances[p] > 0}  # fmt: skip
+    known = {
+        p: float(law.window[1]) / variances[p]
+        for p, law in found.laws.items()
+        if law is not None and law.window is not None and variances[p] > 0
+    }
     draw_points(ratios, window, colours, 1.0, against, known)
     ratios.set_title(f"Variance of the signal window / {found.against}", loc="left")
     lag1 = {p: {e: s.lag1 for e, s in row.items()} for p, row in table.items()}
@@ -225,5 +249,3 @@ def _headline(found: Comparison) -> str:
         f"{height} × {width} pixels, {instrument(system)}; mean S = {flux.signal.mean():.3g}, "
         f"B = {flux.background.mean():.3g} photons per period; {each} exposures of each pixel"
     )
-
-

@@ -59,8 +59,17 @@ def draw_points(
                 frame = ax.get_xaxis_transform()
                 ax.plot(at, edge, "^" if above else "v", ms=4, color=colour, transform=frame)
                 away = 5 + 7 * (k % 2)  # neighbours side by side
-                ax.annotate(f"{found.value:.2g}", (at, edge), (0, -away if above else away), xycoords=frame,
-                            textcoords="offset points", ha="center", va=within, fontsize=6.0, color=colour)  # fmt: skip
+                ax.annotate(
+                    f"{found.value:.2g}",
+                    (at, edge),
+                    (0, -away if above else away),
+                    xycoords=frame,
+                    textcoords="offset points",
+                    ha="center",
+                    va=within,
+                    fontsize=6.0,
+                    color=colour,
+                )
     if goal is None:
         if any(v > 0 for v in finite):
             ax.set_yscale("log")
@@ -97,9 +106,7 @@ def label_panels(axes: Iterable[Axes]) -> None:
         ax.spines[["top", "right"]].set_visible(False)
 
 
-def _range(
-    rows: Mapping[str, Mapping[str, Estimate | Distance]], goal: float, always: str
-) -> tuple[float, float]:
+def _range(rows: Mapping[str, Mapping[str, Estimate | Distance]], goal: float, always: str) -> tuple[float, float]:
     """Limits that keep small deviations visible: four times the median deviation, and all of engine `always`."""
     reach = {
         (pixel, engine): abs(v.value - goal) + 2.0 * v.error

@@ -98,9 +98,7 @@ def _hspace(inches: float) -> float:
     return _GAP_INCHES / max(0.5 * (inches - _GAP_INCHES), 0.1)
 
 
-def _draw_maps(
-    axes: Any, cube: Cube, totals: NDArray[np.int64], peaks_m: NDArray[np.float64], pixels: _Pixels
-) -> None:
+def _draw_maps(axes: Any, cube: Cube, totals: NDArray[np.int64], peaks_m: NDArray[np.float64], pixels: _Pixels) -> None:
     depth = cube.depth_m
     known = bool(np.isfinite(depth).any())
     limits = _limits(depth if known else peaks_m)
@@ -159,7 +157,14 @@ def _draw_pixels(
 ) -> None:
     left, right, bottom, top = box
     grid = figure.add_gridspec(
-        len(pixels), 2, left=left, right=right, bottom=bottom, top=top, wspace=0.14, hspace=0.42,
+        len(pixels),
+        2,
+        left=left,
+        right=right,
+        bottom=bottom,
+        top=top,
+        wspace=0.14,
+        hspace=0.42,
         width_ratios=(2.4, 1.0),
     )
     axes = grid.subplots(squeeze=False)

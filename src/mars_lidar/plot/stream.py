@@ -58,18 +58,20 @@ def draw_counts(ax: Axes, found: Validation) -> None:
     """Law of the count, measured and predicted."""
     measured, law = found.measured, found.predicted
     ax.stairs(
-        measured.p, measured.first - 0.5 + np.arange(measured.p.size + 1), color=COLOURS[0], fill=True, alpha=0.45,
+        measured.p,
+        measured.first - 0.5 + np.arange(measured.p.size + 1),
+        color=COLOURS[0],
+        fill=True,
+        alpha=0.45,
         label="measured",
-    )  # fmt: skip
+    )
     shown = law.p > 1e-4 * law.p.max()
     at = law.first + np.arange(law.p.size)
     ax.plot(at[shown], law.p[shown], color=COLOURS[1], lw=1.2, label="predicted")
     low, high = at[shown][0], at[shown][-1]
     ax.set_xlim(min(low, measured.first) - 0.5, max(high, measured.last) + 0.5)
     ax.set(xlabel="registrations of a realization", ylabel="probability", ylim=(0, None))
-    ax.set_title(
-        f"Count: TV {found.total_variation:.3g}, floor {found.total_variation_floor[0]:.3g}", loc="left"
-    )
+    ax.set_title(f"Count: TV {found.total_variation:.3g}, floor {found.total_variation_floor[0]:.3g}", loc="left")
     ax.legend(frameon=False)
 
 

@@ -61,9 +61,16 @@ class MaximumLikelihood(Method):
         out = np.empty((len(histograms.counts), 8))
         flags = np.empty(len(histograms.counts), np.uint8)
         _core.maximum_likelihood(
-            histograms.recording, histograms.counts, starts=self.starts, least_gain=self.least_gain(histograms.system),
-            less_bias=self.less_bias, out=out, flags=flags, threads=histograms.threads, progress=histograms.progress,
-        )  # fmt: skip
+            histograms.recording,
+            histograms.counts,
+            starts=self.starts,
+            least_gain=self.least_gain(histograms.system),
+            less_bias=self.less_bias,
+            out=out,
+            flags=flags,
+            threads=histograms.threads,
+            progress=histograms.progress,
+        )
         column = np.ascontiguousarray(out.T)
         return Estimates(
             signal=column[0],

@@ -161,9 +161,18 @@ def window_estimates(
 
     out, flags = np.empty((len(given.counts), 5)), np.empty(len(given.counts), np.uint8)
     _core.window_estimates(
-        given.recording, given.counts, correction=correction, locator=_LOCATORS[locator], steps=steps,
-        tolerance=tolerance, total=total, out=out, flags=flags, threads=given.threads, progress=given.progress,
-    )  # fmt: skip
+        given.recording,
+        given.counts,
+        correction=correction,
+        locator=_LOCATORS[locator],
+        steps=steps,
+        tolerance=tolerance,
+        total=total,
+        out=out,
+        flags=flags,
+        threads=given.threads,
+        progress=given.progress,
+    )
     signal, background, delay, signal_error, background_error = np.ascontiguousarray(out.T)
     if correction != _PASSES:
         return Estimates(signal, background, delay, flags)
@@ -178,7 +187,14 @@ def corrected_rates(
 
     out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)
     _core.corrected_rates(
-        given.recording, given.counts, correction=correction, steps=steps, tolerance=tolerance, total=total, out=out,
-        flags=flags, threads=given.threads,
-    )  # fmt: skip
+        given.recording,
+        given.counts,
+        correction=correction,
+        steps=steps,
+        tolerance=tolerance,
+        total=total,
+        out=out,
+        flags=flags,
+        threads=given.threads,
+    )
     return out

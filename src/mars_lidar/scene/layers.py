@@ -125,9 +125,7 @@ class LayeredScene:
         return scene_flux(self.layers, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
 
 
-def read_layers(
-    path: str | Path, *, depth_unit_m: float | None = None, focal_px: float | None = None
-) -> LayeredScene:
+def read_layers(path: str | Path, *, depth_unit_m: float | None = None, focal_px: float | None = None) -> LayeredScene:
     """The scene in an ``.npz`` whose ``depth`` and ``reflectivity`` are (layers, H, W).
 
     ``background`` is (H, W), where there is one. Units and what means "no return": `mars_lidar.Scene.from_rgbd`.

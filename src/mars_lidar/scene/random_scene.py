@@ -25,9 +25,11 @@ def random_scene(size: tuple[int, int], seed: int) -> tuple[FloatArray, FloatArr
     width, height = rng.uniform(2.0, 10.0), rng.uniform(2.2, 4.0)
     length = math.exp(rng.uniform(math.log(2.5), math.log(14.0)))
     shell = Box(
-        (0.0, 0.5 * height, 0.5 * length), (0.5 * width, 0.5 * height, 0.5 * length),
-        tuple(_texture(rng) for _ in range(6)), inside=True,
-    )  # fmt: skip
+        (0.0, 0.5 * height, 0.5 * length),
+        (0.5 * width, 0.5 * height, 0.5 * length),
+        tuple(_texture(rng) for _ in range(6)),
+        inside=True,
+    )
     objects: list[Box | Sphere] = [shell]
     for _ in range(int(rng.integers(3))):  # from floor to ceiling, from one side
         half = 0.5 * width * rng.uniform(0.15, 0.6)
@@ -38,9 +40,10 @@ def random_scene(size: tuple[int, int], seed: int) -> tuple[FloatArray, FloatArr
         objects.append(_thing(rng, width, height, length))
     camera = Camera(
         position=(width * rng.uniform(-0.2, 0.2), height * rng.uniform(0.3, 0.7), 0.02 * length),
-        yaw_deg=rng.uniform(-20.0, 20.0), pitch_deg=rng.uniform(-12.0, 8.0),
+        yaw_deg=rng.uniform(-20.0, 20.0),
+        pitch_deg=rng.uniform(-12.0, 8.0),
         field_of_view_deg=rng.uniform(30.0, 75.0),
-    )  # fmt: skip
+    )
     return cast(objects, camera, size)
 
 

@@ -136,9 +136,7 @@ class Sphere:
         return np.asarray(cosine * self.texture(np.arctan2(x, -z), np.arcsin(np.clip(y, -1.0, 1.0))))
 
 
-def cast(
-    objects: Sequence[Box | Sphere], camera: Camera, size: tuple[int, int]
-) -> tuple[FloatArray, FloatArray]:
+def cast(objects: Sequence[Box | Sphere], camera: Camera, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Depth (range along the ray, m; inf where nothing is hit) and reflectivity in [0, 1], each (H, W)."""
     origin = np.array(camera.position)
     row, column = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64).reshape(2, -1)
@@ -167,9 +165,7 @@ def _uneven(image: FloatArray) -> NDArray[np.bool_]:
     return uneven
 
 
-def _trace(
-    objects: Sequence[Box | Sphere], origin: FloatArray, d: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _trace(objects: Sequence[Box | Sphere], origin: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Range to the nearest surface along each ray (3, n), and albedo times cosine of incidence there."""
     nearest = np.full(d.shape[1], np.inf)
     owner = np.full(d.shape[1], -1, dtype=np.int8 if len(objects) < 128 else np.intp)

@@ -49,9 +49,7 @@ class Scene:
     reflectivity: FloatArray
     background: FloatArray | None
 
-    def __init__(
-        self, depth_m: ArrayLike, reflectivity: ArrayLike, background: ArrayLike | None = None
-    ) -> None:
+    def __init__(self, depth_m: ArrayLike, reflectivity: ArrayLike, background: ArrayLike | None = None) -> None:
         depth = _numbers("depth_m", depth_m)
         if depth.ndim != 2 or depth.size == 0:
             raise ValueError(f"depth_m must be (H, W) with at least one pixel, got shape {depth.shape}")
@@ -91,10 +89,7 @@ class Scene:
         lost = f", {h * w - z.size} pixels without return" if 0 < z.size < h * w else ""
         ambient = "" if self.background is None else ", background map"
         share = self.reflectivity
-        return (
-            f"Scene({h} x {w} pixels, {span}{lost}, "
-            f"reflectivity {share.min():.3g} to {share.max():.3g}{ambient})"
-        )
+        return f"Scene({h} x {w} pixels, {span}{lost}, reflectivity {share.min():.3g} to {share.max():.3g}{ambient})"
 
     def __getitem__(self, key: Any) -> Scene:
         """A crop: ``scene[rows, columns]`` with slices."""

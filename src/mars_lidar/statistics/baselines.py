@@ -20,9 +20,7 @@ FloatArray = NDArray[np.float64]
 _WITHOUT_GATE = MODES[:3]  # what is inside of a gate depends on the delay, which these do not know
 
 
-def poisson_moments(
-    signal: ArrayLike, background: ArrayLike, system: System
-) -> tuple[FloatArray, FloatArray]:
+def poisson_moments(signal: ArrayLike, background: ArrayLike, system: System) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of the count without dead time, both N_r (S + B) (6.1).
 
     `signal` and `background` are S and B in photons per period, scalars or arrays that broadcast; the results

@@ -86,9 +86,14 @@ class Cells:
             unit = wave.reshape(-1, wave.shape[-1])
             unit = unit / np.maximum(unit.sum(-1, keepdims=True), np.finfo(float).tiny)
             return cls(
-                system, total.shape, _flat(total), _flat(back), np.zeros(total.size), unit,
+                system,
+                total.shape,
+                _flat(total),
+                _flat(back),
+                np.zeros(total.size),
+                unit,
                 np.ascontiguousarray(rows.reshape(-1), dtype=np.int64),
-            )  # fmt: skip
+            )
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
         total = _photons("signal", signal) * share
@@ -96,14 +101,10 @@ class Cells:
         total, back, delay = _broadcast(("signal", "background", "delay_ns"), total, back, given)
         bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (total == 0))
         if bad.any():
-            raise ValueError(
-                f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}"
-            )
+            raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}")
         phase = np.nan_to_num(_flat(delay) / system.period_ns)
         phase -= np.floor(phase)
-        return cls(
-            system, total.shape, _flat(total), _flat(back), phase, None, np.zeros(total.size, np.int64)
-        )
+        return cls(system, total.shape, _flat(total), _flat(back), phase, None, np.zeros(total.size, np.int64))
 
     @property
     def size(self) -> int:
@@ -130,9 +131,14 @@ class Cells:
         """Some of the cells, flat."""
         signal = self.signal[index]
         return Cells(
-            self.system, signal.shape, signal, self.background[index], self.delay[index], self.waveform,
+            self.system,
+            signal.shape,
+            signal,
+            self.background[index],
+            self.delay[index],
+            self.waveform,
             self.row[index],
-        )  # fmt: skip
+        )
 
     def name(self, index: int) -> str:
         """One cell in words, for errors."""
@@ -147,9 +153,11 @@ class Cells:
     @property
     def instead(self) -> str:
         """What to use where an exact law is refused, for errors."""
-        able = [] if self.system.detector.mode != "nonparalyzable" else [
-            "joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)"
-        ]  # fmt: skip
+        able = (
+            []
+            if self.system.detector.mode != "nonparalyzable"
+            else ["joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)"]
+        )
         return f"use {', '.join(able)}{', or ' if able else ''}simulate it with engine 'exact'"
 
     @property
@@ -236,9 +244,7 @@ class Cells:
             return np.ascontiguousarray(np.maximum(unit, 0.0)), np.arange(self.size, dtype=np.int32)
         if self.waveform is None:
             delays, rows = np.unique(self.delay, return_inverse=True)
-            energy = self.system.pulse.bin_energy(
-                delays * self.system.period_ns, self.system.period_ns, parts
-            )
+            energy = self.system.pulse.bin_energy(delays * self.system.period_ns, self.system.period_ns, parts)
         else:
             used, rows = np.unique(self.row, return_inverse=True)
             samples = self.waveform.shape[-1]
@@ -263,9 +269,7 @@ def _photons(name: str, value: ArrayLike) -> FloatArray:
     array = _reals(name, value)
     bad = ~((array >= 0) & (array <= _MAX_PHOTONS))
     if bad.any():
-        raise ValueError(
-            f"{name} must lie in [0, {_MAX_PHOTONS:g}] photons per period, got {array[bad].flat[0]}"
-        )
+        raise ValueError(f"{name} must lie in [0, {_MAX_PHOTONS:g}] photons per period, got {array[bad].flat[0]}")
     return array
 
 

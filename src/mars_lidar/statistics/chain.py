@@ -116,9 +116,7 @@ class PhaseChain:
         bad = ~((photons >= 0) & (photons <= _MAX_PHOTONS))
         if bad.any():
             k = int(np.argmax(bad))
-            raise ValueError(
-                f"photons must lie in [0, {_MAX_PHOTONS:g}] per bin, got photons[{k}] = {photons[k]}"
-            )
+            raise ValueError(f"photons must lie in [0, {_MAX_PHOTONS:g}] per bin, got photons[{k}] = {photons[k]}")
         total = float(photons.sum())
         if not total > 0:
             raise ValueError("photons must not all be 0: without flux there is no registration and no chain")

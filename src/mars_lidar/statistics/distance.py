@@ -105,9 +105,7 @@ def g_test(law: Pmf, sample: Pmf, size: int, *, any_mean: bool = False) -> float
     return float(chi2.sf(max(square, 0.0), e.size - 1 - any_mean))
 
 
-def two_sample_g_test(
-    first: Pmf, first_size: int, second: Pmf, second_size: int, *, any_mean: bool = False
-) -> float:
+def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int, *, any_mean: bool = False) -> float:
     """p-value of two samples of counts being of one law; counts expected fewer than 5 times in either are pooled.
 
     `any_mean`: as for `g_test`, of the difference of the two means.

@@ -87,9 +87,15 @@ def electronics_moments(
         run through before its state repeats.
     """
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="electronics_moments",
-        modes=ELECTRONICS_MODES, effects=(*LIGHT_EFFECTS, "electronics_dead_time_ns", *TIMING_EFFECTS),
-    )  # fmt: skip
+        signal,
+        background,
+        system,
+        delay_ns=delay_ns,
+        waveform=waveform,
+        what="electronics_moments",
+        modes=ELECTRONICS_MODES,
+        effects=(*LIGHT_EFFECTS, "electronics_dead_time_ns", *TIMING_EFFECTS),
+    )
     return moments(cells, tolerance)
 
 

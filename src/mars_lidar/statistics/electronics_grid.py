@@ -70,9 +70,7 @@ class RecordGrid:
         self.kernel, self.late = self._kernel()
         self.first, self.first_armed = self._first()
 
-    def _advance(
-        self, armed: FloatArray, rearmed: FloatArray, photons: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _advance(self, armed: FloatArray, rearmed: FloatArray, photons: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Armed probability at the end of a bin and avalanches in it, re-armed evenly over it (9)."""
         keep = np.exp(-photons)
         lasting = np.where(photons > 1e-12, -np.expm1(-photons) / np.maximum(photons, 1e-300), 1.0)

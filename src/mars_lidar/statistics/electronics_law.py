@@ -115,9 +115,7 @@ def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArra
         done = (streak > 3 * grid.periods) | (np.abs(value) < _QUIET) | over
         if done.any():
             ends = done & (np.abs(value) >= _QUIET)  # the others are 0
-            result[index[ends]] = _extrapolated(
-                value[ends], earlier[ends], best[ends], grid.cycles - 1 - period
-            )
+            result[index[ends]] = _extrapolated(value[ends], earlier[ends], best[ends], grid.cycles - 1 - period)
             rest = ~done
             if not rest.any():
                 break

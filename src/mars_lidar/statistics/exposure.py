@@ -128,9 +128,15 @@ def exposure_moments(
         repeated after some 10^5 to 10^7 periods of an exposure that is longer still.
     """
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what="exposure_moments", modes=_MODES, effects=LIGHT_EFFECTS + TIMING_EFFECTS,
-    )  # fmt: skip
+        signal,
+        background,
+        system,
+        delay_ns=delay_ns,
+        waveform=waveform,
+        what="exposure_moments",
+        modes=_MODES,
+        effects=LIGHT_EFFECTS + TIMING_EFFECTS,
+    )
     return recorded_moments(cells, tolerance=tolerance, threads=threads, progress=progress)
 
 
@@ -307,9 +313,17 @@ def _moments(
     energy, row = cells.energies(bins)
     signal, background = cells.native_flux
     _core.exposure_moments(
-        grid=grid, signal=signal, background=background, shape=row, shapes=energy, **into,
-        threads=threads, level="", progress=progress, history=history,
-    )  # fmt: skip
+        grid=grid,
+        signal=signal,
+        background=background,
+        shape=row,
+        shapes=energy,
+        **into,
+        threads=threads,
+        level="",
+        progress=progress,
+        history=history,
+    )
 
 
 def _movement(coarse: Exposure, fine: Exposure) -> FloatArray:

@@ -34,9 +34,15 @@ def mean_histogram(
     time for modes ``"nonparalyzable"`` and ``"gated"`` (to 1e-3, see `electronics_moments`).
     """
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="mean_histogram", modes=MODES,
+        signal,
+        background,
+        system,
+        delay_ns=delay_ns,
+        waveform=waveform,
+        what="mean_histogram",
+        modes=MODES,
         effects=histogram_effects(system),
-    )  # fmt: skip
+    )
     return mean_histograms(cells, tolerance, threads).reshape(*cells.shape, system.bins)
 
 

@@ -75,9 +75,14 @@ def joint_law(
     if waveform is not None and np.ndim(waveform) != 1:
         raise ValueError(f"waveform must be (T,) of one pixel, got shape {np.shape(waveform)}")
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform, what="joint_law",
+        signal,
+        background,
+        system,
+        delay_ns=delay_ns,
+        waveform=waveform,
+        what="joint_law",
         effects=LIGHT_EFFECTS + TIMING_EFFECTS,
-    )  # fmt: skip
+    )
     if not is_timed(system):
         return replace(_law(cells, tolerance), system=system)
     timing = Timing(cells.system, cells.finest)

@@ -143,9 +143,7 @@ class FoldedGrid:
         """(..., n) what being armed at the start of a bin is worth: alpha of (5.3)."""
         return np.asarray(self.response[0] * y[..., 0, :] + self.response[3] * y[..., 1, :])
 
-    def adjoint(
-        self, mass: FloatArray, moment: FloatArray | None = None, tolerance: float = _TOLERANCE
-    ) -> FloatArray:
+    def adjoint(self, mass: FloatArray, moment: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
         """(m, 2, n) solution of the transposed equations (5.4) for sources (m, n)."""
         y = self._adjoint(mass, moment, tolerance)
         if self.whole:
@@ -161,9 +159,15 @@ class FoldedGrid:
         if not self.direct:
             out = np.empty((self.bins, 2))
             done, error = _core.joint_forward(
-                response=self.response, shift=self.shift, fraction=self.fraction, mass_in=source[0],
-                moment_in=source[1], out=out, sweeps=_SWEEPS, tolerance=_TOLERANCE,
-            )  # fmt: skip
+                response=self.response,
+                shift=self.shift,
+                fraction=self.fraction,
+                mass_in=source[0],
+                moment_in=source[1],
+                out=out,
+                sweeps=_SWEEPS,
+                tolerance=_TOLERANCE,
+            )
             x = np.ascontiguousarray(out.T)
             self.direct = not (error <= _TOLERANCE and _left(source - self._apply(x), x) <= _GOOD)
             self.sweeps = max(self.sweeps, int(done))
@@ -186,9 +190,18 @@ class FoldedGrid:
             first, second = np.empty((m, n)), np.empty((m, n))
             done, error = np.empty(m, np.int64), np.empty(m)
             _core.joint_adjoint(
-                response=self.response, shift=self.shift, fraction=self.fraction, mass_in=mass, moment_in=moment,
-                mass=first, moment=second, sweeps=_SWEEPS, tolerance=tolerance, done=done, error=error,
-            )  # fmt: skip
+                response=self.response,
+                shift=self.shift,
+                fraction=self.fraction,
+                mass_in=mass,
+                moment_in=moment,
+                mass=first,
+                moment=second,
+                sweeps=_SWEEPS,
+                tolerance=tolerance,
+                done=done,
+                error=error,
+            )
             y[:, 0], y[:, 1] = first, second
             self.direct = not (error <= tolerance).all()
             self.sweeps = max(self.sweeps, int(done.max()))
@@ -223,9 +236,7 @@ class FoldedGrid:
         pa, p0, p1, qa, q0, q1 = self.response
         total, slope = self.rearmed(x)
         blind = self.blind(x) - self.whole * x[0].sum()
-        return np.array(
-            [x[0] + pa * blind - p0 * total - p1 * slope, x[1] + qa * blind - q0 * total - q1 * slope]
-        )
+        return np.array([x[0] + pa * blind - p0 * total - p1 * slope, x[1] + qa * blind - q0 * total - q1 * slope])
 
     def _apply_transposed(self, y: FloatArray) -> FloatArray:
         """The left side of (5.4) for `y` (m, 2, n), without whole periods of dead time."""

@@ -31,10 +31,17 @@ class Pixel:
             total = np.zeros(bins)
             self.settled = int(
                 _core.joint_settle(
-                    response=grid.response, whole=grid.whole, shift=grid.shift, fraction=grid.fraction,
-                    cycles=grid.cycles, state=self.state, tolerance=_SETTLED, max_steps=_MAX_STEPS, total=total,
+                    response=grid.response,
+                    whole=grid.whole,
+                    shift=grid.shift,
+                    fraction=grid.fraction,
+                    cycles=grid.cycles,
+                    state=self.state,
+                    tolerance=_SETTLED,
+                    max_steps=_MAX_STEPS,
+                    total=total,
                 )
-            )  # fmt: skip
+            )
             self.law = SettledLaw(grid) if self.settled >= 0 else None
         except ConvergenceError as error:
             raise ConvergenceError(f"joint law of {cells.name(0)}: {error}; {_INSTEAD}") from None
@@ -84,9 +91,15 @@ class Pixel:
         grid = self.grid
         columns = np.empty(weights.shape)
         _core.joint_exposure(
-            response=grid.response, whole=grid.whole, shift=grid.shift, fraction=grid.fraction, cycles=grid.cycles,
-            state=self.state if grid.warm else None, weights=np.ascontiguousarray(weights), columns=columns,
-        )  # fmt: skip
+            response=grid.response,
+            whole=grid.whole,
+            shift=grid.shift,
+            fraction=grid.fraction,
+            cycles=grid.cycles,
+            state=self.state if grid.warm else None,
+            weights=np.ascontiguousarray(weights),
+            columns=columns,
+        )
         return columns
 
 

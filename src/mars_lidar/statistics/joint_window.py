@@ -133,6 +133,4 @@ def _spread(x: FloatArray) -> FloatArray:
 
 def _product(matrix: FloatArray, y: FloatArray) -> FloatArray:
     """Symmetric 2 x 2 matrices (3, n) times vectors (m, 2, n)."""
-    return np.stack(
-        [matrix[0] * y[:, 0] + matrix[1] * y[:, 1], matrix[1] * y[:, 0] + matrix[2] * y[:, 1]], 1
-    )
+    return np.stack([matrix[0] * y[:, 0] + matrix[1] * y[:, 1], matrix[1] * y[:, 0] + matrix[2] * y[:, 1]], 1)

@@ -182,9 +182,15 @@ def count_law(
     edge = rearm_of(rearm, method == "mars", f"method {method!r}")
     check_model(model, method)
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what=f"count_law of method {method!r}", modes=_LAW_MODES[method], effects=_law_effects(method, system),
-    )  # fmt: skip
+        signal,
+        background,
+        system,
+        delay_ns=delay_ns,
+        waveform=waveform,
+        what=f"count_law of method {method!r}",
+        modes=_LAW_MODES[method],
+        effects=_law_effects(method, system),
+    )
     team = thread_count(threads)
     if method == "exact" and "electronics_dead_time_ns" in cells.system.detector.effects:
         windows = record_windows(cells, max(tolerance, 1e-3), team)
@@ -216,9 +222,7 @@ def _law_effects(method: str, system: System) -> tuple[str, ...]:
     return histogram_effects(system) if method == "exact" else LIGHT_EFFECTS + TIMING_EFFECTS
 
 
-def _gaussian_moments(
-    method: str, cells: Cells, edge: Literal["centre", "edge"]
-) -> tuple[FloatArray, FloatArray]:
+def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]) -> tuple[FloatArray, FloatArray]:
     """Mean and variance (cells,) of the Gaussian laws."""
     if method == "renewal":
         from mars_lidar.statistics.baselines import renewal_moments

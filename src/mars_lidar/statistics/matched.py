@@ -59,9 +59,7 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Win
     from mars_lidar import _core
 
     _core.matched_pmf(cumulants=given, first=first, start=start, out=flat, threads=team)
-    return [
-        Window(int(first[k]), flat[start[k] : start[k + 1]].copy(), _OUTSIDE) for k in range(first.size)
-    ]
+    return [Window(int(first[k]), flat[start[k] : start[k + 1]].copy(), _OUTSIDE) for k in range(first.size)]
 
 
 def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | None = None) -> IndexArray:

@@ -78,9 +78,14 @@ def paralyzable_moments(
         Naming the cell, where no grid up to 2^20 bins meets the tolerance.
     """
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what="paralyzable_moments", modes=("paralyzable",),
-    )  # fmt: skip
+        signal,
+        background,
+        system,
+        delay_ns=delay_ns,
+        waveform=waveform,
+        what="paralyzable_moments",
+        modes=("paralyzable",),
+    )
     if system.dead_time_periods > _MAX_WHOLE:
         raise ValueError(
             f"dead_time_ns must be at most {_MAX_WHOLE} periods for the variance of mode 'paralyzable', "

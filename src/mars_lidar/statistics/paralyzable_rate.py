@@ -52,4 +52,3 @@ def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
             for order in range(_ORDERS):
                 out[:, :, order] += rate * place**order
     return out
-

@@ -90,9 +90,7 @@ class Feedback:
     def _sweep(self, rhs: FloatArray, x: FloatArray, adjoint: bool, sweeps: int) -> tuple[int, float]:
         from mars_lidar import _core
 
-        steps, error = _core.feedback_sweeps(
-            self.fire, self.refire, rhs, self.shift, adjoint, sweeps, _TOLERANCE, x
-        )
+        steps, error = _core.feedback_sweeps(self.fire, self.refire, rhs, self.shift, adjoint, sweeps, _TOLERANCE, x)
         return int(steps), float(error)
 
     def _terms(self, x: FloatArray, adjoint: bool) -> tuple[FloatArray, FloatArray]:
@@ -194,9 +192,7 @@ class Feedback:
         return csc_matrix(entries, shape=(n, n))
 
 
-def cyclic_recursion(
-    keep: FloatArray, source: FloatArray, loss: float, *, backward: bool = False
-) -> FloatArray:
+def cyclic_recursion(keep: FloatArray, source: FloatArray, loss: float, *, backward: bool = False) -> FloatArray:
     """Solution (n,) of v[j+1] = keep[j] v[j] + source[j] round the circle, or backward from v[j+1] to v[j].
 
     `loss` is 1 - prod(keep), given so that it stays accurate where the product is nearly 1. With non-negative

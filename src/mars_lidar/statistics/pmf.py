@@ -220,9 +220,7 @@ def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, 
     return first.astype(np.int64), last.astype(np.int64), (last - first) * _EDGE
 
 
-def _window(
-    cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float
-) -> Window:
+def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Window:
     counts, purse = last - first + 1, Purse()
     size = counts + counts % 2
     value = _narrow(cell, size, bins, threads, variance, purse) if size > _ALL_POINTS else None
@@ -292,8 +290,13 @@ def _characteristic(
         "tilted": z_im is None,
         "z_re": np.ascontiguousarray(z_re),
         "z_im": np.zeros(z_re.shape) if z_im is None else np.ascontiguousarray(z_im),
-        "re": re, "im": im, "settled": settled, "threads": threads, "level": "", "progress": None,
-    }  # fmt: skip
+        "re": re,
+        "im": im,
+        "settled": settled,
+        "threads": threads,
+        "level": "",
+        "progress": None,
+    }
     if cells.system.detector.mode == "paralyzable":
         for part in cells.chunks(bins, 1):
             some = cells.part(part)

@@ -71,10 +71,15 @@ def registration_pdf(
     edge = rearm_of(rearm, method == "chain", f"method {method!r}")
     check_model(model, method)
     cells = Cells.of(
-        signal, background, system, delay_ns=delay_ns, waveform=waveform,
-        what=f"registration_pdf of method {method!r}", modes=PLAIN if method in _OF_CHAIN else MODES,
+        signal,
+        background,
+        system,
+        delay_ns=delay_ns,
+        waveform=waveform,
+        what=f"registration_pdf of method {method!r}",
+        modes=PLAIN if method in _OF_CHAIN else MODES,
         effects=_shape_effects(method, system),
-    )  # fmt: skip
+    )
     if method == "neural":
         shape = neural_moments(cells, model)[0]
     elif method == "chain":

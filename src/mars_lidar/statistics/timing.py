@@ -110,4 +110,3 @@ class Timing:
     def _split(self) -> tuple[NDArray[np.int64], FloatArray]:
         whole = np.minimum(np.floor(self._edges), self.parts).astype(np.int64)
         return whole, self._edges - whole
-

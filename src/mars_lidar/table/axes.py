@@ -50,9 +50,7 @@ def axis_values(name: str, grid: Grid) -> FloatArray:
         raise ValueError(f"{name} must have shape (n,) with n from 1 to {MAX_POINTS}, got {values.shape}")
     values = values.astype(np.float64)
     if not ((values >= 0) & (values <= _MAX_PHOTONS)).all() or not (np.diff(values) > 0).all():
-        raise ValueError(
-            f"{name} must be strictly ascending photons per period in [0, {_MAX_PHOTONS:g}], got {values}"
-        )
+        raise ValueError(f"{name} must be strictly ascending photons per period in [0, {_MAX_PHOTONS:g}], got {values}")
     return values
 
 

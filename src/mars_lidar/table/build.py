@@ -119,9 +119,14 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
     phases, laws = StartPhases.none(), NodeLaws.none()
     if recipe.method == "exposure":
         phases = start_phases(
-            system, signal, background, entries.cumulants, entries.bins, threads=recipe.threads,
+            system,
+            signal,
+            background,
+            entries.cumulants,
+            entries.bins,
+            threads=recipe.threads,
             progress=_part(progress, cells, settled, total),
-        )  # fmt: skip
+        )
         laws = node_laws(
             system, signal, background, entries, threads=recipe.threads, progress=_part(progress, settled, total, total)
         )

@@ -109,9 +109,13 @@ def _search(system: System, signal: Grid, background: Grid, options: dict[str, A
         raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
     axes = axis_values("signal", signal), axis_values("background", background)
     key = request_key(
-        system, axes, method=chosen["method"], rearm=chosen["rearm"], refine=chosen["refine"],
+        system,
+        axes,
+        method=chosen["method"],
+        rearm=chosen["rearm"],
+        refine=chosen["refine"],
         tolerance=chosen["tolerance"],
-    )  # fmt: skip
+    )
     folder = directory()
     own = folder / f"{key}-{system.cycles}{SUFFIX}"
     others = sorted(folder.glob(f"{key}-*{SUFFIX}")) if folder.is_dir() else []

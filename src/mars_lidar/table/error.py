@@ -173,9 +173,7 @@ def _delayed(
     system = table.system.replace(cycles=cycles)
     shift = rng.integers(0, system.bins, signal.size)
     delay = 0.5 * system.period_ns + shift * system.bin_ns
-    exact = exposure_moments(
-        signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads
-    )
+    exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads)
     found = table.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
     scale = np.maximum(np.sqrt(exact.variance), _LEAST_SPREAD)[:, None] ** np.arange(1, 5)
     total = exact.histogram.sum(-1, keepdims=True)

@@ -92,6 +92,4 @@ def node_laws(
         return NodeLaws.none()
     cells = Cells.of(signal[row // background.size], background[row % background.size], system)
     waiting = None if progress is None else lambda done: progress(done, row.size)
-    return NodeLaws.of(
-        row, guessed_windows(cells, entries.cumulants[row], entries.bins[row], threads, waiting)
-    )
+    return NodeLaws.of(row, guessed_windows(cells, entries.cumulants[row], entries.bins[row], threads, waiting))

@@ -51,10 +51,16 @@ def _refined(axis: FloatArray, along: Callable[[FloatArray], Entries], lines: Fl
         between = midpoints(axis)
         nodes, exact = along(axis), along(between)
         rows, weights, cumulants = evaluate(
-            (axis, lines), nodes.cumulants, StartPhases.none(), True,
-            np.repeat(between, lines.size), np.tile(lines, between.size), np.zeros(between.size * lines.size),
-            False, 1,
-        )  # fmt: skip
+            (axis, lines),
+            nodes.cumulants,
+            StartPhases.none(),
+            True,
+            np.repeat(between, lines.size),
+            np.tile(lines, between.size),
+            np.zeros(between.size * lines.size),
+            False,
+            1,
+        )
         scale = np.maximum(np.sqrt(exact.cumulants[:, 1]), _LEAST_SPREAD)
         off = np.abs(cumulants - exact.cumulants)
         law = _TV_MEAN * off[:, 0] / scale + _TV_VARIANCE * off[:, 1] / scale**2

@@ -228,8 +228,10 @@ def _directly(cells: Cells, cell: int, bins: int, phase: FloatArray, threads: in
     """Corrections (p, 4) of one cell, an exposure for each phase."""
     period = cells.system.period_ns
     whole = Cells.of(
-        cells.signal[cell], cells.background[cell], cells.system,
+        cells.signal[cell],
+        cells.background[cell],
+        cells.system,
         delay_ns=(0.5 - np.concatenate([[0.0], phase])) * period,
-    )  # fmt: skip
+    )
     cumulants = _run(whole, bins, 1, threads, None).cumulants
     return np.asarray(cumulants[1:] - cumulants[0], dtype=np.float64)

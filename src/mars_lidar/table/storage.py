@@ -59,9 +59,17 @@ def load(path: Path, system: System | None) -> Table:
     )
     laws = NodeLaws(**{name: arrays["law_" + name] for name in ("row", "first", "offsets", "pmf")})
     table = Table(
-        system, header["method"], arrays["signal"], arrays["background"], header["rearm"], float(header["tolerance"]),
-        json.loads(header["provenance"]), entries, phases, laws,
-    )  # fmt: skip
+        system,
+        header["method"],
+        arrays["signal"],
+        arrays["background"],
+        header["rearm"],
+        float(header["tolerance"]),
+        json.loads(header["provenance"]),
+        entries,
+        phases,
+        laws,
+    )
     if not table.serves(system.cycles):
         raise ValueError(
             f"{path} is a table of another system: cycles is {made_for.cycles} there and {system.cycles} here, "
@@ -147,9 +155,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
                     f"{path} is a table of format {header['format']}; this version reads "
                     f"{' and '.join(map(str, _READABLE))}"
                 )
-            arrays = {
-                name: _mapped(path, data) if name in _MAPPED else _own(data[()]) for name, data in file.items()
-            }
+            arrays = {name: _mapped(path, data) if name in _MAPPED else _own(data[()]) for name, data in file.items()}
     except OSError as error:
         raise ValueError(f"{path} is not an HDF5 file that can be read: {error}") from error
     arrays["phase_settled"] = arrays["phase_settled"].astype(bool)

@@ -120,9 +120,17 @@ class Table:
         from mars_lidar.table.build import build
 
         return build(
-            system, signal, background, method=method, rearm=rearm, refine=refine, tolerance=tolerance,
-            check_law=check_law, threads=threads, progress=progress,
-        )  # fmt: skip
+            system,
+            signal,
+            background,
+            method=method,
+            rearm=rearm,
+            refine=refine,
+            tolerance=tolerance,
+            check_law=check_law,
+            threads=threads,
+            progress=progress,
+        )
 
     def lookup(
         self,
@@ -172,9 +180,16 @@ class Table:
         everything = inside.size == s.size
         pick: NDArray[np.int64] | slice = slice(None) if everything else inside
         rows[pick], weights[pick], cumulants[pick] = evaluate(
-            (self.signal, self.background), self.entries.cumulants_at(periods), self.start_phases,
-            periods == self.entries.cycles, s[pick], b[pick], phase[pick], interpolation == "nearest", team,
-        )  # fmt: skip
+            (self.signal, self.background),
+            self.entries.cumulants_at(periods),
+            self.start_phases,
+            periods == self.entries.cycles,
+            s[pick],
+            b[pick],
+            phase[pick],
+            interpolation == "nearest",
+            team,
+        )
         if np.isnan(cumulants[inside]).any():
             self._refuse(periods)
         return Lookup(rows, weights, cumulants, beyond)
@@ -266,9 +281,16 @@ class Table:
         phases, entries = self.start_phases, self.entries
         startup = 0 if entries.startup is None else entries.startup.nbytes
         return int(
-            entries.shape.nbytes + startup + entries.cumulants.nbytes + entries.rates.nbytes + entries.enough.nbytes
-            + entries.bins.nbytes + phases.correction.nbytes + phases.settled.nbytes + self.laws.nbytes
-        )  # fmt: skip
+            entries.shape.nbytes
+            + startup
+            + entries.cumulants.nbytes
+            + entries.rates.nbytes
+            + entries.enough.nbytes
+            + entries.bins.nbytes
+            + phases.correction.nbytes
+            + phases.settled.nbytes
+            + self.laws.nbytes
+        )
 
     def _cycles(self, cycles: int | None) -> int:
         return self.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)

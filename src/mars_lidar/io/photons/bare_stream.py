@@ -43,9 +43,7 @@ def read(
     return _timestamps(path, name, cells, unit, period_ns, bins)
 
 
-def _timestamps(
-    path: Path, name: str, cells: _Cells, unit: float, period_ns: float, bins: int | None
-) -> Timestamps:
+def _timestamps(path: Path, name: str, cells: _Cells, unit: float, period_ns: float, bins: int | None) -> Timestamps:
     from mars_lidar.io.photons.streams import from_attributes
 
     height, width = cells.shape
@@ -101,8 +99,9 @@ def _chosen(path: Path, found: dict[str, _Cells], variable: str | None) -> tuple
         if len(names) == 1:
             return names[0], found[names[0]]
     told = ", ".join(images or vectors)
-    raise ValueError(f"{path} has {'several arrays that could be times: ' + told if told else 'no array of times'}; "
-                     "give variable")  # fmt: skip
+    raise ValueError(
+        f"{path} has {'several arrays that could be times: ' + told if told else 'no array of times'}; give variable"
+    )
 
 
 def _period(found: dict[str, _Cells], unit: float) -> float | None:

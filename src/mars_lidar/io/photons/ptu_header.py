@@ -91,7 +91,6 @@ def opened(path: Path) -> Any:
     return ptu
 
 
-
 def set_integer(file: Any, end: int, tag: bytes, value: int) -> None:
     """Set the value of an integer tag in the header, which ends at byte `end`; the file's place is kept."""
     here = file.tell()

@@ -165,9 +165,7 @@ def _depth(path: Path, stored: NDArray[Any], unit: float | None) -> FloatArray:
             )
         unit = 1.0 if unit is None else unit
     else:
-        raise ValueError(
-            f"{path}: depth must be a .png, .tif, .tiff, .pfm, .exr, .npy, .npz or .mat file or a folder"
-        )
+        raise ValueError(f"{path}: depth must be a .png, .tif, .tiff, .pfm, .exr, .npy, .npz or .mat file or a folder")
     depth = unit * pixels.floats(path, "depth", stored)
     if (depth < 0.0).any():
         raise ValueError(f"{path}: depth must not be negative, got {depth[depth < 0.0][0]:g} m")

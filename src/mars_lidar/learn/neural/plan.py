@@ -42,8 +42,13 @@ class Training:
         if not isinstance(self.fluxes, FluxRange):
             raise TypeError(f"fluxes must be a FluxRange, got {self.fluxes!r}")
         for name, most in (
-            ("pairs", 10**7), ("held_out", 10**6), ("steps", 10**7), ("batch", 10**5), ("every", 10**7),
-            ("width", 256), ("code", 4096),
-        ):  # fmt: skip
+            ("pairs", 10**7),
+            ("held_out", 10**6),
+            ("steps", 10**7),
+            ("batch", 10**5),
+            ("every", 10**7),
+            ("width", 256),
+            ("code", 4096),
+        ):
             checks.integer(name, getattr(self, name), low=1, high=most)
         checks.integer("seed", self.seed, low=0, high=2**63 - 1)

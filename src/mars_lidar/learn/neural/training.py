@@ -132,12 +132,18 @@ def _train(
     network.eval().requires_grad_(False)
     last = curve[-1]
     record: dict[str, Any] = {
-        "steps": chosen.steps, "pairs": chosen.pairs, "held_out": chosen.held_out, "seed": chosen.seed,
+        "steps": chosen.steps,
+        "pairs": chosen.pairs,
+        "held_out": chosen.held_out,
+        "seed": chosen.seed,
         "seconds": round(last.seconds, 1),
         "processor_seconds": round(time.process_time() - used, 1),
-        "tv_mean": last.tv_mean, "tv_95": last.tv_95, "tv_max": last.tv_max,
-        "mean_error": last.mean_error, "tv_unconditional": unconditional,
-    }  # fmt: skip
+        "tv_mean": last.tv_mean,
+        "tv_95": last.tv_95,
+        "tv_max": last.tv_max,
+        "mean_error": last.mean_error,
+        "tv_unconditional": unconditional,
+    }
     return Trained(NeuralMap(system, chosen.fluxes, network, record), curve, unconditional)
 
 
@@ -153,9 +159,14 @@ def _validate_on(network: PdfAutoencoder, held_out: _Tensors, step: int, seconds
         variation, error = _errors(network(held_out.photons), held_out.pdf, held_out.wait)
     network.train()
     return Point(
-        step, seconds, loss, float(variation.mean()), float(variation.quantile(0.95)), float(variation.max()),
+        step,
+        seconds,
+        loss,
+        float(variation.mean()),
+        float(variation.quantile(0.95)),
+        float(variation.max()),
         float(error.mean()),
-    )  # fmt: skip
+    )
 
 
 def save_curves(trained: Trained, stem: Path) -> list[Path]:

@@ -6,7 +6,7 @@ import os
 import platform
 from pathlib import Path
 
-from mars_lidar.statistics.exposure import thread_count
+from mars_lidar._base.threads import thread_count
 
 
 def machine() -> str:

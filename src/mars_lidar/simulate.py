@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -11,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
-from mars_lidar.engines import Engine, find_engine
+from mars_lidar._base.threads import thread_count
+from mars_lidar.engines import Engine, check_detector, find_engine
 from mars_lidar.engines.engine import Progress, Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -147,10 +147,10 @@ def simulate_timestamps(
     drawn_by = find_engine(engine)
     task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
-        drawn_by.check_device(device, task.flux, task.system)
-        from mars_lidar.cuda import exact_records
+        from mars_lidar import cuda
 
-        records = exact_records(task)
+        cuda.check(drawn_by, task.flux, task.system)
+        records = cuda.records(drawn_by, task)
     else:
         counts = drawn_by.counts(task)
         _check_memory((int(counts.sum()),), 16, "timestamps")
@@ -173,9 +173,10 @@ def simulate_timestamps(
 
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:
-    engine.check_device("cuda", task.flux, task.system)
+    from mars_lidar import cuda
     from mars_lidar.cuda.machine import cupy_with_device
 
+    cuda.check(engine, task.flux, task.system)
     cupy = cupy_with_device()
     dtype = task.system.histogram_dtype
     if out is None:
@@ -186,7 +187,7 @@ def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> An
         raise ValueError(
             f"out must be C-contiguous, of shape {shape} and dtype {dtype}, got {out.shape} and {out.dtype}"
         )
-    engine.histogram_on_cuda(task, out.reshape(task.items, task.system.bins))
+    cuda.histogram(engine, task, out.reshape(task.items, task.system.bins))
     return out
 
 
@@ -211,14 +212,13 @@ def _task(
     first = checks.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = checks.integer("realizations", realizations, low=1, high=2**32 - first)
     checks.integer("seed", seed, low=0, high=2**64 - 1)
-    team = _default_threads() if threads is None else checks.integer("threads", threads, low=1, high=1024)
+    team = thread_count(threads)
     if progress is not None and not callable(progress):
         raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
     if len(flux.returns_signal) > 16:
         raise ValueError(f"flux must have at most 16 returns, got {len(flux.returns_signal)}; use a waveform")
     _check_registrations(flux.detected(system), system)
-    drawn_by.check_mode(system)
-    drawn_by.check_effects(system)
+    check_detector(drawn_by, system)
     drawn_by.check(flux, system)
     index = _pixel_index(pixel_index, flux.shape)
     if system.detector.crosstalk is not None and not np.array_equal(index, np.arange(index.size)):
@@ -280,10 +280,3 @@ def _check_memory(shape: tuple[int, ...], itemsize: int, what: str) -> None:
         "simulate rows (flux[rows] with pixel_index) or realizations (first_realization) one after another, "
         "or give out= a memory map",
     )
-
-
-def _default_threads() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from mars_lidar.statistics.exposure import thread_count
+from mars_lidar._base.threads import thread_count
 from studies import Request
 from studies.domain import references
 from studies.domain.checks import Check

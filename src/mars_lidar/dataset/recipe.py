@@ -176,12 +176,11 @@ def _crop(data: Any) -> tuple[tuple[int, int] | None, int]:
 
 
 def _engine(engine: Any, systems: tuple[System, ...]) -> str:
-    from mars_lidar.engines import find_engine
+    from mars_lidar.engines import check_detector, find_engine
 
     if not isinstance(engine, str):
         raise TypeError(f"engine must be the name of an engine, got {engine!r}")
     found = find_engine(engine)
     for system in systems:
-        found.check_mode(system)
-        found.check_effects(system)
+        check_detector(found, system)
     return engine

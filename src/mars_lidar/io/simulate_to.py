@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.files import WriteError as WriteError
+from mars_lidar._base.files import reason
 from mars_lidar.engines import find_engine
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube, check_output, create
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import WriteError as WriteError
-from mars_lidar.io.store import reason
 from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:

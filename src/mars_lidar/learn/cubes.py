@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
-from mars_lidar.engines import Engine
+from mars_lidar.engines import Engine, check_detector
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.passing import ABLE, Slot, Slots
 from mars_lidar.learn.sample import Sample
@@ -29,8 +29,7 @@ class CubeMaker:
         self, engine: Engine, systems: Sequence[System], device: Any, layout: str, axes: str, dtype: Any
     ) -> None:
         for system in systems:
-            engine.check_mode(system)
-            engine.check_effects(system)
+            check_detector(engine, system)
         self._engine = engine
         self._layout = checks.choice("layout", layout, ("dense", "sparse"))
         self._axes = checks.choice("axes", axes, ("THW", "HWT"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +11,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.threads import thread_count
 
 try:
     import torch
@@ -225,7 +225,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
             raise ValueError("device='cuda' simulates in the process of the loader: use num_workers=0")
         if info is not None:
             forget()
-        threads = self._threads or max(1, _processors() // workers)
+        threads = self._threads or max(1, thread_count(None) // workers)
         self._given = 0
         for place, indices in enumerate(self._batches(start)):
             if place % workers != worker:
@@ -274,10 +274,3 @@ class CubeStream(IterableDataset[dict[str, Any]]):
 def _first(example: Any) -> Any:
     """Without the leading axis."""
     return {name: _first(one) for name, one in example.items()} if isinstance(example, dict) else example[0]
-
-
-def _processors() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.gate import PLAIN, photons_before, require_mode
+from mars_lidar.statistics.gate import PLAIN, require_mode
+from mars_lidar.statistics.gated_light import photons_before
 
 if TYPE_CHECKING:
     from mars_lidar import _core

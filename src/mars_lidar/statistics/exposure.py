@@ -7,7 +7,6 @@ Derivation and equation numbers: docs/theory_exposure.md.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.threads import thread_count
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
@@ -229,16 +229,6 @@ def _too_long(cells: Cells, steps: int | None) -> str:
         "the state of the pixel does not repeat from period to period for so long that the exposure cannot be run to "
         f"its end; use {more}{cells.instead.removeprefix('use ')}"
     )
-
-
-def thread_count(threads: int | None) -> int:
-    """Threads asked for, or all processors that this process may use."""
-    if threads is not None:
-        return checks.integer("threads", threads, low=1, high=1024)
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on this system
-        return os.cpu_count() or 1
 
 
 def _darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:

@@ -101,7 +101,7 @@ def trusted(cumulants: ArrayLike, *, threads: int | None = None) -> NDArray[np.b
 
 
 def _team(threads: int | None) -> int:
-    from mars_lidar.statistics.exposure import thread_count
+    from mars_lidar._base.threads import thread_count
 
     return thread_count(threads)
 

@@ -44,7 +44,7 @@ def read(
 
 
 def _timestamps(path: Path, name: str, cells: _Cells, unit: float, period_ns: float, bins: int | None) -> Timestamps:
-    from mars_lidar.io.photons.streams import from_attributes
+    from mars_lidar.io.streams.attributes import from_attributes
 
     height, width = cells.shape
     counts = np.array([cell.size for cell in cells.ravel()], np.int64)

@@ -2,7 +2,7 @@
 
 The format holds photons, not counts: `ptufile.PtuWriter` puts those of a pixel one laser period after the
 other, so that any reader that makes an image of the file gets the cube back. *When* in the exposure a photon
-came is not in it; `mars_lidar.io.photons.ptu_stream` writes photons with their real times.
+came is not in it; `mars_lidar.io.streams.ptu_stream` writes photons with their real times.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import TemporarySibling
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.optional import needed
 from mars_lidar.io import layout
-from mars_lidar.io.photons import ptu_header
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import LazyCounts, OpenedStore, TemporarySibling, Writer
+from mars_lidar.io.store import LazyCounts, OpenedStore, Writer
+from mars_lidar.io.streams import ptu_header
 
 KIND = "cube"
 _OVERFLOW = ((1 << 31) | (63 << 25) | 1).to_bytes(4, "little")  # generic T3: 1024 laser periods more

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import INCOMPLETE_SUFFIX
 from mars_lidar._base.optional import needed
-from mars_lidar.io.store import INCOMPLETE_SUFFIX
 from mars_lidar.light.timestamps import Timestamps
 
 _GROUP, _ATTRIBUTES = "mars_lidar", "attributes"  # below /user, which the format leaves to its writers
@@ -37,7 +37,7 @@ def check() -> None:
 
 def write(path: Path, times: Timestamps) -> None:
     """Write a stream; the caller renames the file when it is whole."""
-    from mars_lidar.io.photons.streams import attributes
+    from mars_lidar.io.streams.attributes import attributes
 
     save_photon_hdf5 = needed("phconvert.hdf5", "Photon-HDF5").save_photon_hdf5
     fine = units_per_bin(times.bins)
@@ -106,7 +106,7 @@ def write(path: Path, times: Timestamps) -> None:
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     """Read a stream; `period_ns` and `bins` are for files of others."""
-    from mars_lidar.io.photons.streams import from_attributes, measured
+    from mars_lidar.io.streams.attributes import from_attributes, measured
 
     with _opened(path) as file:
         if _PHOTONS not in file:

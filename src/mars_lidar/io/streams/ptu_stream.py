@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import IncompleteFileError
 from mars_lidar._base.optional import needed
-from mars_lidar.io.photons import ptu_header
-from mars_lidar.io.store import IncompleteFileError
+from mars_lidar.io.streams import ptu_header
 from mars_lidar.light.timestamps import Timestamps
 
 KIND = "timestamps"
@@ -35,7 +35,7 @@ def check() -> None:
 
 def write(path: Path, times: Timestamps) -> None:
     """Write a stream; the caller renames the file when it is whole."""
-    from mars_lidar.io.photons.streams import attributes
+    from mars_lidar.io.streams.attributes import attributes
 
     ptufile = needed("ptufile", "a .ptu")
     if times.bins > ptu_header.MAX_BINS:
@@ -78,7 +78,7 @@ def write(path: Path, times: Timestamps) -> None:
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     """Read a stream; `period_ns` and `bins` are for files of others."""
-    from mars_lidar.io.photons.streams import from_attributes, measured
+    from mars_lidar.io.streams.attributes import from_attributes, measured
 
     ptu = ptu_header.opened(path)
     try:
@@ -173,7 +173,7 @@ def _with_overflows(
 
 def _absolute(photons: Any, clock_ns: float, period_ns: float, bins: int | None, source: str) -> Timestamps:
     """Timestamps of T2 records: absolute times in units of `clock_ns`, folded with the laser period."""
-    from mars_lidar.io.photons.streams import measured
+    from mars_lidar.io.streams.attributes import measured
 
     periods = (photons["time"].astype(np.float64) + 0.5) * clock_ns / period_ns
     cycle = np.floor(periods).astype(np.int64)

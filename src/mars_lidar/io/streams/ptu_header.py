@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError
 from mars_lidar._base.optional import needed
-from mars_lidar.io.store import INCOMPLETE_SUFFIX, IncompleteFileError
 
 MAX_BINS = 2**15  # 15 bits of delay in a generic T3 record
 _ATTRIBUTES, _VARIABLES = "MarsLidar_Attributes", "MarsLidar_Variables"

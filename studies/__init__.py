@@ -102,7 +102,10 @@ STUDIES: dict[str, tuple[str, Study]] = {
         _study("reconstruction"),
     ),
     "transients": ("two returns in fog through the dead time of three detectors", _study("transients")),
-    "downstream": ("T5: networks trained on every simulator's data, tested on gold; --config", _study("downstream")),
+    "downstream": (
+        "T5: networks trained on every simulator's data, tested on gold; --config",
+        _study("downstream.run"),
+    ),
     "start-up": ("what the shape of a table leaves out: the start-up at other delays", _study("start_up")),
     "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _study("table")),
 }

@@ -16,6 +16,7 @@ from studies.classifiers import MissingExtra
 
 def _parser(command: str) -> argparse.ArgumentParser:
     told = "\n".join(f"  {name:<17} {words}" for name, (words, _) in STUDIES.items())
+    told += "\n\nthe network of the neural baseline:\n  neural train|info  see neural --help"
     parser = argparse.ArgumentParser(
         prog=command,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -68,8 +69,11 @@ def _parser(command: str) -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None, command: str = "python -m studies") -> int:
     """Entry point; returns the exit code. `command` is what was called, for the help."""
+    asked = list(sys.argv[1:] if arguments is None else arguments)
+    if asked[:1] == ["neural"]:
+        return _neural(asked[1:], f"{command} neural")
     parser = _parser(command)
-    given = parser.parse_args(arguments)
+    given = parser.parse_args(asked)
     if "reference" in given.studies and given.data is None:
         parser.error("study 'reference' needs --data DIR, the folder of the reference cases")
     if given.data is not None and not (any(given.data.glob("*.json")) or (given.data / "rgbd").is_dir()):
@@ -95,6 +99,16 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
         tell("interrupted")
         return 130
     return 0
+
+
+def _neural(arguments: Sequence[str], command: str) -> int:
+    """Train the network of the neural baseline, or say what is in one."""
+    try:
+        from studies.neural.command import main as neural
+    except MissingLibraryError as error:
+        print(f"{command}: {error}", file=sys.stderr)
+        return 1
+    return neural(arguments, command)
 
 
 if __name__ == "__main__":

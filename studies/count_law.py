@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import Detector, System
-from mars_lidar.learn.neural.plan import Training
 from mars_lidar.statistics import count_law
 from mars_lidar.statistics.distance import Pmf, kl_divergence, wasserstein
 from studies import Tell
+from studies.neural.pairs import Training
 from studies.sample import Sample, draw
 from studies.simulators import Prediction, simulators
 

@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 
 from mars_lidar.engines import ENGINES
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.neural.plan import Training
 from mars_lidar.statistics import CountLaw, count_law, photons_per_bin, registration_pdf
 from mars_lidar.statistics.distance import Pmf
 from mars_lidar.statistics.matched import matched_pmf
+from studies.neural.pairs import Training
 from studies.sample import draw
 
 if TYPE_CHECKING:
-    from mars_lidar.learn.neural import NeuralMap
+    from studies.neural import NeuralEngine
 
 FloatArray = NDArray[np.float64]
 
 # engines whose count law is evaluated instead of sampled, and those that are the truth
-_IN_CLOSED_FORM = ("poisson", "renewal", "neural", "mars", "exact", "sequential")
+_IN_CLOSED_FORM = ("poisson", "renewal", "mars", "exact", "sequential")
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,16 +102,16 @@ def _renewal(signal: FloatArray, background: FloatArray, system: System) -> Pred
 
 
 def _neural(signal: FloatArray, background: FloatArray, system: System, training: Training) -> Prediction:
-    model = _trained(system.replace(cycles=1, start="armed"), training)
-    shape = registration_pdf(signal, background, system, "neural", model=model)
-    return of_law(count_law(signal, background, system, "neural", model=model), shape)
+    engine = _trained(system.replace(cycles=1, start="armed"), training)
+    shape = engine.registration_pdf(signal, background, system)
+    return of_law(engine.count_law(signal, background, system), shape)
 
 
 @lru_cache(maxsize=8)
-def _trained(system: System, training: Training) -> NeuralMap:
-    from mars_lidar.learn.neural import train
+def _trained(system: System, training: Training) -> NeuralEngine:
+    from studies.neural import NeuralEngine, train
 
-    return train(system, training).map
+    return NeuralEngine(train(system, training).map)
 
 
 def _mars(signal: FloatArray, background: FloatArray, system: System, rearm: Literal["centre", "edge"]) -> Prediction:

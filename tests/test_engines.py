@@ -46,7 +46,6 @@ CLAIMS = {
     "poisson": {COUNTS, SHAPE, JOINT},
     "feedback": {COUNTS, SHAPE, JOINT},
     "auto": {COUNTS, SHAPE, JOINT},
-    "neural": set(),  # likewise, of one system: tests/engines/test_neural.py
     "renewal": set(),  # a baseline whose count law is wrong on purpose: tests/engines/test_renewal.py
 }
 WITHOUT_DEAD_TIME = {"poisson"}  # the law of the arrivals, whatever the detector

@@ -19,9 +19,6 @@ from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.timestamps import Timestamps
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from mars_lidar.learn.neural import NeuralMap
     from mars_lidar.table import Table
 
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
@@ -45,7 +42,6 @@ def simulate(
     count: Literal["exact", "matched", "gaussian"] | None = None,
     interpolation: Literal["bilinear", "nearest"] | None = None,
     outside: Literal["error", "exact"] | None = None,
-    model: NeuralMap | str | Path | None = None,
 ) -> NDArray[Any]:
     """Histogram cubes of an image.
 
@@ -58,8 +54,8 @@ def simulate(
     engine
         ``"exact"`` (default), ``"feedback"`` (whole histograms, at a cost independent of the exposure),
         ``"auto"`` (the faster of these two, pixel by pixel), ``"sequential"`` (slow, independent gold standard),
-        ``"mars"`` (count law x shape), ``"renewal"``, ``"neural"`` and ``"poisson"`` (baselines), or an
-        `Engine` of your own settings.
+        ``"mars"`` (count law x shape), ``"renewal"`` and ``"poisson"`` (baselines), or an `Engine`
+        of your own settings.
     realizations
         Independent exposures of the whole image.
     first_realization
@@ -93,8 +89,6 @@ def simulate(
         For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
     outside
         For a table, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
-    model
-        For ``"neural"``: a `mars_lidar.learn.neural.NeuralMap` or its file; default: the one for the example system.
 
     Returns
     -------
@@ -102,7 +96,7 @@ def simulate(
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
         with ``device="cuda"``.
     """
-    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside, model=model)
+    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside)
     task = _task(flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress)
     shape = (task.realizations, *flux.shape, system.bins)
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":

@@ -234,7 +234,7 @@ def test_bad_transients(tmp_path, of_transients, renders):
         ({"scenes": {"transient": str(renders), "pattern": "*.png"}}, "no transient found"),
         ({"scenes": {"transient": str(renders / "a.npz"), "pattern": "*"}}, "pattern belongs to a folder"),
         ({"scenes": {"transient": str(renders / "a.npz"), "name": "x"}}, r"none of the scenes can be used:\s+.*no arr"),
-        ({"engine": "neural"}, "engine 'neural' draws only the system"),
+        ({"engine": "neural"}, "engine 'neural' is no longer in the package"),
     ):
         with pytest.raises(ValueError, match=told):
             ml.generate(of_transients | changes, out)

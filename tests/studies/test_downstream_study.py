@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import mars_lidar as ml
-from mars_lidar.cli import app
 from mars_lidar.statistics import exposure_moments
-from studies import Request, downstream, downstream_data
-from studies.downstream_counts import count_bias
-from studies.downstream_report import spread
+from studies import Request
+from studies.__main__ import main
+from studies.downstream import data as downstream_data
+from studies.downstream import run as downstream
+from studies.downstream.counts import count_bias
+from studies.downstream.report import spread
 
 TINY = downstream_data.CONFIGS["tiny"]
 
@@ -38,8 +39,7 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
         downstream.run(Request(tmp_path, quick=True, tell=stop))
     kept = tmp_path / "downstream-tiny" / "poisson-sbr1-depth-0" / "result.json"
     made = kept.stat().st_mtime_ns
-    done = CliRunner().invoke(app, ["study", "downstream", "--quick", "--out", str(tmp_path)])
-    assert done.exit_code == 0, done.output
+    assert main(["downstream", "--quick", "--out", str(tmp_path)]) == 0
     assert kept.stat().st_mtime_ns == made
     assert "6 networks to train" in said[0].replace("6 of 6", "6")
     text = (tmp_path / "downstream.md").read_text()

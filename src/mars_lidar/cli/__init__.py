@@ -18,7 +18,6 @@ from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
 from mars_lidar.cli.info import info, view
 from mars_lidar.cli.init import init
 from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
-from mars_lidar.cli.neural import app as neural_app
 from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
 from mars_lidar.cli.simulate import EPILOG, simulate
 from mars_lidar.cli.table import app as table_app
@@ -56,7 +55,6 @@ for _command, _epilog in (
     _add(_command, _epilog, no_args_is_help=True)
 _add(init)
 app.add_typer(table_app, name="table")
-app.add_typer(neural_app, name="neural")
 
 
 _EPILOG = "\n\n".join(
@@ -72,7 +70,7 @@ _EPILOG = "\n\n".join(
 
 def _version(asked: bool) -> None:
     if asked:
-        from mars_lidar import __version__
+        from mars_lidar._version import __version__
 
         print(f"mars-lidar {__version__}")
         raise typer.Exit

@@ -103,8 +103,8 @@ Engine = Annotated[
         panel=_RUN,
         default="exact",
         help="exact; feedback (long exposures, at a cost independent of them); auto (the faster of these, pixel by "
-        "pixel); mars (count law x mean histogram); sequential (slow, independent gold standard); renewal, neural, "
-        "poisson (baselines).",
+        "pixel); mars (count law x mean histogram); sequential (slow, independent gold standard); renewal, poisson "
+        "(baselines).",
     ),
 ]
 Table = Annotated[
@@ -114,15 +114,6 @@ Table = Annotated[
         panel=_RUN,
         help="For --engine mars and renewal: a table of this system (mars-lidar table build).",
         default="every distinct pixel is evaluated by itself, which is slow",
-    ),
-]
-Model = Annotated[
-    Path | None,
-    _option(
-        "--model",
-        panel=_RUN,
-        help="For --engine neural: a network of this system (mars-lidar neural train).",
-        default="the package's own, for the default system",
     ),
 ]
 Count = Annotated[

@@ -48,7 +48,6 @@ def simulate(
     light: LightOptions,
     engine: options.Engine = "exact",
     table: options.Table = None,
-    model: options.Model = None,
     count: options.Count = None,
     interpolation: options.Interpolation = None,
     table_outside: options.TableOutside = None,
@@ -92,7 +91,6 @@ def simulate(
                 overwrite=overwrite,
                 progress=progress,
                 table=_table(table, system),
-                model=model,
                 count=count,  # type: ignore[arg-type]  # checked there
                 interpolation=interpolation,  # type: ignore[arg-type]
                 outside=table_outside,  # type: ignore[arg-type]

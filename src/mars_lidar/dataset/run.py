@@ -239,7 +239,7 @@ def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> in
 
 
 def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) -> None:
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     if dataset.attrs.get("version") != __version__:
         raise ValueError(

@@ -10,7 +10,6 @@ from mars_lidar.engines.engine import Engine
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
-from mars_lidar.engines.neural import NeuralEngine
 from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.renewal import RenewalEngine
 from mars_lidar.engines.sequential import SequentialEngine
@@ -26,7 +25,6 @@ ENGINES: dict[str, Engine] = {
         SequentialEngine(),
         MarsEngine(),
         RenewalEngine(),
-        NeuralEngine(),
         PoissonEngine(),
     )
 }
@@ -59,6 +57,11 @@ def find_engine(engine: str | Engine, **options: Any) -> Engine:
             name = next(iter(given))
             raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {given[name]!r}")
         return found
+    if engine == "neural":
+        raise ValueError(
+            "engine 'neural' is no longer in the package: from a checkout, give studies.neural.NeuralEngine(), "
+            "which simulate takes as engine (docs/neural.md)"
+        )
     found = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
     for name in given:
         if name not in found.options:

@@ -113,7 +113,7 @@ def photons(
         The photons do not have the stored counts (another version made the cube), or the engine draws
         histograms only.
     """
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
     from mars_lidar.simulate import simulate_timestamps
 
     k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
@@ -137,7 +137,7 @@ def photons(
 
 
 def _cube(cube: Cube, old: Path, new: Path, realization: int | None, overwrite: bool) -> Converted:
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     if new.suffix not in SUFFIXES:
         raise ValueError(f"{old} is a cube, which goes into one of {', '.join(SUFFIXES)}, not {str(new)!r}")

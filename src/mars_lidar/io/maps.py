@@ -111,7 +111,7 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
 def _contents(
     results: Mapping[str, Maps], source: str
 ) -> tuple[dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, str]]], dict[str, Any]]:
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     first = next(iter(results.values()))
     if first.depth_m.ndim != 3:

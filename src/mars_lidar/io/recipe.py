@@ -37,7 +37,7 @@ class Recipe:
         Free text: where the scene came from.
     options
         Arguments of `mars_lidar.simulate` that the engine takes beside: table, count, interpolation,
-        outside, model.
+        outside.
     settings
         What the cube depends on beside system, flux and seed, as plain data: `Engine.settings`. It is what a file
         keeps of the options.

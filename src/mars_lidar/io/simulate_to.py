@@ -21,7 +21,6 @@ from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
-    from mars_lidar.learn.neural import NeuralMap
     from mars_lidar.table import Table
 
 Progress = Callable[[int, int], None]
@@ -80,7 +79,6 @@ def simulate_to(
     count: Literal["exact", "matched", "gaussian"] | None = None,
     interpolation: Literal["bilinear", "nearest"] | None = None,
     outside: Literal["error", "exact"] | None = None,
-    model: NeuralMap | str | Path | None = None,
 ) -> Written:
     """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
 
@@ -93,7 +91,7 @@ def simulate_to(
         The file; its suffix chooses the format.
     flux, system, engine, realizations, first_realization, pixel_index, seed, threads, device
         As for `mars_lidar.simulate`; blocks from a GPU are copied from there, and the file does not tell.
-    table, count, interpolation, outside, model
+    table, count, interpolation, outside
         As for `mars_lidar.simulate`; the file keeps the name of the engine, its settings, and a hash of the table.
     depth_m, reflectivity
         Maps (H, W) of the scene to store beside the counts; depth is c tau / 2 by default.
@@ -115,7 +113,7 @@ def simulate_to(
     WriteError, Interrupted
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
-    options = _given(table=table, count=count, interpolation=interpolation, outside=outside, model=model)
+    options = _given(table=table, count=count, interpolation=interpolation, outside=outside)
     recipe = Recipe(
         system=system,
         flux=flux,

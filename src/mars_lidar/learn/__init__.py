@@ -1,4 +1,4 @@
-"""Training: streams and datasets for PyTorch, a network for cubes, the training loop.
+"""Training: streams and datasets for PyTorch, histograms and likelihoods that have gradients, inverse problems.
 
 Needs the extra ``learn``: pip install 'mars-lidar[learn]'.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mars_lidar.learn.fit import Examples, FitPlan, Fitted
     from mars_lidar.learn.forward import expected_histogram
     from mars_lidar.learn.inverse import LidarPhysics as LidarPhysics
     from mars_lidar.learn.light import bin_photons
@@ -17,15 +16,10 @@ if TYPE_CHECKING:
     from mars_lidar.learn.stored import StoredDataset
     from mars_lidar.learn.stream import CubeStream
     from mars_lidar.learn.tabulated import HistogramTable
-    from mars_lidar.learn.unet import CubeUNet
 
 _MODULES = {
     "Choice": "ranges",
     "CubeStream": "stream",
-    "CubeUNet": "unet",
-    "Examples": "fit",
-    "FitPlan": "fit",
-    "Fitted": "fit",
     "HistogramTable": "tabulated",
     "LidarPhysics": "inverse",
     "LogUniform": "ranges",
@@ -39,7 +33,14 @@ _MODULES = {
 }
 
 
+_IN_STUDIES = {"CubeUNet": "unet", "Examples": "fit", "FitPlan": "fit", "Fitted": "fit"}
+
+
 def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
+    if name in _IN_STUDIES:
+        raise AttributeError(
+            f"{name} is studies.downstream.{_IN_STUDIES[name]}.{name} of a checkout, not of the package"
+        )
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
@@ -50,10 +51,6 @@ def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
 __all__ = [  # but LidarPhysics: `import *` would ask for deepinv
     "Choice",
     "CubeStream",
-    "CubeUNet",
-    "Examples",
-    "FitPlan",
-    "Fitted",
     "HistogramTable",
     "LogUniform",
     "StoredDataset",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,23 +19,17 @@ from mars_lidar.statistics.electronics_law import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects
-from mars_lidar.statistics.methods import check_model, neural_moments, pixel_of, rearm_of
+from mars_lidar.statistics.methods import pixel_of, rearm_of
 from mars_lidar.statistics.pmf import Window, exact_windows, gaussian_window, poisson_window
 from mars_lidar.statistics.shape import registration_pdf as registration_pdf
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from mars_lidar.learn.neural import NeuralMap
-
-Method = Literal["exact", "mars", "renewal", "neural", "poisson"]
-_METHODS = ("exact", "mars", "renewal", "neural", "poisson")
+Method = Literal["exact", "mars", "renewal", "poisson"]
+_METHODS = ("exact", "mars", "renewal", "poisson")
 _LAW_MODES: dict[str, tuple[Mode, ...]] = {
     "exact": MODES,
     "mars": PLAIN,
     "renewal": PLAIN,
-    "neural": PLAIN,
     "poisson": MODES,
 }
 
@@ -91,8 +85,8 @@ class CountLaw:
     def pmf(self) -> FloatArray:
         """P(N = n) (..., w) for n in `support`; no more than `outside` lies elsewhere.
 
-        For the Gaussian laws ("mars", "renewal", "neural") the normal density integrated from n - 1/2 to n + 1/2, what
-        lies below 0 included in P(0).
+        For the Gaussian laws ("mars", "renewal") the normal density integrated from n - 1/2 to n + 1/2, what lies below
+        0 included in P(0).
         """
         out = np.zeros((len(self._windows), self._width))
         for row, window in zip(out, self._windows, strict=True):
@@ -139,7 +133,6 @@ def count_law(
     rearm: Literal["centre", "edge"] | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
-    model: NeuralMap | str | Path | None = None,
 ) -> CountLaw:
     """Law of the number of registrations in one exposure.
 
@@ -156,8 +149,6 @@ def count_law(
         - ``"mars"``: the Gaussian of the MaRS paper (arXiv 2512.04924), asymptotic in the exposure,
         - ``"renewal"``: the Gaussian of a constant-rate renewal process of equal energy, mean
           lambda t / (1 + lambda t_d) and variance lambda t / (1 + lambda t_d)^3,
-        - ``"neural"``: a stand-in for the neural mapping of arXiv 2505.23992 (`mars_lidar.engines.NeuralEngine`): the
-          Gaussian of the mean that follows from a network's PDF, and a variance without covariances,
         - ``"poisson"``: no dead time, the law of the arrivals (inside of the gate) for every mode.
     delay_ns
         Delay of the return, ns; None: half the period. With ``"exact"`` an array may broadcast with S and B:
@@ -171,8 +162,6 @@ def count_law(
         For ``"exact"``: see `exposure_moments`.
     threads
         Threads to run on; default: all processors that this process may use.
-    model
-        For ``"neural"``: as `simulate`.
 
     Returns
     -------
@@ -181,7 +170,6 @@ def count_law(
     """
     checks.choice("method", method, _METHODS)
     edge = rearm_of(rearm, method == "mars", f"method {method!r}")
-    check_model(model, method)
     cells = Cells.of(
         signal,
         background,
@@ -209,7 +197,7 @@ def count_law(
         means = system.cycles * cells.total
         cumulants = np.repeat(means[:, None], 4, axis=1).reshape(*cells.shape, 4)
         return CountLaw(method, cumulants, lambda: [poisson_window(float(m)) for m in means])
-    mean, variance = neural_moments(cells, model)[1:] if method == "neural" else _gaussian_moments(method, cells, edge)
+    mean, variance = _gaussian_moments(method, cells, edge)
     cumulants = np.zeros((*cells.shape, 4))
     cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
     return CountLaw(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,31 +16,24 @@ from mars_lidar.statistics.cells import Cells, FloatArray
 from mars_lidar.statistics.electronics_shape import stationary_records
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects, mean_histograms
-from mars_lidar.statistics.methods import check_model, neural_moments, pixel_of, rearm_of
+from mars_lidar.statistics.methods import pixel_of, rearm_of
 from mars_lidar.statistics.stationary import stationary_histogram
 from mars_lidar.statistics.timing import recorded
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from mars_lidar.learn.neural import NeuralMap
-
-_SHAPES = ("exposure", "stationary", "chain", "neural")
-_OF_CHAIN = ("chain", "neural")
+_SHAPES = ("exposure", "stationary", "chain")
 
 
 def registration_pdf(
     signal: ArrayLike | None,
     background: ArrayLike,
     system: System,
-    method: Literal["exposure", "stationary", "chain", "neural"] = "exposure",
+    method: Literal["exposure", "stationary", "chain"] = "exposure",
     *,
     delay_ns: ArrayLike | None = None,
     waveform: ArrayLike | None = None,
     rearm: Literal["centre", "edge"] | None = None,
     tolerance: float = 1e-4,
     threads: int | None = None,
-    model: NeuralMap | str | Path | None = None,
 ) -> FloatArray:
     """Shape of the mean histogram: the distribution of registrations over the bins of the period.
 
@@ -53,13 +46,9 @@ def registration_pdf(
         - ``"stationary"``: that of a pixel which has been running for long,
         - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500), for detectors
           of mode ``"nonparalyzable"``; the first two are for every mode (docs/detectors.md), and for dead time of the
-          electronics (to 1e-3 in total variation) with modes ``"nonparalyzable"`` and ``"gated"``,
-        - ``"neural"``: a trained network's answer to the flux, in place of the chain's
-          (`mars_lidar.engines.NeuralEngine`).
+          electronics (to 1e-3 in total variation) with modes ``"nonparalyzable"`` and ``"gated"``.
     rearm
         ``"centre"`` (default) or ``"edge"`` of the bin, for ``"chain"`` only.
-    model
-        For ``"neural"``: as `simulate`.
 
     Returns
     -------
@@ -69,7 +58,6 @@ def registration_pdf(
     """
     checks.choice("method", method, _SHAPES)
     edge = rearm_of(rearm, method == "chain", f"method {method!r}")
-    check_model(model, method)
     cells = Cells.of(
         signal,
         background,
@@ -77,12 +65,10 @@ def registration_pdf(
         delay_ns=delay_ns,
         waveform=waveform,
         what=f"registration_pdf of method {method!r}",
-        modes=PLAIN if method in _OF_CHAIN else MODES,
+        modes=PLAIN if method == "chain" else MODES,
         effects=_shape_effects(method, system),
     )
-    if method == "neural":
-        shape = neural_moments(cells, model)[0]
-    elif method == "chain":
+    if method == "chain":
         shape = _chain_shapes(cells, edge)
     elif method == "exposure" or system.detector.mode == "synchronous":  # there the same at any time
         shape = mean_histograms(cells, tolerance, threads)
@@ -100,7 +86,7 @@ def registration_pdf(
 
 
 def _shape_effects(method: str, system: System) -> tuple[str, ...]:
-    if method in _OF_CHAIN:
+    if method == "chain":
         return LIGHT_EFFECTS
     return histogram_effects(system)
 

@@ -32,7 +32,7 @@ def tags(attrs: Mapping[str, Any], variables: Mapping[str, NDArray[Any]], acquis
 
     `acquisition_s` is the time that all records span; phconvert and PicoQuant's own software ask for it.
     """
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     packed = BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(array) for name, array in variables.items()}

@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
-from mars_lidar._base import checks
-from mars_lidar._base.optional import MissingLibraryError
+import torch
+from torch import Tensor, nn
 
-try:
-    import torch
-    from torch import Tensor, nn
-except ImportError as _error:
-    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
+from mars_lidar._base import checks
 
 Target = Literal["depth", "reflectivity"]
 TARGETS = ("depth", "reflectivity")

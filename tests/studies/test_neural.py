@@ -8,17 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 from harness import mean_vector, require
-from typer.testing import CliRunner
 
 import mars_lidar as ml
-from mars_lidar.cli import app
-from mars_lidar.cli.system_options import DEFAULT_SYSTEM as SYSTEM
-from mars_lidar.engines import NeuralEngine, find_engine
-from mars_lidar.learn.neural import FluxRange, NeuralMap, Training, train
-from mars_lidar.learn.neural.pairs import Pairs
+from mars_lidar.compare.comparison import compare
+from mars_lidar.engines import find_engine
 from mars_lidar.statistics import PhaseChain, holding_times
+from studies.__main__ import main
+from studies.neural import FluxRange, NeuralEngine, NeuralMap, Training, train
+from studies.neural.pairs import Pairs
 
 WITHIN = 0.02  # total variation
+SYSTEM = ml.System(
+    period_ns=1e3 / 7.5,
+    cycles=1000,
+    bins=1024,
+    pulse=ml.GaussianPulse(sigma_ns=0.5),
+    detector=ml.Detector(dead_time_ns=75.0),
+)
+NEURAL = NeuralEngine()
 SMALL = ml.System(
     period_ns=100.0, cycles=50, bins=128, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=30.0)
 )
@@ -39,7 +46,7 @@ def held_out() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_pdf_is_within_a_fiftieth_of_the_chain(held_out):
     signal, background, delay = held_out
     chain = ml.registration_pdf(signal, background, SYSTEM, "chain", delay_ns=delay)
-    found = ml.registration_pdf(signal, background, SYSTEM, "neural", delay_ns=delay)
+    found = NEURAL.registration_pdf(signal, background, SYSTEM, delay_ns=delay)
     np.testing.assert_allclose(found.sum(-1), 1.0, rtol=1e-12)
     assert (found >= 0.0).all()
     off = variation(found, chain)
@@ -60,14 +67,14 @@ def test_pdf_of_two_returns():
 
 def test_the_delay_is_not_learned_but_exact():
     delay = (200.25 + np.array([0.0, 1.0, 517.0])) * SYSTEM.bin_ns
-    pdf = ml.registration_pdf(3.0, 0.5, SYSTEM, "neural", delay_ns=delay)
+    pdf = NEURAL.registration_pdf(3.0, 0.5, SYSTEM, delay_ns=delay)
     np.testing.assert_allclose(np.roll(pdf[0], 1), pdf[1], atol=1e-7)
     np.testing.assert_allclose(np.roll(pdf[0], 517), pdf[2], atol=1e-7)
 
 
 def test_count_has_the_mean_of_the_chain_and_the_variance_of_one_holding_time(held_out):
     signal, background, _ = (x[:40] for x in held_out)
-    law = ml.count_law(signal, background, SYSTEM, "neural")
+    law = NEURAL.count_law(signal, background, SYSTEM)
     for k, (s, b) in enumerate(zip(signal, background, strict=True)):
         times = holding_times(PhaseChain.from_flux(s, b, SYSTEM))
         assert law.mean[k] == pytest.approx(SYSTEM.cycles / times.mu, rel=0.01)
@@ -75,15 +82,15 @@ def test_count_has_the_mean_of_the_chain_and_the_variance_of_one_holding_time(he
         assert law.variance[k] == pytest.approx(SYSTEM.cycles * times.sigma_ss2 / times.mu**3, rel=0.1)
     # and that is not the variance of the count: the covariances are what the MaRS paper adds
     exact = ml.count_law(8.0, 0.1, SYSTEM).variance
-    assert ml.count_law(8.0, 0.1, SYSTEM, "neural").variance > 1.5 * exact
+    assert NEURAL.count_law(8.0, 0.1, SYSTEM).variance > 1.5 * exact
 
 
 def test_engine_draws_its_own_law():
     signal, background, delay = 4.0, 0.7, 31.7
     flux = ml.Flux(np.full((1, 4), signal), background, delay)
-    cube = ml.simulate(flux, SYSTEM, engine="neural", realizations=500, seed=3).reshape(-1, SYSTEM.bins)
-    law = ml.count_law(signal, background, SYSTEM, "neural")
-    pdf = ml.registration_pdf(signal, background, SYSTEM, "neural", delay_ns=delay)
+    cube = ml.simulate(flux, SYSTEM, engine=NEURAL, realizations=500, seed=3).reshape(-1, SYSTEM.bins)
+    law = NEURAL.count_law(signal, background, SYSTEM)
+    pdf = NEURAL.registration_pdf(signal, background, SYSTEM, delay_ns=delay)
     counts = cube.sum(-1, dtype=np.int64)
     groups = cube.reshape(-1, 32, SYSTEM.bins // 32).sum(-1, dtype=np.int64)
     mean, variance = float(law.mean), float(law.variance)
@@ -95,17 +102,17 @@ def test_engine_draws_its_own_law():
 
 def test_bits_do_not_depend_on_threads_or_company():
     scene = ml.Scene.example("room", size=8).flux(SYSTEM, signal=1.0, sbr=1.0)
-    whole = ml.simulate(scene, SYSTEM, engine="neural", seed=4, threads=2)
-    part = ml.simulate(scene[3:], SYSTEM, engine="neural", seed=4, threads=1, pixel_index=np.arange(24, 64))
+    whole = ml.simulate(scene, SYSTEM, engine=NEURAL, seed=4, threads=2)
+    part = ml.simulate(scene[3:], SYSTEM, engine=NEURAL, seed=4, threads=1, pixel_index=np.arange(24, 64))
     assert np.array_equal(part, whole[:, 3:])
 
 
 def test_without_light_or_without_signal():
     flux = ml.Flux(np.array([[0.0, 0.0]]), np.array([[0.0, 1.0]]))
-    cube = ml.simulate(flux, SYSTEM, engine="neural")
+    cube = ml.simulate(flux, SYSTEM, engine=NEURAL)
     assert not cube[0, 0, 0].any()
     assert cube[0, 0, 1].sum() > 500
-    assert np.ptp(ml.registration_pdf(0.0, 1.0, SYSTEM, "neural")) == 0.0
+    assert np.ptp(NEURAL.registration_pdf(0.0, 1.0, SYSTEM)) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -119,9 +126,9 @@ def test_without_light_or_without_signal():
 )
 def test_another_system_is_refused_by_name(changes, words):
     with pytest.raises(ValueError, match=re.escape(words)):
-        ml.simulate(ml.Flux(1.0, 1.0, 5.0), SYSTEM.replace(**changes), engine="neural")
+        ml.simulate(ml.Flux(1.0, 1.0, 5.0), SYSTEM.replace(**changes), engine=NEURAL)
     with pytest.raises(ValueError, match=re.escape(words)):
-        ml.count_law(1.0, 1.0, SYSTEM.replace(**changes), "neural")
+        NEURAL.count_law(1.0, 1.0, SYSTEM.replace(**changes))
 
 
 def test_other_fluxes_are_refused():
@@ -132,29 +139,25 @@ def test_other_fluxes_are_refused():
         (ml.Flux.multi(*(ml.Flux(1.0, 0.1, d) for d in (5.0, 9.0, 20.0))), "3"),
     ):
         with pytest.raises(ValueError, match=words):
-            ml.simulate(flux, SYSTEM, engine="neural")
-    with pytest.raises(ValueError, match="model must be None"):
-        ml.count_law(1.0, 1.0, SYSTEM, "exact", model="x.npz")
-    with pytest.raises(TypeError, match="model must be None"):
-        find_engine("exact", model="x.npz")
+            ml.simulate(flux, SYSTEM, engine=NEURAL)
 
 
 def test_cycles_and_start_do_not_matter():
     flux = ml.Flux(1.0, 1.0, 5.0)
-    ml.simulate(flux, SYSTEM.replace(cycles=5, start="stationary"), engine="neural")
+    ml.simulate(flux, SYSTEM.replace(cycles=5, start="stationary"), engine=NEURAL)
     thin = SYSTEM.replace(detector=ml.Detector(dead_time_ns=75.0, detection_efficiency=0.5))
-    half = ml.count_law(2.0, 2.0, thin, "neural")
-    assert half.mean == ml.count_law(1.0, 1.0, SYSTEM, "neural").mean
+    half = NEURAL.count_law(2.0, 2.0, thin)
+    assert half.mean == NEURAL.count_law(1.0, 1.0, SYSTEM).mean
 
 
-def test_training_from_the_command_line(tmp_path: Path):
+def test_training_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "net.npz"
     system = tmp_path / "small.yaml"
     SMALL.save(system)
     arguments = ["neural", "train", "--system", str(system), "-o", str(path)]
     arguments += ["--steps", "150", "--pairs", "300"]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 0, done.output
+    assert main(arguments) == 0
+    assert "total variation to the chain" in capsys.readouterr().out
     assert {p.name for p in tmp_path.iterdir()} == {"net.npz", "net.csv", "net.png", "small.yaml"}
     found = NeuralMap.load(path)
     assert found.system.dead_time_periods == 0.3
@@ -164,15 +167,27 @@ def test_training_from_the_command_line(tmp_path: Path):
     assert last < 0.5 * first
     assert last < 0.2 * found.record["tv_unconditional"]
     flux = ml.Flux(1.0, 1.0, 5.0)
-    cube = ml.simulate(flux, SMALL, engine="neural", model=path)
+    cube = ml.simulate(flux, SMALL, engine=NeuralEngine(path))
     assert np.array_equal(cube, ml.simulate(flux, SMALL, engine=NeuralEngine(found)))
-    told = ["simulate", "--scene", "room", "--size", "4", "--system", str(system), "--engine", "neural", "--no-picture"]
-    drawn = CliRunner().invoke(app, [*told, "--model", str(path), "-o", str(tmp_path / "cube.npz")])
-    assert drawn.exit_code == 0, drawn.output
-    assert CliRunner().invoke(app, ["neural", "info", str(path)]).exit_code == 0
-    again = CliRunner().invoke(app, arguments)
-    assert again.exit_code == 2
+    assert main(["neural", "info", str(path)]) == 0
+    assert "trained" not in capsys.readouterr().err
+    assert main(arguments) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["neural", "info", str(system)]) == 2
     assert path.exists()
+
+
+def test_the_package_says_where_the_engine_went():
+    for call in (lambda: find_engine("neural"), lambda: ml.simulate(ml.Flux(1.0, 1.0, 5.0), SYSTEM, engine="neural")):
+        with pytest.raises(ValueError, match=r"studies\.neural\.NeuralEngine\(\).*docs/neural\.md"):
+            call()
+
+
+def test_it_is_compared_beside_the_engines_of_the_package():
+    scene = ml.Scene.example("room", size=4)
+    found = compare(scene.flux(SYSTEM, signal=1.0, sbr=1.0), SYSTEM, ["exact", NEURAL], realizations=50, seed=1)
+    assert list(found.scenes) == ["exact", "neural"]
+    assert not found.skipped
 
 
 def test_training_is_repeatable():

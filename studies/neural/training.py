@@ -15,11 +15,10 @@ from torch import Tensor
 from mars_lidar._base import checks
 from mars_lidar.engines.engine import Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.neural.model import NeuralMap
-from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, one_thread, rolled
-from mars_lidar.learn.neural.pairs import Pairs
-from mars_lidar.learn.neural.plan import Training
 from mars_lidar.statistics.gate import require_mode
+from studies.neural.model import NeuralMap
+from studies.neural.network import PdfAutoencoder, canonical, one_thread, rolled
+from studies.neural.pairs import Pairs, Training
 
 _RATE, _WARM_UP, _CLIP = 4e-3, 0.1, 1.0
 _MIN_BINS = 128

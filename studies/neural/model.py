@@ -7,7 +7,6 @@ import zipfile
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from hashlib import blake2b
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +16,19 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import TemporarySibling
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.neural.network import PdfAutoencoder, canonical, one_thread, rolled
-from mars_lidar.learn.neural.pairs import FluxRange
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
+from studies.neural.network import PdfAutoencoder, canonical, one_thread, rolled
+from studies.neural.pairs import FluxRange
 
 FloatArray = NDArray[np.float64]
 
 _FORMAT = 1
 _BATCH = 32  # always filled up to: the answer to a flux must not depend on what else is asked
 _TOLERANCE = 1e-9  # relative, of the range of fluxes
-_EXAMPLE = "example.npz"  # for period 133.33 ns, dead time 75 ns, 1024 bins, Gaussian pulse of sigma 0.5 ns
+_EXAMPLE = Path(__file__).with_name(
+    "example.npz"
+)  # for period 133.33 ns, dead time 75 ns, 1024 bins, Gaussian pulse of sigma 0.5 ns
 # what the stationary chain depends on; any number of cycles, and any start, is served
 _FIELDS = ("period_ns", "bins", "pulse", "detector")
 
@@ -72,7 +73,7 @@ class NeuralMap:
                 ours, theirs = ours["detector"], theirs["detector"]
             raise ValueError(
                 f"engine 'neural' draws only the system it was trained for: {name} is {theirs[name]}, trained for "
-                f"{ours[name]}; train another (mars-lidar neural train) and give it as model (--model)"
+                f"{ours[name]}; train another (python -m studies neural train) and give it: NeuralEngine(file)"
             )
 
     def check_range(self, signal: FloatArray, background: FloatArray) -> None:
@@ -89,7 +90,7 @@ class NeuralMap:
                 raise ValueError(
                     f"engine 'neural' was trained on a {name} of {low:g} to {high:g} photons per period, got "
                     f"{photons[out].min():.4g} to {photons[out].max():.4g} in {int(out.sum())} of {out.size} pixels; "
-                    "train on that range (mars-lidar neural train), or use another engine"
+                    "train on that range (python -m studies neural train), or use another engine"
                 )
 
     def pdf(self, photons: FloatArray) -> FloatArray:
@@ -141,7 +142,7 @@ class NeuralMap:
         if not source.is_file():
             raise FileNotFoundError(f"{source}: there is no such file of a neural map")
         if not zipfile.is_zipfile(source):
-            raise ValueError(f"{source} must be a neural map (mars-lidar neural train writes one)")
+            raise ValueError(f"{source} must be a neural map (python -m studies neural train writes one)")
         try:
             with source.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 header = json.loads(str(stored["header"]))
@@ -153,20 +154,19 @@ class NeuralMap:
             network.load_state_dict(weights)
             fluxes = FluxRange(**header["fluxes"])
         except Exception as error:  # a damaged archive fails in many ways
-            raise ValueError(f"{source} must be a neural map (mars-lidar neural train): {error}") from error
+            raise ValueError(f"{source} must be a neural map (python -m studies neural train): {error}") from error
         network.eval().requires_grad_(False)
         return cls(system, fluxes, network, header["record"])
 
     @staticmethod
     def example() -> NeuralMap:
-        """The one that comes with the package: period 133.33 ns, dead time 75 ns, 1024 bins, pulse of sigma 0.5 ns."""
+        """The network of this folder: period 133.33 ns, dead time 75 ns, 1024 bins, pulse of sigma 0.5 ns."""
         return _example()
 
 
 @lru_cache(maxsize=1)
 def _example() -> NeuralMap:
-    with as_file(files("mars_lidar.learn.neural") / _EXAMPLE) as path:
-        return NeuralMap.load(path)
+    return NeuralMap.load(_EXAMPLE)
 
 
 def check_target(path: str | Path, overwrite: bool) -> Path:

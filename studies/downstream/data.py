@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines import Engine, MarsEngine, NeuralEngine, RenewalEngine
+from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import Detector, System
-from mars_lidar.learn.fit import Examples, FitPlan
 from mars_lidar.scene.scene import Scene
 from mars_lidar.simulate import simulate
 from mars_lidar.table import Table
+from studies.downstream.fit import Examples, FitPlan
+from studies.neural import NeuralEngine
 
-SYSTEM = System(  # that of the neural map which comes with the package
+SYSTEM = System(  # that of the network beside studies/neural
     period_ns=1e3 / 7.5, cycles=1000, bins=1024, pulse=GaussianPulse(sigma_ns=0.5), detector=Detector(dead_time_ns=75.0)
 )
 WORDS = {

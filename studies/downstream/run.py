@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar.scene.scene import Scene
 from studies import OtherRunsError, Request, Tell
-from studies.downstream_counts import count_bias
-from studies.downstream_data import CONFIGS, SYSTEM, WORDS, Config, Simulators, crop, examples, rgbd_scenes
+from studies.downstream.counts import count_bias
+from studies.downstream.data import CONFIGS, SYSTEM, WORDS, Config, Simulators, crop, examples, rgbd_scenes
 
 TARGETS = ("reflectivity", "depth")
 RESULT, SHOWN, CONFIG, COUNTS = "result.json", "shown.npz", "config.json", "counts.json"
@@ -58,7 +58,7 @@ def runs(config: Config) -> list[Run]:
 
 def run(request: Request) -> list[Path]:
     """Make what is left of the runs, and write downstream.md, its CSV and its figures."""
-    from studies.downstream_report import write
+    from studies.downstream.report import write
 
     name = "tiny" if request.quick else request.config
     config = CONFIGS[checks.choice("config", name, tuple(CONFIGS))]
@@ -124,8 +124,8 @@ def train_and_test(one: Run, config: Config, data: Data, folder: Path, tell: Tel
     """Train a network, or go on with it, and leave its result in `folder`."""
     import torch
 
-    from mars_lidar.learn.fit import fit, predict
-    from mars_lidar.learn.unet import CubeUNet, Target
+    from studies.downstream.fit import fit, predict
+    from studies.downstream.unet import CubeUNet, Target
 
     target: Target = "depth" if one.target == "depth" else "reflectivity"
     torch.manual_seed(one.seed)
@@ -161,7 +161,7 @@ def train_and_test(one: Run, config: Config, data: Data, folder: Path, tell: Tel
 
 def errors(maps: NDArray[np.float32], scenes: list[Scene], target: str, config: Config) -> dict[str, float]:
     """PSNR and SSIM, means over the scenes, and RMSE over all pixels; of depth in m, pixels without return left out."""
-    from mars_lidar.learn.metrics import psnr, rmse, ssim
+    from studies.downstream.metrics import psnr, rmse, ssim
 
     peak = config.depth_range_m if target == "depth" else 1.0
     found = maps.astype(np.float64) * peak

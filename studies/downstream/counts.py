@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.scene.scene import Scene
-from studies.downstream_data import Config, Simulators
+from studies.downstream.data import Config, Simulators
 
 QUARTERS = ("dimmest", "second", "third", "brightest")
 _STREAMS = (5, 6, 7)  # of the arms and of two exposures by the gold standard; others than those of the networks' data

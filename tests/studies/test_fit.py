@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from mars_lidar.learn.fit import BEST, LAST, LOG, RECORD, Examples, FitPlan, fit, predict
-from mars_lidar.learn.metrics import psnr, rmse, ssim
-from mars_lidar.learn.unet import CubeUNet
+from studies.downstream.fit import BEST, LAST, LOG, RECORD, Examples, FitPlan, fit, predict
+from studies.downstream.metrics import psnr, rmse, ssim
+from studies.downstream.unet import CubeUNet
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 PLAN = FitPlan(steps=12, batch=2, every=4, patience=9, rate=5e-3)
 
 

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar.engines import Engine
 from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.count_shape import normalised
 from mars_lidar.engines.counts import RoundedGaussian
-from mars_lidar.engines.engine import Engine, Task
+from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Group, groups, single_return
 from mars_lidar.engines.synthesis import Batch, Run
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-
-if TYPE_CHECKING:
-    from mars_lidar.learn.neural import NeuralMap
-    from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics import CountLaw, photons_per_bin
+from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.methods import pixel_of
+from mars_lidar.statistics.pmf import gaussian_window
+from studies.neural.model import NeuralMap
 
 FloatArray = NDArray[np.float64]
 
@@ -32,20 +35,19 @@ class NeuralEngine(Engine):
     count are not public; this is an autoencoder of our own, trained on the Markov chain of phases, and the count has
     the mean of the renewal argument and the variance of independent holding times, t sigma_ss^2 / mu^3: the covariances
     are missing, and the variance is wrong where a pulse matters. The joint law of the bins is multinomial, as in
-    `MarsEngine`.
+    `mars_lidar.engines.MarsEngine`. It goes into ``mars_lidar.simulate(engine=NeuralEngine())``.
 
     Parameters
     ----------
     model
-        A `mars_lidar.learn.neural.NeuralMap` or the file of one (``mars-lidar neural train``). None: the one that comes
-        with the package, for a period of 133.33 ns, dead time 75 ns, 1024 bins and a Gaussian pulse of 0.5 ns.
+        A `studies.neural.NeuralMap` or the file of one (``python -m studies neural train``). None: the one beside this
+        file, for a period of 133.33 ns, dead time 75 ns, 1024 bins and a Gaussian pulse of 0.5 ns.
     level
         Forces one of ``_core.levels()`` (vector widths); it changes speed only.
     """
 
     name = "neural"
     description = "a trained network's shape, a count without covariances: a baseline, for the system trained for"
-    options: ClassVar[tuple[str, ...]] = ("model",)
     any_system = False
 
     def __init__(self, model: NeuralMap | str | Path | None = None, *, level: str = "") -> None:
@@ -55,18 +57,16 @@ class NeuralEngine(Engine):
     @property
     def model(self) -> NeuralMap:
         """The map, read when first asked for."""
-        from mars_lidar.learn.neural.model import NeuralMap
-
         if self._model is None:
             self._model = NeuralMap.example()
         elif not isinstance(self._model, NeuralMap):
             self._model = NeuralMap.load(self._model)
-        found: NeuralMap = self._model
-        return found
+        network: NeuralMap = self._model
+        return network
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Hash of the weights, and what the training found."""
+        """Hash of the weights, and the total variation that the training reached."""
         return {"model": self.model.digest, "tv_mean": self.model.record["tv_mean"]}
 
     def check(self, flux: Flux, system: System) -> None:
@@ -90,11 +90,24 @@ class NeuralEngine(Engine):
                 batch = self._batch(run, group, None if single is None else single[1])
             run.draw(batch)
 
-    def of_cells(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """PDFs (cells, bins), means and variances (cells,): uniform, 0 and 0 where there is no light."""
-        from mars_lidar.statistics.grid import photons_per_bin
-        from mars_lidar.statistics.methods import pixel_of
+    def registration_pdf(
+        self, signal: ArrayLike, background: ArrayLike, system: System, *, delay_ns: ArrayLike | None = None
+    ) -> FloatArray:
+        """PDFs (..., bins) by the network, in place of the chain's: `mars_lidar.registration_pdf`'s arguments."""
+        cells = _cells(signal, background, system, delay_ns)
+        return self._moments(cells)[0].reshape(*cells.shape, system.bins)
 
+    def count_law(self, signal: ArrayLike, background: ArrayLike, system: System) -> CountLaw:
+        """The Gaussian count law of this engine, for cells (...): `mars_lidar.count_law`'s arguments."""
+        cells = _cells(signal, background, system, None)
+        _, mean, variance = self._moments(cells)
+        cumulants = np.zeros((*cells.shape, 4))
+        cumulants[..., 0], cumulants[..., 1] = mean.reshape(cells.shape), variance.reshape(cells.shape)
+        moments = list(zip(mean, variance, strict=True))
+        return CountLaw(self.name, cumulants, lambda: [gaussian_window(float(m), float(v)) for m, v in moments])
+
+    def _moments(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """PDFs (cells, bins), means and variances (cells,): uniform, 0 and 0 where there is no light."""
         system, model = cells.system, self.model
         model.check(system)
         model.check_range(cells.signal, cells.background)
@@ -113,10 +126,15 @@ class NeuralEngine(Engine):
 
     def _batch(self, run: Run, group: Group, delay: FloatArray | None) -> Batch:
         system, cells, cell = run.task.system, group.cells, group.cell
-        pdf, mean, variance = self.of_cells(cells)
+        pdf, mean, variance = self._moments(cells)
         laws, alignment = RoundedGaussian(mean[cell], variance[cell]), None
         if delay is not None:
             signal, background = cells.signal[cell], cells.background[cell]
             rate = mean[cell] / system.cycles
             alignment = Alignment.of(system, signal, background, delay[group.pixels], rate)
         return Batch.unmixed(group.pixels, normalised(pdf), cell, laws, alignment)
+
+
+def _cells(signal: ArrayLike, background: ArrayLike, system: System, delay_ns: ArrayLike | None) -> Cells:
+    effects = LIGHT_EFFECTS + TIMING_EFFECTS  # the network refuses those that it was not trained for, by their fields
+    return Cells.of(signal, background, system, delay_ns=delay_ns, what="the neural map", effects=effects)

@@ -2,7 +2,7 @@
 
 A *stand-in* for the baseline of "Ultrafast High-Flux SP-LiDAR Simulator via Neural Mapping" (arXiv 2505.23992), whose
 layers, loss and count formula are not public: an autoencoder in the flux's own frame, trained on pairs from the Markov
-chain of phases. Needs the extra ``learn``.
+chain of phases. It needs PyTorch, the extra ``learn``. ``python -m studies neural --help`` trains one.
 """
 
 from __future__ import annotations
@@ -10,12 +10,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mars_lidar.learn.neural.model import NeuralMap
-    from mars_lidar.learn.neural.pairs import FluxRange
-    from mars_lidar.learn.neural.plan import Training
-    from mars_lidar.learn.neural.training import train
+    from studies.neural.engine import NeuralEngine
+    from studies.neural.model import NeuralMap
+    from studies.neural.pairs import FluxRange, Training
+    from studies.neural.training import train
 
-_MODULES = {"NeuralMap": "model", "FluxRange": "pairs", "Training": "plan", "train": "training"}
+_MODULES = {
+    "FluxRange": "pairs",
+    "NeuralEngine": "engine",
+    "NeuralMap": "model",
+    "Training": "pairs",
+    "train": "training",
+}
 
 
 def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
@@ -23,7 +29,7 @@ def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"mars_lidar.learn.neural.{_MODULES[name]}"), name)
+    return getattr(import_module(f"studies.neural.{_MODULES[name]}"), name)
 
 
-__all__ = ["FluxRange", "NeuralMap", "Training", "train"]
+__all__ = ["FluxRange", "NeuralEngine", "NeuralMap", "Training", "train"]

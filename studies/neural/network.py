@@ -12,7 +12,7 @@ try:
     import torch
     from torch import Tensor, nn
 except ImportError as _error:
-    raise MissingLibraryError(f"engine 'neural' needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
+    raise MissingLibraryError(f"the neural map needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
 
 STRIDE, LEVELS = 4, 3
 MULTIPLE = STRIDE**LEVELS  # of which the number of bins must be one

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from studies.downstream import SHOWN, TARGETS, Run, by_arm
-from studies.downstream_counts import QUARTERS
-from studies.downstream_data import SYSTEM, WORDS, Config, crop
+from studies.downstream.counts import QUARTERS
+from studies.downstream.data import SYSTEM, WORDS, Config, crop
+from studies.downstream.run import SHOWN, TARGETS, Run, by_arm
 from studies.machine import machine
 from studies.report import Row, configuration, save_csv, save_figure, save_text, table
 

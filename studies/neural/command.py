@@ -1,0 +1,138 @@
+"""``python -m studies neural``: train the network of a system, and say what is in a file."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.system import Detector, System
+from studies.neural.model import NeuralMap, check_target
+from studies.neural.pairs import FluxRange, Training
+from studies.neural.training import Point, save_curves, train
+
+
+def main(arguments: Sequence[str], command: str) -> int:
+    """Entry point; returns the exit code. `command` is what was called, for the help."""
+    parser = _parser(command)
+    given = parser.parse_args(arguments)
+    try:
+        return _train(given) if given.verb == "train" else _info(given.file)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except (ValueError, TypeError, FileNotFoundError, FileExistsError) as error:
+        print(f"{command}: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser(command: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=command, description=__doc__)
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="train|info")
+    learn = verbs.add_parser(
+        "train",
+        help="train on the Markov chain of phases, and validate on held-out fluxes",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = learn.add_argument
+    add("-o", "--out", type=Path, required=True, help="the network: .npz. Curves go beside it: .csv and .png")
+    add("--system", type=Path, metavar="FILE", help="YAML or JSON file (mars-lidar init writes one) to start from")
+    add("--period-ns", type=float, help="laser period, ns (133.33)")
+    add("--dead-time-ns", type=float, help="dead time after a registration, ns (75)")
+    add("--bins", type=int, help="histogram bins per period (1024)")
+    add("--pulse-sigma-ns", type=float, help="Gaussian pulse: standard deviation, ns (0.5); others: --system")
+    flux, plan = FluxRange(), Training()
+    for name in ("signal", "background"):
+        default = "{:g},{:g}".format(*getattr(flux, name))
+        add(f"--{name}", default=default, metavar="LOW,HIGH", help=f"range of the {name}, photons per period")
+    add("--returns", type=int, default=flux.returns, help="most returns of a flux, 1 or 2")
+    add("--steps", type=int, default=plan.steps, help="steps of the training")
+    add("--pairs", type=int, default=plan.pairs, help="pairs to learn from")
+    add("--seed", type=int, default=plan.seed, help="seed of pairs, weights and order")
+    add("--overwrite", action="store_true", help="replace an existing network")
+    info = verbs.add_parser("info", help="what a network was trained for, and how well it does")
+    info.add_argument("file", type=Path, nargs="?", help="a network: .npz. Without it: the one of this folder")
+    return parser
+
+
+def _train(given: argparse.Namespace) -> int:
+    check_target(given.out, given.overwrite)
+    fluxes = FluxRange(
+        signal=_pair("--signal", given.signal),
+        background=_pair("--background", given.background),
+        returns=given.returns,
+    )
+    plan = Training(fluxes=fluxes, steps=given.steps, pairs=given.pairs, seed=given.seed)
+
+    def tell(point: Point) -> None:
+        print(
+            f"step {point.step}: total variation {point.tv_mean:.4f}, 95 % {point.tv_95:.4f}, largest "
+            f"{point.tv_max:.4f}; {point.seconds:.0f} s",
+            file=sys.stderr,
+        )
+
+    trained = train(_system(given), plan, tell=tell)
+    trained.map.save(given.out, overwrite=given.overwrite)
+    curves = save_curves(trained, given.out.with_suffix(""))
+    _show([*_rows(given.out, trained.map), ("curves", ", ".join(map(str, curves)))])
+    return 0
+
+
+def _info(file: Path | None) -> int:
+    _show(_rows(file, NeuralMap.example() if file is None else NeuralMap.load(file)))
+    return 0
+
+
+def _system(given: argparse.Namespace) -> System:
+    """The system of the file, or that of the network of this folder, with the single values in place of its own."""
+    base = NeuralMap.example().system if given.system is None else System.load(given.system)
+    changes = {name: getattr(given, name) for name in ("period_ns", "bins")}
+    if given.pulse_sigma_ns is not None:
+        changes["pulse"] = GaussianPulse(sigma_ns=given.pulse_sigma_ns)
+    if given.dead_time_ns is not None:
+        changes["detector"] = Detector.from_dict(base.detector.to_dict() | {"dead_time_ns": given.dead_time_ns})
+    return base.replace(**{name: value for name, value in changes.items() if value is not None})
+
+
+def _pair(name: str, text: str) -> tuple[float, float]:
+    try:
+        low, high = text.split(",")
+        return float(low), float(high)
+    except ValueError:
+        raise ValueError(f"{name} must be LOW,HIGH, such as 0.002,12, got {text!r}") from None
+
+
+def _show(rows: list[tuple[str, str]]) -> None:
+    for label, text in rows:
+        print(f"{label:<10} {text}")
+
+
+def _rows(path: Path | None, network: NeuralMap) -> list[tuple[str, str]]:
+    system, record, fluxes = network.system, network.record, network.fluxes
+    return [
+        ("network", "example.npz" if path is None else f"{path} ({path.stat().st_size / 1e3:,.4g} kB)"),
+        (
+            "system",
+            f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
+            f"{system.detector.dead_time_ns:.6g} ns",
+        ),
+        (
+            "fluxes",
+            f"S up to {fluxes.signal[1]:g}, B {fluxes.background[0]:g} to {fluxes.background[1]:g} photons per period, "
+            f"up to {fluxes.returns} returns",
+        ),
+        (
+            "training",
+            f"{record['steps']} steps on {record['pairs']} pairs, {record['seconds']:.4g} s "
+            f"({record['processor_seconds']:.4g} s of processor time), seed {record['seed']}",
+        ),
+        (
+            "held out",
+            f"{record['held_out']} fluxes: total variation to the chain {record['tv_mean']:.4f} (95 % "
+            f"{record['tv_95']:.4f}, largest {record['tv_max']:.4f}); the mean PDF alone: "
+            f"{record['tv_unconditional']:.4f}",
+        ),
+        ("count", f"mean off by {record['mean_error']:.2g} of itself, on average"),
+    ]

@@ -8,7 +8,7 @@ from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Task
 from mars_lidar.instrument.detector import MODES
 

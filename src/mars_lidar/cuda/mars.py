@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.cuda.kernels import MARS_LAWS, mars_histograms, overflow
 from mars_lidar.cuda.machine import Machine
 from mars_lidar.engines.alignment import Frame, pulse_frame

@@ -18,7 +18,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
 Progress = Callable[[int, int], object]
 
@@ -72,7 +72,7 @@ class Task:
     @cached_property
     def job(self) -> _core.Job:
         """The native form of this task; times in laser periods."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         wave = self.flux.waveform
         detector = self.system.detector
@@ -182,7 +182,7 @@ class Engine(ABC):
 
 @lru_cache(maxsize=16)
 def _recording(detector: Detector, period_ns: float) -> _core.Recording:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     jitter, no_limit = detector.jitter, 2**31 - 1
     shape: Pulse | None = None

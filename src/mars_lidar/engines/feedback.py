@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Engine, Progress, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback_grid import near_pulse

@@ -14,7 +14,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import recording_of
 
 if TYPE_CHECKING:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
 Progress = Callable[[int, int], object]
 

@@ -56,7 +56,7 @@ class MaximumLikelihood(Method):
 
     def estimate(self, histograms: Histograms) -> Estimates:
         """The estimates, their standard errors, and the significance of the signal."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         out = np.empty((len(histograms.counts), 8))
         flags = np.empty(len(histograms.counts), np.uint8)
@@ -103,7 +103,7 @@ def log_likelihood(
     tuple
         Value (...), gradient (..., 3) and information (..., 3, 3) with respect to (S, B, delay in ns).
     """
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     given, shape = checked(histogram, system, 1)
     if shape:

@@ -143,7 +143,7 @@ def window_estimates(
     total: FloatArray | None = None,
 ) -> Estimates:
     """Delay by a filter or the peak, signal and background by the window around it, of corrected rates."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     out, flags = np.empty((len(given.counts), 5)), np.empty(len(given.counts), np.uint8)
     _core.window_estimates(
@@ -169,7 +169,7 @@ def corrected_rates(
     given: Histograms, correction: int, *, steps: int = 0, tolerance: float = 0.0, total: FloatArray | None = None
 ) -> FloatArray:
     """Photons per period in each bin (pixels, bins)."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)
     _core.corrected_rates(

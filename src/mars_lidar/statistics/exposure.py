@@ -27,7 +27,7 @@ from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.warm import NOT_WARM, warm_history
 
 if TYPE_CHECKING:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
 Progress = Callable[[int, int], object]
 
@@ -255,7 +255,7 @@ def _run(
     cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, steps: int | None = None
 ) -> Exposure:
     """One pass of the recursion over all cells on one grid."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     cells.check_history(bins)
     if steps is not None and min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) * bins > steps:
@@ -298,7 +298,7 @@ def _moments(
     history: FloatArray | None = None,
 ) -> None:
     """One pass of the native recursion; `history` (cells, 2 bins + 2) is the warm state where it is known."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     energy, row = cells.energies(bins)
     signal, background = cells.native_flux
@@ -351,7 +351,7 @@ def _shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
 
 def recorded_light(cells: Cells, out_bins: int) -> FloatArray:
     """Photons (cells, out_bins) of a period: all of them are registered where there is no dead time."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     parts, step = int(_core.EXPOSURE_PARTS), _poisson_bins(out_bins)
     rate = np.empty((cells.size, out_bins))

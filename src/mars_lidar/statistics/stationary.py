@@ -43,7 +43,7 @@ def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threa
 
 
 def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     result = np.empty((cells.size, out_bins))
     settled = np.empty(cells.size, np.int64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.threads import thread_count
-from mars_lidar.engines import Engine, check_detector, find_engine
+from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import Progress, Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -19,7 +19,7 @@ from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.timestamps import Timestamps
 
 if TYPE_CHECKING:
-    from mars_lidar.table import Table
+    pass
 
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
@@ -38,10 +38,7 @@ def simulate(
     out: Any = None,
     progress: Progress | None = None,
     report: dict[str, float] | None = None,
-    table: Table | None = None,
-    count: Literal["exact", "matched", "gaussian"] | None = None,
-    interpolation: Literal["bilinear", "nearest"] | None = None,
-    outside: Literal["error", "exact"] | None = None,
+    **options: Unpack[EngineOptions],
 ) -> NDArray[Any]:
     """Histogram cubes of an image.
 
@@ -79,16 +76,11 @@ def simulate(
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
     report
         A dictionary that takes what the engine has to tell beside the counts, numbers by name.
-    table
-        For ``"mars"`` and ``"renewal"``: the lookup table (`mars_lidar.Table`); see
-        `mars_lidar.engines.MarsEngine`.
-    count
-        For ``"mars"``: the law of the count, ``"exact"`` (default), ``"matched"`` (to four cumulants) or
-        ``"gaussian"`` (the paper's).
-    interpolation
-        For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
-    outside
-        For a table, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
+    **options
+        Of the engines ``"mars"`` and ``"renewal"`` (`mars_lidar.engines.EngineOptions`): `table`, a `mars_lidar.Table`;
+        `count`, the law of the count: ``"exact"`` (default), ``"matched"`` (to four cumulants) or ``"gaussian"`` (the
+        paper's), for ``"mars"``; and for a table `interpolation`, ``"bilinear"`` (default) or ``"nearest"`` (the
+        paper's), and `outside`, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
 
     Returns
     -------
@@ -96,7 +88,7 @@ def simulate(
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
         with ``device="cuda"``.
     """
-    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside)
+    drawn_by = find_engine(engine, **options)
     task = _task(flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress)
     shape = (task.realizations, *flux.shape, system.bins)
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar.engines.count_shape import CountTimesShape, normalised
 from mars_lidar.engines.counts import CountLaws, Matched, Mended, Poisson, RoundedGaussian, Tabulated
+from mars_lidar.engines.options import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
 from mars_lidar.engines.synthesis import Batch, Run
 from mars_lidar.engines.table_laws import exact_laws, untrusted
@@ -72,9 +73,9 @@ class MarsEngine(CountTimesShape):
         self,
         table: Table | None = None,
         *,
-        count: Literal["exact", "matched", "gaussian"] = "exact",
-        interpolation: Literal["bilinear", "nearest"] | None = None,
-        outside: Literal["error", "exact"] | None = None,
+        count: Count = "exact",
+        interpolation: Interpolation | None = None,
+        outside: Outside | None = None,
         level: str = "",
     ) -> None:
         self.count = checks.choice("count", count, _COUNTS)

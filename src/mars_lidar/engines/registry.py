@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Unpack
 
 from mars_lidar._base import checks
 from mars_lidar.engines.auto import AutoEngine
@@ -10,6 +10,7 @@ from mars_lidar.engines.engine import Engine
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
+from mars_lidar.engines.options import EngineOptions, given
 from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.engines.renewal import RenewalEngine
 from mars_lidar.engines.sequential import SequentialEngine
@@ -48,14 +49,14 @@ def check_detector(engine: Engine, system: System) -> None:
     require_effects(f"engine {engine.name!r}", system.detector, engine.effects, instead)
 
 
-def find_engine(engine: str | Engine, **options: Any) -> Engine:
+def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engine:
     """The engine of that name, of default settings but for the options that are not None; or the engine itself."""
-    given = {name: value for name, value in options.items() if value is not None}
+    chosen = given(options)
     if isinstance(engine, Engine):
         found = engine
-        if given:
-            name = next(iter(given))
-            raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {given[name]!r}")
+        if chosen:
+            name = next(iter(chosen))
+            raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {chosen[name]!r}")
         return found
     if engine == "neural":
         raise ValueError(
@@ -63,8 +64,8 @@ def find_engine(engine: str | Engine, **options: Any) -> Engine:
             "which simulate takes as engine (docs/neural.md)"
         )
     found = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
-    for name in given:
+    for name in chosen:
         if name not in found.options:
             takes = ", ".join(found.options) if found.options else "none"
-            raise TypeError(f"{name} must be None for engine {engine!r} (its options: {takes}), got {given[name]!r}")
-    return type(found)(**given) if given else found
+            raise TypeError(f"{name} must be None for engine {engine!r} (its options: {takes}), got {chosen[name]!r}")
+    return type(found)(**chosen) if chosen else found

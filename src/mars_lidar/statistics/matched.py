@@ -1,6 +1,6 @@
 """A law of the count with four given cumulants, for tables that hold no more of the exact law.
 
-The law is native/matched_law.h, which engines draw from: here its probabilities, and where it can be trusted.
+The law is native/laws/matched_law.h, which engines draw from: here its probabilities, and where it can be trusted.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from mars_lidar._base.brief import brief
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, FloatArray
 from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.narrow_pulse import knots
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 _MAX_BINS = 2**20
@@ -106,12 +107,14 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
     histogram = np.empty((cells.size, system.bins))
     for k in range(cells.size):
         cell = cells.part(slice(k, k + 1))
-        n = cell.first_bins(system.bins)
+        n = cell.usual_bins(system.bins)
+        usual = n
         if n // 2 < system.bins:  # every grid has the edges of the histogram: with no others two grids are the same
             n *= 2
-        coarse = _Grid(cell, n // 2, with_variance)
+        start = n
+        coarse = _Grid(cell, n // 2, knots(cell, usual, 0.5), with_variance)
         while True:
-            fine = _Grid(cell, n, with_variance)
+            fine = _Grid(cell, n, knots(cell, usual, n / start), with_variance)
             if _moved(coarse, fine) <= tolerance and (with_variance or _total_moved(coarse, fine) <= 10.0 * tolerance):
                 break
             coarse, n = fine, 2 * n
@@ -130,16 +133,20 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
 
 
 class _Grid:
-    """One pixel on a grid of the period, with edges where the dead time of a start at 0 ends."""
+    """One pixel on a grid of the period, with edges where the dead time of a start at 0, or of a step, ends.
 
-    def __init__(self, cell: Cells, bins: int, with_variance: bool) -> None:
+    `steps` (n,) are phases at which the light steps: between them, and a dead time after them, it is smooth.
+    """
+
+    def __init__(self, cell: Cells, bins: int, steps: FloatArray, with_variance: bool) -> None:
         system = cell.system
         dead = system.dead_time_periods
         self.cell, self.cycles, self.armed = cell, system.cycles, system.start == "armed"
         self.whole = math.floor(dead)
         self.rest = dead - self.whole
         out = np.arange(system.bins + 1) / system.bins
-        self.edges = np.unique(np.concatenate([np.arange(bins + 1) / bins, out, [self.rest]]))
+        edges = [np.arange(bins + 1) / bins, out, np.array([self.rest]), steps, (steps + self.rest) % 1.0]
+        self.edges = np.unique(np.concatenate(edges))
         self.before = self._photons(self.edges)  # C(x)
         self.total = float(self.before[-1])
         photons = np.diff(self.before)

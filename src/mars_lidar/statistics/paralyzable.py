@@ -22,6 +22,8 @@ from mars_lidar.statistics.narrow_pulse import knots
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 _MAX_BINS = 2**20
+_LEAST_SPREAD = 1e-3  # standard deviation of a count, of a Poisson count's: that of the best locked pixels
+_ROUNDING = 1e-12  # of a mean
 _MAX_WHOLE = 20_000  # whole periods of a dead time: each is a step of the variance's start-up
 
 
@@ -96,7 +98,11 @@ def paralyzable_moments(
 
 
 def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
-    """Mean histograms (cells, bins) of checked cells, any dead time; sums to 10 x `tolerance` standard deviations."""
+    """Mean histograms (cells, bins) of checked cells, any dead time.
+
+    They sum to the mean count within 10 x `tolerance` standard deviations, down to 1e-3 of a Poisson count's, or 1e-12
+    of itself.
+    """
     return _refined(cells, tolerance, with_variance=False).histogram.reshape(cells.size, -1)
 
 
@@ -112,12 +118,14 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
         if n // 2 < system.bins:  # every grid has the edges of the histogram: with no others two grids are the same
             n *= 2
         start = n
-        coarse = _Grid(cell, n // 2, knots(cell, usual, 0.5), with_variance)
+        coarse, before = _Grid(cell, n // 2, knots(cell, usual, 0.5), with_variance), math.inf
         while True:
             fine = _Grid(cell, n, knots(cell, usual, n / start), with_variance)
-            if _moved(coarse, fine) <= tolerance and (with_variance or _total_moved(coarse, fine) <= 10.0 * tolerance):
+            limit = fine.mean + (fine.mean - coarse.mean) / 3.0  # grids err by the square of their step
+            still = with_variance or abs(limit - before) <= _total_allowed(limit, tolerance)
+            if still and _moved(coarse, fine) <= tolerance:
                 break
-            coarse, n = fine, 2 * n
+            coarse, before, n = fine, limit, 2 * n
             if n > max(_MAX_BINS, 4 * system.bins):
                 raise ConvergenceError(
                     f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still move by "
@@ -157,7 +165,7 @@ class _Grid:
         keep = np.exp(-within)
         rise = np.diff(within)
         # integral of exp(-within) over a bin where it is linear in the exponent: (1 - e^-d) / d
-        flat = np.abs(rise) < 1e-8
+        flat = rise == 0.0
         mean_keep = np.where(flat, 1.0, -np.expm1(-rise) / np.where(flat, 1.0, rise))
         self.rate = photons * keep[:-1] * mean_keep  # registrations of each bin and period, warmed up
         self.alone = np.exp(-self.before[:-1]) * -np.expm1(-photons)  # the first arrival is there, one period
@@ -224,13 +232,9 @@ class _Grid:
         return float(np.sum(0.5 * (apart[1:] + apart[:-1]) * np.diff(now)))
 
 
-def _total_moved(coarse: _Grid, fine: _Grid) -> float:
-    """Error of the limit's mean, in standard deviations of a Poisson count: grids err by the square of their step.
-
-    The limit errs by the fourth power: by some fifteenth of what it is away from the fine grid.
-    """
-    spread = max(min(fine.mean, math.sqrt(fine.mean)), np.finfo(float).tiny)
-    return abs(fine.mean - coarse.mean) / 45.0 / spread
+def _total_allowed(mean: float, tolerance: float) -> float:
+    """By how much the mean may move: the standard deviation may be a thousandth of a Poisson count's."""
+    return max(10.0 * tolerance * min(mean, _LEAST_SPREAD * math.sqrt(mean)), _ROUNDING * mean)
 
 
 def _moved(coarse: _Grid, fine: _Grid) -> float:

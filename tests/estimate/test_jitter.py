@@ -117,7 +117,7 @@ def test_how_much_jitter_may_hide():
         for _ in range(number):
             after = np.sort(600.0 * random.random(random.poisson(600.0)))
             after = np.sort(after + width * random.standard_normal(after.size))[:300] + 1000.0
-            chances.append(is_sharp(Ages(after, np.arange(after.size), 0.0, 0.0), flat)[0])
+            chances.append(is_sharp(Ages(after, np.arange(after.size), 0.0, 0.0, math.inf), flat)[0])
         found[width > 0.0] = int((np.array(chances) < SHARP).sum())
     outcomes = {"power": float(stats.binom.cdf(found[True], number, 0.9))}
     outcomes["level"] = float(stats.binom.sf(found[False] - 1, number, SHARP))

@@ -10,6 +10,7 @@ import numpy as np
 
 from mars_lidar.plot.figures import _draw_map, _limits
 from mars_lidar.plot.style import COLOURS, INK, style
+from mars_lidar.reconstruct import METHODS
 from studies.draw import panels
 from studies.machine import load, machine
 from studies.reconstruction import (
@@ -25,9 +26,7 @@ from studies.reconstruction import (
 )
 from studies.report import Row, configuration, save_csv, save_figure, save_text, table
 
-_COLOUR = dict(
-    zip(("maximum_likelihood", "generalised_coates", "mchc", "coates", "matched_filter", "peak"), COLOURS, strict=True)
-)
+_COLOUR = dict(zip(METHODS, (*COLOURS, INK), strict=True))
 KNOWN = 10.0  # %, of S: a bound above it is not reached by any estimate (section "Near the bound")
 _TITLE = {"nonparalyzable": "free-running, t_d = 75 ns", "synchronous": "synchronous"}
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+from native_emulation import run_kernel
 from numpy.typing import NDArray
 
-from mars_lidar import _core
 from mars_lidar.cuda.kernels import Kernel
-
-_RUNS: dict[str, Callable[..., None]] = {
-    "cuda/mars.h": _core.mars_on_host,
-    "cuda/feedback.h": _core.feedback_on_host,
-}
 
 
 class Host:
@@ -50,4 +45,4 @@ class Host:
     def launch(self, kernel: Kernel, blocks: int, lanes: int, argument: bytes, shared: int = 0) -> None:
         assert shared <= self.shared_bytes
         self.launched.append(kernel.expression)
-        _RUNS[kernel.header](kernel.expression, argument, blocks, lanes, shared)
+        run_kernel(PurePath(kernel.header).stem, kernel.expression, argument, blocks, lanes, shared)

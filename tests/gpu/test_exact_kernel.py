@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from native_emulation import run_kernel
 from numpy.typing import NDArray
 
 import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.cuda.exact import host_arrays
-from mars_lidar.cuda.kernels import Sink
+from mars_lidar.cuda.kernels import Sink, Variant, block_bytes
 from mars_lidar.engines.engine import Records, Task
 from mars_lidar.engines.exact import ExactEngine
 
@@ -60,10 +61,13 @@ def task(detector: dict[str, Any], pulse: str, start: str, returns: int, bins: i
 def run_on_host(task: Task, sink: Sink, to: dict[str, NDArray[Any]], lanes: int = 32) -> None:
     arrays = {**host_arrays(task), **to}
     addresses = {name: array.ctypes.data for name, array in arrays.items() if array.size}
+    kernel = Variant.of(task, sink).expression
     part = task.items // 2 + 1  # two launches
     for first in range(0, task.items, part):
         items = min(part, task.items - first)
-        _core.device_run_on_host(task.job, task.pulse, addresses, first, items, int(sink), lanes)
+        argument = _core.device_task(task.job, task.pulse, addresses, first, items)
+        blocks, shared = -(-items // lanes), block_bytes(task.system.bins, lanes)
+        run_kernel("exact", kernel, argument, blocks, lanes, shared)
 
 
 def expected(task: Task, dtype: Any = np.uint16) -> NDArray[Any]:

@@ -1,4 +1,5 @@
-// Generating function E[z^N] of the count of a finite exposure.
+// Generating function E[z^N] of the count of a finite exposure: the delay recursion with complex numbers, on the
+// unit circle for probabilities by Fourier's series, and at real z for tails (docs/theory_exposure.md).
 #pragma once
 #include <cmath>
 #include <complex>

@@ -1,11 +1,6 @@
-// The engine "feedback" on a GPU, as the host sees it: its internal grid and the kernel's argument, and the kernel in a
-// loop over blocks and threads on the processor, to check its bits without a GPU.
+// The feedback engine on a GPU, as the host sees it: its internal grid and the pulse's tables, to be copied to the device, and
+// the argument of its kernel (cuda/feedback.h).
 #define MARS_LEVEL one_lane  // whose batches are not those of feedback/engine.cpp
-#include <string>
-#include <vector>
-
-#include <nanobind/stl/string.h>
-
 #include "cuda/feedback.h"
 
 #include "feedback/grid.h"
@@ -96,20 +91,6 @@ void bind_feedback_device(nb::module_& module) {
             return (int64_t{8} * kRow * cells + feedback_bytes(cells, laps, cells) + 63) / 64 * 64;
         },
         nb::arg("cells"), nb::arg("laps"), "Bytes that a warp of feedback_histograms works in.");
-    module.def(
-        "feedback_on_host",
-        [](const std::string& kernel, const nb::bytes& argument, int64_t blocks, int32_t lanes, int64_t shared) {
-            const HostLaunch launch{blocks, lanes, shared};
-            const FeedbackTask task = argument_of<FeedbackTask>(argument);
-            if (kernel == "mars::feedback_histograms<false>")
-                launch(feedback_histograms<false>, task, lanes);
-            else if (kernel == "mars::feedback_histograms<true>")
-                launch(feedback_histograms<true>, task, lanes);
-            else
-                throw nb::value_error("kernel must be one of this engine");
-        },
-        nb::arg("kernel"), nb::arg("argument"), nb::arg("blocks"), nb::arg("lanes"), nb::arg("shared"),
-        "A kernel of the engine as a loop on the processor, on host addresses: to check its bits without a GPU.");
 }
 
 }  // namespace mars

@@ -1,9 +1,9 @@
-// Lookup in a table for many pixels on threads; the lookup itself is table_lookup.h.
+// Bindings of the lookup in a table, for many pixels on threads; mars/table_lookup.h is the lookup.
 #include <algorithm>
 
-#include "base/parallel.h"
-#include "python/axis_tables.h"
+#include "mars/axis_tables.h"
 #include "python/bindings.h"
+#include "python/watched.h"
 
 namespace mars {
 
@@ -16,7 +16,9 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
             Matrix<const float> correction, Vector<const double> signal, Vector<const double> background,
             Vector<const double> at, bool nearest, Matrix<int64_t> rows, Matrix<double> weights,
             Matrix<double> cumulants, int threads) {
-    const AxisTables s(signal_axis), b(background_axis), x(sub_signal), y(sub_background);
+    const auto tables = [](const Vector<const double>& axis) { return AxisTables(axis.data(), size_of(axis)); };
+    const AxisTables s = tables(signal_axis), b = tables(background_axis);
+    const AxisTables x = tables(sub_signal), y = tables(sub_background);
     const TableLookup table{s.axis(),
                             b.axis(),
                             x.axis(),
@@ -41,12 +43,13 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
         cumulants.shape(0) != signal.shape(0) || rows.shape(1) != 4 || weights.shape(1) != 4 ||
         cumulants.shape(1) != kCumulants)
         throw nb::value_error("rows, weights and cumulants must be (pixels, 4)");
-    run_chunks((pixels + kBlock - 1) / kBlock, threads, nb::none(), [&](int64_t block, const std::atomic<bool>&) {
-        const int64_t last = std::min(pixels, (block + 1) * kBlock);
-        for (int64_t p = block * kBlock; p < last; ++p)
-            table.pixel(signal.data()[p], background.data()[p], at.data()[p], rows.data() + 4 * p,
-                        weights.data() + 4 * p, cumulants.data() + kCumulants * p);
-    });
+    run_watched_chunks((pixels + kBlock - 1) / kBlock, threads, nb::none(),
+                       [&](int64_t block, const std::atomic<bool>&) {
+                           const int64_t last = std::min(pixels, (block + 1) * kBlock);
+                           for (int64_t p = block * kBlock; p < last; ++p)
+                               table.pixel(signal.data()[p], background.data()[p], at.data()[p], rows.data() + 4 * p,
+                                           weights.data() + 4 * p, cumulants.data() + kCumulants * p);
+                       });
 }
 
 }  // namespace

@@ -1,23 +1,29 @@
-// Maximum likelihood of signal, background and delay of each pixel: docs/reconstruction.md, section 3.
+// Maximum likelihood of signal, background and delay of one pixel: docs/reconstruction.md, section 3. Climbs by Fisher scoring
+// from several delays, compares with no signal at all, and takes off the first-order bias where that is asked for.
+#pragma once
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 
-#include "base/parallel.h"
-#include "python/estimators.h"
 #include "reconstruct/delay_search.h"
 #include "reconstruct/likelihood_bias.h"
+#include "reconstruct/pixel_flags.h"
 
 namespace mars {
-namespace {
 
-constexpr int64_t kChunk = 64;  // pixels
-constexpr int kMostSteps = 80;
-constexpr double kGain = 5e-7;  // of the log likelihood that a further step promises: 1e-3 of a standard error
-constexpr double kMostPhotons = 1e4;
-constexpr int kColumns = 8;  // of the output
+struct ReconstructionJob {
+    int starts = 1;           // delays to begin at
+    double least_gain = 0.0;  // twice the gain of the log likelihood below which a signal counts as not seen
+    bool less_bias = false;   // take off the first-order bias of the maximum
+};
+
+constexpr int kMostSteps = 80;        // of a climb; most end within ten
+constexpr double kGain = 5e-7;        // of the log likelihood that a further step promises: 1e-3 of a standard error
+constexpr double kMostPhotons = 1e4;  // per period: a bound on S and on B
+constexpr int kMaximumColumns = 8;    // of the output: see Maximizer
 
 // Solves A x = b, A symmetric 3 x 3 and positive definite where `free`; x = 0 elsewhere. False where it is singular.
-bool solve(const double a[3][3], const double* b, const bool* free, double* x) {
+inline bool solve(const double a[3][3], const double* b, const bool* free, double* x) {
     double l[3][3] = {}, y[3] = {};
     for (int i = 0; i < 3; ++i) {
         if (!free[i]) continue;
@@ -47,7 +53,7 @@ bool solve(const double a[3][3], const double* b, const bool* free, double* x) {
 }
 
 // What is known where the likelihood stands, without what the ends of the exposure hide, if that is positive definite.
-void known_information(const Likelihood& likelihood, const bool* free, double known[3][3]) {
+inline void known_information(const Likelihood& likelihood, const bool* free, double known[3][3]) {
     double none[3] = {}, x[3];
     for (int a = 0; a < 3; ++a)
         for (int b = 0; b < 3; ++b) known[a][b] = likelihood.information[a][b] - likelihood.hidden[a][b];
@@ -72,7 +78,7 @@ struct Terrain {
 
 // Fisher scoring with Levenberg's damping: a step is taken if the likelihood does not fall. S >= 0 and B >= least. A
 // climb is given up where several times the gain that its next step promises would not make it the best.
-Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
+inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
     const double least = terrain.least, farthest = terrain.farthest;
     Fit fit;
     std::copy(start, start + 3, fit.at);
@@ -133,11 +139,12 @@ class Maximizer {
     Maximizer(const HistogramRecord& recording, const ReconstructionJob& job)
         : r_(recording), job_(job), passes_(recording.bins), search_(recording) {}
 
-    // Signal, background, delay, their standard errors, twice the gain of the log likelihood by the signal, and its value.
+    // Signal, background, delay, their standard errors, twice the gain of the log likelihood by the signal, and its
+    // value.
     void operator()(const Count* histogram, double* out, uint8_t* flag) {
         passes_.set(r_, histogram);
         PixelLikelihood pixel(r_, passes_);
-        for (int k = 0; k < kColumns; ++k) out[k] = NAN;
+        for (int k = 0; k < kMaximumColumns; ++k) out[k] = NAN;
         *flag = 0;
         if (!(pixel.count() > 0.0) || !(pixel.time() > 0.0)) {
             *flag = pixel.count() > 0.0 ? kSaturated : kEmpty;
@@ -226,64 +233,4 @@ class Maximizer {
     BackgroundSeries series_;
     LikelihoodBias bias_;
 };
-
-template <class Count>
-void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> histogram, int starts, double least_gain,
-                        bool less_bias, Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
-    const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
-    if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
-        throw nb::value_error("histogram must be (pixels, bins)");
-    if (out.shape(0) != histogram.shape(0) || out.shape(1) != kColumns || flags.shape(0) != histogram.shape(0))
-        throw nb::value_error("out must be (pixels, 8), flags (pixels)");
-    const ReconstructionJob job{starts, least_gain, less_bias};
-    run_chunks((pixels + kChunk - 1) / kChunk, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-        Maximizer<Count> maximizer(recording, job);
-        for (int64_t p = chunk * kChunk; p < std::min(pixels, (chunk + 1) * kChunk); ++p) {
-            if (stop) return;
-            maximizer(histogram.data() + p * recording.bins, out.data() + p * kColumns, flags.data() + p);
-        }
-    });
-}
-
-void log_likelihood(const HistogramRecord& recording, Vector<const double> histogram, Matrix<const double> at,
-                    Matrix<double> out, bool whole) {
-    if (static_cast<int64_t>(histogram.shape(0)) != recording.bins || at.shape(1) != 3 || out.shape(1) != 13 ||
-        out.shape(0) != at.shape(0))
-        throw nb::value_error("histogram must be (bins), at (points, 3), out (points, 13)");
-    ArmedPasses passes(recording.bins);
-    passes.set(recording, histogram.data());
-    PixelLikelihood pixel(recording, passes);
-    ExposureEnds ends;
-    BackgroundSeries series;
-    for (size_t k = 0; k < at.shape(0); ++k) {
-        const double* x = at.data() + 3 * k;
-        ends.set(recording, passes, x[2]);
-        pixel.expect(x[1], series);
-        const Likelihood found = pixel(x[0], x[1], x[2], ends, whole);
-        double* to = out.data() + 13 * k;
-        *to++ = found.value;
-        for (int a = 0; a < 3; ++a) *to++ = found.gradient[a];
-        for (int a = 0; a < 3; ++a)
-            for (int b = 0; b < 3; ++b) *to++ = found.information[a][b] - found.hidden[a][b];
-    }
-}
-
-}  // namespace
-
-void bind_maximum_likelihood(nb::module_& module) {
-    constexpr const char* kText = "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).";
-    auto add = [&](auto* function) {
-        module.def("maximum_likelihood", function, nb::arg("recording"), nb::arg("histogram").noconvert(),
-                   nb::kw_only(), nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"),
-                   nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"),
-                   nb::arg("progress").none(), kText);
-    };
-    add(&maximum_likelihood<uint16_t>);
-    add(&maximum_likelihood<uint32_t>);
-    add(&maximum_likelihood<double>);
-    module.def("histogram_log_likelihood", &log_likelihood, nb::arg("recording"), nb::arg("histogram"), nb::arg("at"),
-               nb::arg("out").noconvert(), nb::arg("whole") = true,
-               "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");
-}
-
 }  // namespace mars

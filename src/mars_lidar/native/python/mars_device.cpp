@@ -1,15 +1,10 @@
-// The engine "mars" on a GPU, as the host sees it: the arguments of its kernels, and the same kernels in a loop over
-// blocks and threads on the processor, to check their bits without a GPU.
-#include <algorithm>
-#include <cstring>
-#include <functional>
-#include <string>
-#include <vector>
-
-#include <nanobind/stl/string.h>
-
+// The engine "mars" on a GPU, as the host sees it: the arguments of its kernels (cuda/mars.h), the memory of a block, and a
+// table's axes to be copied to the device.
 #include "cuda/mars.h"
-#include "python/axis_tables.h"
+
+#include <string>
+
+#include "mars/axis_tables.h"
 #include "python/bindings.h"
 #include "python/device_fields.h"
 
@@ -20,7 +15,7 @@ namespace {
 Axis axis_at(const DeviceFields& fields, const std::string& name, const nb::handle& of) {
     Axis axis{};
     const Vector<const double> values = nb::cast<Vector<const double>>(of);
-    const AxisTables tables(values);
+    const AxisTables tables(values.data(), size_of(values));
     axis = tables.axis();
     axis.value = fields.at<const double>(name + ".value");
     axis.log = fields.at<const double>(name + ".log");
@@ -129,7 +124,7 @@ void bind_mars_device(nb::module_& module) {
     module.def(
         "table_axis",
         [](const Vector<const double>& values) {
-            const AxisTables tables(values);
+            const AxisTables tables(values.data(), size_of(values));
             nb::dict told;
             told["value"] = copied(std::vector<double>(values.data(), values.data() + values.shape(0)));
             told["log"] = copied(tables.log());
@@ -138,21 +133,6 @@ void bind_mars_device(nb::module_& module) {
             return told;
         },
         nb::arg("values"), "What the lookup needs of an axis of a table, to be copied to the device.");
-    module.def(
-        "mars_on_host",
-        [](const std::string& kernel, const nb::bytes& argument, int64_t blocks, int32_t lanes, int64_t shared) {
-            const HostLaunch launch{blocks, lanes, shared};
-            if (kernel == "mars::mars_laws")
-                launch(mars_laws, argument_of<MarsLawTask>(argument), lanes);
-            else if (kernel == "mars::mars_histograms<false>")
-                launch(mars_histograms<false>, argument_of<MarsTask>(argument), 1);
-            else if (kernel == "mars::mars_histograms<true>")
-                launch(mars_histograms<true>, argument_of<MarsTask>(argument), 1);
-            else
-                throw nb::value_error("kernel must be one of this engine");
-        },
-        nb::arg("kernel"), nb::arg("argument"), nb::arg("blocks"), nb::arg("lanes"), nb::arg("shared"),
-        "A kernel of the engine as a loop on the processor, on host addresses: to check its bits without a GPU.");
 }
 
 }  // namespace mars

@@ -1,20 +1,19 @@
-// The axes of a table with what finds a pixel's cell in them.
+// The axes of a table, with the logarithms, scales and cells by which mars/table_lookup.h finds a pixel's place in them.
 #pragma once
 #include <algorithm>
 #include <vector>
 
 #include "mars/table_lookup.h"
-#include "python/bindings.h"
 
 namespace mars {
 
 // An axis and the tables that go with it.
 class AxisTables {
  public:
-    explicit AxisTables(const Vector<const double>& values) {
+    AxisTables(const double* values, int64_t size) {
         Axis& axis = axis_;
-        axis.value = values.data();
-        axis.size = static_cast<int64_t>(values.shape(0));
+        axis.value = values;
+        axis.size = size;
         axis.lowest = axis.size > 1 && axis.value[0] <= 0.0;
         for (int64_t k = 0; k < axis.size; ++k) log_.push_back(TableFlux(axis.value[k]).log);
         axis.count = static_cast<int32_t>(std::min<int64_t>(4, axis.size - axis.lowest));

@@ -15,6 +15,7 @@ import numpy as np
 
 import mars_lidar as ml
 from benchmarks.gpu_resources import MEMORY_BYTES_PER_S
+from mars_lidar import cuda
 from mars_lidar.cuda.exact import exact_histogram
 from mars_lidar.cuda.machine import cupy_with_device
 from mars_lidar.engines import Engine, find_engine
@@ -123,7 +124,7 @@ def measure(cupy: Any, case: Case, scenes: int, realizations: int, in_block: boo
     system, engine = case.system, _engine(case)
     flux = case.flux(scenes)
     task = _task(flux, system, engine, realizations, 0, None, 1, None, None)
-    engine.check_device("cuda", task.flux, task.system)
+    cuda.check(engine, task.flux, task.system)
     out = cupy.empty((task.items, BINS), system.histogram_dtype)
     draw = _drawing(engine, task, out, in_block)
     draw()  # compiles
@@ -161,7 +162,7 @@ def _engine(case: Case) -> Engine:
 def _drawing(engine: Engine, task: Task, out: Any, in_block: bool | None) -> Callable[[], None]:
     if in_block is not None:
         return lambda: exact_histogram(task, out, in_block=in_block)
-    return lambda: engine.histogram_on_cuda(task, out)
+    return lambda: cuda.histogram(engine, task, out)
 
 
 if __name__ == "__main__":

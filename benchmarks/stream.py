@@ -41,7 +41,9 @@ def stream(config: Config, bandwidth: Bandwidth) -> Section:
     for level in LEVELS:
 
         def made(dtype: torch.dtype | None, level: float = level) -> CubeStream:
-            return CubeStream(system, size=side, batch_size=BATCH, signal=level, sbr=1.0, dtype=dtype, threads=1)
+            return CubeStream(
+                system, size=side, batch_size=BATCH, signal=level, sbr=1.0, dtype=dtype, threads=1, ahead=0
+            )
 
         samples = [made(None).sample(k) for k in range(4 * BATCH)]
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.threads import thread_count
 from mars_lidar.calibrate import Calibration, Inspection, calibrate, inspect
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import GaussianPulse
@@ -21,7 +22,6 @@ from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 from mars_lidar.simulate import simulate_timestamps
-from mars_lidar.statistics.exposure import thread_count
 from studies import Tell
 
 ESTIMATES = ("dead time", "jitter", "background", "signal", "delay", "width", "all light, any shape")

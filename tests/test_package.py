@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import subprocess
 import sys
 import tomllib
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import mars_lidar as ml
+from mars_lidar.engines import EngineOptions
 
 ROOT = Path(__file__).parents[1]
 HEAVY = (
@@ -83,7 +85,37 @@ def test_every_argument_is_documented_and_typed(name: str):
     for parameter in inspect.signature(function).parameters.values():
         assert parameter.annotation is not inspect.Parameter.empty
         if name == "simulate":  # the other refers to it
-            assert f"\n{parameter.name}\n" in text
+            many = parameter.kind is inspect.Parameter.VAR_KEYWORD
+            assert f"\n{'**' if many else ''}{parameter.name}\n" in text
+
+
+def test_every_option_of_an_engine_is_documented_where_it_is_given():
+    text = inspect.getdoc(ml.simulate)
+    for name in EngineOptions.__annotations__:
+        assert f"`{name}`" in text
+        assert f"\n{name}\n" in inspect.getdoc(EngineOptions)
+    system = ml.System(
+        period_ns=10.0, cycles=1, bins=8, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=1.0)
+    )
+    with pytest.raises(TypeError, match="'tabel' is no argument of this function, nor an option of an engine"):
+        ml.simulate(ml.Flux(1.0, 1.0, 5.0), system, engine="mars", tabel=None)  # type: ignore[call-arg]
+
+
+def test_where_a_module_calls_one_above_it():
+    """The only uses of `late`: docs/architecture.md lists them."""
+    package = Path(ml.__file__).parent
+    used = [
+        f"{path.relative_to(package)}: {name}"
+        for path in package.rglob("*.py")
+        for name in re.findall(r'late\("([^"]+)"\)', path.read_text())
+    ]
+    assert sorted(used) == [
+        "light/flux.py: light.fog:in_fog",
+        "light/flux.py: light.transient:Transient",
+        "light/timestamps.py: io.streams.files:load",
+        "light/timestamps.py: io.streams.files:save",
+        "scene/scene.py: io.rgbd:read_rgbd",
+    ]
 
 
 def test_package_is_marked_as_typed():

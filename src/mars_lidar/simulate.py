@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-import os
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
-from mars_lidar.engines import Engine, find_engine
+from mars_lidar._base.threads import thread_count
+from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import Progress, Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -19,7 +19,7 @@ from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.timestamps import Timestamps
 
 if TYPE_CHECKING:
-    from mars_lidar.table import Table
+    pass
 
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
@@ -38,10 +38,7 @@ def simulate(
     out: Any = None,
     progress: Progress | None = None,
     report: dict[str, float] | None = None,
-    table: Table | None = None,
-    count: Literal["exact", "matched", "gaussian"] | None = None,
-    interpolation: Literal["bilinear", "nearest"] | None = None,
-    outside: Literal["error", "exact"] | None = None,
+    **options: Unpack[EngineOptions],
 ) -> NDArray[Any]:
     """Histogram cubes of an image.
 
@@ -79,16 +76,11 @@ def simulate(
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
     report
         A dictionary that takes what the engine has to tell beside the counts, numbers by name.
-    table
-        For ``"mars"`` and ``"renewal"``: the lookup table (`mars_lidar.Table`); see
-        `mars_lidar.engines.MarsEngine`.
-    count
-        For ``"mars"``: the law of the count, ``"exact"`` (default), ``"matched"`` (to four cumulants) or
-        ``"gaussian"`` (the paper's).
-    interpolation
-        For a table: ``"bilinear"`` (default) or ``"nearest"`` (the paper's).
-    outside
-        For a table, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
+    **options
+        Of the engines ``"mars"`` and ``"renewal"`` (`mars_lidar.engines.EngineOptions`): `table`, a `mars_lidar.Table`;
+        `count`, the law of the count: ``"exact"`` (default), ``"matched"`` (to four cumulants) or ``"gaussian"`` (the
+        paper's), for ``"mars"``; and for a table `interpolation`, ``"bilinear"`` (default) or ``"nearest"`` (the
+        paper's), and `outside`, of pixels beyond its range: ``"error"`` (default), or ``"exact"``, some ms each.
 
     Returns
     -------
@@ -96,7 +88,7 @@ def simulate(
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
         with ``device="cuda"``.
     """
-    drawn_by = find_engine(engine, table=table, count=count, interpolation=interpolation, outside=outside)
+    drawn_by = find_engine(engine, **options)
     task = _task(flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress)
     shape = (task.realizations, *flux.shape, system.bins)
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
@@ -141,10 +133,10 @@ def simulate_timestamps(
     drawn_by = find_engine(engine)
     task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")
     if checks.choice("device", device, ("cpu", "cuda")) == "cuda":
-        drawn_by.check_device(device, task.flux, task.system)
-        from mars_lidar.cuda import exact_records
+        from mars_lidar import cuda
 
-        records = exact_records(task)
+        cuda.check(drawn_by, task.flux, task.system)
+        records = cuda.records(drawn_by, task)
     else:
         counts = drawn_by.counts(task)
         _check_memory((int(counts.sum()),), 16, "timestamps")
@@ -167,9 +159,10 @@ def simulate_timestamps(
 
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:
-    engine.check_device("cuda", task.flux, task.system)
+    from mars_lidar import cuda
     from mars_lidar.cuda.machine import cupy_with_device
 
+    cuda.check(engine, task.flux, task.system)
     cupy = cupy_with_device()
     dtype = task.system.histogram_dtype
     if out is None:
@@ -180,7 +173,7 @@ def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> An
         raise ValueError(
             f"out must be C-contiguous, of shape {shape} and dtype {dtype}, got {out.shape} and {out.dtype}"
         )
-    engine.histogram_on_cuda(task, out.reshape(task.items, task.system.bins))
+    cuda.histogram(engine, task, out.reshape(task.items, task.system.bins))
     return out
 
 
@@ -205,14 +198,13 @@ def _task(
     first = checks.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = checks.integer("realizations", realizations, low=1, high=2**32 - first)
     checks.integer("seed", seed, low=0, high=2**64 - 1)
-    team = _default_threads() if threads is None else checks.integer("threads", threads, low=1, high=1024)
+    team = thread_count(threads)
     if progress is not None and not callable(progress):
         raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
     if len(flux.returns_signal) > 16:
         raise ValueError(f"flux must have at most 16 returns, got {len(flux.returns_signal)}; use a waveform")
     _check_registrations(flux.detected(system), system)
-    drawn_by.check_mode(system)
-    drawn_by.check_effects(system)
+    check_detector(drawn_by, system)
     drawn_by.check(flux, system)
     index = _pixel_index(pixel_index, flux.shape)
     if system.detector.crosstalk is not None and not np.array_equal(index, np.arange(index.size)):
@@ -274,10 +266,3 @@ def _check_memory(shape: tuple[int, ...], itemsize: int, what: str) -> None:
         "simulate rows (flux[rows] with pixel_index) or realizations (first_realization) one after another, "
         "or give out= a memory map",
     )
-
-
-def _default_threads() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1

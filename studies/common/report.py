@@ -126,7 +126,7 @@ def save_figure(path: Path, figure: Figure) -> Path:
 def machine() -> str:
     """Processor, processors of this process, vector level and system, in one line."""
     from mars_lidar import _core
-    from mars_lidar.statistics.exposure import thread_count
+    from mars_lidar._base.threads import thread_count
 
     return (
         f"{_processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "

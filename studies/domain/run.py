@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar.statistics.exposure import thread_count
+from mars_lidar._base.threads import thread_count
 from studies import Request
 from studies.common.report import number, save_csv, write
 from studies.domain import references

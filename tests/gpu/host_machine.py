@@ -12,8 +12,8 @@ from mars_lidar import _core
 from mars_lidar.cuda.kernels import Kernel
 
 _RUNS: dict[str, Callable[..., None]] = {
-    "mars_device.h": _core.mars_on_host,
-    "feedback_device.h": _core.feedback_on_host,
+    "cuda/mars.h": _core.mars_on_host,
+    "cuda/feedback.h": _core.feedback_on_host,
 }
 
 

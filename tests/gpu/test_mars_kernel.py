@@ -10,6 +10,7 @@ import pytest
 from host_machine import Host
 
 import mars_lidar as ml
+from mars_lidar import cuda
 from mars_lidar.cuda.mars import mars_histogram
 from mars_lidar.engines import MarsEngine
 from mars_lidar.engines.engine import Task
@@ -52,8 +53,7 @@ def both(
 ) -> dict[str, Any]:
     """Cubes of the processor and of the kernels, and the report of the latter."""
     index = np.arange(1000, 1000 + flux.background.size, dtype=np.uint32)
-    for on in ("host", "cuda"):
-        engine.check_device("cpu" if on == "host" else on, flux.detected(system), system.detected())
+    cuda.check(engine, flux.detected(system), system.detected())
     one, two = (Task(flux, system, realizations, 7, index, 2**40 + 9, 1, None) for _ in range(2))
     wanted = np.empty((one.items, system.bins), system.histogram_dtype)
     engine.histogram(one, wanted)

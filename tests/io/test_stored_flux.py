@@ -146,7 +146,8 @@ def test_matlab_files(transient, tmp_path):
 _CHILD = """
 import resource, sys
 import mars_lidar as ml
-from mars_lidar import io, stored_flux
+from mars_lidar import io
+from mars_lidar.light import stored_flux
 from mars_lidar.io import recipe
 stored_flux.BAND_BYTES = recipe.BLOCK_BYTES = 8 * 2**20
 transient = io.read_transient(sys.argv[1])

@@ -13,7 +13,7 @@ from store_cases import SYSTEM, one_return
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.io.photons import ptu_header
+from mars_lidar.io.streams import ptu_header
 
 
 def needs(library: str, suffix: str):
@@ -275,7 +275,7 @@ def test_nothing_is_left_of_a_stream_that_fails(tmp_path, monkeypatch):
 
 
 def test_a_layout_from_the_future_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("mars_lidar.io.photons.streams.FORMAT_VERSION", 2)
+    monkeypatch.setattr("mars_lidar.io.streams.attributes.FORMAT_VERSION", 2)
     photons().save(tmp_path / "photons.npz")
     monkeypatch.undo()
     with pytest.raises(ValueError, match=r"photons\.npz.*layout version 2; version 1 can be read"):

@@ -6,6 +6,7 @@ import itertools
 import math
 import pickle
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from torch.utils.data import DataLoader
 
 import mars_lidar as ml
 from mars_lidar.learn import Choice, CubeStream, LogUniform, SystemRange, Uniform
+from mars_lidar.learn.ahead import ahead
 from mars_lidar.learn.scene_cache import SharedScenes
 
 SYSTEM = ml.System(
@@ -376,20 +378,42 @@ def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
     assert stacked[0]["cube"].shape == (2, 64, 6, 6)
 
 
-@pytest.mark.filterwarnings("ignore:This DataLoader will create")
-def test_memory_of_workers_is_given_back():
-    from mars_lidar.learn import passing
+def test_examples_are_made_ahead_in_order_and_what_fails_is_told():
+    alone = list(stream(SYSTEM, epoch_size=7, ahead=0))
+    for number in (1, 3):
+        for one, other in zip(stream(SYSTEM, epoch_size=7, ahead=number), alone, strict=True):
+            assert_same(one, other)
+    made: list[int] = []
 
-    if not passing.ABLE:
-        pytest.skip("slots need memfd (Linux)")
-    for _ in range(2):
-        batches = iter(loader(stream(SYSTEM, epoch_size=60, batch_size=2), 2, batch_size=None))
-        held = list(itertools.islice(batches, 24))  # more than workers use again
-        assert len(passing._mapped) <= 2 * passing._KEPT  # of this loader: the last one's have ended
-        del held
-        for _ in batches:
-            pass
-        del batches
+    def items():
+        for k in range(9):
+            made.append(k)
+            if k == 4:
+                raise OSError("a file is gone")
+            yield k
+
+    got = ahead(items(), 2)
+    assert [next(got) for _ in range(4)] == [0, 1, 2, 3]
+    with pytest.raises(OSError, match="a file is gone"):
+        next(got)
+    assert made == [0, 1, 2, 3, 4]
+
+
+def test_a_stream_that_is_left_makes_no_more():
+    made: list[int] = []
+
+    def items():
+        for k in itertools.count():
+            made.append(k)
+            yield k
+
+    got = ahead(items(), 2)
+    assert next(got) == 0
+    got.close()
+    number = len(made)
+    assert number <= 5
+    assert not [thread for thread in threading.enumerate() if thread.name == "mars_lidar.learn"]
+    assert len(made) == number
 
 
 def test_mixed_counts_and_types():

@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 import mars_lidar as ml
+from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.reconstruct.histogram_bound import _variances
 from mars_lidar.statistics import ConvergenceError
 from studies.__main__ import main
@@ -61,7 +62,7 @@ def test_systems_are_functions_of_their_number_and_reach_the_ends() -> None:
     assert {f["mode"] for f in facts} == {"nonparalyzable", "paralyzable", "synchronous", "gated", MOVING}
     assert {f["start"] for f in facts} == {"armed", "stationary"}
     effects = set(" ".join(f["effects"] for f in facts).split())
-    assert effects == set(ml.effects.EFFECTS) - {"crosstalk"}
+    assert effects == set(EFFECTS) - {"crosstalk"}
 
 
 def test_a_right_engine_passes_and_wrong_ones_do_not(monkeypatch: pytest.MonkeyPatch) -> None:

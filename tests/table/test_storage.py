@@ -194,4 +194,4 @@ def test_a_cache_that_cannot_be_written_costs_the_next_build_and_no_more(tmp_pat
         table = ml.Table.cached(system, [0.5, 1.0], [0.2, 0.4], threads=1)
     assert table.lookup(0.7, 0.3).cumulants.shape == (1, 4)
     with pytest.raises(OSError):  # a path cannot be given
-        cache.cached_path(system, [0.5, 1.0], [0.2, 0.4], threads=1)
+        cache.cached_path(ml.Table, system, [0.5, 1.0], [0.2, 0.4], threads=1)

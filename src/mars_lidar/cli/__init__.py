@@ -70,7 +70,7 @@ _EPILOG = "\n\n".join(
 
 def _version(asked: bool) -> None:
     if asked:
-        from mars_lidar import __version__
+        from mars_lidar._version import __version__
 
         print(f"mars-lidar {__version__}")
         raise typer.Exit

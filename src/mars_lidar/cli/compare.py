@@ -13,7 +13,8 @@ from mars_lidar.cli.effect_options import Effects
 from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.info import parsed_pixel
 from mars_lidar.cli.options import _OUTPUT, _RUN, _option
-from mars_lidar.cli.scene_options import LightOptions, SceneOptions, seen
+from mars_lidar.cli.scene_options import LightOptions, SceneOptions
+from mars_lidar.cli.scene_view import seen
 from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
@@ -163,7 +164,7 @@ def _draw(found: Comparison, out: Path) -> None:
 
 
 def _write(file: Path, text: str) -> None:
-    from mars_lidar.io.store import TemporarySibling
+    from mars_lidar._base.files import TemporarySibling
 
     with TemporarySibling(file).writing() as unfinished:
         unfinished.write_text(text)

@@ -114,7 +114,7 @@ def check_picture(out: Path | None, overwrite: bool) -> None:
 
 def save_picture(figure: Figure, out: Path) -> None:
     """Write a figure beside its name and rename it when it is whole."""
-    from mars_lidar.io.store import TemporarySibling
+    from mars_lidar._base.files import TemporarySibling
 
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 4}} if out.suffix == ".png" else {}
     with TemporarySibling(out).writing() as unfinished:

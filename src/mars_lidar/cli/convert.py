@@ -78,7 +78,7 @@ def timestamps(
     with reported():
         from mars_lidar.io.convert import photons, resolution_ns
         from mars_lidar.io.cube import load
-        from mars_lidar.io.photons.streams import check_output
+        from mars_lidar.io.streams.files import check_output
 
         check_output(out, overwrite=overwrite)
         with load(cube) as stored, progress_bar("simulating") as progress:

@@ -138,8 +138,8 @@ def generate(
         _option(
             "--layout",
             panel=_OUTPUT,
-            default="sparse",
-            help="sparse (packed bins that are not zero) or dense (for other Zarr libraries).",
+            default="dense",
+            help="dense (any Zarr library reads it) or sparse (bins that are not zero, packed: smaller in dim light).",
         ),
     ] = None,
     resume: Annotated[bool, _option("--resume", panel=_OUTPUT, help="Continue what was stopped.")] = False,

@@ -11,7 +11,8 @@ from mars_lidar.cli.console import progress_bar, reported, save_picture, say
 from mars_lidar.cli.console import table as print_table
 from mars_lidar.cli.effect_options import Effects
 from mars_lidar.cli.groups import grouped
-from mars_lidar.cli.scene_options import LightOptions, SceneOptions, seen
+from mars_lidar.cli.scene_options import LightOptions, SceneOptions
+from mars_lidar.cli.scene_view import seen
 from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.threads import thread_count
 from mars_lidar.compare.expected import Expected, PixelLaw, expected_counts, pixel_law
 from mars_lidar.compare.pixel import (
     PixelStatistics,
@@ -31,7 +32,6 @@ from mars_lidar.engines.engine import Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics import ConvergenceError
-from mars_lidar.statistics.exposure import thread_count
 
 
 @dataclass(frozen=True, eq=False)

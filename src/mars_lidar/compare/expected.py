@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.compare.sample import FloatArray, Moments
+from mars_lidar.compare.views import law_arguments
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.plot.data import law_arguments
 from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments, joint_law, mean_histogram
 from mars_lidar.statistics.distance import Pmf
 

@@ -22,10 +22,10 @@ from mars_lidar.compare.sample import (
     score,
     shape_distance,
 )
+from mars_lidar.compare.views import example_pixels, incident_rate
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.plot.data import example_pixels, incident_rate
 from mars_lidar.simulate import simulate
 from mars_lidar.statistics.distance import Pmf
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from mars_lidar.compare.expected import Expected
 from mars_lidar.compare.sample import Estimate, FloatArray, score
+from mars_lidar.compare.views import bin_depth_m
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.plot.data import bin_depth_m
 from mars_lidar.simulate import simulate
 
 

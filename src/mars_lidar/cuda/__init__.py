@@ -1,5 +1,5 @@
 """Engines on a GPU: the native headers compiled for CUDA at run time."""
 
-from mars_lidar.cuda.exact import exact_histogram, exact_records
+from mars_lidar.cuda.dispatch import check, histogram, records
 
-__all__ = ["exact_histogram", "exact_records"]
+__all__ = ["check", "histogram", "records"]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.cuda.kernels import Sink, Variant, block_bytes
 from mars_lidar.cuda.machine import compiled, cupy_with_device
 from mars_lidar.engines.engine import Records, Task

@@ -8,7 +8,7 @@ from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Task
 from mars_lidar.instrument.detector import MODES
 
@@ -29,7 +29,7 @@ OPTIONS = (
 def source(header: str) -> str:
     """What is compiled. It tells the headers' contents, by which CuPy names what it has compiled before."""
     contents = blake2b(digest_size=16)
-    for file in sorted(HEADERS.glob("*.h")):
+    for file in sorted(HEADERS.rglob("*.h")):
         contents.update(file.read_bytes())
     return f'// {contents.hexdigest()}\n#include "{header}"\n'
 
@@ -42,21 +42,21 @@ class Kernel:
     expression: str
 
 
-MARS_LAWS = Kernel("mars_device.h", "mars::mars_laws")
+MARS_LAWS = Kernel("cuda/mars.h", "mars::mars_laws")
 
 
 def mars_histograms(wide: bool) -> Kernel:
     """The kernel that draws, into histograms of uint32 or uint16."""
-    return Kernel("mars_device.h", f"mars::mars_histograms<{str(wide).lower()}>")
+    return Kernel("cuda/mars.h", f"mars::mars_histograms<{str(wide).lower()}>")
 
 
 def feedback_histograms(wide: bool) -> Kernel:
     """The engine "feedback", into histograms of uint32 or uint16."""
-    return Kernel("feedback_device.h", f"mars::feedback_histograms<{str(wide).lower()}>")
+    return Kernel("cuda/feedback.h", f"mars::feedback_histograms<{str(wide).lower()}>")
 
 
 class Sink(IntEnum):
-    """Where registrations go, `DeviceSink` of native/exact_device.h."""
+    """Where registrations go, `DeviceSink` of native/cuda/exact.h."""
 
     COUNTS = 0
     BLOCK16 = 1  # histograms counted in the memory of a block, with 8 bits a bin, then written as uint16
@@ -91,7 +91,7 @@ class Variant:
     @property
     def kernel(self) -> Kernel:
         """As it is compiled."""
-        return Kernel("exact_device.h", self.expression)
+        return Kernel("cuda/exact.h", self.expression)
 
     @property
     def expression(self) -> str:

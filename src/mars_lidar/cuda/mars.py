@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.cuda.kernels import MARS_LAWS, mars_histograms, overflow
 from mars_lidar.cuda.machine import Machine
 from mars_lidar.engines.alignment import Frame, pulse_frame
@@ -60,7 +60,7 @@ def check_mars(task_flux_most: float, cycles: int, dead_time_periods: float) -> 
 def mars_histogram(engine: MarsEngine, task: Task, out: Any, machine: Machine) -> None:
     """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor."""
     reader = engine.reader
-    assert reader is not None  # see check_device
+    assert reader is not None  # see cuda.check
     single = single_return(task.flux)
     assert single is not None
     inside, left = _on_grid(reader.table, single[0], task.flux.background.reshape(-1))

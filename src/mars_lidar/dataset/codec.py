@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from zarr.abc.codec import ArrayBytesCodec
 from zarr.registry import register_codec
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 
 if TYPE_CHECKING:
     from zarr.core.array_spec import ArraySpec

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar._base.threads import thread_count
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import MAPS, histogram_array, histogram_blocks
 from mars_lidar.dataset.recipe import DatasetRecipe
@@ -76,7 +77,6 @@ def estimate(
     Up to four scenes, spread over the list, are read, and up to eight chunks of them simulated and packed in memory.
     Arguments are those of `mars_lidar.generate`.
     """
-    from mars_lidar.simulate import _default_threads
 
     plan, folder = read_recipe(recipe)
     assert plan is not None
@@ -92,7 +92,7 @@ def estimate(
     dense = math.prod(shape) * dtype.itemsize
     pixels = math.prod(image)
     maps = 4 * len(MAPS) * pixels * total + sum(map(_scene_bytes, looked)) // len(looked) * number
-    team = threads or _default_threads()
+    team = thread_count(threads or None)
     parts = max(one.waveform_parts(system) for one in looked for system in plan.systems)
     block = making_bytes(chunk, dtype.itemsize, parts)
     shards = math.prod(math.ceil(a / b) for a, b in zip(shape, shard, strict=True))

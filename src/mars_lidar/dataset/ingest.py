@@ -60,7 +60,7 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
     """A new store without arrays, marked incomplete; what was there is removed."""
     import zarr
 
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     if path.exists():
         (path / "zarr.json").unlink(missing_ok=True)  # from now on it is no store

@@ -52,7 +52,7 @@ class DatasetRecipe:
     engine: str = "exact"
     realizations: int = 1
     seed: int = 0
-    layout: str = "sparse"
+    layout: str = "dense"
     chunk_mib: float = 8.0
     shard_mib: float = 64.0
 
@@ -107,7 +107,7 @@ class DatasetRecipe:
             engine=engine,
             realizations=values.integer(("realizations",), root.get("realizations", 1), low=1, high=2**31),
             seed=values.integer(("seed",), root.get("seed", 0), low=0, high=2**64 - 1),
-            layout=values.choice(("store", "layout"), store.get("layout", "sparse"), LAYOUTS),
+            layout=values.choice(("store", "layout"), store.get("layout", "dense"), LAYOUTS),
             chunk_mib=chunk,
             shard_mib=shard,
         )
@@ -176,12 +176,11 @@ def _crop(data: Any) -> tuple[tuple[int, int] | None, int]:
 
 
 def _engine(engine: Any, systems: tuple[System, ...]) -> str:
-    from mars_lidar.engines import find_engine
+    from mars_lidar.engines import check_detector, find_engine
 
     if not isinstance(engine, str):
         raise TypeError(f"engine must be the name of an engine, got {engine!r}")
     found = find_engine(engine)
     for system in systems:
-        found.check_mode(system)
-        found.check_effects(system)
+        check_detector(found, system)
     return engine

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mars_lidar._base import checks
+from mars_lidar._base.threads import thread_count
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.recipe import DatasetRecipe
@@ -102,10 +103,10 @@ def generate(
     mars_lidar.io.WriteError, mars_lidar.io.Interrupted
         Stopped half way (a full disk, Ctrl-C); the text says how to go on.
     """
+    from mars_lidar._base.files import check_target
     from mars_lidar.dataset.ingest import create
     from mars_lidar.dataset.store import open_dataset
     from mars_lidar.io import Interrupted, WriteError
-    from mars_lidar.io.store import check_target
 
     began = time.perf_counter()
     target = Path(out)
@@ -197,9 +198,8 @@ def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None
     parts are made at a time, each on several threads.
     """
     from mars_lidar.dataset.write import Maker, Stopped
-    from mars_lidar.simulate import _default_threads
 
-    team = threads or _default_threads()
+    team = thread_count(threads or None)
     array = dataset.histogram
     parts = dataset.scenes.waveform_parts(dataset.recipe.systems)
     chunk = making_bytes(array.chunks, array.dtype.itemsize, parts)
@@ -239,7 +239,7 @@ def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> in
 
 
 def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) -> None:
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     if dataset.attrs.get("version") != __version__:
         raise ValueError(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 
 _NONE = 2**64 - 1  # offset and length of a chunk that is not there
 Region = tuple[slice, ...]

@@ -18,11 +18,12 @@ from mars_lidar.dataset.renders import transient_files
 from mars_lidar.dataset.sample_content import Shown, Surfaces
 from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
+from mars_lidar.io.rgbd.layered import read_layers
 from mars_lidar.io.rgbd.stack import is_stack
 from mars_lidar.io.scan import Problem, SceneFile, scan
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
-from mars_lidar.scene.layers import LayeredScene, read_layers
+from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
 from mars_lidar.simulate import _check_registrations
 

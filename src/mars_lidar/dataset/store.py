@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import IncompleteFileError
 from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.sample_content import Rendered
 from mars_lidar.dataset.scenes import SceneReader
 from mars_lidar.io.scan import Problem
-from mars_lidar.io.store import IncompleteFileError
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene

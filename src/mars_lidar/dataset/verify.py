@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.threads import thread_count
 from mars_lidar._version import other_version
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.store import open_dataset
@@ -61,7 +62,6 @@ def verify(
     threads, progress
         As for `mars_lidar.generate`.
     """
-    from mars_lidar.simulate import _default_threads
 
     dataset = open_dataset(path)
     array = dataset.histogram
@@ -72,7 +72,7 @@ def verify(
         checks.integer("threads", threads, low=1, high=1024)
     random = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     chosen = np.arange(total) if number == total else np.sort(random.choice(total, number, replace=False))
-    maker = Maker(dataset, threads or _default_threads())
+    maker = Maker(dataset, thread_count(threads or None))
     different = []
     for k, flat in enumerate(chosen):
         place = np.unravel_index(int(flat), grid)

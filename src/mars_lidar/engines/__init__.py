@@ -1,53 +1,18 @@
 """Engines: one file each, under the names that `simulate` takes."""
 
-from typing import Any
-
-from mars_lidar._base import checks
-from mars_lidar.engines.auto import AutoEngine
 from mars_lidar.engines.engine import Engine
-from mars_lidar.engines.exact import ExactEngine
-from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.mars import MarsEngine
-from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.engines.options import EngineOptions
+from mars_lidar.engines.registry import ANY_SYSTEM, ENGINES, check_detector, find_engine
 from mars_lidar.engines.renewal import RenewalEngine
-from mars_lidar.engines.sequential import SequentialEngine
 
-ENGINES: dict[str, Engine] = {
-    engine.name: engine
-    for engine in (
-        ExactEngine(),
-        FeedbackEngine(),
-        AutoEngine(),
-        SequentialEngine(),
-        MarsEngine(),
-        RenewalEngine(),
-        PoissonEngine(),
-    )
-}
-
-ANY_SYSTEM = tuple(name for name, engine in ENGINES.items() if engine.any_system)
-
-
-def find_engine(engine: str | Engine, **options: Any) -> Engine:
-    """The engine of that name, of default settings but for the options that are not None; or the engine itself."""
-    given = {name: value for name, value in options.items() if value is not None}
-    if isinstance(engine, Engine):
-        found = engine
-        if given:
-            name = next(iter(given))
-            raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {given[name]!r}")
-        return found
-    if engine == "neural":
-        raise ValueError(
-            "engine 'neural' is no longer in the package: from a checkout, give studies.neural.NeuralEngine(), "
-            "which simulate takes as engine (docs/neural.md)"
-        )
-    found = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
-    for name in given:
-        if name not in found.options:
-            takes = ", ".join(found.options) if found.options else "none"
-            raise TypeError(f"{name} must be None for engine {engine!r} (its options: {takes}), got {given[name]!r}")
-    return type(found)(**given) if given else found
-
-
-__all__ = ["ANY_SYSTEM", "ENGINES", "Engine", "MarsEngine", "RenewalEngine", "find_engine"]
+__all__ = [
+    "ANY_SYSTEM",
+    "ENGINES",
+    "Engine",
+    "EngineOptions",
+    "MarsEngine",
+    "RenewalEngine",
+    "check_detector",
+    "find_engine",
+]

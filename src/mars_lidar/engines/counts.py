@@ -72,7 +72,7 @@ class RoundedGaussian(CountLaws):
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         streams.fill(_core.gaussian_counts, out, mean=self.mean, variance=self.variance)
 
@@ -89,7 +89,7 @@ class Poisson(CountLaws):
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         streams.fill(_core.poisson_counts, out, mean=self.mean)
 
@@ -106,7 +106,7 @@ class Matched(CountLaws):
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         streams.fill(_core.matched_counts, out, cumulants=self.cumulants)
 
@@ -138,7 +138,7 @@ class Tabulated(CountLaws):
 
     def fill(self, streams: Streams, out: IndexArray) -> None:
         """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         laws = {"first": self.first, "offsets": self.offsets, "cumulative": self.cumulative}
         streams.fill(_core.tabulated_counts, out, law=self.law, **laws)

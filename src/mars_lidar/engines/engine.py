@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.instrument.detector import MODES, Detector, Mode
-from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter, code_edges, require_effects
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter, code_edges
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
 Progress = Callable[[int, int], object]
 
@@ -72,7 +72,7 @@ class Task:
     @cached_property
     def job(self) -> _core.Job:
         """The native form of this task; times in laser periods."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         wave = self.flux.waveform
         detector = self.system.detector
@@ -153,7 +153,6 @@ class Engine(ABC):
     modes: ClassVar[tuple[Mode, ...]] = ("nonparalyzable",)  # of the detector, that the engine reproduces
     effects: ClassVar[tuple[str, ...]] = LIGHT_EFFECTS  # likewise
     any_system: ClassVar[bool] = True  # False: it draws the system that it was made for
-    devices: ClassVar[tuple[str, ...]] = ("cpu",)  # that it runs on
     options: ClassVar[tuple[str, ...]] = ()  # arguments of `simulate` that the engine's constructor takes
 
     def __repr__(self) -> str:
@@ -167,42 +166,6 @@ class Engine(ABC):
 
     def check(self, flux: Flux, system: System) -> None:  # noqa: B027  (most engines take everything)
         """Raise ValueError, naming the field, for what this engine cannot do."""
-
-    def check_mode(self, system: System) -> None:
-        """Raise ValueError, naming the engines to use, where the detector's mode is not among `modes`."""
-        mode = system.detector.mode
-        if mode not in self.modes:
-            from mars_lidar.engines import ENGINES
-
-            able = " or ".join(repr(name) for name, engine in ENGINES.items() if mode in engine.modes)
-            raise ValueError(
-                f"engine {self.name!r} does not do mode {mode!r} of the detector, only "
-                f"{', '.join(map(repr, self.modes))}; use {able}"
-            )
-
-    def check_effects(self, system: System) -> None:
-        """Raise ValueError, naming the effect and the engines to use, where one of the detector is not in `effects`."""
-        from mars_lidar.engines import ENGINES
-
-        def instead(effect: str) -> str:
-            return "; use " + " or ".join(repr(name) for name, engine in ENGINES.items() if effect in engine.effects)
-
-        require_effects(f"engine {self.name!r}", system.detector, self.effects, instead)
-
-    def check_device(self, device: str, flux: Flux, system: System) -> None:
-        """Raise ValueError, naming what to use, for what this engine cannot do on that device."""
-        if device not in self.devices:
-            from mars_lidar.engines import ENGINES
-
-            able = " or ".join(repr(name) for name, engine in ENGINES.items() if device in engine.devices)
-            raise ValueError(
-                f"engine {self.name!r} does not run on device {device!r}, only on "
-                f"{', '.join(map(repr, self.devices))}; use engine {able}, or device 'cpu'"
-            )
-
-    def histogram_on_cuda(self, task: Task, out: Any) -> None:
-        """`histogram` of a checked task into a CuPy array, on CuPy's current device and stream."""
-        raise ValueError(f"engine {self.name!r} does not run on device 'cuda'; use device 'cpu'")
 
     @abstractmethod
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
@@ -219,7 +182,7 @@ class Engine(ABC):
 
 @lru_cache(maxsize=16)
 def _recording(detector: Detector, period_ns: float) -> _core.Recording:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     jitter, no_limit = detector.jitter, 2**31 - 1
     shape: Pulse | None = None

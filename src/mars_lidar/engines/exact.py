@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Engine, Records, Task
 from mars_lidar.instrument.detector import MODES
-from mars_lidar.instrument.effects import EFFECTS, LIGHT_EFFECTS, require_effects
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
+from mars_lidar.instrument.effects import EFFECTS
 
 
 class ExactEngine(Engine):
@@ -27,26 +25,9 @@ class ExactEngine(Engine):
     description = "every registered photon, nothing approximated; the default"
     modes = MODES
     effects = tuple(name for name in EFFECTS if name != "crosstalk")
-    devices = ("cpu", "cuda")
 
     def __init__(self, level: str = "") -> None:
         self.level = level
-
-    def check_device(self, device: str, flux: Flux, system: System) -> None:
-        """On a GPU: returns of a pulse, in every mode, recorded as they are registered."""
-        super().check_device(device, flux, system)
-        if device == "cpu":
-            return
-        if flux.waveform is not None:
-            raise ValueError(f"flux must have returns, not a waveform, on device {device!r}; use device 'cpu'")
-        able = tuple(effect for effect in LIGHT_EFFECTS if effect in self.effects)
-        require_effects(f"device {device!r}", system.detector, able, lambda effect: "; use device 'cpu'")
-
-    def histogram_on_cuda(self, task: Task, out: Any) -> None:
-        """One exposure a thread."""
-        from mars_lidar.cuda import exact_histogram
-
-        exact_histogram(task, out)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every registration, binned as it is drawn."""

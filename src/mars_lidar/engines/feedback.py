@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Engine, Progress, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback_grid import near_pulse
 from mars_lidar.engines.feedback_rule import Grid, Plan, Reason, Rest, draw_rest, sweep_pixels
 from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.engines.poisson import PoissonEngine
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
 
 
 class FeedbackEngine(Engine):
@@ -49,38 +47,9 @@ class FeedbackEngine(Engine):
 
     name = "feedback"
     description = "whole histograms with their joint law, at a cost independent of the exposure"
-    devices = ("cpu", "cuda")
 
     def __init__(self, level: str = "") -> None:
         self.level = level
-
-    def check_device(self, device: str, flux: Flux, system: System) -> None:
-        """On a GPU: pixels with a dead time; without one they are Poisson numbers, which no kernel draws."""
-        super().check_device(device, flux, system)
-        if device == "cpu":
-            return
-        if system.dead_time_periods == 0.0:
-            raise ValueError(
-                f"dead_time_ns must be > 0 for engine 'feedback' on device {device!r}; use engine 'exact' there, or "
-                "device 'cpu'"
-            )
-
-    def histogram_on_cuda(self, task: Task, out: Any) -> None:
-        """One pixel a thread; what the sweeps refuse is drawn by the exact engine, there or, a waveform, here."""
-        from mars_lidar.cuda.feedback import feedback_histogram
-        from mars_lidar.cuda.machine import Cuda
-
-        machine = Cuda()
-
-        def draw_exactly(part: Task, rows: Any) -> None:
-            if part.flux.waveform is None:
-                ExactEngine().histogram_on_cuda(part, rows)
-                return
-            here = np.empty((part.items, part.system.bins), rows.dtype)
-            ExactEngine(self.level).histogram(part, here)
-            rows[...] = machine.array(here)
-
-        feedback_histogram(task, out, machine, draw_exactly)
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Poisson numbers, feedback, or the exact engine, pixel by pixel."""

@@ -27,7 +27,7 @@ BRIGHTEST_ECHO = 4.0  # signal photons of a pulse that meets its own echo; beyon
 
 
 class Reason(IntEnum):
-    """What became of an exposure: `FeedbackStatus` of native/feedback_kernel.h, and reasons known before."""
+    """What became of an exposure: `FeedbackStatus` of native/feedback/kernel.h, and reasons known before."""
 
     DRAWN = 0
     SLOW = 1

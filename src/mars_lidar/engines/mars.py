@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar.engines.count_shape import CountTimesShape, normalised
 from mars_lidar.engines.counts import CountLaws, Matched, Mended, Poisson, RoundedGaussian, Tabulated
-from mars_lidar.engines.engine import Task
+from mars_lidar.engines.options import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
 from mars_lidar.engines.synthesis import Batch, Run
 from mars_lidar.engines.table_laws import exact_laws, untrusted
 from mars_lidar.engines.table_reader import Entries, TableReader
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
@@ -68,16 +67,15 @@ class MarsEngine(CountTimesShape):
     name = "mars"
     description = "count law x mean histogram: cost flat in the exposure, bins not correlated as they should be"
     effects = LIGHT_EFFECTS + TIMING_EFFECTS
-    devices = ("cpu", "cuda")
     options: ClassVar[tuple[str, ...]] = ("table", "count", "interpolation", "outside")
 
     def __init__(
         self,
         table: Table | None = None,
         *,
-        count: Literal["exact", "matched", "gaussian"] = "exact",
-        interpolation: Literal["bilinear", "nearest"] | None = None,
-        outside: Literal["error", "exact"] | None = None,
+        count: Count = "exact",
+        interpolation: Interpolation | None = None,
+        outside: Outside | None = None,
         level: str = "",
     ) -> None:
         self.count = checks.choice("count", count, _COUNTS)
@@ -87,27 +85,6 @@ class MarsEngine(CountTimesShape):
     def settings(self) -> dict[str, Any]:
         """Count law, and the table if there is one."""
         return {"count": self.count} | super().settings
-
-    def check_device(self, device: str, flux: Flux, system: System) -> None:
-        """On a GPU: with a table, and no more registrations than single precision counts."""
-        super().check_device(device, flux, system)
-        if device == "cpu":
-            return
-        if self.reader is None:
-            raise ValueError(
-                f"table must be given for engine 'mars' on device {device!r}: without one every pixel is evaluated by "
-                "the processor; build a mars_lidar.Table, or use device 'cpu'"
-            )
-        from mars_lidar.cuda.mars import check_mars
-
-        check_mars(float(flux.total.max()), system.cycles, system.dead_time_periods)
-
-    def histogram_on_cuda(self, task: Task, out: Any) -> None:
-        """A table's pixels there, one a block; what lies beyond the table is evaluated here."""
-        from mars_lidar.cuda.machine import Cuda
-        from mars_lidar.cuda.mars import mars_histogram
-
-        mars_histogram(self, task, out, Cuda())
 
     def _evaluate(self, run: Run, pixels: IndexArray) -> None:
         """The exact statistics of each distinct pixel, at its own delay."""

@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.system import System

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.count_shape import CountTimesShape, normalised
 from mars_lidar.engines.counts import CountLaws, RoundedGaussian
+from mars_lidar.engines.options import Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups, single_return
 from mars_lidar.engines.synthesis import Batch, Run
 from mars_lidar.engines.table_reader import Entries, TableReader
@@ -49,8 +50,8 @@ class RenewalEngine(CountTimesShape):
         self,
         table: Table | None = None,
         *,
-        interpolation: Literal["bilinear", "nearest"] | None = None,
-        outside: Literal["error", "exact"] | None = None,
+        interpolation: Interpolation | None = None,
+        outside: Outside | None = None,
         level: str = "",
     ) -> None:
         super().__init__(table, interpolation, outside, level)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import _core
+from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Engine, Records, Task
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS

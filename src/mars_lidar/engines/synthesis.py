@@ -106,7 +106,7 @@ class Run:
                 self._draw(some, realization, min(deep, number - realization))
 
     def _draw(self, batch: Batch, first: int, number: int) -> None:
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         task, pixels = self.task, batch.pixels
         index = np.ascontiguousarray(task.pixel_index[pixels])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ from mars_lidar._base.brief import brief
 from mars_lidar.instrument import effects
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.effects import Jitter, SampledJitter
+from mars_lidar.instrument.presets import preset
 
 Mode = Literal["nonparalyzable", "paralyzable", "synchronous", "gated"]
 MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "synchronous", "gated")
@@ -137,9 +139,7 @@ class Detector:
 
         `dataclasses.replace` changes fields. Efficiencies are left at 1: they go with the wavelength.
         """
-        from mars_lidar.instrument.presets import preset
-
-        return preset(name)
+        return cls(**preset(name))
 
     def _check_avalanches(self) -> None:
         if self.twilight_ns > 0.0 and self.mode != "nonparalyzable":
@@ -226,3 +226,12 @@ class Detector:
             if field.read is not None and known.get(name) is not None:
                 known[name] = field.read(known[name])
         return cls(**known)
+
+
+def require_effects(what: str, detector: Detector, able: tuple[str, ...], instead: Callable[[str], str]) -> None:
+    """Raise ValueError, naming the first effect that is on and not in `able`, and what `instead` says of it."""
+    for name in detector.effects:
+        if name not in able:
+            value = repr(getattr(detector, name))
+            told = value if len(value) <= 100 else f"{value[:97]}..."
+            raise ValueError(f"{what} does not do {name} of the detector, got {told}{instead(name)}")

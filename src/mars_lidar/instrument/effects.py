@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,6 @@ from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.jitter import Jitter as Jitter
 from mars_lidar.instrument.jitter import SampledJitter as SampledJitter
 from mars_lidar.instrument.jitter import jitter_from_dict
-
-if TYPE_CHECKING:
-    from mars_lidar.instrument.detector import Detector
 
 LIGHT_EFFECTS = ("detection_efficiency", "dark_count_hz")
 """What changes the flux only, `Flux.detected`: every engine and statistic takes it."""
@@ -111,12 +108,3 @@ def code_edges(code_density: tuple[float, ...]) -> FloatArray:
     widths = np.array(code_density)
     edges = np.concatenate([[0.0], np.cumsum(widths)])
     return np.asarray(edges * (widths.size / edges[-1]), dtype=np.float64)
-
-
-def require_effects(what: str, detector: Detector, able: tuple[str, ...], instead: Callable[[str], str]) -> None:
-    """Raise ValueError, naming the first effect that is on and not in `able`, and what `instead` says of it."""
-    for name in detector.effects:
-        if name not in able:
-            value = repr(getattr(detector, name))
-            told = value if len(value) <= 100 else f"{value[:97]}..."
-            raise ValueError(f"{what} does not do {name} of the detector, got {told}{instead(name)}")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar.instrument.avalanches import Afterpulsing
-from mars_lidar.instrument.detector import Detector
 
 # Afterpulses of the module of serial number 3605H by time after the recovery, ns, and the share of them up to then:
 # the distribution that goes with Straka et al. (github.com/ivo-s/SPAD-counting-model, apDist_3605H.txt, 81 ps bins),
@@ -19,37 +19,37 @@ _UNTIL_NS = np.array([0.324, 2.43, 8.1, 16.2, 24.3, 32.4, 56.7, 113.4, 226.8])
 _SHARE = np.array([0.593, 0.686, 0.784, 0.846, 0.883, 0.903, 0.938, 0.975, 1.0])
 
 
-def _excelitas_spcm_aqrh() -> Detector:
+def _excelitas_spcm_aqrh() -> dict[str, Any]:
     """Straka et al., J. Lightwave Technol. 38, 4765 (2020), and the program that goes with it."""
     edges = np.arange(round(_UNTIL_NS[-1] / _STEP_NS) + 1) * _STEP_NS
     share = np.diff(np.interp(edges, np.append(0.0, _UNTIL_NS), np.append(0.0, _SHARE)))
     blind = np.zeros(round(_RECOVERY_NS / _STEP_NS))
-    return Detector(
-        dead_time_ns=_RECOVERY_NS,
-        afterpulsing=Afterpulsing(
+    return {
+        "dead_time_ns": _RECOVERY_NS,
+        "afterpulsing": Afterpulsing(
             probability=0.0171, delays=tuple(np.concatenate([blind, share]).round(9)), bin_ns=_RECOVERY_NS / blind.size
         ),
-        twilight_ns=3.2,
-    )
+        "twilight_ns": 3.2,
+    }
 
 
-def _thorlabs_spcm20a() -> Detector:
+def _thorlabs_spcm20a() -> dict[str, Any]:
     """Thorlabs' page of the photon counters SPCM20A and SPCM50A: a photon every 35 and 45 ns, typical dark counts."""
-    return Detector(dead_time_ns=35.0, dark_count_hz=25.0)
+    return {"dead_time_ns": 35.0, "dark_count_hz": 25.0}
 
 
-def _thorlabs_spcm50a() -> Detector:
+def _thorlabs_spcm50a() -> dict[str, Any]:
     """As `_thorlabs_spcm20a`, of a diode of 50 um instead of 20 um."""
-    return Detector(dead_time_ns=45.0, dark_count_hz=150.0)
+    return {"dead_time_ns": 45.0, "dark_count_hz": 150.0}
 
 
-PRESETS: dict[str, Callable[[], Detector]] = {
+PRESETS: dict[str, Callable[[], dict[str, Any]]] = {
     "excelitas-spcm-aqrh": _excelitas_spcm_aqrh,
     "thorlabs-spcm20a": _thorlabs_spcm20a,
     "thorlabs-spcm50a": _thorlabs_spcm50a,
 }
 
 
-def preset(name: str) -> Detector:
-    """The detector of that name; ValueError with all names if there is none."""
+def preset(name: str) -> dict[str, Any]:
+    """The fields of the `Detector` of that name; ValueError with all names if there is none."""
     return PRESETS[checks.choice("preset", name, tuple(PRESETS))]()

@@ -125,7 +125,7 @@ class GaussianPulse(Pulse):
         return {"kind": "gaussian", "sigma_ns": self.sigma_ns}
 
     def _native(self, period_ns: float) -> PulseTable:
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         return _core.PulseTable.gaussian(self.sigma_ns / period_ns)
 
@@ -233,7 +233,7 @@ class SampledPulse(Pulse):
         return {"kind": "sampled", "values": self.values.tolist(), "bin_ns": self.bin_ns, "origin": self.origin}
 
     def _native(self, period_ns: float) -> PulseTable:
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         inside = np.flatnonzero(np.diff(self._cumulative) > 0)
         knots = np.ascontiguousarray(self._cumulative[inside[0] : inside[-1] + 2])

@@ -3,6 +3,7 @@
 Every library is imported when its format is first used.
 """
 
+from mars_lidar._base.files import IncompleteFileError
 from mars_lidar._base.optional import MissingLibraryError
 from mars_lidar.io.convert import Converted, convert, photons
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save
@@ -10,7 +11,6 @@ from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.scan import Problem, SceneFile, scan
 from mars_lidar.io.simulate_to import Interrupted, WriteError, Written, regenerate, simulate_to, verify
 from mars_lidar.io.spad_mat import SpadMat, read_mat, save_mat
-from mars_lidar.io.store import IncompleteFileError
 from mars_lidar.io.transient import read_transient
 from mars_lidar.light.transient import Transient
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save
-from mars_lidar.io.photons.streams import STREAM_SUFFIXES, is_stream
+from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
 from mars_lidar.light.timestamps import Timestamps
 
 
@@ -113,7 +113,7 @@ def photons(
         The photons do not have the stored counts (another version made the cube), or the engine draws
         histograms only.
     """
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
     from mars_lidar.simulate import simulate_timestamps
 
     k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
@@ -137,7 +137,7 @@ def photons(
 
 
 def _cube(cube: Cube, old: Path, new: Path, realization: int | None, overwrite: bool) -> Converted:
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     if new.suffix not in SUFFIXES:
         raise ValueError(f"{old} is a cube, which goes into one of {', '.join(SUFFIXES)}, not {str(new)!r}")
@@ -176,7 +176,7 @@ def resolution_ns(path: Path, times: Timestamps) -> float:
     """Unit of the times that the format of `path` stores, ns; 0 for .npz, which holds them as they are."""
     if path.suffix == ".npz":
         return 0.0
-    from mars_lidar.io.photons import photon_hdf5, ptu_stream
+    from mars_lidar.io.streams import photon_hdf5, ptu_stream
 
     module = ptu_stream if path.suffix == ".ptu" else photon_hdf5
     return float(times.period_ns / (times.bins * module.units_per_bin(times.bins)))

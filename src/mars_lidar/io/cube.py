@@ -12,19 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.brief import brief
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, WriteError, check_target, reason
 from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import (
-    INCOMPLETE_SUFFIX,
-    CountArray,
-    IncompleteFileError,
-    WriteError,
-    Writer,
-    check_target,
-    reason,
-)
+from mars_lidar.io.store import CountArray, Writer
 from mars_lidar.light.flux import Flux
 
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz", ".mat", ".ptu")
@@ -249,7 +242,7 @@ def _format(path: Path, argument: str) -> Any:
     elif path.suffix == ".mat":
         from mars_lidar.io import mat as module
     elif path.suffix == ".ptu":
-        from mars_lidar.io.photons import ptu as module
+        from mars_lidar.io.streams import ptu as module
     else:
         raise ValueError(f"{argument} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
     return module

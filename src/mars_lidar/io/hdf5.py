@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, TemporarySibling
+from mars_lidar._base.hdf5 import ForgivingFile
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import INCOMPLETE_SUFFIX, IncompleteFileError, OpenedStore, TemporarySibling, Writer
+from mars_lidar.io.store import OpenedStore, Writer
 
 if TYPE_CHECKING:
-    import h5py
+    pass
 
 # 1 MiB is HDF5's default chunk cache. gzip at level 1 with byte shuffle, on the room of zarr_store.py (write,
 # read, size): 0.32 s, 0.15 s, 5.2 MB; level 4 0.72 s, 0.21 s, 4.5 MB; lzf 0.26 s, 0.16 s, 8.7 MB, and MATLAB
@@ -30,7 +31,7 @@ class Hdf5Writer(Writer):
         import h5py
 
         self._sibling = TemporarySibling(path)
-        self._disk = _ForgivingFile(self._sibling.path)
+        self._disk = ForgivingFile(self._sibling.path)
         self._file = h5py.File(self._disk, "w", libver=("earliest", "v110"))
         try:
             for name, value in layout.attributes(recipe).items():
@@ -91,20 +92,6 @@ class Hdf5Writer(Writer):
         return self._sibling.discard()
 
 
-@contextlib.contextmanager
-def new_file(path: Path) -> Iterator[h5py.File]:
-    """A new file, closed and checked at the end: HDF5's own, when a disk is full, ends the process as it is closed."""
-    import h5py
-
-    disk = _ForgivingFile(path)
-    try:
-        with h5py.File(disk, "w", libver=("earliest", "v110")) as file:
-            yield file
-    finally:
-        disk.close()
-    disk.check()
-
-
 def open_writer(path: Path, recipe: Recipe) -> Writer:
     """Begin a file; an existing one is replaced."""
     return Hdf5Writer(path, recipe)
@@ -135,68 +122,6 @@ def open_store(path: Path) -> OpenedStore:
 
     names = frozenset(file)
     return OpenedStore(attrs, names, read, file["histogram"], complete, "", file.close, lambda name: file[name])
-
-
-class _ForgivingFile:
-    """A file that keeps the first error of writing to itself, for `check` to raise.
-
-    The HDF5 library cannot live with a disk that fills up: it holds on to what it could not write, fails to
-    close the file, and crashes when the process ends.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115  # closed by `close`
-        self._error: OSError | None = None
-
-    def check(self) -> None:
-        """Raise the first error there was."""
-        if self._error is not None:
-            raise self._error
-
-    def write(self, data: Any) -> int:
-        """Write all of `data`, or nothing more once something failed."""
-        rest = memoryview(data).cast("B")
-        size = rest.nbytes
-        while rest.nbytes and self._error is None:
-            try:
-                rest = rest[self._file.write(rest) :]
-            except OSError as error:
-                self._error = error
-        return size
-
-    def truncate(self, size: int) -> int:
-        """Set the length of the file."""
-        try:
-            return self._file.truncate(size)
-        except OSError as error:
-            self._error = self._error or error
-            return size
-
-    def close(self) -> None:
-        """Close the file."""
-        try:
-            self._file.close()
-        except OSError as error:
-            self._error = self._error or error
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """As for any file."""
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        """As for any file."""
-        return self._file.tell()
-
-    def read(self, size: int = -1) -> bytes:
-        """As for any file."""
-        return self._file.read(size)
-
-    def readinto(self, buffer: Any) -> int:
-        """As for any file; only HDF5's own book-keeping is ever read back."""
-        return self._file.readinto(buffer)
-
-    def flush(self) -> None:
-        """Nothing is buffered here."""
 
 
 def _label(dataset: Any, labels: dict[str, str]) -> None:

@@ -119,7 +119,7 @@ def variables(recipe: Recipe) -> list[Variable]:
 
 def attributes(recipe: Recipe) -> dict[str, str | int]:
     """Attributes of the file as plain strings and integers; ``complete`` is the writer's own."""
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     return {
         "format": FORMAT,

@@ -11,15 +11,13 @@ import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.io.store import TemporarySibling, check_target
-
-if TYPE_CHECKING:
-    from mars_lidar.reconstruct import Reconstruction
+from mars_lidar._base.files import TemporarySibling, check_target
+from mars_lidar.instrument.system import System
 
 FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")
@@ -40,6 +38,22 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
 }
 
 
+class Maps(Protocol):
+    """What is written of a `mars_lidar.Reconstruction`: its maps (realizations, H, W) and its system."""
+
+    @property
+    def depth_m(self) -> NDArray[np.float64]:
+        """Depth, m."""
+
+    @property
+    def system(self) -> System:
+        """The system that the cube was recorded with."""
+
+    @property
+    def level(self) -> float:
+        """Signal, photons per period, of a surface of reflectivity 1."""
+
+
 def check_maps_output(path: str | Path, *, overwrite: bool = False) -> None:
     """Raise what `save_maps` would raise for this path, without touching anything."""
     target = Path(path)
@@ -48,9 +62,7 @@ def check_maps_output(path: str | Path, *, overwrite: bool = False) -> None:
     check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
 
 
-def save_maps(
-    path: str | Path, results: Mapping[str, Reconstruction], *, source: str = "", overwrite: bool = False
-) -> Path:
+def save_maps(path: str | Path, results: Mapping[str, Maps], *, source: str = "", overwrite: bool = False) -> Path:
     """Write reconstructions (realizations, H, W) of one cube, by method; the file is whole or not there at all."""
     target = Path(path)
     check_maps_output(target, overwrite=overwrite)
@@ -97,9 +109,9 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
 
 
 def _contents(
-    results: Mapping[str, Reconstruction], source: str
+    results: Mapping[str, Maps], source: str
 ) -> tuple[dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, str]]], dict[str, Any]]:
-    from mars_lidar import __version__
+    from mars_lidar._version import __version__
 
     first = next(iter(results.values()))
     if first.depth_m.ndim != 3:
@@ -149,7 +161,7 @@ def _write_npz(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any
 
 
 def _write_hdf5(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
-    from mars_lidar.io.hdf5 import new_file
+    from mars_lidar._base.hdf5 import new_file
 
     with new_file(path) as file:
         file.attrs.update(attrs)

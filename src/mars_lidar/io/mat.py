@@ -31,11 +31,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, TemporarySibling
 from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
-from mars_lidar.io.store import INCOMPLETE_SUFFIX, IncompleteFileError, OpenedStore, TemporarySibling, Writer
+from mars_lidar.io.store import OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 
 UPSAMPLING = 8  # bin_hr over bin: 512 x 512 and 64 x 64 in the files that the networks were trained on

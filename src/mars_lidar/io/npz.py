@@ -16,17 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, TemporarySibling
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
-from mars_lidar.io.store import (
-    INCOMPLETE_SUFFIX,
-    IncompleteFileError,
-    LazyCounts,
-    OpenedStore,
-    TemporarySibling,
-    Writer,
-)
+from mars_lidar.io.store import LazyCounts, OpenedStore, Writer
 
 _LEVEL = 1  # zlib; on the room of zarr_store.py 0.6 s and 6.6 MB, level 6 takes 3.9 s for 5.0 MB
 

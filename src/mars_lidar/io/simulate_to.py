@@ -7,17 +7,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar.engines import find_engine
+from mars_lidar._base.files import WriteError as WriteError
+from mars_lidar._base.files import reason
+from mars_lidar.engines import EngineOptions, find_engine
+from mars_lidar.engines.options import given
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube, check_output, create
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import WriteError as WriteError
-from mars_lidar.io.store import reason
 from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
@@ -75,10 +76,7 @@ def simulate_to(
     source: str = "",
     overwrite: bool = False,
     progress: Progress | None = None,
-    table: Table | None = None,
-    count: Literal["exact", "matched", "gaussian"] | None = None,
-    interpolation: Literal["bilinear", "nearest"] | None = None,
-    outside: Literal["error", "exact"] | None = None,
+    **options: Unpack[EngineOptions],
 ) -> Written:
     """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
 
@@ -91,7 +89,7 @@ def simulate_to(
         The file; its suffix chooses the format.
     flux, system, engine, realizations, first_realization, pixel_index, seed, threads, device
         As for `mars_lidar.simulate`; blocks from a GPU are copied from there, and the file does not tell.
-    table, count, interpolation, outside
+    **options
         As for `mars_lidar.simulate`; the file keeps the name of the engine, its settings, and a hash of the table.
     depth_m, reflectivity
         Maps (H, W) of the scene to store beside the counts; depth is c tau / 2 by default.
@@ -113,7 +111,7 @@ def simulate_to(
     WriteError, Interrupted
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
-    options = _given(table=table, count=count, interpolation=interpolation, outside=outside)
+    chosen = given(options)
     recipe = Recipe(
         system=system,
         flux=flux,
@@ -125,8 +123,8 @@ def simulate_to(
         depth_m=system.depth_m(flux.delay_ns) if depth_m is None else np.asarray(depth_m),
         reflectivity=None if reflectivity is None else np.asarray(reflectivity),
         source=source,
-        options=options,
-        settings=_settings(engine, options),
+        options=chosen,
+        settings=_settings(engine, chosen),
     )
     target = Path(path)
     check_output(target, recipe, overwrite=overwrite)
@@ -233,10 +231,6 @@ def _simulate(
     return here
 
 
-def _given(**options: Any) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
-
-
 def _settings(engine: str, options: dict[str, Any]) -> dict[str, Any]:
     """What a cube of this engine depends on, as plain data; checks the options on the way."""
     return find_engine(engine, **options).settings if isinstance(engine, str) else {}
@@ -248,11 +242,13 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
     table = recipe.options.get("table") if table is None else table
     if table is None and "table" in recorded:
         raise ValueError(f"table must be the one that the cube was made with, got None: {_grid(recorded['table'])}")
-    options = _given(
-        table=table,
-        count=recorded.get("count"),
-        interpolation=recorded.get("interpolation"),
-        outside=None if table is None else "exact",  # no count depends on it
+    options = given(
+        {
+            "table": table,
+            "count": recorded.get("count"),
+            "interpolation": recorded.get("interpolation"),
+            "outside": None if table is None else "exact",  # no count depends on it
+        }
     )
     settings = _settings(recipe.engine, options)
     if table is not None and settings.get("table") != recorded.get("table"):

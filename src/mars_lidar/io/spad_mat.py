@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.files import check_target
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import mat
 from mars_lidar.io.cube import Cube
-from mars_lidar.io.store import check_target
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
-from mars_lidar.engines import Engine
+from mars_lidar.engines import Engine, check_detector
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.passing import ABLE, Slot, Slots
 from mars_lidar.learn.sample import Sample
 from mars_lidar.simulate import simulate
 
@@ -29,8 +28,7 @@ class CubeMaker:
         self, engine: Engine, systems: Sequence[System], device: Any, layout: str, axes: str, dtype: Any
     ) -> None:
         for system in systems:
-            engine.check_mode(system)
-            engine.check_effects(system)
+            check_detector(engine, system)
         self._engine = engine
         self._layout = checks.choice("layout", layout, ("dense", "sparse"))
         self._axes = checks.choice("axes", axes, ("THW", "HWT"))
@@ -38,7 +36,7 @@ class CubeMaker:
             raise TypeError(f"dtype must be a torch.dtype, or None for the counts as they are, got {dtype!r}")
         self._counts = max((system.histogram_dtype for system in systems), key=lambda dtype: dtype.itemsize)
         self._dtype = dtype
-        self._buffers, self._slots = Buffers(), Slots()
+        self._buffers = Buffers()
         self.device = torch.device(device)
         if self.device.type not in ("cpu", "cuda"):
             raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
@@ -50,15 +48,15 @@ class CubeMaker:
         """Whether cubes are made on a GPU."""
         return self.device.type == "cuda"
 
-    def cubes(self, samples: Sequence[Sample], threads: int, shared: bool) -> tuple[torch.Tensor, Slot | None]:
-        """(samples, T, H, W) or (samples, H, W, T); `shared`: for another process, and the slot that it is in."""
+    def cubes(self, samples: Sequence[Sample], threads: int) -> torch.Tensor:
+        """(samples, T, H, W) or (samples, H, W, T)."""
         shapes = {sample.flux.shape for sample in samples}
         if len(shapes) > 1:
             raise ValueError(f"scenes must be of one size to be stacked, got {sorted(shapes)}; give size")
         shape = (len(samples), *shapes.pop(), samples[0].system.bins)
         if self.on_gpu:
             counts = torch.stack([self._simulated_on_gpu(sample) for sample in samples])
-            return self._finished(counts if self._layout == "dense" else counts.to_sparse()), None
+            return self._finished(counts if self._layout == "dense" else counts.to_sparse())
         check_memory(int(np.prod(shape)) * self._counts.itemsize, f"cubes of shape {shape}", "use a smaller batch_size")
         kind = _UNSIGNED[self._counts]
         wanted = kind if self._dtype is None else self._dtype
@@ -66,14 +64,8 @@ class CubeMaker:
             counts = self._buffers.take(shape, kind)
             for place, sample in enumerate(samples):
                 self._simulated(sample, counts[place : place + 1].numpy(), threads)
-            return self._finished(_sparse(counts.numpy())), None
-        slot: Slot | None = None
-        if shared and ABLE:
-            cube, slot = self._slots.take(shape, wanted)
-        elif shared:
-            cube = _shared(shape, wanted)
-        else:
-            cube = self._buffers.take(shape, wanted)
+            return self._finished(_sparse(counts.numpy()))
+        cube = self._buffers.take(shape, wanted)
         for place, sample in enumerate(samples):
             part = cube[place : place + 1]
             if wanted == kind:
@@ -85,7 +77,7 @@ class CubeMaker:
                 part.copy_(counts)
             else:  # by this thread: those of torch would spin for longer than this takes
                 np.copyto(part.numpy(), counts.numpy(), casting="unsafe")
-        return self._turned(cube), slot
+        return self._turned(cube)
 
     def _simulated(self, sample: Sample, out: NDArray[Any], threads: int) -> None:
         own = sample.system.histogram_dtype == self._counts
@@ -115,13 +107,6 @@ class CubeMaker:
             made = simulate(sample.flux, sample.system, engine=self._engine, seed=sample.seed, **options)
         tensor: torch.Tensor = torch.utils.dlpack.from_dlpack(made)[0]
         return tensor
-
-
-def _shared(shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
-    """In PyTorch's shared memory, from the beginning: to move a tensor there is to write it twice."""
-    size = int(np.prod(shape)) * dtype.itemsize
-    memory = torch.UntypedStorage._new_shared(size)  # type: ignore[no-untyped-call]
-    return torch.empty(0, dtype=dtype).set_(memory).view(shape)
 
 
 def _sparse(counts: NDArray[Any]) -> torch.Tensor:

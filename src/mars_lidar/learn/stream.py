@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +11,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.threads import thread_count
 
 try:
     import torch
@@ -23,9 +23,9 @@ from mars_lidar._base.resample import image_size
 from mars_lidar.engines import Engine, find_engine
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scan import SceneFile
+from mars_lidar.learn.ahead import ahead as made_ahead
 from mars_lidar.learn.cubes import CubeMaker
 from mars_lidar.learn.distributed import rank_of, worker_of
-from mars_lidar.learn.passing import forget, passed
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.sample import Recipe, Sample, maps_of, numbers_of
 from mars_lidar.learn.scenes import as_source
@@ -92,6 +92,9 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         Integer in [0, 2**63).
     threads
         Of one process; default: the processors shared out among the loader's workers.
+    ahead
+        Examples that a background thread simulates while the last one is in use, without workers and on the CPU;
+        0: none. Another process would cost a copy of every cube, this costs none.
     transform
         Called on each example; what it returns is given out.
     rank, world_size
@@ -128,6 +131,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         reuse: int = 16,
         seed: int = 0,
         threads: int | None = None,
+        ahead: int = 1,
         transform: Callable[[dict[str, Any]], Any] | None = None,
         rank: int | None = None,
         world_size: int | None = None,
@@ -156,6 +160,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         self._size = None if epoch_size is None else checks.integer("epoch_size", epoch_size, low=1, high=_LAST)
         self._batch = None if batch_size is None else checks.integer("batch_size", batch_size, low=1, high=2**20)
         self._threads = None if threads is None else checks.integer("threads", threads, low=1, high=1024)
+        self._ahead = checks.integer("ahead", ahead, low=0, high=1024)
         self._maker = CubeMaker(find_engine(engine), drawn.corners(), device, layout, axes, dtype)
         self._transform = transform
         self._rank, self._world = rank_of(rank, world_size)
@@ -220,18 +225,16 @@ class CubeStream(IterableDataset[dict[str, Any]]):
     def __iter__(self) -> Iterator[Any]:
         epoch, start = self._state.tolist()
         worker, workers = worker_of()
-        info = get_worker_info()
-        if info is not None and self._maker.on_gpu:
+        in_worker = get_worker_info() is not None
+        if in_worker and self._maker.on_gpu:
             raise ValueError("device='cuda' simulates in the process of the loader: use num_workers=0")
-        if info is not None:
-            forget()
-        threads = self._threads or max(1, _processors() // workers)
+        threads = self._threads or max(1, thread_count(None) // workers)
         self._given = 0
-        for place, indices in enumerate(self._batches(start)):
-            if place % workers != worker:
-                continue
-            samples = [self._recipe.sample(epoch, index) for index in indices]
-            example = self._example(samples, threads, shared=info is not None)
+        mine = ((place, indices) for place, indices in enumerate(self._batches(start)) if place % workers == worker)
+        examples = ((place, self._example(epoch, indices, threads)) for place, indices in mine)
+        if self._ahead and not in_worker and not self._maker.on_gpu:
+            examples = made_ahead(examples, self._ahead)  # type: ignore[assignment]
+        for place, example in examples:
             self._given = place + 1
             yield example if self._transform is None else self._transform(example)
 
@@ -246,9 +249,10 @@ class CubeStream(IterableDataset[dict[str, Any]]):
         if part:
             yield range(start + self._rank * part, start + (self._rank + 1) * part)
 
-    def _example(self, samples: list[Sample], threads: int, shared: bool) -> dict[str, Any]:
+    def _example(self, epoch: int, indices: range, threads: int) -> dict[str, Any]:
+        samples = [self._recipe.sample(epoch, index) for index in indices]
         device = self._maker.device
-        cube, slot = self._maker.cubes(samples, threads, shared)
+        cube = self._maker.cubes(samples, threads)
         maps = [maps_of(one) for one in samples]
         stacked = {
             name: torch.from_numpy(np.stack([one[name] for one in maps]).astype(np.float32)).to(device)
@@ -266,18 +270,9 @@ class CubeStream(IterableDataset[dict[str, Any]]):
             "index": torch.tensor([one.index for one in samples]),
             "seed": torch.tensor([one.seed for one in samples]),
         }
-        if self._batch is None:
-            example = _first(example)
-        return passed(example, example["cube"], slot) if shared else example
+        return _first(example) if self._batch is None else example
 
 
-def _first(example: Any) -> Any:
+def _first(example: dict[str, Any]) -> dict[str, Any]:
     """Without the leading axis."""
-    return {name: _first(one) for name, one in example.items()} if isinstance(example, dict) else example[0]
-
-
-def _processors() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
+    return {name: _first(one) if isinstance(one, dict) else one[0] for name, one in example.items()}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mars_lidar._base.late import late
 from mars_lidar.light.photon_maps import MAX_PHOTONS as MAX_PHOTONS
 from mars_lidar.light.photon_maps import FloatArray as FloatArray
 from mars_lidar.light.photon_maps import broadcast, check_photons, common_shape, frozen, light_map, waveform_maps
@@ -120,9 +121,9 @@ class Flux:
         `level` takes the arguments of `mars_lidar.io.Transient.flux`: ``signal`` or ``photons_per_unit``, and
         ``sbr``, ``dark_counts_per_s``, ``pulse``, ``parts``. Files are read by `mars_lidar.io.read_transient`.
         """
-        from mars_lidar.light.transient import Transient
-
-        return Transient(values, bin_ns, start_ns=start_ns).flux(system, **level)
+        rendered = late("light.transient:Transient")(values, bin_ns, start_ns=start_ns)
+        flux: Flux = rendered.flux(system, **level)
+        return flux
 
     def detected(self, system: System) -> Flux:
         """The photons that avalanches follow: times `Detector.detection_efficiency`, plus `Detector.dark_count_hz`.
@@ -194,9 +195,9 @@ class Flux:
         parts
             Parts of the waveform; default 4 for each bin of the histogram.
         """
-        from mars_lidar.light.fog import in_fog
-
-        return in_fog(self, system, extinction_per_m, backscatter, nearest_m, parts)
+        in_fog = late("light.fog:in_fog")
+        flux: Flux = in_fog(self, system, extinction_per_m, backscatter, nearest_m, parts)
+        return flux
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.resample import area_mean
 
-if TYPE_CHECKING:
-    from mars_lidar.light.transient import RateArray
+
+class RateArray(Protocol):
+    """Rates (H, W, T) in memory or on disk: `shape`, and rows by ``values[first:last]``."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W, T)."""
+
+    def __getitem__(self, key: Any) -> Any:
+        """The selected rows, in memory."""
 
 
 class CroppedRates:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.late import late
+
 if TYPE_CHECKING:
     from mars_lidar.instrument.system import System
 
@@ -69,9 +71,7 @@ class Timestamps:
         OSError
             `path` exists and `overwrite` is false, or cannot be written.
         """
-        from mars_lidar.io.photons.streams import save
-
-        save(path, self, overwrite=overwrite)
+        late("io.streams.files:save")(path, self, overwrite=overwrite)
 
     @classmethod
     def load(
@@ -103,9 +103,9 @@ class Timestamps:
         ValueError
             A file of the wrong kind, damaged or incomplete: the message names it.
         """
-        from mars_lidar.io.photons.streams import load
-
-        return load(path, period_ns=period_ns, bins=bins, unit_ns=unit_ns, variable=variable)
+        load = late("io.streams.files:load")
+        loaded: Timestamps = load(path, period_ns=period_ns, bins=bins, unit_ns=unit_ns, variable=variable)
+        return loaded
 
     def pixel(self, y: int, x: int) -> Timestamps:
         """The registrations of one pixel, as views."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import cached_property, lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from mars_lidar._base.resample import new_size, window
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.light.rate_parts import CroppedRates, ResizedRates
+from mars_lidar.light.rate_parts import CroppedRates, RateArray, ResizedRates
 from mars_lidar.light.stored_flux import StoredFlux
 
 FloatArray = NDArray[np.float64]
@@ -28,17 +28,6 @@ _BAND_BYTES = 64 * 2**20
 _WORK_BYTES = 8 * 2**20  # of rows that are folded and convolved together, some six times over
 _MAX_PARTS = 2**20
 _DELAYS = 64  # midpoints inside a part for the pulse's average: error below (part / pulse width)^2 / 1e5
-
-
-class RateArray(Protocol):
-    """Rates (H, W, T) in memory or on disk: `shape`, and rows by ``values[first:last]``."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(H, W, T)."""
-
-    def __getitem__(self, key: Any) -> Any:
-        """The selected rows, in memory."""
 
 
 class Transient:

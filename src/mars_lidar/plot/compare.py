@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar.compare.views import instrument
 from mars_lidar.plot.compare_panels import draw_points, draw_times, engine_colours, label_panels
-from mars_lidar.plot.data import instrument
 from mars_lidar.plot.figures import _draw_map
 from mars_lidar.plot.pixel import _steps, _zoom_ns, quiet_corner
 from mars_lidar.plot.style import DPI, INK, style

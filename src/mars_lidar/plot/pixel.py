@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.compare.views import incident_rate, predicted_counts
 from mars_lidar.instrument.system import System
-from mars_lidar.plot.data import incident_rate, predicted_counts
 from mars_lidar.plot.style import INK, MUTED
 
 if TYPE_CHECKING:

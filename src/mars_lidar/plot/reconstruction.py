@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar.plot.data import depth_error_m
+from mars_lidar.compare.views import depth_error_m
 from mars_lidar.plot.figures import _draw_map, _limits, _metres
 from mars_lidar.plot.style import DPI, style
 

@@ -7,13 +7,9 @@ from mars_lidar.reconstruct.matched_filter import MatchedFilter
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood, log_likelihood
 from mars_lidar.reconstruct.mchc import ChainCorrection, mchc_rates
 from mars_lidar.reconstruct.method import Flags, Method
+from mars_lidar.reconstruct.methods import METHODS
 from mars_lidar.reconstruct.peak import Peak
 from mars_lidar.reconstruct.reconstruction import Reconstruction, reconstruct
-
-METHODS: dict[str, Method] = {
-    method.name: method
-    for method in (MaximumLikelihood(), GeneralisedCoates(), ChainCorrection(), Coates(), MatchedFilter(), Peak())
-}
 
 __all__ = [
     "METHODS",

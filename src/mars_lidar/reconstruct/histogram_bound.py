@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
-from mars_lidar.instrument.effects import LIGHT_EFFECTS, require_effects
+from mars_lidar.instrument.detector import require_effects
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import core_ns, open_bins, relative_width
 from mars_lidar.reconstruct.method import FloatArray

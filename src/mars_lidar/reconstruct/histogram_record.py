@@ -13,7 +13,7 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
 FloatArray = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ _OUTSIDE_CORE = 0.0015  # of the energy on either side of the window in which th
 @lru_cache(maxsize=16)
 def recording_of(system: System) -> _core.HistogramRecord:
     """The native form of a system whose gate, if any, does not move; times in laser periods."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     low, cell, energy, slope = _curve(system.pulse, system.period_ns)
     knots = low + cell * np.arange(energy.size, dtype=np.float64)

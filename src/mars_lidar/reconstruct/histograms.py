@@ -1,16 +1,37 @@
-"""Checks of the histograms that are given to an estimator."""
+"""Histograms as estimators take them: checked, flat, in a type that the native core reads."""
 
 from __future__ import annotations
 
-import os
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import checks
+from mars_lidar._base.threads import thread_count
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruct.method import Histograms, Progress
+from mars_lidar.reconstruct.histogram_record import recording_of
+
+if TYPE_CHECKING:
+    from mars_lidar._base.native import _core
+
+Progress = Callable[[int, int], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Histograms:
+    """What a method works on: `counts` (pixels, bins) of uint16, uint32 or float64, and how they were recorded."""
+
+    counts: NDArray[Any]
+    system: System
+    threads: int
+    progress: Progress | None = None
+
+    @property
+    def recording(self) -> _core.HistogramRecord:
+        """The native form of the system."""
+        return recording_of(self.system)
 
 
 def checked(
@@ -19,7 +40,7 @@ def checked(
     """Histograms (pixels, bins) in a type that the native core takes, and the leading shape (...) of the cube."""
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
-    team = default_threads() if threads is None else checks.integer("threads", threads, low=1, high=1024)
+    team = thread_count(threads)
     if progress is not None and not callable(progress):
         raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
     counts = np.asarray(cube)
@@ -50,11 +71,3 @@ def _typed(counts: NDArray[Any]) -> NDArray[Any]:
     if counts.dtype.itemsize > 4 and counts.max() >= 2**32:
         raise ValueError(f"cube must hold counts below 2**32, got {counts.max()}")
     return counts.astype(np.uint16 if counts.dtype.itemsize == 1 else np.uint32)
-
-
-def default_threads() -> int:
-    """All processors that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1

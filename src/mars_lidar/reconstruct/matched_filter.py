@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mars_lidar._base import checks
-from mars_lidar.reconstruct.method import FILTERS, Estimates, Filter, Histograms, Method, window_estimates
+from mars_lidar.reconstruct.histograms import Histograms
+from mars_lidar.reconstruct.method import FILTERS, Estimates, Filter, Method, window_estimates
 
 
 @dataclass(frozen=True)

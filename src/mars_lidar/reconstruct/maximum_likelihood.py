@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from mars_lidar._base import checks
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import recording_of, relative_width
-from mars_lidar.reconstruct.histograms import checked
-from mars_lidar.reconstruct.method import Estimates, FloatArray, Histograms, Method
+from mars_lidar.reconstruct.histograms import Histograms, checked
+from mars_lidar.reconstruct.method import Estimates, FloatArray, Method
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class MaximumLikelihood(Method):
 
     def estimate(self, histograms: Histograms) -> Estimates:
         """The estimates, their standard errors, and the significance of the signal."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         out = np.empty((len(histograms.counts), 8))
         flags = np.empty(len(histograms.counts), np.uint8)
@@ -103,7 +103,7 @@ def log_likelihood(
     tuple
         Value (...), gradient (..., 3) and information (..., 3, 3) with respect to (S, B, delay in ns).
     """
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     given, shape = checked(histogram, system, 1)
     if shape:

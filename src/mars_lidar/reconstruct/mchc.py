@@ -9,16 +9,8 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruct.histograms import checked
-from mars_lidar.reconstruct.method import (
-    _CHAIN,
-    Estimates,
-    FloatArray,
-    Histograms,
-    RateMethod,
-    corrected_rates,
-    window_estimates,
-)
+from mars_lidar.reconstruct.histograms import Histograms, checked
+from mars_lidar.reconstruct.method import _CHAIN, Estimates, FloatArray, RateMethod, corrected_rates, window_estimates
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntFlag
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,12 +17,9 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import check_window, recording_of
-
-if TYPE_CHECKING:
-    from mars_lidar import _core
+from mars_lidar.reconstruct.histograms import Histograms, checked
 
 FloatArray = NDArray[np.float64]
-Progress = Callable[[int, int], object]
 Filter = Literal["log", "linear"]
 FILTERS = ("log", "linear")
 
@@ -41,21 +38,6 @@ class Flags(IntFlag):
     """Bins that registered whenever they could: the rate has no upper bound."""
     UNCONVERGED = 8
     """The iteration did not come to rest."""
-
-
-@dataclass(frozen=True, eq=False)
-class Histograms:
-    """What a method works on: `counts` (pixels, bins) of uint16, uint32 or float64, and how they were recorded."""
-
-    counts: NDArray[Any]
-    system: System
-    threads: int
-    progress: Progress | None = None
-
-    @property
-    def recording(self) -> _core.HistogramRecord:
-        """The native form of the system."""
-        return recording_of(self.system)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +67,9 @@ class Method(ABC):
 
     def check(self, system: System) -> None:
         """Raise ValueError, naming mode and method, for a system that this method does not hold for."""
-        from mars_lidar.reconstruct import METHODS
-
         mode = system.detector.mode
         if mode not in self.modes:
-            able = " or ".join(repr(name) for name, method in METHODS.items() if mode in method.modes)
+            able = " or ".join(repr(each.name) for each in _known() if mode in each.modes)
             raise ValueError(
                 f"method {self.name!r} is not for detectors of mode {mode!r}, only for "
                 f"{', '.join(map(repr, self.modes))}; use {able}"
@@ -106,6 +86,14 @@ class Method(ABC):
     @abstractmethod
     def estimate(self, histograms: Histograms) -> Estimates:
         """Estimates of every pixel; the system is one that `check` let pass."""
+
+
+def _known(kind: Any = None) -> Iterator[type[Method]]:
+    """All methods that were defined, in that order."""
+    for each in (kind or Method).__subclasses__():
+        if hasattr(each, "name"):
+            yield each
+        yield from _known(each)
 
 
 def tell_effects(system: System) -> None:
@@ -140,8 +128,6 @@ class RateMethod(Method):
 
     def rates(self, cube: ArrayLike, system: System, threads: int | None) -> FloatArray:
         """Photons per period in each bin (..., bins) behind the histograms (..., bins)."""
-        from mars_lidar.reconstruct.histograms import checked
-
         given, shape = checked(cube, system, threads)
         self.check(system)
         return corrected_rates(given, self.correction).reshape(*shape, system.bins)
@@ -157,7 +143,7 @@ def window_estimates(
     total: FloatArray | None = None,
 ) -> Estimates:
     """Delay by a filter or the peak, signal and background by the window around it, of corrected rates."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     out, flags = np.empty((len(given.counts), 5)), np.empty(len(given.counts), np.uint8)
     _core.window_estimates(
@@ -183,7 +169,7 @@ def corrected_rates(
     given: Histograms, correction: int, *, steps: int = 0, tolerance: float = 0.0, total: FloatArray | None = None
 ) -> FloatArray:
     """Photons per period in each bin (pixels, bins)."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)
     _core.corrected_rates(

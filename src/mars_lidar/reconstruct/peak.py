@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mars_lidar.reconstruct.method import Estimates, Histograms, Method, window_estimates
+from mars_lidar.reconstruct.histograms import Histograms
+from mars_lidar.reconstruct.method import Estimates, Method, window_estimates
 
 
 @dataclass(frozen=True)

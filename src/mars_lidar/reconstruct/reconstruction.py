@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruct.histograms import checked
-from mars_lidar.reconstruct.method import Estimates, Flags, FloatArray, Method, Progress, tell_effects
+from mars_lidar.reconstruct.histograms import Progress, checked
+from mars_lidar.reconstruct.method import Estimates, Flags, FloatArray, Method, tell_effects
+from mars_lidar.reconstruct.methods import METHODS
 
 ATTENUATIONS = ("none", "inverse_square")
 
@@ -121,8 +122,6 @@ def reconstruct(
 
 def find_method(method: str | Method) -> Method:
     """The method of that name, of default settings, or the method itself."""
-    from mars_lidar.reconstruct import METHODS
-
     if isinstance(method, Method):
         return method
     return METHODS[checks.choice("method", method, tuple(METHODS))]

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar.reconstruct.histograms import checked, default_threads
-from mars_lidar.reconstruct.method import Estimates, Method, Progress, tell_effects
+from mars_lidar._base.threads import thread_count
+from mars_lidar.reconstruct.histograms import Progress, checked
+from mars_lidar.reconstruct.method import Estimates, Method, tell_effects
 from mars_lidar.reconstruct.reconstruction import Reconstruction, assembled, find_method
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def reconstruct_stored(
     if attenuation is None:
         attenuation = str(cube.flux.info.get("attenuation", "none"))
     scale = true_level(cube, attenuation) if level is None else checks.real("level", level, low=0.0, strict_low=True)
-    team = default_threads() if threads is None else threads
+    team = thread_count(threads)
     shape = cube.shape[:3]
     buffers: dict[str, dict[str, np.ndarray]] = {method.name: {} for method in used}
     seconds = dict.fromkeys(buffers, 0.0)

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,38 @@ from mars_lidar._base import checks
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
-if TYPE_CHECKING:
-    from mars_lidar.scene.scene import Scene
-
 FloatArray = NDArray[np.float64]
 
 _ATTENUATIONS = ("none", "inverse_square")
 _AMBIENTS = ("uniform", "reflectivity", "map")
 
 
+class Surface(Protocol):
+    """What radiometry needs to know of a surface, such as a `Scene`; maps are (H, W)."""
+
+    @property
+    def depth_m(self) -> FloatArray:
+        """Range along the ray, m; NaN where there is no return."""
+
+    @property
+    def reflectivity(self) -> FloatArray:
+        """Share of the laser light that comes back, relative."""
+
+    @property
+    def background(self) -> FloatArray | None:
+        """Relative ambient light, where there is a map of it."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Pixels with a return."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+
+
 def scene_flux(
-    layers: Sequence[Scene],
+    layers: Sequence[Surface],
     system: System,
     signal: float,
     sbr: float,
@@ -87,7 +108,7 @@ def scene_flux(
     return flux
 
 
-def _ambient_light(layers: Sequence[Scene], name: str) -> FloatArray:
+def _ambient_light(layers: Sequence[Surface], name: str) -> FloatArray:
     """Relative ambient light (H, W)."""
     scene = layers[0]
     if name == "uniform":
@@ -102,7 +123,7 @@ def _ambient_light(layers: Sequence[Scene], name: str) -> FloatArray:
     return scene.background
 
 
-def _returned(layers: Sequence[Scene], attenuation: str) -> list[FloatArray]:
+def _returned(layers: Sequence[Surface], attenuation: str) -> list[FloatArray]:
     """Relative returned laser light of each layer (H, W), 0 where nothing returns."""
     share = [np.where(one.valid, one.reflectivity, 0.0) for one in layers]
     if attenuation == "inverse_square":

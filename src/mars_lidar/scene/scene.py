@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.late import late
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -250,11 +251,11 @@ class Scene:
         ValueError
             A file that is missing, damaged or of the wrong kind: the message names it and says why.
         """
-        from mars_lidar.io.rgbd import read_rgbd
-
         if size is not None:  # refuse a bad size before reading anything
             cls(np.ones((1, 1)), 1.0).resize(size)
-        read = read_rgbd(depth_path, image_path, depth_unit_m=depth_unit_m, focal_px=focal_px, index=index)
+        read = late("io.rgbd:read_rgbd")(
+            depth_path, image_path, depth_unit_m=depth_unit_m, focal_px=focal_px, index=index
+        )
         scene = cls(*read)
         return scene if size is None else scene.resize(size)
 

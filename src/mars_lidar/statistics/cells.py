@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.gate import PLAIN, photons_before, require_mode
+from mars_lidar.statistics.gate import PLAIN, require_mode
+from mars_lidar.statistics.gated_light import photons_before
 
 if TYPE_CHECKING:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -185,7 +186,7 @@ class Cells:
 
     def grid(self, bins: int, out_bins: int, steps: int | None = None) -> _core.ExposureGrid:
         """The native grid of `bins` bins per period; a cell is given up after `steps` bins x periods (None: many)."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         dead = self.system.dead_time_periods
         whole = math.floor(dead)
@@ -235,7 +236,7 @@ class Cells:
 
     def energies(self, bins: int) -> tuple[FloatArray, NDArray[np.int32]]:
         """Unit energies (rows, parts of bins) of the distinct signal shapes, and each cell's row (cells,)."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         parts = bins * int(_core.EXPOSURE_PARTS)
         if self.system.detector.mode == "gated":

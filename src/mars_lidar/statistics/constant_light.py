@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar.instrument.detector import Detector
-from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS, require_effects
+from mars_lidar.instrument.detector import Detector, require_effects
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 
 _EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", *TIMING_EFFECTS)
 _TOLERANCE = 1e-12

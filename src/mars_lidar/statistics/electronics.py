@@ -21,7 +21,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, FloatArray
 from mars_lidar.statistics.electronics_grid import MOST_EFFORT, Effort, RecordGrid, RecordRun
 from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 

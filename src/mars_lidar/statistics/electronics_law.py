@@ -105,7 +105,7 @@ def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArra
         left[0] -= a_period * index.size
         value = value + (z[index] - 1.0) * records.sum(-1)
         state = np.concatenate([records, run.armed[:, None], value[:, None]], axis=1)
-        # as in native/exposure_characteristic.h: the state repeats but for a factor, by least squares
+        # as in native/laws/exposure_characteristic.h: the state repeats but for a factor, by least squares
         size, norm = np.abs(state).sum(-1), np.maximum((np.abs(before) ** 2).sum(-1), 1e-300)
         best = (before.conj() * state).sum(-1) / norm
         moved = np.abs(state - best[:, None] * before).sum(-1) + np.abs(best - ratio) * size

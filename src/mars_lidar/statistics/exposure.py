@@ -7,7 +7,6 @@ Derivation and equation numbers: docs/theory_exposure.md.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.threads import thread_count
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
@@ -27,7 +27,7 @@ from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.warm import NOT_WARM, warm_history
 
 if TYPE_CHECKING:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
 Progress = Callable[[int, int], object]
 
@@ -231,16 +231,6 @@ def _too_long(cells: Cells, steps: int | None) -> str:
     )
 
 
-def thread_count(threads: int | None) -> int:
-    """Threads asked for, or all processors that this process may use."""
-    if threads is not None:
-        return checks.integer("threads", threads, low=1, high=1024)
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on this system
-        return os.cpu_count() or 1
-
-
 def _darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
     """Nothing is registered where nothing arrives."""
     for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
@@ -265,7 +255,7 @@ def _run(
     cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, steps: int | None = None
 ) -> Exposure:
     """One pass of the recursion over all cells on one grid."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     cells.check_history(bins)
     if steps is not None and min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) * bins > steps:
@@ -308,7 +298,7 @@ def _moments(
     history: FloatArray | None = None,
 ) -> None:
     """One pass of the native recursion; `history` (cells, 2 bins + 2) is the warm state where it is known."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     energy, row = cells.energies(bins)
     signal, background = cells.native_flux
@@ -361,7 +351,7 @@ def _shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
 
 def recorded_light(cells: Cells, out_bins: int) -> FloatArray:
     """Photons (cells, out_bins) of a period: all of them are registered where there is no dead time."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     parts, step = int(_core.EXPOSURE_PARTS), _poisson_bins(out_bins)
     rate = np.empty((cells.size, out_bins))

@@ -1,24 +1,10 @@
-"""Which statistics treat which mode and effects of the detector, and the flux behind a gate.
-
-A gate that repeats every period makes a gated pixel a free-running one that sees the flux inside of the gate, so that
-the exposure recursion holds for it with that flux: docs/detectors.md.
-"""
+"""Which statistics treat which mode and effects of the detector, and when a gate is open."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
-from numpy.typing import NDArray
-
-from mars_lidar.instrument.detector import Mode
-from mars_lidar.instrument.effects import LIGHT_EFFECTS, require_effects
+from mars_lidar.instrument.detector import Mode, require_effects
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
-
-if TYPE_CHECKING:
-    from mars_lidar.statistics.cells import Cells
-
-FloatArray = NDArray[np.float64]
 
 PLAIN: tuple[Mode, ...] = ("nonparalyzable",)
 _INSTEAD = {
@@ -48,9 +34,7 @@ def require_mode(
 
 
 def _simulated(effect: str) -> str:
-    from mars_lidar.engines import ENGINES
-
-    able = " or ".join(repr(name) for name, engine in ENGINES.items() if effect in engine.effects)
+    able = "'sequential'" if effect == "crosstalk" else "'exact' or 'sequential'"
     return f"; simulate it with engine {able}"
 
 
@@ -59,33 +43,3 @@ def open_parts(system: System) -> tuple[tuple[float, float], ...]:
     start, _, width = system.detector.gate_periods(system.period_ns)
     end = start + width
     return ((start, end),) if end <= 1.0 else ((0.0, end - 1.0), (start, 1.0))
-
-
-def photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
-    """Photons that reach each cell between the start of the period and `edges` (n,) in [0, 1]: (cells, n).
-
-    What lies outside of the detector's gate is left out.
-    """
-    if cells.system.detector.mode != "gated":
-        return _photons_before(cells, edges)
-    total = np.zeros((cells.size, edges.size))
-    for low, high in open_parts(cells.system):
-        bounded = np.concatenate([[low], np.clip(edges, low, high)])
-        inside = _photons_before(cells, bounded)
-        total += inside[:, 1:] - inside[:, :1]
-    return total
-
-
-def _photons_before(cells: Cells, edges: FloatArray) -> FloatArray:
-    if cells.waveform is None:
-        period = cells.system.period_ns
-        at = np.concatenate([[0.0], edges])
-        energy = cells.system.pulse.wrapped_cumulative((at - cells.delay[:, None]) * period, period)
-        energy = energy[:, 1:] - energy[:, :1]
-    else:
-        knots = np.linspace(0.0, 1.0, cells.waveform.shape[-1] + 1)
-        rows, used = np.unique(cells.row, return_inverse=True)
-        below = [np.concatenate([[0.0], np.cumsum(cells.waveform[row])]) for row in rows]
-        energy = np.stack([np.interp(edges, knots, b) for b in below])[used.reshape(-1)]
-    total = cells.signal[:, None] * energy + cells.background[:, None] * edges
-    return np.asarray(np.maximum(total, 0.0), dtype=np.float64)

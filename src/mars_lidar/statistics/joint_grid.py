@@ -50,7 +50,7 @@ class FoldedGrid:
     @classmethod
     def of(cls, cells: Cells, bins: int) -> FoldedGrid:
         """The only cell of `cells` on `bins` bins."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         dead = cells.system.dead_time_periods
         whole = int(np.floor(dead))
@@ -153,7 +153,7 @@ class FoldedGrid:
         return y
 
     def _forward(self, source: FloatArray) -> FloatArray:
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         source = np.ascontiguousarray(source)
         if not self.direct:
@@ -180,7 +180,7 @@ class FoldedGrid:
         return x
 
     def _adjoint(self, mass: FloatArray, moment: FloatArray | None, tolerance: float) -> FloatArray:
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         m, n = mass.shape
         y = np.zeros((m, 2, n))

@@ -21,7 +21,7 @@ class Pixel:
     """One pixel on one grid, windows on `out` bins: by the closed form, or through all periods."""
 
     def __init__(self, cells: Cells, bins: int, out: int) -> None:
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         cells.check_history(bins)
         self.cells, self.out = cells, out
@@ -86,7 +86,7 @@ class Pixel:
 
     def _columns(self, weights: FloatArray) -> FloatArray:
         """(m, out) covariances of windows with every bin (6.1)-(6.4)."""
-        from mars_lidar import _core
+        from mars_lidar._base.native import _core
 
         grid = self.grid
         columns = np.empty(weights.shape)

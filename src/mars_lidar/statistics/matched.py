@@ -1,6 +1,6 @@
 """A law of the count with four given cumulants, for tables that hold no more of the exact law.
 
-The law is native/matched_law.h, which engines draw from: here its probabilities, and where it can be trusted.
+The law is native/laws/matched_law.h, which engines draw from: here its probabilities, and where it can be trusted.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Win
         )
     start = np.concatenate([[0], np.cumsum(size)])
     flat = np.empty(int(start[-1]))
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     _core.matched_pmf(cumulants=given, first=first, start=start, out=flat, threads=team)
     return [Window(int(first[k]), flat[start[k] : start[k + 1]].copy(), _OUTSIDE) for k in range(first.size)]
@@ -85,7 +85,7 @@ def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | N
         raise ValueError(f"uniform must be of shape ({given.shape[0]}, draws), got {u.shape}")
     if not ((u > 0.0) & (u < 1.0)).all():
         raise ValueError(f"uniform must be in (0, 1), got {u[~((u > 0.0) & (u < 1.0))][0]:g}")
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     out = np.empty(u.shape, np.int64)
     _core.matched_draw(cumulants=given, uniform=u, out=out, threads=team)
@@ -101,7 +101,7 @@ def trusted(cumulants: ArrayLike, *, threads: int | None = None) -> NDArray[np.b
 
 
 def _team(threads: int | None) -> int:
-    from mars_lidar.statistics.exposure import thread_count
+    from mars_lidar._base.threads import thread_count
 
     return thread_count(threads)
 
@@ -121,7 +121,7 @@ def _checked(cumulants: ArrayLike) -> FloatArray:
 
 
 def _support(given: FloatArray, team: int) -> tuple[IndexArray, IndexArray, NDArray[np.bool_]]:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     cells: tuple[Any] = (given.shape[0],)
     first, last = np.empty(cells, np.int64), np.empty(cells, np.int64)

@@ -17,7 +17,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, FloatArray
-from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 _MAX_BINS = 2**20

@@ -274,7 +274,7 @@ def _characteristic(
     cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, purse: Purse | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
     dead = cells.system.dead_time_periods

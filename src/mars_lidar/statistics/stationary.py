@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.threads import thread_count
 from mars_lidar.statistics.cells import Cells, FloatArray
-from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED, recorded_light, thread_count
+from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED, recorded_light
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.warm import warm_history
 
@@ -42,7 +43,7 @@ def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threa
 
 
 def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     result = np.empty((cells.size, out_bins))
     settled = np.empty(cells.size, np.int64)

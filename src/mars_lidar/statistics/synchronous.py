@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.statistics.cells import Cells, FloatArray
-from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.pmf import Window
 

@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.threads import thread_count
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.chain import Rearm
-from mars_lidar.statistics.exposure import thread_count
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.table.axes import Grid, axis_values, describe
-from mars_lidar.table.cache import request_key
-from mars_lidar.table.entries import Entries, Progress, exposure_entries
-from mars_lidar.table.error import QuantisationError, long_error
+from mars_lidar.table.entries import Progress
+from mars_lidar.table.error import QuantisationError, long_error, quantisation_error
+from mars_lidar.table.law import law_error
 from mars_lidar.table.node_laws import NodeLaws, node_laws
+from mars_lidar.table.nodes import Method, N
+from mars_lidar.table.recipe import Recipe
 from mars_lidar.table.refine import refined_axes
-from mars_lidar.table.renewal_entries import renewal_entries
+from mars_lidar.table.request import request_key
 from mars_lidar.table.start_phase import StartPhases, start_phases
-from mars_lidar.table.table import Method, Table
 
 _METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
 _ERROR_SAMPLES = 128  # pixels on which a table is checked when it is built
@@ -32,42 +32,21 @@ _ATTEMPTS = 4  # of refining, each with half the error of the one before
 Axes = tuple[FloatArray, FloatArray]
 
 
-@dataclass(frozen=True, eq=False)
-class Recipe:
-    """How entries are evaluated."""
-
-    method: Method
-    rearm: Rearm
-    tolerance: float
-    threads: int
-
-    def entries(
-        self, signal: FloatArray, background: FloatArray, system: System, progress: Progress | None = None
-    ) -> Entries:
-        """Entries of cells (n,)."""
-        if self.method == "mars":
-            return renewal_entries(
-                signal, background, system, rearm=self.rearm, threads=self.threads, progress=progress
-            )
-        return exposure_entries(
-            signal, background, system, tolerance=self.tolerance, threads=self.threads, progress=progress
-        )
-
-
 def build(
+    make: type[N],
     system: System,
     signal: Grid,
     background: Grid,
     *,
-    method: Method,
-    rearm: Rearm,
-    refine: float | None,
-    tolerance: float,
-    check_law: bool,
-    threads: int | None,
-    progress: Progress | None,
-) -> Table:
-    """See `Table.build`."""
+    method: Method = "exposure",
+    rearm: Rearm = "centre",
+    refine: float | None = None,
+    tolerance: float = 1e-4,
+    check_law: bool = False,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> N:
+    """A table of the class `make`; arguments and errors as `Table.build`."""
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     require_mode("a table", system)
@@ -86,12 +65,12 @@ def build(
     recipe = Recipe(method, rearm, tolerance, thread_count(threads))
     began = time.perf_counter()
     if goal is None:
-        table = _evaluated(system, axes, recipe, progress)
-        error = table.quantisation_error(samples=_ERROR_SAMPLES, threads=recipe.threads)
+        table = _evaluated(make, system, axes, recipe, progress)
+        error = quantisation_error(table, "bilinear", _ERROR_SAMPLES, 0, None, recipe.threads)
     else:
-        table, error = _refined(system, axes, recipe, goal, progress)
+        table, error = _refined(make, system, axes, recipe, goal, progress)
     longest = long_error(table, _ERROR_SAMPLES, recipe.threads)
-    law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
+    law = law_error(table, 50, 0, None, recipe.threads).to_dict() if check_law else None
     table.provenance.update(
         key=request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
         refine=goal,
@@ -103,7 +82,7 @@ def build(
     return table
 
 
-def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:
+def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> N:
     signal, background = axes
     check_memory(
         2 * 4 * signal.size * background.size * system.bins,
@@ -133,19 +112,19 @@ def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | 
     if progress is not None:
         progress(total, total)
     provenance = {"version": __version__, "signal": describe(signal), "background": describe(background)}
-    return Table(
+    return make(
         system, recipe.method, signal, background, recipe.rearm, recipe.tolerance, provenance, entries, phases, laws
     )
 
 
 def _refined(
-    system: System, axes: Axes, recipe: Recipe, goal: float, progress: Progress | None
-) -> tuple[Table, QuantisationError]:
+    make: type[N], system: System, axes: Axes, recipe: Recipe, goal: float, progress: Progress | None
+) -> tuple[N, QuantisationError]:
     inner = goal
     for _ in range(_ATTEMPTS):
         axes = refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
-        table = _evaluated(system, axes, recipe, progress)
-        error = table.quantisation_error(samples=4 * _ERROR_SAMPLES, threads=recipe.threads)
+        table = _evaluated(make, system, axes, recipe, progress)
+        error = quantisation_error(table, "bilinear", 4 * _ERROR_SAMPLES, 0, None, recipe.threads)
         if error.largest <= goal:
             return table, error
         inner *= 0.5

@@ -6,25 +6,20 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
 import os
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mars_lidar._version import __version__
+from mars_lidar._base.files import reason
 from mars_lidar.instrument.system import System
-from mars_lidar.io.store import reason
-from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.table.axes import Grid, axis_values
+from mars_lidar.table.build import build
+from mars_lidar.table.nodes import N, Nodes
+from mars_lidar.table.request import KEY_LENGTH, request_key
+from mars_lidar.table.storage import load, save
 
-if TYPE_CHECKING:
-    from mars_lidar.table.table import Table
-
-FORMAT = 2
 SUFFIX = ".h5"
-_KEY_LENGTH = 24
 
 
 def directory() -> Path:
@@ -37,39 +32,11 @@ def directory() -> Path:
     return root / "mars-lidar"
 
 
-def request_key(
-    system: System,
-    axes: tuple[FloatArray, FloatArray],
-    *,
-    method: str,
-    rearm: str,
-    refine: float | None,
-    tolerance: float,
-) -> str:
-    """Hash of all that decides a table but its cycles, which many tables do not depend on."""
-    instrument = system.to_dict()
-    del instrument["cycles"]
-    request = {
-        "format": FORMAT,
-        "version": __version__,
-        "system": instrument,
-        "axes": [[value.hex() for value in axis.tolist()] for axis in axes],
-        "method": method,
-        "rearm": rearm,
-        "refine": refine,
-        "tolerance": tolerance,
-    }
-    text = json.dumps(request, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]
-
-
-def cached(system: System, signal: Grid, background: Grid, **options: Any) -> Table:
+def cached(make: type[N], system: System, signal: Grid, background: Grid, **options: Any) -> N:
     """The table from the cache, or built and put there; where nothing can be written, built, with a warning."""
-    from mars_lidar.table.table import Table
-
-    own, found = _search(system, signal, background, options)
+    own, found = _search(make, system, signal, background, options)
     if found is None:
-        table = Table.build(system.detected(), signal, background, **options)
+        table = build(make, system.detected(), signal, background, **options)
         try:
             _keep(table, own)
         except OSError as error:
@@ -80,26 +47,24 @@ def cached(system: System, signal: Grid, background: Grid, **options: Any) -> Ta
                 stacklevel=3,
             )
             return table
-    return Table.load(found or own, system)
+    return load(make, found or own, system)
 
 
-def cached_path(system: System, signal: Grid, background: Grid, **options: Any) -> Path:
+def cached_path(make: type[Nodes], system: System, signal: Grid, background: Grid, **options: Any) -> Path:
     """File of the table in the cache; built and put there where it is not.
 
     A table made for another number of cycles is taken where every entry of it holds for those of `system`.
     """
-    from mars_lidar.table.table import Table
-
-    own, found = _search(system, signal, background, options)
+    own, found = _search(make, system, signal, background, options)
     if found is None:
-        _keep(Table.build(system.detected(), signal, background, **options), own)
+        _keep(build(make, system.detected(), signal, background, **options), own)
     return found or own
 
 
-def _search(system: System, signal: Grid, background: Grid, options: dict[str, Any]) -> tuple[Path, Path | None]:
+def _search(
+    make: type[Nodes], system: System, signal: Grid, background: Grid, options: dict[str, Any]
+) -> tuple[Path, Path | None]:
     """Where the table belongs, and the file that serves, if there is one."""
-    from mars_lidar.table.table import Table
-
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     system = system.detected()
@@ -121,16 +86,16 @@ def _search(system: System, signal: Grid, background: Grid, options: dict[str, A
     others = sorted(folder.glob(f"{key}-*{SUFFIX}")) if folder.is_dir() else []
     for path in [own, *(other for other in others if other != own)]:
         with contextlib.suppress(OSError, ValueError):  # absent, out of reach, damaged, or of too few cycles
-            law = Table.load(path, system).provenance["law"]
+            law = load(make, path, system).provenance["law"]
             if law is not None or not chosen.get("check_law", False):
                 return own, path
     return own, None
 
 
-def _keep(table: Table, own: Path) -> None:
+def _keep(table: Nodes, own: Path) -> None:
     own.parent.mkdir(parents=True, exist_ok=True)
     mine = own.with_name(f"{own.stem}-{os.getpid()}{SUFFIX}")  # several processes may build the same table at once
-    table.save(mine, overwrite=True)
+    save(table, mine, overwrite=True)
     os.replace(mine, own)
 
 
@@ -154,4 +119,4 @@ def clear(folder: Path | None = None) -> tuple[int, int]:
 
 def _is_ours(name: str) -> bool:
     key, _, rest = name.partition("-")
-    return len(key) == _KEY_LENGTH and all(c in "0123456789abcdef" for c in key) and SUFFIX in rest
+    return len(key) == KEY_LENGTH and all(c in "0123456789abcdef" for c in key) and SUFFIX in rest

@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.threads import thread_count
 from mars_lidar.statistics.cells import FloatArray
-from mars_lidar.statistics.exposure import exposure_moments, thread_count
+from mars_lidar.statistics.exposure import exposure_moments
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
-
-if TYPE_CHECKING:
-    from mars_lidar.table.table import Interpolation, Table
+from mars_lidar.table.nodes import Interpolation, Nodes
+from mars_lidar.table.recipe import Recipe
 
 # total variation between normal laws that differ a little: 0.399 per standard deviation of the mean, 0.242 per
 # relative change of the variance
@@ -90,7 +90,7 @@ class QuantisationError:
         return dataclasses.asdict(self)
 
 
-def long_error(table: Table, samples: int, threads: int | None) -> QuantisationError | None:
+def long_error(table: Nodes, samples: int, threads: int | None) -> QuantisationError | None:
     """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
     if table.system.cycles != MOST_CYCLES and not table.entries.serves(MOST_CYCLES).all():
         return None
@@ -101,11 +101,9 @@ def long_error(table: Table, samples: int, threads: int | None) -> QuantisationE
 
 
 def quantisation_error(
-    table: Table, interpolation: Interpolation, samples: int, seed: int, cycles: int | None, threads: int | None
+    table: Nodes, interpolation: Interpolation, samples: int, seed: int, cycles: int | None, threads: int | None
 ) -> QuantisationError:
     """See `Table.quantisation_error`."""
-    from mars_lidar.table.build import Recipe
-
     samples = checks.integer("samples", samples, low=1, high=1_000_000)
     rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     periods = table.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
@@ -160,7 +158,7 @@ def random_pixels(rng: np.random.Generator, axis: FloatArray, samples: int, belo
 
 
 def _delayed(
-    table: Table,
+    table: Nodes,
     interpolation: Interpolation,
     rng: np.random.Generator,
     signal: FloatArray,

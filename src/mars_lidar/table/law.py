@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar.statistics.pmf import Window
 from mars_lidar.table.error import random_pixels
-
-if TYPE_CHECKING:
-    from mars_lidar.table.table import Table
+from mars_lidar.table.nodes import Nodes
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class LawError:
         return dataclasses.asdict(self)
 
 
-def law_error(table: Table, samples: int, seed: int, cycles: int | None, threads: int | None) -> LawError:
+def law_error(table: Nodes, samples: int, seed: int, cycles: int | None, threads: int | None) -> LawError:
     """See `Table.law_error`."""
     from mars_lidar.statistics.law import count_law
     from mars_lidar.statistics.matched import matched_pmf

@@ -98,7 +98,7 @@ def evaluate(
     threads: int,
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
     """Rows, weights and cumulants (P, 4) each of pixels (P,) inside the axes; `phase` in [0, 1) periods."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     rows = np.empty((signal.size, 4), np.int64)
     weights, out = np.empty((signal.size, 4)), np.empty((signal.size, 4))

@@ -138,7 +138,7 @@ def _blocks(grids: IndexArray) -> list[tuple[IndexArray, int]]:
 
 def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tuple[FloatArray, IndexArray]:
     """Corrections (cells, p, 4) at phases on the grid of `bins`, and when they settled (cells,) (P7)."""
-    from mars_lidar import _core
+    from mars_lidar._base.native import _core
 
     cells.check_history(bins)
     energy, shape = cells.energies(bins)

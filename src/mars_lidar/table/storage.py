@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import TemporarySibling, check_target
 from mars_lidar.instrument.system import System
-from mars_lidar.io.store import TemporarySibling, check_target
-from mars_lidar.table.cache import FORMAT
 from mars_lidar.table.entries import Entries
 from mars_lidar.table.node_laws import NodeLaws
+from mars_lidar.table.nodes import N, Nodes
+from mars_lidar.table.request import FORMAT
 from mars_lidar.table.start_phase import StartPhases
-
-if TYPE_CHECKING:
-    from mars_lidar.table.table import Table
 
 _KIND = "mars-lidar table"
 _SUFFIXES = (".h5", ".hdf5")
@@ -25,9 +23,9 @@ _MAPPED = ("shape", "startup")
 _READABLE = (1, FORMAT)  # the first kept no laws of entries
 
 
-def save(table: Table, path: Path, *, overwrite: bool) -> None:
+def save(table: Nodes, path: Path, *, overwrite: bool) -> None:
     """Write all of a table; the file gets its name when it is complete."""
-    from mars_lidar.io.hdf5 import new_file
+    from mars_lidar._base.hdf5 import new_file
 
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
@@ -39,10 +37,8 @@ def save(table: Table, path: Path, *, overwrite: bool) -> None:
             file.create_dataset(name, data=array)
 
 
-def load(path: Path, system: System | None) -> Table:
-    """See `Table.load`."""
-    from mars_lidar.table.table import Table
-
+def load(make: type[N], path: Path, system: System | None) -> N:
+    """A table of the class `make`; arguments and errors as `Table.load`."""
     if system is not None and not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     header, arrays = _read(path)
@@ -58,7 +54,7 @@ def load(path: Path, system: System | None) -> Table:
         **{n: arrays["phase_" + n] for n in ("signal", "background", "phase", "correction", "settled")}
     )
     laws = NodeLaws(**{name: arrays["law_" + name] for name in ("row", "first", "offsets", "pmf")})
-    table = Table(
+    table = make(
         system,
         header["method"],
         arrays["signal"],
@@ -98,7 +94,7 @@ def read_header(path: Path) -> dict[str, Any]:
     }
 
 
-def _header(table: Table) -> dict[str, Any]:
+def _header(table: Nodes) -> dict[str, Any]:
     made_for = table.system.replace(cycles=table.entries.cycles)
     return {
         "kind": _KIND,
@@ -111,7 +107,7 @@ def _header(table: Table) -> dict[str, Any]:
     }
 
 
-def _arrays(table: Table) -> dict[str, NDArray[Any]]:
+def _arrays(table: Nodes) -> dict[str, NDArray[Any]]:
     entries, phases = table.entries, table.start_phases
     arrays: dict[str, NDArray[Any]] = {
         "signal": table.signal,

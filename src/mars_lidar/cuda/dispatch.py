@@ -1,0 +1,94 @@
+"""Which engine runs on a GPU, and what it does there: the engines themselves know of no device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mars_lidar.cuda.exact import exact_histogram, exact_records
+from mars_lidar.cuda.feedback import feedback_histogram
+from mars_lidar.cuda.machine import Cuda
+from mars_lidar.cuda.mars import check_mars, mars_histogram
+from mars_lidar.engines.engine import Engine, Records, Task
+from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.feedback import FeedbackEngine
+from mars_lidar.engines.mars import MarsEngine
+from mars_lidar.instrument.detector import require_effects
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+
+ABLE: tuple[type[Engine], ...] = (ExactEngine, FeedbackEngine, MarsEngine)
+
+
+def check(engine: Engine, flux: Flux, system: System) -> None:
+    """Raise ValueError, naming what to use, for what `engine` cannot do on a GPU."""
+    match engine:
+        case ExactEngine():
+            _check_exact(engine, flux, system)
+        case FeedbackEngine():
+            if system.dead_time_periods == 0.0:  # the bins are Poisson numbers, which no kernel draws
+                raise ValueError(
+                    "dead_time_ns must be > 0 for engine 'feedback' on device 'cuda'; use engine 'exact' there, or "
+                    "device 'cpu'"
+                )
+        case MarsEngine():
+            if engine.reader is None:
+                raise ValueError(
+                    "table must be given for engine 'mars' on device 'cuda': without one every pixel is evaluated by "
+                    "the processor; build a mars_lidar.Table, or use device 'cpu'"
+                )
+            check_mars(float(flux.total.max()), system.cycles, system.dead_time_periods)
+        case _:
+            names = " or ".join(repr(able.name) for able in ABLE)
+            raise ValueError(
+                f"engine {engine.name!r} does not run on device 'cuda', only on 'cpu'; use engine {names}, or device "
+                "'cpu'"
+            )
+
+
+def histogram(engine: Engine, task: Task, out: Any) -> None:
+    """Fill `out` (items, bins), a C-contiguous CuPy array, with the bits of the processor.
+
+    On CuPy's current device and stream, for a task that `check` took.
+    """
+    match engine:
+        case ExactEngine():  # one exposure a thread
+            exact_histogram(task, out)
+        case FeedbackEngine():  # one pixel a thread; what the sweeps refuse is drawn exactly
+            machine = Cuda()
+            feedback_histogram(task, out, machine, _exactly(engine, machine))
+        case MarsEngine():  # one pixel a block; what lies beyond the table is evaluated by the processor
+            mars_histogram(engine, task, out, Cuda())
+        case _:
+            check(engine, task.flux, task.system)
+
+
+def records(engine: Engine, task: Task) -> Records:
+    """Registrations of a task that `check` took, in the processor's memory; ValueError where an engine draws none."""
+    if not isinstance(engine, ExactEngine):
+        raise ValueError(f"engine {engine.name!r} draws histograms only, not timestamps; use 'exact'")
+    return exact_records(task)
+
+
+def _check_exact(engine: ExactEngine, flux: Flux, system: System) -> None:
+    """On a GPU: returns of a pulse, in every mode, recorded as they are registered."""
+    if flux.waveform is not None:
+        raise ValueError("flux must have returns, not a waveform, on device 'cuda'; use device 'cpu'")
+    able = tuple(effect for effect in LIGHT_EFFECTS if effect in engine.effects)
+    require_effects("device 'cuda'", system.detector, able, lambda effect: "; use device 'cpu'")
+
+
+def _exactly(engine: FeedbackEngine, machine: Cuda) -> Any:
+    """The exact engine for pixels that feedback refuses: a waveform is drawn by the processor."""
+
+    def draw(part: Task, rows: Any) -> None:
+        if part.flux.waveform is None:
+            exact_histogram(part, rows)
+            return
+        here = np.empty((part.items, part.system.bins), rows.dtype)
+        ExactEngine(engine.level).histogram(part, here)
+        rows[...] = machine.array(here)
+
+    return draw

@@ -1,0 +1,71 @@
+"""The engines by name: which there are, and which of them to use where one cannot."""
+
+from __future__ import annotations
+
+from typing import Unpack
+
+from mars_lidar._base import checks
+from mars_lidar.engines.auto import AutoEngine
+from mars_lidar.engines.engine import Engine
+from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.feedback import FeedbackEngine
+from mars_lidar.engines.mars import MarsEngine
+from mars_lidar.engines.options import EngineOptions, given
+from mars_lidar.engines.poisson import PoissonEngine
+from mars_lidar.engines.renewal import RenewalEngine
+from mars_lidar.engines.sequential import SequentialEngine
+from mars_lidar.instrument.detector import require_effects
+from mars_lidar.instrument.system import System
+
+ENGINES: dict[str, Engine] = {
+    engine.name: engine
+    for engine in (
+        ExactEngine(),
+        FeedbackEngine(),
+        AutoEngine(),
+        SequentialEngine(),
+        MarsEngine(),
+        RenewalEngine(),
+        PoissonEngine(),
+    )
+}
+
+ANY_SYSTEM = tuple(name for name, engine in ENGINES.items() if engine.any_system)
+
+
+def check_detector(engine: Engine, system: System) -> None:
+    """Raise ValueError, naming the engines to use, where `engine` does not do the detector's mode or effects."""
+    mode = system.detector.mode
+    if mode not in engine.modes:
+        able = " or ".join(repr(name) for name, each in ENGINES.items() if mode in each.modes)
+        raise ValueError(
+            f"engine {engine.name!r} does not do mode {mode!r} of the detector, only "
+            f"{', '.join(map(repr, engine.modes))}; use {able}"
+        )
+
+    def instead(effect: str) -> str:
+        return "; use " + " or ".join(repr(name) for name, each in ENGINES.items() if effect in each.effects)
+
+    require_effects(f"engine {engine.name!r}", system.detector, engine.effects, instead)
+
+
+def find_engine(engine: str | Engine, **options: Unpack[EngineOptions]) -> Engine:
+    """The engine of that name, of default settings but for the options that are not None; or the engine itself."""
+    chosen = given(options)
+    if isinstance(engine, Engine):
+        found = engine
+        if chosen:
+            name = next(iter(chosen))
+            raise TypeError(f"{name} must be None where engine is an Engine, which has its own, got {chosen[name]!r}")
+        return found
+    if engine == "neural":
+        raise ValueError(
+            "engine 'neural' is no longer in the package: from a checkout, give studies.neural.NeuralEngine(), "
+            "which simulate takes as engine (docs/neural.md)"
+        )
+    found = ENGINES[checks.choice("engine", engine, tuple(ENGINES))]
+    for name in chosen:
+        if name not in found.options:
+            takes = ", ".join(found.options) if found.options else "none"
+            raise TypeError(f"{name} must be None for engine {engine!r} (its options: {takes}), got {chosen[name]!r}")
+    return type(found)(**chosen) if chosen else found

@@ -1,0 +1,176 @@
+"""Absolute times of photons in files without a header: MATLAB ``.mat`` (v5, v7.3) and NumPy ``.npz`` of others.
+
+A vector holds the times of one pixel; a cell array (H, W) those of an image, empty cells and scalars included.
+Times count from a laser pulse, in a unit that the caller gives (or the end of a name tells: ``_ns``, ``_ps``).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.light.timestamps import Timestamps
+
+_BINS = 1024  # of times that are no whole numbers of a unit, where none are asked for
+_MOST_BINS = 2**20
+_PERIODS = ("syncPeriod", "sync_period", "period")  # names under which files give the laser period, in their unit
+_SUFFIX_NS = {"_ps": 1e-3, "_ns": 1.0, "_us": 1e3, "_s": 1e9}
+
+_Cells = NDArray[Any]  # (H, W) of arrays of times
+
+
+def read(
+    path: Path, period_ns: float | None, bins: int | None, unit_ns: float | None, variable: str | None
+) -> Timestamps:
+    """Read a stream; see `Timestamps.load`."""
+    try:
+        found = _mat(path) if path.suffix == ".mat" else _npz(path)
+    except Exception as error:  # whatever the readers make of a damaged file: they know a dozen errors
+        raise ValueError(f"{path} cannot be read ({error})") from error
+    name, cells = _chosen(path, found, variable)
+    unit = unit_ns
+    if unit is None:
+        unit = next((ns for ending, ns in _SUFFIX_NS.items() if name.endswith(ending)), None)
+    if unit is None:
+        raise ValueError(f"{path}: nothing tells the unit of {name!r}: give unit_ns (1 if its times are in ns)")
+    if period_ns is None:
+        period_ns = _period(found, unit)
+    if period_ns is None:
+        raise ValueError(f"{path} does not tell the laser period: give period_ns")
+    return _timestamps(path, name, cells, unit, period_ns, bins)
+
+
+def _timestamps(path: Path, name: str, cells: _Cells, unit: float, period_ns: float, bins: int | None) -> Timestamps:
+    from mars_lidar.io.streams.attributes import from_attributes
+
+    height, width = cells.shape
+    counts = np.array([cell.size for cell in cells.ravel()], np.int64)
+    total = int(counts.sum())
+    raw = np.concatenate([np.empty(0), *(np.asarray(cell).ravel() for cell in cells.ravel())])
+    bad = ~(np.isfinite(raw) & (raw >= 0))
+    if bad.any():
+        raise ValueError(f"{path}: times of {name!r} must be finite and >= 0, got {raw[int(np.argmax(bad))]}")
+    pixel = np.repeat(np.arange(counts.size), counts)
+    disordered = int(((np.diff(raw) < 0) & (np.diff(pixel) == 0)).sum())
+    clocked = total > 0 and bool((raw == np.floor(raw)).all())
+    # a whole number of units is known to a unit: its middle
+    times_ns = (raw + 0.5) * unit if clocked else raw * unit
+    if total > counts.size and times_ns.max() < period_ns:
+        raise ValueError(
+            f"{path}: all times of {name!r} lie within one laser period of {period_ns:g} ns: these are phases, and "
+            "without the period that each photon fell into there are no intervals; give absolute times"
+        )
+    order = np.lexsort((times_ns, pixel))
+    times_ns = times_ns[order]
+    cycle = np.floor(times_ns / period_ns)
+    if total and cycle.max() >= 2**31:
+        raise ValueError(f"{path}: a stream may span 2^31 laser periods at most, got {cycle.max():.4g}")
+    if bins is None:
+        bins = max(1, round(period_ns / unit)) if clocked and period_ns / unit <= _MOST_BINS else _BINS
+    place = np.minimum(((times_ns / period_ns - cycle) * bins).astype(np.int64), bins - 1)
+    info: dict[str, Any] = {"source": str(path)}
+    if clocked:
+        info["unit_ns"] = unit
+    if disordered:
+        info["disordered"] = disordered
+    attrs = {
+        "shape": (height, width),
+        "bins": bins,
+        "dtype": "uint16" if total < 2**16 else "uint32",
+        "period_ns": period_ns,
+        "cycles": int(cycle.max()) + 1 if total else 1,
+        "info": info,
+    }
+    return from_attributes(attrs, times_ns, cycle, place, counts)
+
+
+def _chosen(path: Path, found: dict[str, _Cells], variable: str | None) -> tuple[str, _Cells]:
+    """The variable that holds the times: the one named, the only cell array, or the only vector."""
+    if variable is not None:
+        if variable not in found:
+            raise ValueError(f"variable must be one of {', '.join(found) or 'none'} in {path}, got {variable!r}")
+        return variable, found[variable]
+    images = [name for name, cells in found.items() if cells.size > 1]
+    vectors = [name for name, cells in found.items() if cells.size == 1 and cells[0, 0].size > 1]
+    for names in (images, vectors):
+        if len(names) == 1:
+            return names[0], found[names[0]]
+    told = ", ".join(images or vectors)
+    raise ValueError(
+        f"{path} has {'several arrays that could be times: ' + told if told else 'no array of times'}; give variable"
+    )
+
+
+def _period(found: dict[str, _Cells], unit: float) -> float | None:
+    for name in _PERIODS:
+        if name in found and found[name].size == 1 and found[name][0, 0].size == 1:
+            value = float(found[name][0, 0].ravel()[0]) * unit
+            if np.isfinite(value) and value > 0:
+                return value
+    return None
+
+
+def _one(values: NDArray[Any]) -> _Cells:
+    out = np.empty((1, 1), object)
+    out[0, 0] = values.ravel()
+    return out
+
+
+def _is_times(values: Any) -> bool:
+    return isinstance(values, np.ndarray) and values.dtype.kind in "fiu" and values.size == max((0, *values.shape))
+
+
+def _npz(path: Path) -> dict[str, _Cells]:
+    with np.load(path, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    return {name: _one(values) for name, values in arrays.items() if _is_times(np.atleast_1d(values))}
+
+
+def _mat(path: Path) -> dict[str, _Cells]:
+    import h5py
+
+    return _mat_73(path) if h5py.is_hdf5(path) else _mat_5(path)
+
+
+def _mat_5(path: Path) -> dict[str, _Cells]:
+    from scipy.io import loadmat
+
+    out: dict[str, _Cells] = {}
+    for name, values in loadmat(path).items():
+        if name.startswith("__") or not isinstance(values, np.ndarray):
+            continue
+        if values.dtype == object:
+            cells = np.atleast_2d(values)
+            if all(_is_times(cell) or (isinstance(cell, np.ndarray) and cell.size == 0) for cell in cells.ravel()):
+                out[name] = cells
+        elif _is_times(values):
+            out[name] = _one(values)
+    return out
+
+
+def _mat_73(path: Path) -> dict[str, _Cells]:
+    """HDF5: a cell array is an array of references, stored transposed; an empty array holds its own size."""
+    import h5py
+
+    out: dict[str, _Cells] = {}
+    with h5py.File(path, "r") as file:
+        for name, item in file.items():
+            if not isinstance(item, h5py.Dataset):
+                continue
+            if item.dtype == h5py.ref_dtype:
+                references = np.atleast_2d(item[()]).T
+                cells = np.empty(references.shape, object)
+                for place, reference in np.ndenumerate(references):
+                    part = file[reference]
+                    empty = bool(part.attrs.get("MATLAB_empty", 0))
+                    cells[place] = np.empty(0) if empty else np.asarray(part[()]).ravel()
+                if all(cell.dtype.kind in "fiu" for cell in cells.ravel()):
+                    out[name] = cells
+            elif item.dtype.kind in "fiu" and not item.attrs.get("MATLAB_empty", 0):
+                values = np.asarray(item[()])
+                if _is_times(values):
+                    out[name] = _one(values)
+    return out

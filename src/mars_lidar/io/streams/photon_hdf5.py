@@ -1,0 +1,203 @@
+"""Photon-HDF5 0.5 (photon-hdf5.github.io), photon streams: timestamps, detectors = pixels, nanotimes.
+
+All pixels look at the same time: ``timestamps`` counts laser periods from the start of the exposure (unit in
+s), ``detectors`` is the pixel y W + x, ``nanotimes`` the time since the laser pulse in units of
+``bin width / m``, m as large as 16 bits allow (32 for more than 65536 bins): the bin is kept exactly, the
+time to half a unit. Photons are in order of time. phconvert writes and validates the file; h5py reads it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import re
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.files import INCOMPLETE_SUFFIX
+from mars_lidar._base.optional import needed
+from mars_lidar.light.timestamps import Timestamps
+
+_GROUP, _ATTRIBUTES = "mars_lidar", "attributes"  # below /user, which the format leaves to its writers
+_PHOTONS = "photon_data"
+_FULL = 2**20  # bytes free on a disk that is taken for full
+
+
+def check() -> None:
+    """Raise where the library that writes the format is missing."""
+    needed("phconvert.hdf5", "Photon-HDF5")
+
+
+def write(path: Path, times: Timestamps) -> None:
+    """Write a stream; the caller renames the file when it is whole."""
+    from mars_lidar.io.streams.attributes import attributes
+
+    save_photon_hdf5 = needed("phconvert.hdf5", "Photon-HDF5").save_photon_hdf5
+    fine = units_per_bin(times.bins)
+    kind = np.uint16 if times.bins * fine <= 2**16 else np.uint32
+    bin_ = times.bin.astype(np.int64)
+    within = (times.times_ns / times.period_ns - times.cycle) * times.bins - bin_  # of a bin: 0 to 1
+    nanotimes: NDArray[Any] = (bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)).astype(kind)
+    counts = times.counts.ravel()
+    pixels = np.arange(counts.size, dtype=np.uint16 if counts.size <= 2**16 else np.uint32)
+    detectors = np.repeat(pixels, counts)
+    # in order of time; photons at the same time keep the order of their pixels
+    order = np.argsort(times.cycle.astype(np.int64) * (times.bins * fine) + nanotimes, kind="stable")
+    period_s = 1e-9 * times.period_ns
+    rate_hz = 1.0 / period_s
+    content: dict[str, Any] = {
+        "description": "Photon stream of a single-photon LiDAR simulated by mars-lidar",
+        "acquisition_duration": period_s * times.cycles,
+        _PHOTONS: {
+            "timestamps": times.cycle[order].astype(np.int64),
+            "timestamps_specs": {"timestamps_unit": period_s},
+            "detectors": detectors[order],
+            "nanotimes": nanotimes[order],
+            "nanotimes_specs": {
+                "tcspc_unit": period_s / (times.bins * fine),
+                "tcspc_range": period_s,
+                "tcspc_num_bins": times.bins * fine,
+            },
+            "measurement_specs": {
+                "measurement_type": "generic",
+                "laser_repetition_rate": rate_hz,
+                "detectors_specs": {"spectral_ch1": pixels},
+            },
+        },
+        "setup": {
+            "num_pixels": int(counts.size),
+            "num_spots": 1,
+            "num_spectral_ch": 1,
+            "num_polarization_ch": 1,
+            "num_split_ch": 1,
+            "modulated_excitation": False,
+            "excitation_alternated": [False],
+            "excitation_cw": [False],
+            "lifetime": True,
+            "laser_repetition_rates": [rate_hz],
+            "detectors": {"id": pixels, "id_hardware": pixels, "counts": counts},
+        },
+        "user": {_GROUP: {_ATTRIBUTES: json.dumps(attributes(times))}},
+    }
+    try:
+        with warnings.catch_warnings(), open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+            warnings.simplefilter("ignore")  # of PyTables, about names that are no Python identifiers
+            save_photon_hdf5(
+                content, str(path), overwrite=True, warnings=False, compression={"complevel": 1, "complib": "zlib"}
+            )
+    except Exception as error:  # on a full disk PyTables tells a back trace, or phconvert that the file is wrong
+        told = re.search(r"errno = (\d+)", str(error))
+        if told is None and shutil.disk_usage(path.parent).free > _FULL:
+            raise
+        raise OSError(int(told[1]) if told else errno.ENOSPC, "Photon-HDF5 could not be written") from None
+    finally:
+        file = content.get("_data_file")
+        if file is not None and file.isopen:
+            file.close()
+    _rename(path, path.with_name(path.name.removesuffix(INCOMPLETE_SUFFIX)))
+
+
+def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
+    """Read a stream; `period_ns` and `bins` are for files of others."""
+    from mars_lidar.io.streams.attributes import from_attributes, measured
+
+    with _opened(path) as file:
+        if _PHOTONS not in file:
+            raise ValueError(f"{path} is not Photon-HDF5 of one spot: it has no group 'photon_data'")
+        try:
+            data = file[_PHOTONS]
+            timestamps = np.asarray(data["timestamps"][...])
+            detectors = data["detectors"][...] if "detectors" in data else np.zeros(timestamps.shape, np.uint8)
+            unit_s = float(data["timestamps_specs/timestamps_unit"][()])
+            own = file.get(f"user/{_GROUP}/{_ATTRIBUTES}")
+            attrs = {} if own is None else json.loads(_text(own[()]))
+            if "nanotimes" not in data:
+                if period_ns is None:
+                    raise ValueError("it has no nanotimes: give period_ns, and the timestamps are folded with it")
+                periods = (timestamps.astype(np.float64) + 0.5) * (1e9 * unit_s) / period_ns
+                cycle = np.floor(periods).astype(np.int64)
+                tick = 1e9 * unit_s if bins is None else period_ns / bins
+                rest = (periods - cycle) * (period_ns / tick) - 0.5
+                return measured(cycle, rest, tick, detectors, period_ns, bins, str(path), 1e9 * unit_s)
+            nanotimes = np.asarray(data["nanotimes"][...])
+            tcspc_s = _tcspc_unit(file)
+        except (KeyError, OSError, ValueError) as error:
+            told = str(error).strip("'\"")
+            raise ValueError(f"{path} cannot be read as Photon-HDF5 ({told})") from error
+        rates = file["setup/laser_repetition_rates"][...] if "setup/laser_repetition_rates" in file else []
+    if not attrs:
+        known = period_ns
+        if known is None:
+            known = 1e9 / float(rates[0]) if len(rates) else 1e9 * unit_s
+        if abs(1e9 * unit_s / known - 1.0) > 1e-3:
+            raise ValueError(
+                f"{path}: timestamps must count laser periods of {known:g} ns where there are nanotimes, "
+                f"their unit is {1e9 * unit_s:g} ns"
+            )
+        return measured(timestamps, nanotimes, 1e9 * tcspc_s, detectors, known, bins, str(path))
+    if period_ns is not None or bins is not None:
+        raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
+    fine, number = units_per_bin(int(attrs["bins"])), int(attrs["bins"])
+    order = np.argsort(detectors, kind="stable")
+    nano, cycle = nanotimes[order].astype(np.int64), timestamps[order]
+    times_ns = (cycle + (nano + 0.5) / (number * fine)) * float(attrs["period_ns"])
+    height, width = attrs["shape"]
+    counts = np.bincount(detectors, minlength=height * width)
+    return from_attributes(attrs, times_ns, cycle, nano // fine, counts)
+
+
+def is_stream(path: Path) -> bool:
+    """Whether the file has a group of photons."""
+    with _opened(path) as file:
+        return _PHOTONS in file
+
+
+def _rename(path: Path, target: Path) -> None:
+    """Put the name that the file will have where phconvert put the one that it has now."""
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        for name, value in (("filename", target.name), ("filename_full", str(target.absolute()))):
+            place = f"identity/{name}"
+            if place not in file:
+                continue
+            labels = dict(file[place].attrs)
+            del file[place]
+            file[place] = np.bytes_(value.encode())
+            file[place].attrs.update(labels)
+
+
+def _opened(path: Path) -> Any:
+    import h5py
+
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise ValueError(f"{path} is not an HDF5 file that can be read: {error}") from error
+
+
+def _tcspc_unit(file: Any) -> float:
+    """Unit of the nanotimes in s: below the photons, or (format 0.5) one per detector."""
+    place = f"{_PHOTONS}/nanotimes_specs/tcspc_unit"
+    if place in file:
+        return float(file[place][()])
+    units = np.unique(file["setup/detectors/tcspc_unit"][...])
+    if units.size != 1:
+        raise ValueError(f"its detectors have {units.size} different TCSPC units, and one is needed")
+    return float(units[0])
+
+
+def units_per_bin(bins: int) -> int:
+    """Units of the nanotimes in a histogram bin."""
+    return 2**16 // bins if bins <= 2**16 else 2**32 // (bins * 2**8)
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)

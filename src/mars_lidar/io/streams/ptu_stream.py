@@ -1,0 +1,182 @@
+"""PTU of PicoQuant, photon streams: generic T3 records with the real times of a raster scan.
+
+Written: one detector looks at the pixels one after the other, each for one exposure, so pixel k spans laser
+periods ``k * cycles`` to ``(k + 1) * cycles`` and line markers stand at both ends of each image row. Any
+reader that makes images (`ptufile.imread`) gets the cube; one that makes streams gets the photons. The fine
+time is in units of ``bin width / m``, m as large as the 15 bits of a record allow: the bin is kept exactly,
+the time to half a unit.
+
+Read: these files, and T3 and T2 streams of others, where a pixel is a detector.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.files import IncompleteFileError
+from mars_lidar._base.optional import needed
+from mars_lidar.io.streams import ptu_header
+from mars_lidar.light.timestamps import Timestamps
+
+KIND = "timestamps"
+_WRAP = 1024  # laser periods that the 10 bits of a generic T3 record count
+_SPECIAL, _OVERFLOW = np.uint32(1 << 31), np.uint32(63 << 25)
+_LINE_START, _LINE_STOP, _FRAME = 1, 2, 4  # marker bits, as the header of ptufile's writer declares them
+
+
+def check() -> None:
+    """Raise where the library that writes the format is missing."""
+    needed("ptufile", "a .ptu")
+
+
+def write(path: Path, times: Timestamps) -> None:
+    """Write a stream; the caller renames the file when it is whole."""
+    from mars_lidar.io.streams.attributes import attributes
+
+    ptufile = needed("ptufile", "a .ptu")
+    if times.bins > ptu_header.MAX_BINS:
+        raise ValueError(f"bins must be at most {ptu_header.MAX_BINS} in a .ptu, got {times.bins}; use .h5 or .npz")
+    height, width = times.shape
+    if not times.cycles < 2**31:
+        raise ValueError(f"cycles must be below 2^31 in a .ptu, got {times.cycles}")
+    fine = units_per_bin(times.bins)
+    period_s = 1e-9 * times.period_ns
+    exposure_s = period_s * times.cycles
+    attrs = {"kind": KIND, **attributes(times)}
+    tags = ptu_header.tags(attrs, {}, exposure_s * height * width)
+    with open(path, "w+b") as file:
+        ptufile.PtuWriter(
+            file,
+            (1, height, width, 1, times.bins * fine),
+            period_s,
+            period_s / (times.bins * fine),
+            exposure_s,
+            record_type=ptufile.PtuRecordType.GenericT3,
+            tags=tags,
+        )
+        begin = file.tell()
+        number = 0
+        last = np.int64(0)  # overflows written so far
+        for row in range(height):
+            records, last = _with_overflows(*_row(times, row, fine), last)
+            file.write(records.tobytes())
+            number += records.size
+        end = height * width * times.cycles
+        records, last = _with_overflows(
+            np.array([end]), np.array([_marker(_FRAME) | np.uint32(end % _WRAP)], np.uint32), last
+        )
+        file.write(records.tobytes())
+        number += records.size
+        ptu_header.set_integer(file, begin, b"TTResult_NumberOfRecords", number)
+        ptu_header.set_integer(file, begin, b"ImgHdr_MaxFrames", 1)
+        ptu_header.set_integer(file, begin, ptu_header.PHOTONS.encode(), len(times))
+
+
+def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
+    """Read a stream; `period_ns` and `bins` are for files of others."""
+    from mars_lidar.io.streams.attributes import from_attributes, measured
+
+    ptu = ptu_header.opened(path)
+    try:
+        attrs = ptu_header.attributes(ptu.tags)
+        if attrs.get("kind") == "cube":
+            raise ValueError(f"{path} is a cube, not a stream: mars_lidar.io.load reads it")
+        if not attrs and ptu.is_image:
+            raise ValueError(
+                f"{path} is an image of another program; ptufile.imread reads it (pixels of a scan need its markers)"
+            )
+        if attrs and (period_ns is not None or bins is not None):
+            raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
+        decoded = ptu.decode_records()
+        is_t3, unit_ns = ptu.is_t3, 1e9 * ptu.tcspc_resolution
+        clock_ns = 1e9 * ptu.global_resolution
+    finally:
+        ptu.close()
+    photons = decoded[decoded["channel"] >= 0]
+    if not attrs:
+        if is_t3:
+            known = clock_ns if period_ns is None else period_ns
+            return measured(photons["time"], photons["dtime"], unit_ns, photons["channel"], known, bins, str(path))
+        if period_ns is None:
+            raise ValueError(f"{path} holds T2 records, absolute times without laser pulses: give period_ns")
+        return _absolute(photons, clock_ns, period_ns, bins, str(path))
+    height, width = (int(n) for n in attrs["shape"])
+    cycles, number = int(attrs["cycles"]), int(attrs["bins"])
+    if not ((decoded["marker"] == _FRAME) & (decoded["channel"] < 0)).any():
+        raise IncompleteFileError(f"{path} is incomplete: the marker at the end of its image is missing")
+    pixel, cycle = np.divmod(photons["time"].astype(np.int64), cycles)
+    if pixel.size and pixel.max() >= height * width:
+        raise ValueError(f"{path} is damaged: it has photons after the last of {height} x {width} pixels")
+    fine = units_per_bin(number)
+    dtime = photons["dtime"].astype(np.int64)
+    times_ns = (cycle + (dtime + 0.5) / (number * fine)) * float(attrs["period_ns"])
+    counts = np.bincount(pixel, minlength=height * width)
+    return from_attributes(attrs, times_ns, cycle, dtime // fine, counts)
+
+
+def units_per_bin(bins: int) -> int:
+    """Units of the fine time in a histogram bin."""
+    return ptu_header.MAX_BINS // bins
+
+
+def is_stream(path: Path) -> bool:
+    """Whether the file holds a stream: ours, or of others but no image."""
+    ptu = ptu_header.opened(path)
+    try:
+        attrs = ptu_header.attributes(ptu.tags)
+        return attrs.get("kind") == KIND if attrs else not ptu.is_image
+    finally:
+        ptu.close()
+
+
+def _row(times: Timestamps, row: int, fine: int) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+    """Laser periods and records of an image row, its markers first and last."""
+    width = times.shape[1]
+    pixels = np.arange(row * width, (row + 1) * width)
+    part = slice(int(times.offsets[pixels[0]]), int(times.offsets[pixels[-1] + 1]))
+    counts = np.diff(times.offsets[pixels[0] : pixels[-1] + 2])
+    cycle = times.cycle[part].astype(np.int64)
+    bin_ = times.bin[part].astype(np.int64)
+    within = (times.times_ns[part] / times.period_ns - cycle) * times.bins - bin_  # of a bin: 0 to 1
+    dtime = bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)
+    period = np.repeat(pixels, counts) * times.cycles + cycle
+    records = (dtime.astype(np.uint32) << np.uint32(10)) | (period % _WRAP).astype(np.uint32)
+    ends = np.array([pixels[0], pixels[-1] + 1]) * times.cycles
+    marks = [_marker(_LINE_START), _marker(_LINE_STOP)]
+    first, last = (np.uint32(mark | np.uint32(end % _WRAP)) for mark, end in zip(marks, ends, strict=True))
+    return (
+        np.concatenate([ends[:1], period, ends[1:]]),
+        np.concatenate([[first], records, [last]]).astype(np.uint32),
+    )
+
+
+def _marker(bits: int) -> np.uint32:
+    return np.uint32(_SPECIAL | np.uint32(bits << 25))
+
+
+def _with_overflows(
+    period: NDArray[np.int64], records: NDArray[np.uint32], last: np.int64
+) -> tuple[NDArray[np.uint32], np.int64]:
+    """Records with overflow records between them: each tells of up to 1023 times 1024 periods."""
+    wraps = period // _WRAP
+    steps = np.diff(wraps, prepend=last)
+    extra = -(-steps // (_WRAP - 1))
+    at = np.repeat(np.arange(period.size), extra)
+    order = np.arange(at.size) - np.repeat(np.cumsum(extra) - extra, extra)
+    size = np.minimum(steps[at] - order * (_WRAP - 1), _WRAP - 1)
+    return np.insert(records, at, _SPECIAL | _OVERFLOW | size.astype(np.uint32)), wraps[-1]
+
+
+def _absolute(photons: Any, clock_ns: float, period_ns: float, bins: int | None, source: str) -> Timestamps:
+    """Timestamps of T2 records: absolute times in units of `clock_ns`, folded with the laser period."""
+    from mars_lidar.io.streams.attributes import measured
+
+    periods = (photons["time"].astype(np.float64) + 0.5) * clock_ns / period_ns
+    cycle = np.floor(periods).astype(np.int64)
+    unit = clock_ns if bins is None else period_ns / bins
+    fine = (periods - cycle) * (period_ns / unit) - 0.5  # `measured` adds half a unit
+    return measured(cycle, fine, unit, photons["channel"], period_ns, bins, source, clock_ns)

@@ -1,0 +1,159 @@
+// Where the registrations of lanes go: the kernels log them, one row of lanes after the other, and write the column of
+// one lane at a time when the log is full. The histogram of one pixel stays in the first-level cache that way, those of
+// all lanes together would not.
+#pragma once
+#include <string.h>
+
+#include "exact/kernel.h"
+#include "instrument/recording.h"
+#include "lanes/lanes.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+constexpr int kLog = 128;  // rows
+
+// `Phase` is the precision that times are told in; `timed` logs can keep them. Which output is asked for matters only
+// when the log is written, so one kernel serves them all.
+template <class Phase, bool timed>
+class LaneLog {
+ public:
+    LaneLog(const Output& output, const Job& job)
+        : output_(output), bins_(static_cast<size_t>(job.bins)), cycles_(job.cycles) {
+        for (int lane = 0; lane < kLanes; ++lane) items_[lane] = -1;
+    }
+
+    // Whether times are asked for.
+    bool wants_times() const { return timed && output_.sink == Sink::kTimestamps; }
+    bool busy(int lane) const { return items_[lane] >= 0; }
+
+    // An item of the job without any registration yet.
+    void clear(int64_t item) {
+        switch (output_.sink) {
+            case Sink::kCounts:
+                static_cast<int64_t*>(output_.out)[item] = 0;
+                return;
+            case Sink::kHistogram16:
+                return clear_row<uint16_t>(item);
+            case Sink::kHistogram32:
+                return clear_row<uint32_t>(item);
+            case Sink::kTimestamps:
+                return;
+        }
+    }
+    // From now on a lane is at an item that has been cleared, or at none (-1).
+    void assign(int lane, int64_t item) {
+        if (busy(lane)) write<1>(lane, first_row_[lane], rows_);
+        first_row_[lane] = rows_;
+        items_[lane] = item;
+        if (item >= 0 && output_.sink == Sink::kTimestamps) next_[lane] = output_.offsets[item];
+    }
+
+    // Row k after those that are complete: the registrations of all lanes, some of them outside of the exposure.
+    MARS_INLINE void put(int k, Mask lost, Int bin) { store(bin_[rows_ + k], select(lost, splat(-1), bin)); }
+    MARS_INLINE void put_cycle(int k, Int cycle) { store(cycle_[rows_ + k], cycle); }
+    MARS_INLINE Phase (&phase(int k)) [kLanes] { return phase_[rows_ + k]; }
+
+    // `n` rows, a divisor of kLog, are complete.
+    void advance(int n) {
+        rows_ += n;
+    }
+    bool full() const { return rows_ == kLog; }
+
+    // Several lanes at once, where all have work: the processor is busy while a bin that was just counted is still on
+    // its way to the cache.
+    MARS_NOINLINE void flush() {
+        constexpr int team = kLanes < 4 ? kLanes : 4;
+        for (int lane = 0; lane < kLanes; lane += team) {
+            int common = 0;
+            bool all = true;
+            for (int i = lane; i < lane + team; ++i) {
+                if (first_row_[i] > common) common = first_row_[i];
+                all = all && busy(i);
+            }
+            if (!all) common = rows_;
+            for (int i = lane; i < lane + team; ++i)
+                if (busy(i)) write<1>(i, first_row_[i], common);
+            if (all) write<team>(lane, common, rows_);
+        }
+        memset(first_row_, 0, sizeof first_row_);
+        rows_ = 0;
+    }
+
+ private:
+    template <class Count>
+    Count* row(int64_t item) const {
+        return static_cast<Count*>(output_.out) + static_cast<size_t>(item) * bins_;
+    }
+
+    // The next row is asked for meanwhile: a cube is larger than the caches, and to wait for its lines took a seventh of
+    // the time of dim light.
+    template <class Count>
+    void clear_row(int64_t item) const {
+        constexpr size_t most = 4096, line = 64;
+        Count* const cleared = row<Count>(item);
+        const size_t bytes = bins_ * sizeof(Count);
+        const char* const next = reinterpret_cast<const char*>(cleared) + bytes;
+        for (size_t k = 0; k < (bytes < most ? bytes : most); k += line) prefetch<1, 2>(next + k);
+        memset(cleared, 0, bytes);
+    }
+
+    // Rows [from, to) of n lanes from `lane`.
+    template <int n>
+    void write(int lane, int from, int to) {
+        switch (output_.sink) {
+            case Sink::kCounts:
+                return count<n>(lane, from, to);
+            case Sink::kHistogram16:
+                return count_bins<n, uint16_t>(lane, from, to);
+            case Sink::kHistogram32:
+                return count_bins<n, uint32_t>(lane, from, to);
+            case Sink::kTimestamps:
+                if constexpr (timed)
+                    for (int i = lane; i < lane + n; ++i) tell_times(i, from, to);
+                return;
+        }
+    }
+    template <int n>
+    void count(int lane, int from, int to) {
+        for (int i = lane; i < lane + n; ++i) {
+            int64_t found = 0;
+            for (int k = from; k < to; ++k) found += bin_[k][i] >= 0;
+            static_cast<int64_t*>(output_.out)[items_[i]] += found;
+        }
+    }
+    template <int n, class Count>
+    void count_bins(int lane, int from, int to) {
+        Count* rows[n];
+        for (int i = 0; i < n; ++i) rows[i] = row<Count>(items_[lane + i]);
+        for (int k = from; k < to; ++k)
+            for (int i = 0; i < n; ++i) {
+                const int32_t bin = bin_[k][lane + i];
+                if (bin >= 0) ++rows[i][bin];
+            }
+    }
+    void tell_times(int lane, int from, int to) {
+        for (int k = from; k < to; ++k) {
+            if (bin_[k][lane] < 0) continue;
+            const int64_t record = next_[lane]++;
+            const int32_t cycle = round_exposure(cycle_[k][lane], cycles_);
+            output_.times[record] = registration_time(cycle, phase_[k][lane]);
+            output_.cycles[record] = cycle;
+            output_.bins[record] = bin_[k][lane];
+        }
+    }
+
+    static constexpr int kTimes = timed ? kLog : 1;
+
+    const Output output_;
+    const size_t bins_;
+    const int32_t cycles_;
+    int64_t items_[kLanes], next_[kLanes];  // of the job, or -1; the lane's next record
+    int first_row_[kLanes] = {}, rows_ = 0;
+    alignas(64) int32_t bin_[kLog][kLanes];  // -1: not registered
+    alignas(64) int32_t cycle_[kTimes][kLanes];
+    alignas(64) Phase phase_[kTimes][kLanes];
+};
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

@@ -1,0 +1,304 @@
+// The physics of one registration: from re-arming to the next registered photon.
+//
+// Only registered photons are drawn. With C(t) the integrated flux, the next registration after re-arming at u
+// is C^-1(C(u) + E), E ~ Exp(1). The flux is a superposition, so each part (the background, each return) has an
+// exponential of its own and the earliest arrival wins; by memorylessness all are redrawn each time. Cost:
+// O(registrations), however bright the scene.
+//
+// Time is counted in frames: a frame is one period around a return of the first echo, [-1/2, 1/2) periods before
+// and after it. One pixel per lane (lanes.h); this header also compiles for CUDA with one lane.
+#pragma once
+#include "numbers/random.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+// Streams of draws of one pixel: the second counter word; the first is the number of the registration.
+constexpr uint32_t kStageArrival = 0;      // background and first return
+constexpr uint32_t kStageArrivalFine = 1;  // fresh fractions for long waits of those two
+constexpr uint32_t kStageStart = 2;        // arrivals before a stationary exposure: waits and components; + 1: phases
+constexpr uint32_t kStageJitter = 4;       // first word of the counter: half the number; + 1: tails
+constexpr uint32_t kStageReturns = 16;     // + 2 k: returns 2 k + 1 and 2 k + 2; + 2 k + 1: their fractions
+
+constexpr uint32_t kStageTails = 64;          // + k: place of an arrival in the tails of return k
+constexpr uint32_t kStageTraps = 0x40000000;  // afterpulses, by the number of the avalanche that leaves carriers (+ k)
+
+constexpr float kLongWait = 256.0f;       // periods; `split_wait` resolves 2^-24 of one up to here
+constexpr float kForever = 134217728.0f;  // 2^27 periods: beyond every exposure
+constexpr float kDarkInverse = 1e30f;     // 1 / rate of a component without photons: every wait is kForever
+
+// Energies nearer to 0 than this are drawn afresh: between two numbers of the lattice of 2^-24 of energies near 1.
+constexpr float kTail = 0x1p-14f - 0x1p-25f;
+constexpr int kEnergyShift = 16;  // the leading bits of an energy name its cell in the tables
+
+// Tables of the pulse, see pulse_table.h.
+struct PulseView {
+    const float* forward;
+    const float* inverse;
+    const int32_t* guide;
+    const float* upper;
+    const float* end;
+    const float* periods_per_energy;
+    float cell_of_centre, cells_per_period, last_cell, split;
+    int32_t late_cell, guides, last_early, last_late;
+};
+
+// Positions of the gate in units of 2^-64 period, which add up and wrap exactly.
+struct GateView {
+    uint64_t start, step;
+    float width;
+    uint32_t cycles;  // periods at each position
+};
+
+struct SystemView {
+    PulseView pulse;
+    GateView gate;
+    int32_t cycles, bins, returns;
+    int32_t dead_whole;   // dead time: whole periods ...
+    float dead_fraction;  // ... and the rest
+};
+
+// Flux of one component at the lane's pixel. A component without photons has rate = 0 and inverse = kDarkInverse.
+struct Rate {
+    Float rate, inverse;
+};
+
+struct Return {
+    Rate flux;
+    Float offset;  // of this return from the first one, in [-1/2, 1/2) periods
+};
+
+struct Time {
+    Int frame;
+    Float phase;  // in [-1/2, 1/2)
+};
+
+struct Wait {
+    Int whole;
+    Float fraction;  // in [0, 1)
+};
+
+MARS_INLINE Float magnitude(Float x) { return from_bits(bits(x) & 0x7fffffffu); }
+
+// Position in the frame of the energy p, signed as in pulse_table.h; `size` is its magnitude.
+template <bool gaussian>
+MARS_INLINE Float quantile(const PulseView& pulse, Float p, Float size) {
+    const Int cell = as_int(bits(size) >> kEnergyShift);
+    if constexpr (gaussian) {  // the early half, mirrored
+        const UInt late = bits(p) & 0x80000000u;
+        Float intercept, slope;
+        gather_pair(pulse.inverse, cell, intercept, slope);
+        return from_bits(bits(intercept + slope * size) ^ late);
+    } else {
+        const Mask late = p < 0.0f;
+        Int k = gather(pulse.guide, cell + select(late, splat(pulse.guides), splat(0)));
+        const Int last = select(late, splat(pulse.last_late), splat(pulse.last_early));
+        Float upper = gather(pulse.upper, k);
+        Mask step = (p >= upper) & (k < last);
+        while (any(step)) {
+            k = plus_if(k, step);
+            upper = gather(pulse.upper, k);
+            step = (p >= upper) & (k < last);
+        }
+        return gather(pulse.end, k) + minimum(p - upper, splat(0.0f)) * gather(pulse.periods_per_energy, k);
+    }
+}
+
+// Whole periods and rest of a wait. A float32 knows waits of 64 periods to 2^-17 of one, and the random numbers that it
+// is made of have a lattice of their own. So only the 16 leading bits are kept. They name a cell of 2^-15 times the
+// power of two below the wait, in which its law is uniform but for a slope of 2^-15 times the exponential number; `place`,
+// uniform in (0, 2^-15) and independent of the wait, draws afresh where in the cell it ends.
+MARS_INLINE Wait split_wait(Float wait, Float place) {
+    const Float cell = from_bits(bits(wait) & 0xffffff00u), power = from_bits(bits(wait) & 0x7f800000u);
+    const Int whole = truncate(cell);
+    return {whole, (cell - to_float(whole)) + power * place};
+}
+
+// The fraction of a long wait afresh. Exact, since whole periods and fraction of an exponential wait are independent;
+// the fraction has the density ~ e^(-rate r) on [0, 1).
+MARS_INLINE void refresh(Wait& wait, Mask lanes, UInt word, Float rate) {
+    const Float v = uniform(word);
+    const Float bend = 0.5f * rate * v * (1.0f - v) * (1.0f - rate * (1.0f - 2.0f * v) * 0.33333334f);
+    wait.fraction = select(lanes, v - bend, wait.fraction);
+}
+
+// Of waits beyond kLongWait, where cells grow longer than a period: whole periods of float32, fractions of their own.
+MARS_INLINE void refresh_long(Float wait_a, Float wait_b, const Rate& a, const Rate& b, UInt key0, UInt key1,
+                              UInt event, uint32_t stage, Wait& split_a, Wait& split_b) {
+    const Mask long_a = wait_a >= kLongWait, long_b = wait_b >= kLongWait;
+    split_a = {select(long_a, truncate(wait_a), split_a.whole), select(long_a, splat(0.5f), split_a.fraction)};
+    split_b = {select(long_b, truncate(wait_b), split_b.whole), select(long_b, splat(0.5f), split_b.fraction)};
+    const Mask fresh_a = long_a & (wait_a < kForever), fresh_b = long_b & (wait_b < kForever);
+    if (!any(fresh_a | fresh_b)) return;
+    const Pair<UInt> fine = threefry<13>(event, splat(stage + 1), key0, key1);
+    refresh(split_a, fresh_a, fine.first, a.rate);
+    refresh(split_b, fresh_b, fine.second, b.rate);
+}
+
+// Waits of two components, in periods (background) or pulse energies (returns). The place in their cells comes from the
+// low bits of the sum of their words: given either word it is uniform by the other.
+MARS_INLINE void draw_waits(UInt key0, UInt key1, UInt event, uint32_t stage, const Rate& a, const Rate& b,
+                            Wait& wait_a, Wait& wait_b) {
+    const Pair<UInt> words = threefry<13>(event, splat(stage), key0, key1);
+    const Float place = dither(words.first + words.second), rest = place * 0x1p15f;
+    Float wa = exponential(words.first, rest) * a.inverse, wb = exponential(words.second, rest) * b.inverse;
+    const bool far = any_reaches(wa, wb, kLongWait);
+    if (far) {
+        wa = minimum(wa, splat(kForever));
+        wb = minimum(wb, splat(kForever));
+    }
+    wait_a = split_wait(wa, place);
+    wait_b = split_wait(wb, place);
+    if (far) refresh_long(wa, wb, a, b, key0, key1, event, stage, wait_a, wait_b);
+}
+
+// One draw of a pixel's stream that is seldom needed.
+struct Source {
+    UInt key0, key1, event;
+    uint32_t stage;
+};
+
+// Energies p near 0 to a relative precision. What the sum of an energy and a wait leaves of them is a lattice of 2^-24;
+// but that an arrival from the energy `here` on is nearer to 0 than `reach` comes out right, and given that, p has the
+// density ~ e^(-rate p) in (-reach, reach) if all of that interval lies ahead: after a turn, or from far below. From
+// nearer by, the sum itself is relatively precise.
+MARS_INLINE Float resolve_tail(Float p, Float here, Int turns, const Rate& flux, const Source& source) {
+    const Float reach = minimum(flux.inverse * 0x1p-8f, splat(kTail));
+    const Mask coarse = (magnitude(p) < reach) & ((turns > 0) | (here < -2.0f * reach));
+    if (!any(coarse)) return p;
+    const UInt word = threefry<13>(source.event, splat(source.stage), source.key0, source.key1).first;
+    const Float v = (to_float(as_int(word)) + 0.5f) * 0x1p-31f;  // in (-1, 1), relatively fine near 0
+    return select(coarse, reach * (v - 0.5f * (flux.rate * reach) * (1.0f - v * v)), p);
+}
+
+// Next arrival of a return after `from`, both in frames of that return, its wait given in pulse energies. With
+// `whole` (a dead time of whole periods) `energy` holds the signed energy of the lanes in `known` at `from` on
+// entry: a registration of this return that re-arms at the same phase takes no detour over the tables. On return
+// it holds the arrival's.
+template <bool gaussian, bool whole>
+MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask known, const Rate& flux,
+                             const Source& source, Float& energy) {
+    const Float x = minimum(maximum(from.phase * pulse.cells_per_period + pulse.cell_of_centre, splat(0.0f)),
+                            splat(pulse.last_cell));
+    const Int cell = truncate(x);
+    Float here, slope;
+    gather_pair(pulse.forward, cell, here, slope);
+    here = here + slope * (x - to_float(cell));
+    // by the cell, not the phase: rounding may put a phase at the median into either cell, and only its own sign counts
+    Mask late = cell >= pulse.late_cell;
+    if constexpr (whole) {
+        here = select(known, energy, here);
+        late = select(known, energy, select(late, splat(-1.0f), splat(0.0f))) < 0.0f;
+    }
+    const Float sum = here + wait.fraction;
+    const Mask over = sum >= pulse.split;
+    const Int turns = plus_if(wait.whole, over);
+    Float p = minus_if(sum, over), size = magnitude(p);
+    if (seldom(any_below(size, kTail))) {
+        p = resolve_tail(p, here, turns, flux, source);
+        size = magnitude(p);
+    }
+    energy = p;
+    // from the late half of a frame to an early half: one frame further
+    const Int frames = minus_if(plus_if(turns, late), p < 0.0f);
+    const Float arrival = quantile<gaussian>(pulse, p, size);
+    // the tables' rounding must not turn time back
+    return {from.frame + frames, select(frames == 0, maximum(arrival, from.phase), arrival)};
+}
+
+MARS_INLINE Mask before(Time a, Time b) { return (a.frame < b.frame) | ((a.frame == b.frame) & (a.phase < b.phase)); }
+
+MARS_INLINE Time earlier(Mask first, Time a, Time b) {
+    return {select(first, a.frame, b.frame), select(first, a.phase, b.phase)};
+}
+
+// `time` later by a number of frames and less than one frame.
+MARS_INLINE Time later(Time time, Int frames, Float fraction) {
+    const Float phase = time.phase + fraction;
+    const Mask carry = phase >= 0.5f;
+    return {plus_if(time.frame + frames, carry), minus_if(phase, carry)};
+}
+
+// The same without the lattice of 2^-23 that sums above 1 have.
+MARS_INLINE Time finely_later(Time time, Int frames, Float fraction) {
+    const Mask carry = time.phase + fraction >= 0.5f;
+    return {plus_if(time.frame + frames, carry), minus_if(time.phase, carry) + fraction};
+}
+
+// The same instant in the laser period that holds it, of frames around `delay` in [0, 1): phases in [0, 1].
+MARS_INLINE Time in_period(Time time, Float delay) {
+    const Float here = time.phase + delay,
+                next = time.phase + (delay - 1.0f);  // no sum above 1: its lattice is coarser
+    const Mask before_it = here < 0.0f, after_it = next >= 0.0f;
+    return {minus_if(plus_if(time.frame, after_it), before_it), select(after_it, next, plus_if(here, before_it))};
+}
+
+// The same instant in the frames of a return `offset` later.
+MARS_INLINE Time shifted(Time time, Float offset) {
+    const Float phase = time.phase - offset;
+    const Int wrap = minus_if(one_if(phase >= 0.5f), phase < -0.5f);
+    return {time.frame + wrap, phase - to_float(wrap)};
+}
+
+// What the last registration was, for dead times of whole periods: the pixel then re-arms at the same phase of
+// the pulse, whose energy is known without rounding.
+struct Memory {
+    Mask known;  // the last registration came from return `source`
+    Int source;
+    Float energy;  // its signed energy
+};
+
+// Waits for the background and the first return, drawn ahead: they depend on the number of the registration only.
+struct Draw {
+    Wait background, signal;
+};
+
+MARS_INLINE Draw draw(const Rate& background, const Rate& signal, UInt key0, UInt key1, UInt event) {
+    Draw next;
+    draw_waits(key0, key1, event, kStageArrival, background, signal, next.background, next.signal);
+    return next;
+}
+
+// The next registration of a pixel that re-armed at `from`.
+template <bool gaussian, bool whole>
+MARS_INLINE Time next_registration(const SystemView& system, const Return* returns, Time from, const Draw& drawn,
+                                   UInt key0, UInt key1, UInt event, Memory& memory) {
+    Time first = finely_later(from, drawn.background.whole, drawn.background.fraction);
+    Float energy = memory.energy;
+    const Time echo =
+        next_return<gaussian, whole>(system.pulse, from, drawn.signal, memory.known & (memory.source == 0),
+                                     returns[0].flux, {key0, key1, event, kStageTails}, energy);
+    const Mask wins = before(echo, first);
+    first = earlier(wins, echo, first);
+    Memory next = {wins, splat(0), energy};
+
+    for (int32_t k = 1; k < system.returns; k += 2) {
+        const int32_t partner = k + 1 < system.returns ? k + 1 : k;
+        Wait waits[2];
+        draw_waits(key0, key1, event, kStageReturns + static_cast<uint32_t>(k - 1), returns[k].flux,
+                   returns[partner].flux, waits[0], waits[1]);
+        for (int32_t i = k; i <= partner; ++i) {
+            energy = memory.energy;
+            const Source source = {key0, key1, event, kStageTails + static_cast<uint32_t>(i)};
+            const Time frames =
+                next_return<gaussian, whole>(system.pulse, shifted(from, returns[i].offset), waits[i - k],
+                                             memory.known & (memory.source == i), returns[i].flux, source, energy);
+            const Time other = shifted(frames, negative(returns[i].offset));
+            const Mask sooner = before(other, first);
+            first = earlier(sooner, other, first);
+            next.known = next.known | sooner;
+            next.source = select(sooner, splat(i), next.source);
+            next.energy = select(sooner, energy, next.energy);
+        }
+    }
+    if constexpr (whole) memory = next;
+    return first;
+}
+
+// End of the dead time after a registration.
+MARS_INLINE Time rearm(const SystemView& system, Time registration) {
+    return later(registration, splat(system.dead_whole), splat(system.dead_fraction));
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

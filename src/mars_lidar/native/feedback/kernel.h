@@ -1,0 +1,114 @@
+// The feedback engine's inner loops, one function per vector level (feedback/kernel.cpp is compiled once for each).
+// Symbols and steps are those of docs/feedback.md.
+#pragma once
+#include "base/integers.h"
+#if !defined(__CUDACC_RTC__)
+#include <atomic>
+#endif
+
+#ifndef MARS_FEEDBACK_TEAM
+#define MARS_FEEDBACK_TEAM 32
+#endif
+
+namespace mars {
+
+// Lanes of a batch: at every level of the processor two vectors of AVX-512; on a GPU the one of a thread.
+constexpr int kTeam = MARS_FEEDBACK_TEAM;
+constexpr int kRow = 32;              // lanes of a row in memory: a batch's, or those of a warp's threads
+constexpr int kTeams = kRow / kTeam;  // batches side by side in it
+
+// What lies one dead time (without whole periods) before an edge of the internal grid: the cell from edge `early` to
+// edge `late`, `turns` periods ago, and the share f of it that comes after that instant. RA = C_late - f (C_late -
+// C_early).
+struct FeedbackEdge {
+    int32_t late, early, turns;
+    float part;  // f, 0 <= f < 1
+};
+
+// One laser period on n internal cells; dead time K periods and a rest of at least two cells, at most one period and
+// a cell. All lanes share the grid; theirs is the period from the lane's first bin on. Made by feedback/grid.h.
+//
+// The integer sweeps run round a circle of L laser periods (laps), which pieces of the exposure go through together,
+// L > 1 for K = 0 only. What the pieces leave of the exposure, less than L periods, is drawn photon by photon.
+struct FeedbackGrid {
+    int32_t cells;                 // n
+    int32_t bins;                  // of the histogram
+    int32_t whole;                 // K
+    int32_t watch, lap_watch;      // cells from here on are within one dead time of the end of the period, of the laps
+    const FeedbackEdge* edge;      // (n + 1)
+    const FeedbackEdge* lap_edge;  // (L n + 1) of the laps
+    const double* place;           // (n + 1) of the edges, in periods
+    const int32_t* bin_cell;       // (bins + 1) cell that each bin of the histogram begins with
+    const uint8_t* narrow;         // (n) 1: a cell of the finer kind
+    double width[2];               // of the wide and the narrow cells, in periods
+    double dead_time;              // in periods
+    int32_t laps;                  // L
+    int32_t pieces;                // floor(N_r / L)
+    int32_t remainder;             // N_r - L pieces
+    bool stationary;
+
+    int32_t path() const { return cells * laps; }  // cells of all laps
+};
+
+// What became of an exposure. Refused ones are not written.
+enum class FeedbackStatus : uint8_t {
+    kDrawn = 0,
+    kSlow = 1,       // the sweeps contract too slowly: all of a pixel
+    kLocked = 2,     // a count law narrower than whole blind periods resolve: all of a pixel
+    kFew = 3,        // too few pieces of the exposure for the laps that it needs: all of a pixel
+    kUnsettled = 4,  // its sweeps did not end
+    kNegative = 5,   // fewer than no exposures armed
+    kUnlikely = 6,   // a count that its law does not allow
+    kLaps = 64,      // more laps are needed: kLaps + their number, all of a pixel
+};
+
+constexpr int32_t kMostLaps = 64;
+
+// One batch: kTeam exposures at a time, each lane its own pixel. A lane counts cells from a first bin of its own, so
+// that the pulses of different pixels lie in the same cells.
+struct FeedbackBatch {
+    const FeedbackGrid* grid;
+    const int32_t* first_bin;     // (kTeam): bin of the histogram that the lane's period begins with
+    const double* dark_photons;   // (2, kTeam): per period in a cell without signal, of the wide and the narrow kind
+    int32_t lit_begin, lit_end;   // cells that may have signal ...
+    const double* lit_photons;    // ... (lit_end - lit_begin, kTeam): theirs, background included
+    int64_t lit_row;              // from cell to cell of these
+    int32_t lit_room;             // cells that scratch has room for: the same for batches that share rows
+    const uint32_t* pixel_index;  // (kTeam)
+    const uint32_t* realization;  // (kTeam): of the first draw
+    uint32_t realization_step;    // from draw to draw
+    const int32_t* draws;         // (kTeam): of each lane; 0 is an idle lane
+    uint64_t seed;
+    void* const* rows;              // (kTeam): histogram of the first draw
+    int64_t row_step;               // counts from draw to draw
+    bool wide;                      // uint32 counts, else uint16
+    FeedbackStatus* const* status;  // (kTeam): of the first draw
+    int64_t status_step;            // from draw to draw
+    unsigned char* memory;          // `feedback_bytes` of scratch
+    int32_t lane;                   // of the rows in there: the batch's first
+#if defined(__CUDACC_RTC__)
+    bool stopped() const { return false; }
+#else
+    const std::atomic<bool>* stop;
+    bool stopped() const { return stop && stop->load(std::memory_order_relaxed); }
+#endif
+};
+
+// Scratch of a batch, or of as many as share rows: `lit` of its cells may have signal.
+inline int64_t feedback_bytes(int64_t cells, int64_t laps, int64_t lit) {
+    const int64_t row = kRow, rows = cells * row, path = laps * rows;
+    const int64_t periodic = 4 * row + 2 * lit * row + 4 * (rows + row), whole = 4 * (path + row);
+    const int64_t photons = laps > 1 ? 8 * (rows + row) : 0;
+    return 4 * (periodic + whole) + photons + 2 * (path + row) + 4 * laps * cells * kTeams + 64 * 32;  // room to align
+}
+
+#if !defined(__CUDACC_RTC__)
+// Returns false where a count does not fit into its histogram bin.
+#define MARS_DECLARE_FEEDBACK(level) bool feedback_kernel_##level(const FeedbackBatch& batch);
+MARS_DECLARE_FEEDBACK(scalar)
+MARS_DECLARE_FEEDBACK(vector128)
+MARS_DECLARE_FEEDBACK(avx2)
+MARS_DECLARE_FEEDBACK(avx512)
+#endif
+
+}  // namespace mars

@@ -1,0 +1,223 @@
+// Laws of a pixel that its sweeps need: rates, means, variance of the count, blind time at the ends of the exposure.
+#pragma once
+#include "base/standard.h"
+#include "feedback/sweeps.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+MARS_INLINE double floor_of(double x) {
+    const double whole = static_cast<double>(static_cast<int64_t>(x));
+    return whole > x ? whole - 1.0 : whole;
+}
+
+// A row of p = 1 - e^-l and q = 1 - p / l: Taylor series at l / 64, then six times 1 - e^-2x = p (2 - p).
+MARS_NOINLINE void set_rates(const double* photons, float* fire, float* refire) {
+    for (int i = 0; i < kTeam; ++i) {
+        const double l = photons[i] < 40.0 ? photons[i] : 40.0, x = l * 0x1p-6;
+        double p = 1.0;
+        p = 1.0 - p * x * (1.0 / 12);
+        p = 1.0 - p * x * (1.0 / 11);
+        p = 1.0 - p * x * (1.0 / 10);
+        p = 1.0 - p * x * (1.0 / 9);
+        p = 1.0 - p * x * (1.0 / 8);
+        p = 1.0 - p * x * (1.0 / 7);
+        p = 1.0 - p * x * (1.0 / 6);
+        p = 1.0 - p * x * (1.0 / 5);
+        p = 1.0 - p * x * (1.0 / 4);
+        p = 1.0 - p * x * (1.0 / 3);
+        p = 1.0 - p * x * (1.0 / 2);
+        p *= x;
+        p *= 2.0 - p;
+        p *= 2.0 - p;
+        p *= 2.0 - p;
+        p *= 2.0 - p;
+        p *= 2.0 - p;
+        p *= 2.0 - p;
+        const double series = l * (0.5 - l * (1.0 / 6 - l * (1.0 / 24 - l * (1.0 / 120 - l * (1.0 / 720)))));
+        const double bright = photons[i] > 1e-300 ? photons[i] : 1e-300;
+        fire[i] = static_cast<float>(p);
+        refire[i] = static_cast<float>(l < 0.02 ? series : 1.0 - p / bright);
+    }
+}
+
+// A row of lanes of MeanLaw: arrays that do not overlap, for the loop to vectorise.
+MARS_NOINLINE void mean_row(const float* __restrict__ p, const float* __restrict__ q, const History<float>::Rows& back,
+                            float part, const float* __restrict__ here, const float* __restrict__ scale,
+                            float* __restrict__ re, float* __restrict__ mean, float* __restrict__ variance,
+                            float* __restrict__ armed_now) {
+    const float *late = back.late, *early = back.early, *gone = back.gone;
+    for (int i = 0; i < kTeam; ++i) {
+        const float then = late[i] - gone[i] - part * (late[i] - early[i]);
+        float armed = scale[i] * (1.0f - (here[i] - re[i])), in = scale[i] * (then - re[i]);
+        armed = armed > 0.0f ? armed : 0.0f;
+        in = in > 0.0f ? in : 0.0f;
+        re[i] = then;
+        mean[i] = p[i] * armed + q[i] * in;
+        variance[i] = p[i] * (1.0f - p[i]) * armed + q[i] * (1.0f - q[i]) * in;
+        armed_now[i] = armed;
+    }
+}
+
+// Mean and variance of every cell's count given its past, at the means; cells in order.
+class MeanLaw {
+ public:
+    alignas(64) float mean[kTeam], variance[kTeam], armed[kTeam];
+
+    // `sums`: prefix sums of the mean at K = 0; `scale`: N_r / (1 + K sum w), what it is to be multiplied by.
+    MeanLaw(const FeedbackGrid& grid, const Rates& rates, const float* sums, const float* scale)
+        : edge_(grid.edge), rates_(rates), sums_(sums), scale_(scale), history_(sums, sums, grid.cells) {
+        for (int i = 0; i < kTeam; ++i) re_[i] = rearmed_before(history_.at(edge_[0]), edge_[0].part, i);
+    }
+
+    MARS_INLINE void next(int32_t j) {
+        const FeedbackEdge& edge = edge_[j + 1];
+        mean_row(rates_.fire(j), rates_.refire(j), history_.at(edge), edge.part, sums_ + static_cast<int64_t>(j) * kRow,
+                 scale_, re_, mean, variance, armed);
+    }
+
+    // A bit per lane of cell j that has fewer than `few` exposures armed and a mean above `counts`, or fires with a
+    // probability above `likely`.
+    MARS_INLINE uint32_t rare(int32_t j, float few, float counts, float likely) const {
+        const float* p = rates_.fire(j);
+        auto is_rare = [&](int i) {
+            return (armed[i] < few ? 1 : 0) & ((mean[i] > counts ? 1 : 0) | (p[i] > likely ? 1 : 0));
+        };
+        int32_t some = 0;
+        for (int i = 0; i < kTeam; ++i) some |= is_rare(i);
+        if (!some) return 0u;
+        uint32_t bits = 0;
+        for (int i = 0; i < kTeam; ++i) bits |= static_cast<uint32_t>(is_rare(i)) << i;
+        return bits;
+    }
+
+ private:
+    const FeedbackEdge* edge_;
+    const Rates& rates_;
+    const float *sums_, *scale_;
+    const History<float> history_;
+    alignas(64) float re_[kTeam];
+};
+
+// Sweep of the adjoint, backwards, for the variance of the count: y_j = 1 - (what one registration more in cell j takes
+// from the means of the later cells). Edges e < e0 do not yet see all of cell j; it re-arms 1 - f_e of itself at the
+// edge e that lies in it one dead time on, and
+//     y_j = 1 - sum over j < i < e0 of p_i y_i + q y at e0 - 1 + sum over those e of (1 - f_e) (p_e y_e - q_e y_e +
+//           q_{e-1} y_{e-1}).
+// `old`, `fresh`: suffix sums of p y (n + 1 rows); `values`: y, replaced in place. `moved`: the largest change of y.
+MARS_NOINLINE void adjoint_sweep(const FeedbackGrid& grid, const Rates& rates, const float* __restrict__ old,
+                                 float* __restrict__ fresh, float* __restrict__ values, float* __restrict__ moved) {
+    const int32_t n = grid.cells;
+    alignas(64) float total[kTeam], sum[kTeam], y[kTeam];
+    for (int i = 0; i < kTeam; ++i) {
+        total[i] = old[i];
+        sum[i] = moved[i] = 0.0f;
+        fresh[static_cast<int64_t>(n) * kRow + i] = 0.0f;
+    }
+    auto row = [](auto* rows, int32_t j) { return rows + static_cast<int64_t>(j) * kRow; };
+    auto source = [&](int32_t e) {  // cell one dead time before edge e, e counted on through the periods
+        const int32_t turns = e / n;
+        const FeedbackEdge& edge = grid.edge[e - turns * n];
+        return edge.early + (turns - edge.turns) * n;
+    };
+    int32_t all = 3 * n;  // e0
+    for (int32_t j = n - 1; j >= 0; --j) {
+        while (source(all - 1) > j) --all;
+        const int32_t turns = all > n ? (all > 2 * n ? 2 : 1) : 0, last = (all - 1) % n;
+        const float* beyond = turns ? row(old, all - turns * n) : row(fresh, all);
+        const float *q = rates.refire(last), *y_last = row(values, last);
+        for (int i = 0; i < kTeam; ++i)
+            y[i] = 1.0f - (sum[i] - (beyond[i] - static_cast<float>(turns) * total[i])) + q[i] * y_last[i];
+        for (int32_t e = all - 1; source(e) == j; --e) {
+            const int32_t here = e % n, ahead = (e - 1) % n;
+            const float keep = 1.0f - grid.edge[here].part;
+            const float *p = rates.fire(here), *q_here = rates.refire(here), *q_ahead = rates.refire(ahead);
+            const float *y_here = row(values, here), *y_ahead = row(values, ahead);
+            for (int i = 0; i < kTeam; ++i) y[i] += keep * ((p[i] - q_here[i]) * y_here[i] + q_ahead[i] * y_ahead[i]);
+        }
+        const float* p = rates.fire(j);
+        float *value = row(values, j), *after = row(fresh, j);
+        for (int i = 0; i < kTeam; ++i) {
+            const float step = y[i] > value[i] ? y[i] - value[i] : value[i] - y[i];
+            moved[i] = step > moved[i] ? step : moved[i];
+            value[i] = y[i];
+            sum[i] += p[i] * y[i];
+            after[i] = sum[i];
+        }
+    }
+}
+
+// Variance of the count of every lane at K = 0, sum of y^2 v with y = T' 1. `variance` (n, kTeam): v of all cells; the
+// rest is scratch of n + 1 rows.
+MARS_NOINLINE void count_variance(const FeedbackGrid& grid, const Rates& rates, const float* variance, float* old,
+                                  float* fresh, float* values, int sweeps, double* result) {
+    const int32_t n = grid.cells;
+    alignas(64) float moved[kTeam];
+    bool done[kTeam] = {};
+    for (int i = 0; i < kTeam; ++i) {
+        old[static_cast<int64_t>(n) * kRow + i] = 0.0f;
+        result[i] = 0.0;
+    }
+    for (int32_t j = n - 1; j >= 0; --j)
+        for (int i = 0; i < kTeam; ++i) {
+            const int64_t at = static_cast<int64_t>(j) * kRow + i;
+            values[at] = 1.0f;
+            old[at] = old[at + kRow] + rates.fire(j)[i];
+        }
+    for (int sweep = 1; sweep <= sweeps; ++sweep) {
+        adjoint_sweep(grid, rates, old, fresh, values, moved);
+        std::swap(old, fresh);
+        bool some = false;
+        for (int i = 0; i < kTeam; ++i) {
+            if (done[i]) continue;
+            done[i] = !(moved[i] > 1e-3f) || sweep == sweeps;
+            some = some || !done[i];
+            for (int32_t j = 0; done[i] && j < n; ++j) {
+                const int64_t at = static_cast<int64_t>(j) * kRow + i;
+                const double y = static_cast<double>(values[at]);
+                result[i] += y * y * static_cast<double>(variance[at]);
+            }
+        }
+        if (!some) break;
+    }
+}
+
+// Blind time rho at a period's edge in the stationary state: returns its whole periods, and in `cells` how many cells
+// of the period begin within the rest. Registrations in the last y before the edge number R(y) per period; R(y) = u
+// gives the last one, and rho = t_d - y. `sums`: prefix sums of the mean at K = 0, of one lane (stride kRow), `total`
+// in all; `share` = 1 / (1 + K total); the period begins with the lane's cell `edge`.
+MARS_NOINLINE int32_t blind_cells(const FeedbackGrid& grid, const float* sums, double total, double share, int32_t edge,
+                                  double u, int32_t& cells) {
+    const int32_t n = grid.cells;
+    auto before = [sums](int32_t j) { return static_cast<double>(sums[static_cast<int64_t>(j) * kRow]); };
+    // the last j in [0, n) at which a rising function is not yet above `target`
+    auto search = [n](auto rising, double target) {
+        int32_t low = 0, high = n;
+        while (high - low > 1) {
+            const int32_t middle = (low + high) / 2;
+            (rising(middle) <= target ? low : high) = middle;
+        }
+        return low;
+    };
+    cells = 0;
+    if (!(total > 0.0)) return 0;
+    const double level = u / share, periods = floor_of(level / total);
+    if (periods > grid.dead_time) return 0;
+    double target = before(edge) - (level - periods * total);
+    const bool round = target < 0.0;
+    if (round) target += total;
+    const int32_t low = search(before, target);
+    const double below = before(low), step = before(low + 1) - below;
+    const double inside = step > 0.0 ? (target - below) / step : 0.0, width = grid.place[low + 1] - grid.place[low];
+    const double at = grid.place[low] + (inside < 1.0 ? inside : 1.0) * width;
+    const double rho = grid.dead_time - periods - (grid.place[edge] - at + (round ? 1.0 : 0.0));
+    if (!(rho > 0.0)) return 0;
+    const double whole = floor_of(rho), end = grid.place[edge] + (rho - whole);
+    const int32_t turn = end > 1.0 ? 1 : 0;
+    const int32_t last = search([&grid](int32_t j) { return grid.place[j]; }, end - turn);
+    cells = last + turn * n - edge + (grid.place[last] < end - turn ? 1 : 0);
+    return static_cast<int32_t>(whole);
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

@@ -1,0 +1,104 @@
+// Logarithm, exponential, normal quantile and the quantile of a bin's count, on lanes of plain arrays.
+//
+// Only + - * / and sqrt, which IEEE 754 rounds correctly: every vector width gives the same bits. All functions are
+// free of branches, so that loops over lanes vectorise.
+#pragma once
+#include "base/standard.h"
+#include "numbers/random.h"
+
+namespace mars {
+inline namespace MARS_LEVEL {
+
+MARS_INLINE uint32_t float_bits(float x) {
+#if defined(__CUDACC_RTC__)
+    return __float_as_uint(x);
+#else
+    uint32_t u;
+    memcpy(&u, &x, sizeof u);
+    return u;
+#endif
+}
+MARS_INLINE float bits_float(uint32_t u) {
+#if defined(__CUDACC_RTC__)
+    return __uint_as_float(u);
+#else
+    float x;
+    memcpy(&x, &u, sizeof x);
+    return x;
+#endif
+}
+
+// log(x), x > 0 and normal: x = m 2^e, m in [sqrt(1/2), sqrt(2)); log(1 + t) = t - t^2/2 + t^3 P(t), the polynomial
+// of random.h (relative error 2.6e-7).
+MARS_INLINE float log_of(float x) {
+    const uint32_t shifted = float_bits(x) - 0x3f3504f3u;
+    const int32_t e = static_cast<int32_t>(shifted) >> 23;
+    const float t = bits_float((shifted & 0x007fffffu) + 0x3f3504f3u) - 1.0f;
+    float p = -0.10191701352596283f;
+    p = p * t + 0.16024371981620789f;
+    p = p * t - 0.17137131094932556f;
+    p = p * t + 0.19924505054950714f;
+    p = p * t - 0.24983267486095428f;
+    p = p * t + 0.33334246277809143f;
+    const float z = t * t;
+    return static_cast<float>(e) * 0.693147182464599609375f + ((t - 0.5f * z) + (z * t) * p);
+}
+
+// log(1 - p), 0 <= p < 1/8, relatively accurate; beyond, log_of(1 - p) is.
+MARS_INLINE float log_one_minus(float p) {
+    float s = 0.125f;
+    s = s * p + 0.14285715f;
+    s = s * p + 0.16666667f;
+    s = s * p + 0.2f;
+    s = s * p + 0.25f;
+    s = s * p + 0.33333334f;
+    s = s * p + 0.5f;
+    return -(s * p + 1.0f) * p;
+}
+
+// e^x, -87 <= x <= 0: x = k log 2 + r, Taylor series to r^7 for |r| <= log(2)/2.
+MARS_INLINE float exp_of(float x) {
+    const int32_t k = static_cast<int32_t>(x * 1.44269504f - 0.5f);
+    const float whole = static_cast<float>(k);
+    const float r = (x - whole * 0.693359375f) + whole * 2.12194440e-4f;
+    float s = 1.0f / 5040.0f;
+    s = s * r + 1.0f / 720.0f;
+    s = s * r + 1.0f / 120.0f;
+    s = s * r + 1.0f / 24.0f;
+    s = s * r + 1.0f / 6.0f;
+    s = s * r + 0.5f;
+    s = s * r + 1.0f;
+    s = s * r + 1.0f;
+    return s * bits_float(static_cast<uint32_t>(k + 127) << 23);
+}
+
+#if defined(__CUDACC_RTC__)
+MARS_INLINE float root(float x) { return __fsqrt_rn(x); }
+MARS_INLINE double root(double x) { return __dsqrt_rn(x); }
+#else
+MARS_INLINE float root(float x) { return __builtin_sqrtf(x); }
+MARS_INLINE double root(double x) { return __builtin_sqrt(x); }
+#endif
+
+// A uniform number from a word, as its lesser tail r in (0, 1/2], and which tail that is.
+MARS_INLINE float tail_of(uint32_t word) {
+    return (static_cast<float>(static_cast<int32_t>(word & 0x7fffffffu)) + 0.5f) * 0x1p-32f;
+}
+
+// |z| of the standard normal quantile for the tail r in (0, 1/2]: PPND7 of M. J. Wichura, "Algorithm AS 241: the
+// percentage points of the normal distribution", Applied Statistics 37 (1988) 477-484 (seven digits; its far-tail
+// branch begins at r < e^-25, out of reach here).
+MARS_INLINE float normal_size(float tail) {
+    const float q = 0.5f - tail;
+    const float c = 0.180625f - q * q;
+    const float over = q * (((5.9109374720e1f * c + 1.5929113202e2f) * c + 5.0434271938e1f) * c + 3.3871327179f);
+    const float under = ((6.7187563600e1f * c + 7.8757757664e1f) * c + 1.7895169469e1f) * c + 1.0f;
+    const float t = root(-log_of(tail)) - 1.6f;
+    const float far_over = ((1.7023821103e-1f * t + 1.3067284816f) * t + 2.7568153900f) * t + 1.4234372777f;
+    const float far_under = (1.2021132975e-1f * t + 7.3700164250e-1f) * t + 1.0f;
+    const bool centre = q <= 0.425f;
+    return (centre ? over : far_over) / (centre ? under : far_under);
+}
+
+}  // namespace MARS_LEVEL
+}  // namespace mars

@@ -1,0 +1,47 @@
+// The exposure recursion at one vector level: entry points.
+#include "laws/exposure_kernel.h"
+
+#include "laws/exposure_backward.h"
+#include "laws/exposure_characteristic.h"
+#include "laws/exposure_moments.h"
+
+#define MARS_JOIN2(a, b) a##b
+#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
+
+namespace mars {
+
+void MARS_JOIN(exposure_moments_, MARS_LEVEL)(const MomentsBlock& block) {
+    block.rate ? MomentsRun<ParalyzableRecursion>(block).run() : MomentsRun<Recursion>(block).run();
+}
+
+void MARS_JOIN(exposure_phases_, MARS_LEVEL)(const PhasesBlock& block) {
+    const MomentsBlock& moments = block.moments;
+    MomentsRun<Recursion>(moments).run();
+    if (moments.stop->load(std::memory_order_relaxed)) return;
+    const auto response = responses(*moments.flux, moments.first, moments.count);
+    if (moments.grid->stationary) {
+        const Stationary start =
+            warm_state(*moments.grid, *moments.flux, moments.first, moments.count, response, *moments.stop);
+        BackwardRun(block, response, &start).run();
+    } else {
+        BackwardRun(block, response, nullptr).run();
+    }
+}
+
+void MARS_JOIN(exposure_characteristic_, MARS_LEVEL)(const CharacteristicBlock& block) {
+    block.rate ? CharacteristicRun<ParalyzableRecursion>(block).run() : CharacteristicRun<Recursion>(block).run();
+}
+
+void MARS_JOIN(exposure_stationary_, MARS_LEVEL)(const StationaryBlock& block) {
+    const auto response = responses(*block.flux, block.first, block.count);
+    const Stationary state = stationary_state(*block.grid, response, block.count, *block.stop);
+    std::vector<Real> mass(state.bins.size());
+    for (size_t j = 0; j < mass.size(); ++j) mass[j] = state.bins[j].mass;
+    for (int k = 0; k < block.count; ++k) {
+        const int64_t entry = block.first + k;
+        put_histogram(*block.grid, mass.data(), k, 1.0, block.histogram + entry * block.grid->out_bins);
+        block.settled[entry] = state.settled[k] ? 0 : kUnsettled;
+    }
+}
+
+}  // namespace mars

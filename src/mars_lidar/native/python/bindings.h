@@ -1,0 +1,49 @@
+// What the Python bindings of the engines share.
+#pragma once
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include "instrument/job.h"
+#include "instrument/pulse.h"
+#include "instrument/recording.h"
+
+namespace mars {
+
+namespace nb = nanobind;
+
+template <class T>
+using Vector = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Matrix = nb::ndarray<T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+// A job together with the arrays that it points into.
+struct BoundJob : Job {
+    nb::object arrays;
+};
+
+// A recording together with the tables that it points to.
+struct BoundRecording : Recording {
+    nb::object tables;
+};
+
+void bind_pulse(nb::module_& module);
+void bind_exact(nb::module_& module);
+void bind_device(nb::module_& module);
+void bind_mars_device(nb::module_& module);
+void bind_feedback_device(nb::module_& module);
+void bind_waveform(nb::module_& module);
+void bind_sequential(nb::module_& module);
+void bind_poisson(nb::module_& module);
+void bind_chain(nb::module_& module);
+void bind_exposure(nb::module_& module);
+void bind_joint(nb::module_& module);
+void bind_shape_sampler(nb::module_& module);
+void bind_count_draws(nb::module_& module);
+void bind_matched(nb::module_& module);
+void bind_table(nb::module_& module);
+void bind_feedback(nb::module_& module);
+void bind_packing(nb::module_& module);
+void bind_corrected_rates(nb::module_& module);
+void bind_maximum_likelihood(nb::module_& module);
+
+}  // namespace mars

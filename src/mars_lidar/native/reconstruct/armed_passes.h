@@ -1,0 +1,170 @@
+// The laser periods in which a pixel was armed in each bin, from its own histogram: docs/reconstruction.md, section 1.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "reconstruct/histogram_record.h"
+
+namespace mars {
+
+// Of one pixel, folded over the exposure: `armed` periods in which it was armed at the start of the bin, `rearmed`
+// periods in which it became so inside of it, at a place taken as uniform. For dead times below one bin `armed` is
+// the armed time of the bin instead, in periods, and `rearmed` is 0. `raw` is `armed` before it is kept within bounds.
+struct ArmedPasses {
+    std::vector<double> count, before, armed, rearmed, raw;  // (bins), before (bins + 1)
+    double total = 0.0;
+
+    explicit ArmedPasses(int64_t bins) : count(bins), before(bins + 1), armed(bins), rearmed(bins), raw(bins) {}
+
+    // Armed time of bin j, in periods, where the registrations of the bin came in its middle (R5).
+    double time(const HistogramRecord& r, int64_t j) const {
+        if (r.below_bin()) return armed[j];
+        return std::max(armed[j] + 0.5 * rearmed[j] - 0.5 * count[j], 0.0);
+    }
+
+    template <class Count>
+    void set(const HistogramRecord& r, const Count* histogram) {
+        const int64_t n = r.bins;
+        before[0] = 0.0;
+        for (int64_t j = 0; j < n; ++j) {
+            count[j] = static_cast<double>(histogram[j]);
+            before[j + 1] = before[j] + count[j];
+        }
+        total = before[n];
+        if (r.synchronous)
+            set_synchronous(r);
+        else if (r.below_bin())
+            set_below_bin(r);
+        else
+            set_free(r);
+    }
+
+ private:
+    // Share of the registrations whose effect `p` period edges later still lies within the exposure (R3). From a
+    // stationary start those before the exposure make up for the rest.
+    static double within(const HistogramRecord& r, int64_t p) {
+        return r.stationary ? 1.0 : std::max(0.0, 1.0 - static_cast<double>(p) / static_cast<double>(r.cycles));
+    }
+
+    // Sum of `within` over p = 1 .. k.
+    static double within_sum(const HistogramRecord& r, int64_t k) {
+        if (k <= 0) return 0.0;
+        if (r.stationary) return static_cast<double>(k);
+        const double m = static_cast<double>(std::min(k, r.cycles));
+        return m - m * (m + 1.0) / (2.0 * static_cast<double>(r.cycles));
+    }
+
+    void set_free(const HistogramRecord& r) {
+        const int64_t n = r.bins;
+        const double periods = static_cast<double>(r.cycles), f = r.fraction;
+        const double early = (1.0 - f) * (1.0 - f), late = f * (2.0 - f);  // (R2)
+        double turns[2], whole[2], edge[3];                                // for p = whole (+ 1, + 2)
+        for (int64_t k = 0; k < 2; ++k) {
+            turns[k] = static_cast<double>(r.whole + k);
+            whole[k] = within_sum(r, r.whole + k - 1);
+        }
+        for (int64_t k = 0; k < 3; ++k) edge[k] = within(r, r.whole + k);
+        for (int64_t j = 0; j < n; ++j) {
+            const int wraps = j < r.shift ? 1 : 0;  // the registration one dead time ago lies in an earlier period
+            const int64_t q = j - r.shift + (wraps ? n : 0);
+            const bool further = q == 0;
+            const int64_t q2 = further ? n - 1 : q - 1;
+            const double weight = edge[wraps], weight2 = edge[wraps + (further ? 1 : 0)];
+            double blind;  // (R1): registrations of the preceding whole bins of the dead time
+            if (turns[wraps] == 0.0)
+                blind = before[j] - before[q];
+            else
+                blind = before[j] + whole[wraps] * total + weight * (total - before[q]);
+            blind += f * weight2 * count[q2];
+            rearmed[j] = early * weight * count[q] + late * weight2 * count[q2];
+            raw[j] = periods - blind;
+            armed[j] = std::max({raw[j], count[j] - rearmed[j], 0.0});
+        }
+    }
+
+    void set_below_bin(const HistogramRecord& r) {
+        const double f = r.fraction, same = f * (1.0 - 0.5 * f), next = 0.5 * f * f;  // (R6)
+        for (int64_t j = 0; j < r.bins; ++j) {
+            const int64_t q = j == 0 ? r.bins - 1 : j - 1;
+            const double weight = within(r, j == 0 ? 1 : 0);
+            raw[j] = static_cast<double>(r.cycles) - same * count[j] - next * weight * count[q];
+            armed[j] = std::max(raw[j], 0.0);
+            rearmed[j] = 0.0;
+        }
+    }
+
+    void set_synchronous(const HistogramRecord& r) {
+        const int64_t n = r.bins;
+        // A registration is followed by `whole` lost periods, by one more in the last `shift + fraction` bins (R4).
+        const bool dead = r.whole > 0 || r.shift > 0 || r.fraction > 0.0;
+        const double edge = static_cast<double>(n - r.shift) - r.fraction;
+        double lost = 0.0;
+        for (int64_t j = 0; dead && j < n; ++j) {
+            const double late = std::clamp(static_cast<double>(j + 1) - edge, 0.0, 1.0);
+            lost += count[j] * ((1.0 - late) * within_sum(r, r.whole) + late * within_sum(r, r.whole + 1));
+        }
+        for (int64_t j = 0; j < n; ++j) {
+            raw[j] = static_cast<double>(r.cycles) - lost - before[j];
+            armed[j] = std::max({raw[j], count[j], 0.0});
+            rearmed[j] = 0.0;
+        }
+    }
+};
+
+// What becomes of one pass of a bin of `photons`, armed at its start or re-armed inside of it (R7).
+struct Pass {
+    double quiet, fired;  // armed: P(no registration), P(one)
+    double q, dq, none;   // re-armed: P(registration), its derivative, P(none)
+
+    Pass(double photons, bool rearmed) {
+        quiet = std::exp(-photons);
+        fired = photons < 1e-5 ? photons * (1.0 - 0.5 * photons) : 1.0 - quiet;
+        if (!rearmed) {
+            q = dq = 0.0;
+            none = 1.0;
+        } else if (photons < 0.02) {
+            q = photons * (0.5 - photons * (1.0 / 6 - photons * (1.0 / 24 - photons / 120)));
+            dq = 0.5 - photons * (1.0 / 3 - photons * (0.125 - photons / 30));
+            none = 1.0 - q;
+        } else {
+            none = fired / photons;
+            q = 1.0 - none;
+            dq = (none - quiet) / photons;
+        }
+    }
+};
+
+// Registrations that are expected in a bin (R7), and what follows from them.
+struct Expected {
+    double mean, slope, silent;  // m, dm/dl, and the passes without a registration
+
+    Expected(const Pass& pass, double armed, double rearmed) {
+        mean = armed * pass.fired + rearmed * pass.q;
+        slope = armed * pass.quiet + rearmed * pass.dq;
+        silent = armed * pass.quiet + rearmed * pass.none;
+    }
+
+    Expected(double photons, double armed, double rearmed) : Expected(Pass(photons, rearmed != 0.0), armed, rearmed) {}
+};
+
+// Photons per period of a bin with which it registers as often as it did (R8); infinite where it always did.
+inline double corrected_rate(const HistogramRecord& r, const ArmedPasses& passes, int64_t j, double count) {
+    if (!(count > 0.0)) return 0.0;
+    const double armed = passes.armed[j], rearmed = passes.rearmed[j];
+    if (r.below_bin()) return armed > 0.0 ? count / armed : HUGE_VAL;
+    if (count >= armed + rearmed) return HUGE_VAL;
+    if (rearmed == 0.0) return -std::log1p(-count / armed);
+    // m is concave in l, so Newton's steps from below rise to the root without overshooting
+    double l = count / (armed + 0.5 * rearmed);
+    for (int step = 0; step < 200; ++step) {
+        const Expected now(l, armed, rearmed);
+        const double move = (count - now.mean) / now.slope;
+        l += move;
+        if (!(move > 1e-13 * l)) break;
+    }
+    return l;
+}
+
+}  // namespace mars

@@ -1,0 +1,130 @@
+// Where in the period a pulse may be: likelihood gains on a grid of delays, for starting values.
+#pragma once
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <vector>
+
+#include "reconstruct/pixel_likelihood.h"
+
+namespace mars {
+
+struct Start {
+    double signal, background, delay;
+};
+
+class DelaySearch {
+ public:
+    explicit DelaySearch(const HistogramRecord& recording) : r_(recording) {
+        // the template: bins of a pulse whose delay is the centre of bin 0, without the gate, which differs by delay
+        HistogramRecord plain = recording;
+        plain.open.clear();
+        const double n = static_cast<double>(r_.bins), at = 0.5 / n;
+        first_ = static_cast<int64_t>(std::floor((at + r_.pulse.low) * n));
+        for_pulse_bins(plain, at, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
+                       [&](int64_t, int64_t, double s, double) { energy_.push_back(static_cast<float>(s)); });
+        step_ = std::max<int64_t>(1, static_cast<int64_t>(r_.width * n / 3.0));
+        points_ = r_.bins / step_;
+        gain_.resize(energy_.size());
+        score_.resize(points_);
+        score2_.resize(points_);
+    }
+
+    // Up to `most` starting values, the best first.
+    int operator()(const ArmedPasses& passes, const PixelLikelihood& likelihood, int most, Start* out) {
+        const int64_t n = r_.bins, taps = static_cast<int64_t>(energy_.size());
+        const double flat = likelihood.count() / likelihood.time();
+        extend(passes);
+        // Score of a weak pulse over a flat rate, over its standard deviation (R11).
+        correlate(count_.data(), energy_.data(), score_.data());
+        correlate(time_.data(), energy_.data(), score2_.data());
+        int64_t best = 0;
+        double top = -HUGE_VAL;
+        for (int64_t g = 0; g < points_; ++g) {
+            const double expected = flat * score2_[g];
+            const double z = (score_[g] - expected) / std::sqrt(std::max(expected, 1e-6));
+            if (z > top) {
+                top = z;
+                best = g;
+            }
+        }
+        // What lies inside and outside of that pulse gives S and B.
+        const int64_t from = best * step_ + first_;
+        double inside = 0.0, time = 0.0, weighted = 0.0;
+        for (int64_t i = 0; i < taps; ++i) {
+            const int64_t j = ((from + i) % n + n) % n;
+            inside += count_[j];
+            time += time_[j];
+            weighted += energy_[i] * time_[j];
+        }
+        const double least = 0.5 / likelihood.time();
+        double back = std::max((likelihood.count() - inside) / std::max(likelihood.time() - time, 1.0), least);
+        if (taps >= n) back = 0.5 * flat;
+        const double signal =
+            std::max((inside - back * time) / std::max(weighted, 1e-9), 1.0 / std::max(weighted, 1e-9));
+        // Gain of the likelihood for that S and B at every delay (R12).
+        for (int64_t i = 0; i < taps; ++i) gain_[i] = static_cast<float>(std::log1p(signal * energy_[i] / back));
+        correlate(count_.data(), gain_.data(), score_.data());
+        for (int64_t g = 0; g < points_; ++g) score_[g] -= static_cast<float>(signal) * score2_[g];
+        int found = 0;
+        std::array<int64_t, kMost> at{};
+        most = std::min(most, kMost);
+        for (int64_t g = 0; g < points_; ++g) {
+            const float here = score_[g];
+            if (points_ > 2 && (here < score_[(g + points_ - 1) % points_] || here <= score_[(g + 1) % points_]))
+                continue;
+            int place = found < most ? found++ : most;
+            while (place > 0 && score_[at[place - 1]] < here) {
+                if (place < most) at[place] = at[place - 1];
+                --place;
+            }
+            if (place < most) at[place] = g;
+        }
+        if (found == 0) at[found++] = best;
+        for (int k = 0; k < found; ++k)
+            out[k] = {signal, back * static_cast<double>(n),
+                      (static_cast<double>(at[k] * step_) + 0.5) / static_cast<double>(n)};
+        return found;
+    }
+
+    static constexpr int kMost = 8;
+
+ private:
+    // Counts and armed times of the open bins, continued round the period as far as the template reaches.
+    void extend(const ArmedPasses& passes) {
+        const int64_t n = r_.bins, taps = static_cast<int64_t>(energy_.size());
+        shift_ = ((first_ % n) + n) % n;
+        count_.resize(2 * n + taps);
+        time_.resize(2 * n + taps);
+        for (int64_t j = 0; j < n; ++j) {
+            const double share = r_.share(j);
+            count_[j] = share > 0.0 ? static_cast<float>(passes.count[j]) : 0.0f;
+            time_[j] = static_cast<float>(share * passes.time(r_, j));
+        }
+        for (int64_t j = n; j < 2 * n + taps; ++j) {
+            count_[j] = count_[j - n];
+            time_[j] = time_[j - n];
+        }
+    }
+
+    void correlate(const float* values, const float* weights, float* out) const {
+        const int64_t taps = static_cast<int64_t>(energy_.size());
+        for (int64_t g = 0; g < points_; ++g) {
+            const float* from = values + shift_ + g * step_;
+            float lanes[8] = {};
+            int64_t i = 0;
+            for (; i + 8 <= taps; i += 8)
+                for (int k = 0; k < 8; ++k) lanes[k] += weights[i + k] * from[i + k];
+            float sum = 0.0f;
+            for (; i < taps; ++i) sum += weights[i] * from[i];
+            for (int k = 0; k < 8; ++k) sum += lanes[k];
+            out[g] = sum;
+        }
+    }
+
+    const HistogramRecord& r_;
+    int64_t first_ = 0, step_ = 1, points_ = 1, shift_ = 0;
+    std::vector<float> energy_, gain_, score_, score2_, count_, time_;
+};
+
+}  // namespace mars

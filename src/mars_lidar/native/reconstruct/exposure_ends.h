@@ -1,0 +1,147 @@
+// How many passes of the pulse the ends of the exposure leave out: docs/reconstruction.md, section 3, (R9a). A histogram
+// says so on average only; where few passes are left at the pulse, the likelihood weighs what they may have been.
+#pragma once
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <vector>
+
+#include "reconstruct/armed_passes.h"
+
+namespace mars {
+
+class ExposureEnds {
+ public:
+    static constexpr int kMost = 5;       // possible numbers of passes
+    static constexpr double kFew = 50.0;  // passes at the pulse, for each that is uncertain, above which it is nothing
+
+    // For a pulse around `delay`; empty (`count` 0) where the numbers do not matter, or are too many.
+    void set(const HistogramRecord& r, const ArmedPasses& passes, double delay) {
+        count = 0;
+        if (r.below_bin()) return;
+        const double n = static_cast<double>(r.bins), margin = 2.0 * r.width;
+        first = static_cast<int64_t>(std::floor((delay + r.pulse.low - margin) * n));
+        length = static_cast<int64_t>(std::ceil((delay + r.pulse.low + r.pulse.span() + margin) * n)) - first;
+        length = std::min(length, r.bins);
+        low = (static_cast<double>(first) + 0.5) / n;
+        high = (static_cast<double>(first + length) - 0.5) / n;
+        first = ((first % r.bins) + r.bins) % r.bins;
+        const double turn = delay - std::floor(delay);
+        const int64_t at = std::min(static_cast<int64_t>(turn * n), r.bins - 1);
+        double one[kMost + 1];
+        const int most = numbers(r, passes, at, one);
+        const int possible = r.stationary ? 2 * most + 1 : most + 1;
+        if (most == 0 || possible > kMost) return;
+        double fewest = HUGE_VAL;
+        for (int64_t k = 0; k < length; ++k) {
+            const int64_t j = (first + k) % r.bins;
+            fewest = std::min(fewest, passes.raw[j] + passes.rearmed[j]);
+        }
+        if (fewest > kFew * most) return;
+        // before a stationary exposure as after it, independent of each other: the difference counts
+        double chance[kMost] = {}, mean = 0.0;
+        if (r.stationary) {
+            for (int a = 0; a <= most; ++a)
+                for (int b = 0; b <= most; ++b) chance[a - b + most] += one[a] * one[b];
+        } else {
+            std::copy(one, one + possible, chance);
+            for (int c = 0; c < possible; ++c) mean += c * chance[c];
+        }
+        const double lowest = r.stationary ? -most : 0.0, slack = r.fraction > 0.0 ? 1.0 : 0.5;
+        for (int c = 0; c < possible; ++c) {
+            const double move = lowest + c - mean;
+            if (!(chance[c] > 0.0) || !can_be(r, passes, move, slack)) continue;
+            shift[count] = move;
+            log_chance[count++] = std::log(chance[c]);
+        }
+        if (count > 0) set_choices(r, passes);
+    }
+
+    // Whether bin j is one of those that `set` covers, and which.
+    bool covers(int64_t j, int64_t bins, int64_t* k) const {
+        *k = j - first + (j < first ? bins : 0);
+        return *k < length;
+    }
+
+    static double armed(const ArmedPasses& passes, int64_t j, double move) {
+        return std::max({passes.raw[j] + move, passes.count[j] - passes.rearmed[j], 0.0});
+    }
+
+    const double* choices(int64_t k) const { return choices_.data() + k * kMost; }
+
+    int count = 0;
+    double low = 0.0, high = 0.0;  // what is covered, from within its first bin to within its last, in periods
+    std::array<double, kMost> shift{}, log_chance{};
+
+ private:
+    // Chances of 0, 1 .. passes of bin `at` after the exposure that a registration within it blinds; returns the most.
+    // Of the last t_d at most one registration is left; the pass i periods after the end is blind with the chance that
+    // it fell into the last t_d - i - at / n periods.
+    static int numbers(const HistogramRecord& r, const ArmedPasses& passes, int64_t at, double* chance) {
+        const int64_t n = r.bins;
+        double reached[kMost + 1];
+        int most = 0;
+        const double periods = static_cast<double>(r.cycles);
+        if (r.synchronous) {
+            if (r.whole >= kMost) return kMost;
+            const double edge = static_cast<double>(n - r.shift) - r.fraction;
+            const bool late = r.shift > 0 || r.fraction > 0.0;
+            for (int64_t i = 0; i < r.whole + (late ? 1 : 0); ++i) {
+                double sum = passes.total * static_cast<double>(std::max<int64_t>(r.whole - i, 0));
+                for (int64_t j = static_cast<int64_t>(edge); late && j < n; ++j)
+                    sum += passes.count[j] * std::clamp(static_cast<double>(j + 1) - edge, 0.0, 1.0);
+                reached[most++] = std::min(sum / periods, 1.0);
+            }
+        } else {
+            for (int64_t i = 0; i <= r.whole + 1; ++i) {
+                const int64_t length = (r.whole - i) * n + r.shift - at;  // of that part, in bins, and `fraction`
+                if (length < 0) break;
+                if (most == kMost) return kMost;
+                const int64_t rest = n - length % n;  // the last of its bins that is whole begins here
+                double sum = passes.total * static_cast<double>(length / n) + passes.total - passes.before[rest];
+                sum += r.fraction * passes.count[rest - 1];
+                reached[most++] = std::min(sum / periods, 1.0);
+            }
+        }
+        for (int c = 0; c <= most; ++c)
+            chance[c] = std::max((c == 0 ? 1.0 : reached[c - 1]) - (c == most ? 0.0 : reached[c]), 0.0);
+        return most;
+    }
+
+    // No bin registers more often than it was passed.
+    bool can_be(const HistogramRecord& r, const ArmedPasses& passes, double move, double slack) const {
+        for (int64_t k = 0; k < length; ++k) {
+            const int64_t j = (first + k) % r.bins;
+            if (passes.raw[j] + move + passes.rearmed[j] < passes.count[j] - slack) return false;
+        }
+        return true;
+    }
+
+    // The ways in which a bin's registrations can be spread over its passes, log C(passes, h), less those of the mean.
+    void set_choices(const HistogramRecord& r, const ArmedPasses& passes) {
+        choices_.assign(static_cast<size_t>(length) * kMost, 0.0);
+        for (int64_t k = 0; k < length; ++k) {
+            const int64_t j = (first + k) % r.bins;
+            const double h = passes.count[j], b = passes.rearmed[j];
+            if (!(h > 0.0)) continue;
+            const double mean =
+                log_choices(passes.armed[j] + b, h) + h * std::log((passes.armed[j] + 0.5 * b) / (passes.armed[j] + b));
+            for (int c = 0; c < count; ++c)
+                choices_[k * kMost + c] = log_choices(armed(passes, j, shift[c]) + b, h) - mean;
+        }
+    }
+
+    static double log_choices(double passes, double h) {
+        if (h <= 4.0 && h == std::floor(h)) {
+            double product = 1.0;
+            for (double i = 0.0; i < h; i += 1.0) product *= std::max(passes - i, 1e-3);
+            return std::log(product);
+        }
+        return std::lgamma(passes + 1.0) - std::lgamma(std::max(passes - h, 0.0) + 1.0);
+    }
+
+    int64_t first = 0, length = 0;
+    std::vector<double> choices_;  // (length, kMost)
+};
+
+}  // namespace mars

@@ -1,0 +1,174 @@
+// The likelihood of one pixel's histogram as a function of signal, background and delay: docs/reconstruction.md,
+// section 3. O(bins that the pulse reaches) per evaluation: the rest of the period enters by sums.
+#pragma once
+#include <cmath>
+
+#include "reconstruct/background_series.h"
+#include "reconstruct/exposure_ends.h"
+
+namespace mars {
+
+struct Likelihood {
+    double value = 0.0;
+    double gradient[3] = {};        // with respect to S, B (photons per period) and the delay (periods)
+    double information[3][3] = {};  // Fisher's, at the passes that were
+    double hidden[3][3] = {};       // what of it is lost because the ends of the exposure are not known
+
+    void add(double score, double info, const double* dl) {
+        for (int a = 0; a < 3; ++a) {
+            gradient[a] += score * dl[a];
+            for (int b = 0; b < 3; ++b) information[a][b] += info * dl[a] * dl[b];
+        }
+    }
+};
+
+class PixelLikelihood {
+ public:
+    // Where a bin of background alone holds more than this many photons, their sum does not suffice (it neglects
+    // l^2 / 12): a series takes its place, and beyond the reach of that all bins are treated as those of the pulse are.
+    static constexpr double kDim = 0.005;
+
+    PixelLikelihood(const HistogramRecord& recording, const ArmedPasses& passes) : r_(recording), passes_(passes) {
+        for (int64_t j = 0; j < r_.bins; ++j) {
+            const double share = r_.share(j);
+            if (share <= 0.0) continue;
+            count_ += passes_.count[j];
+            time_ += share * passes_.time(r_, j);
+            if (r_.gated()) shares_ += passes_.count[j] * std::log(share);
+        }
+    }
+
+    // To be told before the first evaluation: a background that is not above 1 or 2 times this, per period.
+    void expect(double background, BackgroundSeries& series) {
+        const double flat = background / static_cast<double>(r_.bins);
+        whole_ = flat > BackgroundSeries::kMost;
+        series_ = nullptr;
+        if (flat > kDim && !whole_) {
+            series.set(r_, passes_);
+            series_ = &series;
+        }
+    }
+
+    double count() const { return count_; }  // registrations of the open bins
+    double time() const { return time_; }    // their armed time, bins x periods
+
+    // With `ends`, mixed over what they leave of the bins that these cover. `whole`: bin by bin round the period.
+    Likelihood operator()(double signal, double background, double delay, const ExposureEnds& ends,
+                          bool whole = false) const {
+        Likelihood out, each[ExposureEnds::kMost];
+        const double flat = background / static_cast<double>(r_.bins);
+        whole = whole || whole_ || (series_ && flat > 2.0 * BackgroundSeries::kMost);
+        double low = r_.pulse.low, high = low + (whole ? 1.0 : r_.pulse.span());
+        if (ends.count > 0 && !whole) {  // always the same bins, or the mixture would jump where the pulse leaves one
+            low = std::min(low, ends.low - delay);
+            high = std::max(high, ends.high - delay);
+        }
+        int64_t first = 0, seen = 0;
+        double count = count_, time = time_, shares = shares_;
+        for_pulse_bins(r_, delay, low, high, [&](int64_t i, int64_t j, double s, double ds) {
+            if (i == 0) first = j;
+            seen = i + 1;
+            const double share = r_.share(j);
+            if (share <= 0.0) return;
+            const double h = passes_.count[j];
+            count -= h;
+            time -= share * passes_.time(r_, j);
+            if (r_.gated()) shares -= h * std::log(share);
+            const double l = signal * s + flat * share;
+            const double dl[3] = {s, share / static_cast<double>(r_.bins), signal * ds};
+            int64_t k;
+            if (ends.count == 0 || !ends.covers(j, r_.bins, &k)) {
+                bin(out, h, passes_.armed[j], passes_.rearmed[j], l, dl);
+                return;
+            }
+            const Pass pass(l, passes_.rearmed[j] != 0.0);
+            const double* choices = ends.choices(k);
+            for (int c = 0; c < ends.count; ++c) {
+                const double armed = ExposureEnds::armed(passes_, j, ends.shift[c]),
+                             quiet = armed + passes_.rearmed[j] - h;
+                if (!(armed + passes_.rearmed[j] > 1e-9)) continue;
+                const Expected e(pass, armed, passes_.rearmed[j]);
+                passed(each[c], h, quiet, e, 1.0 / (armed + passes_.rearmed[j]), dl);
+                each[c].value += choices[c];
+            }
+        });
+        if (!whole && time > 0.0) {  // (R10)
+            const double dl[3] = {0.0, 1.0 / static_cast<double>(r_.bins), 0.0};
+            count = std::max(count, 0.0);
+            double sum = -flat * time, slope = -time, curve = -time / flat;
+            if (series_) {
+                const BackgroundSeries::Terms terms = series_->without(first, seen);
+                sum = slope = curve = 0.0;
+                for (int k = BackgroundSeries::kOrder; k > 0; --k) {
+                    curve = curve * flat + k * (k - 1) * terms[k - 1];
+                    slope = slope * flat + k * terms[k - 1];
+                    sum = (sum + terms[k - 1]) * flat;
+                }
+                curve = curve / flat - count / (flat * flat);  // powers k - 2, from k = 1 on
+            }
+            out.value += count * std::log(flat) + shares + sum;
+            out.add(count / flat + slope, -curve, dl);
+        }
+        if (ends.count > 0) mix(out, each, ends);
+        return out;
+    }
+
+ private:
+    void bin(Likelihood& out, double h, double armed, double rearmed, double l, const double* dl) const {
+        if (r_.below_bin()) {
+            if (armed <= 0.0) return;
+            out.value += h * std::log(l) - armed * l;
+            out.add(h / l - armed, armed / l, dl);
+            return;
+        }
+        const double passes = armed + rearmed, time = armed + 0.5 * rearmed;
+        if (!(time > 1e-12)) return;
+        const Expected e(l, armed, rearmed);
+        passed(out, h, passes - h, e, 1.0 / passes, dl);
+        out.value += h * std::log(passes / time);
+    }
+
+    // (R9): `h` of the passes registered, `quiet` did not.
+    static void passed(Likelihood& out, double h, double quiet, const Expected& e, double share, const double* dl) {
+        quiet = std::max(quiet, 0.0);
+        double score = 0.0;
+        if (h > 0.0) {
+            out.value += h * std::log(e.mean * share);
+            score += h / e.mean;
+        }
+        if (quiet > 0.0) {
+            out.value += quiet * std::log(e.silent * share);
+            score -= quiet / e.silent;
+        }
+        out.add(e.slope * score, e.slope * e.slope / (share * e.mean * e.silent), dl);
+    }
+
+    // Adds the mixture of `each` (R9a): gradient and information are means over what is likely.
+    static void mix(Likelihood& out, const Likelihood* each, const ExposureEnds& ends) {
+        double mean[3] = {}, top = -HUGE_VAL, sum = 0.0, weight[ExposureEnds::kMost];
+        for (int c = 0; c < ends.count; ++c) top = std::max(top, weight[c] = ends.log_chance[c] + each[c].value);
+        for (int c = 0; c < ends.count; ++c) sum += weight[c] = std::exp(weight[c] - top);
+        out.value += top + std::log(sum);
+        for (int c = 0; c < ends.count; ++c) {
+            const double share = weight[c] / sum;
+            for (int a = 0; a < 3; ++a) {
+                out.gradient[a] += share * each[c].gradient[a];
+                for (int b = 0; b < 3; ++b) {
+                    out.information[a][b] += share * each[c].information[a][b];
+                    out.hidden[a][b] += share * each[c].gradient[a] * each[c].gradient[b];
+                }
+                mean[a] += share * each[c].gradient[a];
+            }
+        }
+        for (int a = 0; a < 3; ++a)  // the variance of the scores (Louis, J. R. Stat. Soc. B 44, 226, 1982)
+            for (int b = 0; b < 3; ++b) out.hidden[a][b] -= mean[a] * mean[b];
+    }
+
+    const HistogramRecord& r_;
+    const ArmedPasses& passes_;
+    double count_ = 0.0, time_ = 0.0, shares_ = 0.0;
+    const BackgroundSeries* series_ = nullptr;
+    bool whole_ = false;
+};
+
+}  // namespace mars

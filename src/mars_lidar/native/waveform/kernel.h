@@ -1,0 +1,40 @@
+// The exact engine's inner loop for waveforms, one function per vector level (waveform/runner.h is compiled once for
+// each), and others with a recorder and with traps.
+#pragma once
+#include <atomic>
+#include <cstdint>
+
+#include "exact/kernel.h"
+#include "instrument/job.h"
+
+namespace mars {
+
+constexpr int kMostWaveLanes = 32;  // of any level
+
+// Pixels times realizations of a job.
+struct WaveformBlock {
+    const Job* job;
+    int64_t first_pixel, pixels;
+    int64_t first_realization, realizations;  // relative to the job's first
+    const int32_t* start_cycle;               // (pixels, realizations) where the search begins, or null: armed at 0
+    const double* start_phase;                // in periods, [0, 1)
+    Output output;
+    int64_t team;  // tables that there is memory for: waveform/table.h
+    int32_t* edges;
+    uint16_t* guides;
+    const std::atomic<bool>* stop;
+};
+
+using WaveformKernel = void (*)(const WaveformBlock&);
+
+#define MARS_DECLARE_WAVEFORM(level)                                    \
+    void waveform_kernel_##level(const WaveformBlock& block);           \
+    void waveform_recording_kernel_##level(const WaveformBlock& block); \
+    void waveform_avalanche_kernel_##level(const WaveformBlock& block);
+
+MARS_DECLARE_WAVEFORM(scalar)
+MARS_DECLARE_WAVEFORM(vector128)
+MARS_DECLARE_WAVEFORM(avx2)
+MARS_DECLARE_WAVEFORM(avx512)
+
+}  // namespace mars

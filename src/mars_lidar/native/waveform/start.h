@@ -1,0 +1,143 @@
+// What a pixel with a waveform that has been running for long is doing at the start of the exposure.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "exact/backward.h"
+#include "exact/mode_start.h"
+#include "laws/stationary.h"
+
+namespace mars {
+
+// C at the edges in photons, without the background: in eight runs of parts side by side, because each addition waits
+// for the one before it.
+struct Runs {
+    static constexpr int64_t kRuns = 8;
+    int64_t length;
+    double before[kRuns];  // photons before each run
+    double total;          // and in all parts
+};
+
+// Fills `edge` with C at the edges of each run from its beginning on, one run `stride` after the other, then with C at
+// the edges of the parts after the last run.
+inline Runs integrate_runs(const double* photons, int64_t parts, int64_t stride, double* edge) {
+    Runs runs;
+    const int64_t length = runs.length = parts / Runs::kRuns;
+    double sum[Runs::kRuns] = {};
+    const double* from = photons;
+    double* to = edge;
+    for (int64_t j = 0; j < length; ++j, ++from, ++to) {
+        for (int64_t run = 0; run < Runs::kRuns; ++run) to[run * stride] = sum[run] += from[run * length];
+    }
+    runs.total = 0.0;
+    for (int64_t run = 0; run < Runs::kRuns; ++run) {
+        runs.before[run] = runs.total;
+        runs.total += sum[run];
+    }
+    for (int64_t j = Runs::kRuns * length; j < parts; ++j)
+        edge[Runs::kRuns * (stride - length) + j] = runs.total += photons[j];
+    return runs;
+}
+
+// C at the edges (parts + 1) in photons, without the background.
+inline double integrate(const double* photons, int64_t parts, double* edge) {
+    edge[0] = 0.0;
+    const Runs runs = integrate_runs(photons, parts, parts / Runs::kRuns, edge + 1);
+    for (int64_t run = 0; run < Runs::kRuns; ++run)
+        for (int64_t j = 1; j <= runs.length; ++j) edge[run * runs.length + j] += runs.before[run];
+    return runs.total;
+}
+
+// C of one pixel and its inverse, by phase in [0, 1), in double precision.
+class PixelWaveform {
+ public:
+    PixelWaveform(const Job& job, int64_t pixel) : parts_(job.samples), edges_(job.samples + 1) {
+        total_ = integrate(job.waveform + pixel * parts_, parts_, edges_.data()) + job.background[pixel];
+        const double each = job.background[pixel] / static_cast<double>(parts_);
+        for (int64_t j = 1; j < parts_; ++j) edges_[j] += static_cast<double>(j) * each;
+        edges_[parts_] = std::max(total_, edges_[parts_ - 1]);
+    }
+
+    double total() const { return total_; }
+
+    double energy(double phase) const {
+        const double x = phase * static_cast<double>(parts_);
+        const int64_t j = std::min(static_cast<int64_t>(x), parts_ - 1);
+        return edges_[j] + (edges_[j + 1] - edges_[j]) * (x - static_cast<double>(j));
+    }
+
+    double phase(double energy) const {
+        const int64_t above = std::upper_bound(edges_.begin(), edges_.end(), energy) - edges_.begin();
+        const int64_t j = std::min(std::max<int64_t>(above - 1, 0), parts_ - 1);
+        const double step = edges_[j + 1] - edges_[j];
+        const double inside = step > 0.0 ? std::min((energy - edges_[j]) / step, 1.0) : 0.0;
+        return std::min((static_cast<double>(j) + inside) / static_cast<double>(parts_), 1.0 - 0x1p-53);
+    }
+
+    // In at least 1024 parts, or `least` up to 16384; a whole number of them in each sample.
+    std::vector<double> photons(double least) const {
+        const int64_t wanted = static_cast<int64_t>(std::min(std::max(least, 1024.0), 16384.0));
+        const int64_t split = std::max<int64_t>(1, wanted / parts_);
+        std::vector<double> photons;
+        photons.reserve(parts_ * split);
+        for (int64_t j = 0; j < parts_; ++j)
+            photons.insert(photons.end(), split, (edges_[j + 1] - edges_[j]) / static_cast<double>(split));
+        return photons;
+    }
+
+ private:
+    int64_t parts_;
+    double total_;
+    std::vector<double> edges_;
+};
+
+class WaveformWarmedUp {
+ public:
+    WaveformWarmedUp(const Job& job, int64_t pixel) : job_(job), pixel_(job.pixel_index[pixel]), wave_(job, pixel) {
+        const double dead = job.dead_time, total = wave_.total();
+        if (job.mode == DetectorMode::kParalyzable) {
+            cycle_ = -paralyzable_warm_up(dead, total);
+        } else if (job.mode == DetectorMode::kSynchronous) {
+            const double early = wave_.energy(1.0 - (dead - std::floor(dead)));
+            synchronous_ = std::make_unique<SynchronousStart>(dead, total, early);
+        } else if (job.mode == DetectorMode::kNonparalyzable && gaps_are_near(total, total * dead, dead)) {
+            gaps_ = true;
+        } else {
+            const bool gated = job.mode == DetectorMode::kGated;
+            std::vector<double> photons = wave_.photons(gated ? 64.0 / job.gate.width : 0.0);
+            if (gated)
+                apply_gate(job.gate, photons, [&](double a, double b) { return wave_.energy(b) - wave_.energy(a); });
+            cycle_ = -static_cast<int64_t>(dead) - 2;
+            blind_ = std::make_unique<StationaryState>(photons, dead);
+            blind_->check(pixel_);
+        }
+    }
+
+    // Cycle and phase from which on the arrivals of one realization matter.
+    void draw(uint32_t realization, GapSearch& search, int32_t& cycle, double& phase) const {
+        const Pair<uint32_t> key = stream_key(job_.seed, realization, pixel_);
+        const double total = wave_.total(), u = start_uniform(key);
+        const auto place = [&](uint32_t, const Pair<uint32_t>& words) { return wave_.phase(unit(words) * total); };
+        const double residual = gaps_          ? search.residual(total, job_.dead_time, key, place)
+                                : blind_       ? blind_->residual(u)
+                                : synchronous_ ? static_cast<double>(synchronous_->periods(u))
+                                               : 0.0;
+        const double periods = std::floor(residual);
+        cycle = static_cast<int32_t>(cycle_ + static_cast<int64_t>(periods));
+        phase = residual - periods;
+    }
+
+ private:
+    const Job& job_;
+    uint32_t pixel_;
+    PixelWaveform wave_;
+    std::unique_ptr<StationaryState> blind_;
+    std::unique_ptr<SynchronousStart> synchronous_;
+    int64_t cycle_ = 0;  // at which that is
+    bool gaps_ = false;  // drawn from the arrivals before the exposure
+};
+
+}  // namespace mars

@@ -1,6 +1,6 @@
 """The MaRS paper's whole pipeline in NumPy, stage by stage, in turn with the engines that do the same.
 
-The pipeline is `studies.numpy_pipeline`; its table holds the exact moments, 256 x 100 at full size.
+The pipeline is `studies.runtime.numpy_pipeline`; its table holds the exact moments, 256 x 100 at full size.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from benchmarks.workload import EngineRun, canonical
 from mars_lidar import _core
 from mars_lidar.engines import ANY_SYSTEM, MarsEngine
 from mars_lidar.table import Table
-from studies.numpy_pipeline import NumpyTable, Stages, synthesize
+from studies.runtime.numpy_pipeline import NumpyTable, Stages, synthesize
 
 _AXIS = (0.01, 10.0)
 GOAL_MARS = 25.0

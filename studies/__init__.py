@@ -51,63 +51,69 @@ def _study(module: str) -> Study:
 
 
 STUDIES: dict[str, tuple[str, Study]] = {
-    "covariance": ("covariance of holding times, and the rules that truncate its sum", _study("covariance_report")),
+    "covariance": ("covariance of holding times, and the rules that truncate its sum", _study("covariance.run")),
     "joint": (
         "can a classifier tell an engine's histograms from exact ones? needs scikit-learn",
-        _study("joint_report"),
+        _study("joint.run"),
     ),
     "joint-covariance": (
         "the histogram's covariance in closed form against simulation; --data adds reference cases",
-        _study("joint_covariance_report"),
+        _study("joint.covariance"),
     ),
     "long-exposures": (
         "the feedback engine at a million cycles and more against the closed form",
-        _study("long_exposures"),
+        _study("long_exposures.run"),
     ),
     "domain": (
         "every engine and prediction on random systems over the declared domain; --seed draws others",
-        _study("domain"),
+        _study("domain.run"),
     ),
-    "law": ("where each count law holds: total variation to simulation over flux and exposure", _study("law_report")),
+    "law": (
+        "where each count law holds: total variation to simulation over flux and exposure",
+        _study("count_law.law"),
+    ),
     "detectors": (
         "what each mode of a detector does to the same flux, simulated and in closed form",
-        _study("detectors"),
+        _study("detectors.run"),
     ),
     "effects": (
         "what each effect of a detector does to the same flux, simulated and in closed form",
-        _study("effects"),
+        _study("detectors.effects"),
     ),
-    "matched": ("a law of the count from four cumulants: total variation to the exact law", _study("matched_report")),
-    "reference": ("every count law against simulated reference cases; needs --data", _study("reference")),
-    "count-law": ("T1: every simulator's count law and shape against simulation", _study("count_law_report")),
+    "matched": (
+        "a law of the count from four cumulants: total variation to the exact law",
+        _study("count_law.matched"),
+    ),
+    "reference": ("every count law against simulated reference cases; needs --data", _study("count_law.reference")),
+    "count-law": ("T1: every simulator's count law and shape against simulation", _study("count_law.run")),
     "joint-table": (
         "variance of signal window and bins, covariance of neighbours: every engine",
-        _study("joint_table_report"),
+        _study("joint.table"),
     ),
     "quantisation": (
         "what a table's lookup costs, nearest and interpolated, over its size",
-        _study("quantisation_report"),
+        _study("table.quantisation"),
     ),
     "hardware": (
         "T6: streams calibrated and validated, faulty detectors; --stream adds a measured one",
-        _study("hardware_report"),
+        _study("hardware.run"),
     ),
     "streams": (
         "ideal streams over the whole range of light, jitter and clock: false alarms, and how well errors hold",
         _study("streams_report"),
     ),
-    "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _study("runtime_report")),
+    "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _study("runtime.run")),
     "reconstruction": (
         "bias and error of depth and signal over flux, every method, beside the bound",
-        _study("reconstruction"),
+        _study("reconstruction.run"),
     ),
-    "transients": ("two returns in fog through the dead time of three detectors", _study("transients")),
+    "transients": ("two returns in fog through the dead time of three detectors", _study("transients.run")),
     "downstream": (
         "T5: networks trained on every simulator's data, tested on gold; --config",
         _study("downstream.run"),
     ),
-    "start-up": ("what the shape of a table leaves out: the start-up at other delays", _study("start_up")),
-    "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _study("table")),
+    "start-up": ("what the shape of a table leaves out: the start-up at other delays", _study("table.start_up")),
+    "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _study("table.run")),
 }
 
 __all__ = ["STUDIES", "OtherRunsError", "Request", "Study", "Tell"]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mars_lidar._base.optional import MissingLibraryError
 from studies import STUDIES, OtherRunsError, Request
-from studies.classifiers import MissingExtra
+from studies.joint.classifiers import MissingExtra
 
 
 def _parser(command: str) -> argparse.ArgumentParser:

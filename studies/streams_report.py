@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from studies import Request
-from studies.machine import machine
-from studies.report import Row, configuration, save_csv, save_text, table
+from studies.common.report import Row, configuration, machine, save_csv, save_text, table
 from studies.streams import ESTIMATES, FULL, QUICK, Coverage, Outcome, Settings, outcomes
 
 LEVEL = 1e-4  # false-alarm probability of an inspection, as it is stated

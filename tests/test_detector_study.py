@@ -7,9 +7,9 @@ import csv
 from harness import require
 from scipy import stats
 
-from studies import detectors
 from studies.__main__ import main
-from studies.report import MAX_FIGURE_BYTES
+from studies.common.report import MAX_FIGURE_BYTES
+from studies.detectors import run as detectors
 
 
 def test_quick(tmp_path):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from studies import effects
 from studies.__main__ import main
+from studies.detectors import effects
 
 
 def test_quick_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

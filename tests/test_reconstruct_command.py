@@ -20,7 +20,7 @@ from mars_lidar.reconstruct import stored as stored_module
 from mars_lidar.reconstruct.quality import map_error
 from mars_lidar.reconstruct.stored import reconstruct_stored
 from studies.__main__ import main
-from studies.report import MAX_FIGURE_BYTES
+from studies.common.report import MAX_FIGURE_BYTES
 
 SMALL = ("--size", 12, "--cycles", 300, "--bins", 256, "--signal", 2)
 

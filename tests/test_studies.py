@@ -13,9 +13,12 @@ import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, count_law
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.distance import Pmf, g_test, sampling_floor, total_variation, variance_score
-from studies import STUDIES, Request, covariance, covariance_findings, law, law_report, modes
+from studies import STUDIES, Request
 from studies.__main__ import main
-from studies.report import MAX_FIGURE_BYTES, table
+from studies.common.report import MAX_FIGURE_BYTES, table
+from studies.count_law import law
+from studies.covariance import modes
+from studies.covariance import run as covariance
 
 
 def read_csv(path):
@@ -65,10 +68,10 @@ def test_covariance_figures_make_sense(quick):
 
 def test_rules_of_the_covariance_sum():
     cells = covariance.compute(covariance.QUICK, "centre", str)
-    errors = [covariance_findings.mean_error(cells, covariance.cutoff_name(c)) for c in (0, 20, 500)]
+    errors = [covariance.mean_error(cells, covariance.cutoff_name(c)) for c in (0, 20, 500)]
     assert all(one > other for one, other in pairwise(errors))
-    best = covariance_findings.best_cutoff(cells)
-    assert covariance_findings.mean_error(cells, covariance.cutoff_name(best)) <= errors[1]
+    best = covariance.best_cutoff(cells)
+    assert covariance.mean_error(cells, covariance.cutoff_name(best)) <= errors[1]
     for cell in cells:
         expected = -2 * cell.terms.exact_sum / cell.terms.sigma2
         assert cell.relative_error("cut-off 0") == pytest.approx(expected)
@@ -129,7 +132,7 @@ def test_simulation_of_a_cell_is_keyed_by_the_seed():
 def test_edgeworth_constant():
     z = stats.norm()
     integral = z.expect(lambda x: np.abs(x**3 - 3 * x), lb=-12, ub=12)
-    assert pytest.approx(integral / 12, rel=1e-6) == law_report._PER_SKEWNESS
+    assert pytest.approx(integral / 12, rel=1e-6) == law._PER_SKEWNESS
 
 
 def test_total_variation():
@@ -231,7 +234,7 @@ def test_table():
         "| 123456 | 2 |",
     ]
     assert table([]) == ""
-    assert math.isclose(law_report._PER_SKEWNESS, 0.1258, abs_tol=1e-4)
+    assert math.isclose(law._PER_SKEWNESS, 0.1258, abs_tol=1e-4)
 
 
 def test_long_exposures_are_those_of_the_closed_form(tmp_path):

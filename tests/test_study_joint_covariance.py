@@ -8,10 +8,10 @@ import pytest
 from harness import require
 from scipy import stats
 
-from studies import joint_covariance_report
 from studies.__main__ import main
-from studies.joint_covariance import QUICK, random_systems
-from studies.report import MAX_FIGURE_BYTES
+from studies.common.report import MAX_FIGURE_BYTES
+from studies.joint import covariance as joint_covariance
+from studies.joint.covariance import QUICK, random_systems
 
 
 @pytest.fixture(scope="module")
@@ -21,14 +21,14 @@ def systems():
 
 def test_random_systems(systems):
     """One z from each system and kind: independent, standard normal."""
-    for name, z in joint_covariance_report._scores(systems, QUICK).items():
+    for name, z in joint_covariance._scores(systems, QUICK).items():
         outcome = {"normal": stats.kstest(z, "norm").pvalue, "chi-square": stats.chi2.sf((z**2).sum(), z.size)}
         require(outcome, f"joint-covariance study, {name}")
     assert {o.law.settled >= 0 for o in systems} == {True, False}, "both routes"
 
 
 def test_report(systems, tmp_path, monkeypatch):
-    monkeypatch.setattr(joint_covariance_report, "random_systems", lambda *_: systems)
+    monkeypatch.setattr(joint_covariance, "random_systems", lambda *_: systems)
     assert main(["joint-covariance", "--quick", "--out", str(tmp_path)]) == 0
     text = (tmp_path / "joint_covariance.md").read_text()
     assert "Quick form" in text

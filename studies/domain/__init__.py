@@ -2,11 +2,5 @@
 
 Systems (`case`, `systems`), what is drawn of each (`samples`), comparisons (`checks`, `records`), what they are held
 against (`predictions`, `closed_forms`, `simulator`, `references`), one case (`judge`, in its own process: `watch`),
-who is to blame (`verdict`), the sweep (`sweep`) and its report (`run`, `report`, `figures`).
+who is to blame (`verdict`), the sweep (`sweep`) and its report (`run`, `figures`).
 """
-
-from __future__ import annotations
-
-from studies.domain.run import run
-
-__all__ = ["run"]

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from studies.common.draw import WIDTH, panels
+from studies.common.report import save_figure
 from studies.domain.verdict import ENGINES, FAILED, HANDED, LAWS, REFUSED, SLOW, UNJUDGED, VERIFIED
-from studies.draw import WIDTH, panels
-from studies.report import save_figure
 
 _INK = {
     VERIFIED: "#3b78b5",

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from queue import Empty, Queue
 from threading import Thread
-from typing import Any
 
 from studies import Tell
 from studies.domain.case import Case
@@ -127,31 +123,3 @@ def _blame(outcomes: list[Outcome], case: Case, party: str, checks: list[Check])
             outcome.state = FAILED
             return
     outcomes.append(Outcome(case.name, party, FAILED, note=words))
-
-
-def rows(judged: Judged) -> list[dict[str, Any]]:
-    """One row of the data for each subject."""
-    facts = judged.case.facts()
-    return [
-        facts
-        | {
-            "subject": o.subject,
-            "state": o.state,
-            "seconds": o.seconds,
-            "checks": len(o.checks),
-            "least p": min((c.p for c in o.checks), default=1.0),
-            "note": o.note.replace("\n", " "),
-        }
-        for o in judged.outcomes
-    ]
-
-
-def describe(check: Check) -> str:
-    """A check on one line."""
-    return json.dumps(asdict(check))
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """Rows of an earlier sweep."""
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))

@@ -1,4 +1,4 @@
-"""T5 of the MaRS paper: networks trained on every simulator's data, tested on their own and on gold-standard data.
+"""Study "downstream", T5 of the MaRS paper: networks trained on every simulator's data, tested on gold-standard data.
 
 A network for each simulator, ratio, target and seed; each leaves its result in a folder of its own, and a study that
 was stopped goes on where it was.
@@ -58,7 +58,7 @@ def runs(config: Config) -> list[Run]:
 
 def run(request: Request) -> list[Path]:
     """Make what is left of the runs, and write downstream.md, its CSV and its figures."""
-    from studies.downstream.report import write
+    from studies.downstream.report import report
 
     name = "tiny" if request.quick else request.config
     config = CONFIGS[checks.choice("config", name, tuple(CONFIGS))]
@@ -74,7 +74,7 @@ def run(request: Request) -> list[Path]:
     if not (folder / COUNTS).exists():
         request.tell("downstream: counts of every simulator on the test scenes")
         _write(folder / COUNTS, json.dumps(count_bias(config, data.test, data.simulators), indent=2) + "\n")
-    return write(request.out, folder, config, found, json.loads((folder / COUNTS).read_text()))
+    return report(request, folder, config, found, json.loads((folder / COUNTS).read_text()))
 
 
 def fixed(folder: Path, config: Config) -> None:

@@ -12,8 +12,8 @@ from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.statistics.matched import matched_counts, matched_pmf, trusted
 from mars_lidar.statistics.pmf import Window
 from studies.__main__ import main
-from studies.matched import QUICK
-from studies.report import MAX_FIGURE_BYTES
+from studies.common.report import MAX_FIGURE_BYTES
+from studies.count_law.matched import QUICK
 
 PERIOD_NS = 1e3 / 7.5
 AIM = 0.002

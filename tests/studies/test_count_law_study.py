@@ -11,11 +11,12 @@ from scipy import stats
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.poisson import PoissonEngine
 from mars_lidar.statistics.distance import KL_FLOOR, Pmf, kl_divergence, wasserstein
-from studies import count_law, count_law_report, simulators
 from studies.__main__ import main
-from studies.count_law_shape import shape_sweep
-from studies.report import MAX_FIGURE_BYTES
-from studies.sample import draw
+from studies.common import simulators
+from studies.common.report import MAX_FIGURE_BYTES
+from studies.common.sample import draw
+from studies.count_law import run as count_law
+from studies.count_law.run import shape_sweep
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +56,14 @@ def test_exact_law_passes_and_poisson_fails(cells):
         assert cell.truth.p.sum() == pytest.approx(1.0)
         assert np.rint(cell.truth.p * size).sum() == size
     require(outcomes, "count-law study")
-    figures, floor, limit = count_law_report.average(cells, "mars_exact")
+    figures, floor, limit = count_law.average(cells, "mars_exact")
     assert all(value <= 2 * bound for value, bound in zip(figures, limit, strict=True))
     assert all(low < high for low, high in zip(floor, limit, strict=True))
-    assert count_law_report.average(cells, "poisson")[0][0] > 100 * floor[0]
+    assert count_law.average(cells, "poisson")[0][0] > 100 * floor[0]
     bright = max(cells, key=lambda cell: cell.signal + cell.background)
-    assert count_law_report.right(bright, "mars_exact") == {"mean": True, "variance": True, "shape": True}
-    assert count_law_report.right(bright, "renewal") == {"mean": False, "variance": False, "shape": True}
-    assert not any(count_law_report.right(bright, "poisson")[key] for key in ("mean", "variance"))
+    assert count_law.right(bright, "mars_exact") == {"mean": True, "variance": True, "shape": True}
+    assert count_law.right(bright, "renewal") == {"mean": False, "variance": False, "shape": True}
+    assert not any(count_law.right(bright, "poisson")[key] for key in ("mean", "variance"))
 
 
 def test_distances():

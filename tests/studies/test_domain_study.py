@@ -14,6 +14,7 @@ from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.reconstruct.histogram_bound import _variances
 from mars_lidar.statistics import ConvergenceError
 from studies.__main__ import main
+from studies.common.report import MAX_FIGURE_BYTES
 from studies.domain import judge as judging
 from studies.domain import verdict, watch
 from studies.domain.case import MOVING, PERIOD_NS, Case
@@ -24,7 +25,6 @@ from studies.domain.samples import Windows, simulated
 from studies.domain.sweep import Settings, judge_case
 from studies.domain.systems import FAMILIES, draw
 from studies.domain.watch import Watched
-from studies.report import MAX_FIGURE_BYTES
 
 
 def pixel(signal: float = 1.0, background: float = 0.5, dead: float = 0.4, cycles: int = 100, **more: object) -> Case:

@@ -10,8 +10,8 @@ import pytest
 
 import mars_lidar as ml
 from studies.__main__ import main
-from studies.hardware import joined, system_of
-from studies.report import MAX_FIGURE_BYTES
+from studies.common.report import MAX_FIGURE_BYTES
+from studies.hardware.cases import joined, system_of
 
 
 def test_quick(tmp_path):

@@ -8,8 +8,8 @@ from harness.ledger import require
 from scipy import stats
 
 from mars_lidar.engines import ANY_SYSTEM
-from studies import joint_table as joint
 from studies.__main__ import main
+from studies.joint import table as joint
 
 POISSON = joint.Case("no dead time", 0.5, 0.5, 0.0, cycles=300)
 

@@ -7,8 +7,8 @@ import pytest
 
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
-from studies import quantisation
 from studies.__main__ import main
+from studies.table import quantisation
 
 
 def test_files(tmp_path):

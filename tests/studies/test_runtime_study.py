@@ -9,9 +9,10 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.engines import ANY_SYSTEM
-from studies import contenders, runtime
 from studies.__main__ import main
-from studies.numpy_pipeline import STAGES, NumpyTable, Stages, synthesize
+from studies.runtime import contenders
+from studies.runtime import run as runtime
+from studies.runtime.numpy_pipeline import STAGES, NumpyTable, Stages, synthesize
 
 
 @pytest.fixture(scope="module")

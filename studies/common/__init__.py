@@ -1,0 +1,1 @@
+"""What the studies share: reports, figures, samples, simulators."""

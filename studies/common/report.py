@@ -1,0 +1,163 @@
+"""Reports of the studies: Markdown from a template, CSV beside it, figures of bounded size."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import os
+import platform
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mars_lidar._base.optional import MissingLibraryError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from studies import Request
+
+Row = Mapping[str, Any]
+
+MAX_FIGURE_BYTES = 200_000
+
+
+def write(
+    request: Request,
+    name: str,
+    template: Path,
+    facts: Mapping[str, Any],
+    *,
+    rows: Sequence[Row] = (),
+    figures: Sequence[Path] = (),
+) -> list[Path]:
+    """Write NAME.md from a Jinja template and `facts`, and NAME.csv of `rows`; returns these and `figures`."""
+    text = request.out / f"{name}.md"
+    text.write_text(render(request, template, facts), encoding="utf-8")
+    return [text, *figures, *([save_csv(request.out / f"{name}.csv", rows)] if rows else [])]
+
+
+def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:
+    """The Markdown of a template, which also knows the names below."""
+    try:
+        import jinja2
+    except ImportError as error:
+        raise MissingLibraryError(f"studies need Jinja2: pip install 'mars-lidar[studies]' ({error})") from error
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(template.parent),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        autoescape=False,
+    )
+    environment.filters |= {
+        "f": format,  # x|f(".3g")
+        "n": number,
+        "each": lambda values, spec="g": ", ".join(format(v, spec) for v in values),
+        "mean": lambda values: float(np.mean(list(values))),
+        "median": lambda values: float(np.median(list(values))),
+        "quantile": lambda values, q: float(np.quantile(list(values), q)),
+    }
+    environment.globals |= {
+        "quick": request.quick,
+        "for_looking": "_Quick form: a look, not for citing._" if request.quick else "",
+        "flag": " --quick" if request.quick else "",
+        "versions": versions(),
+        "machine": machine,
+        "load": load,
+        "table": table,
+        "zip": zip,
+        "len": len,
+    }
+    text = environment.get_template(template.name).render(facts)
+    return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
+
+
+def number(value: Any) -> str:
+    """Four significant figures of a float, thousands kept whole; anything else as it is."""
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
+
+
+def table(rows: Iterable[Row]) -> str:
+    """A Markdown table; all rows have the keys of the first."""
+    lines = list(rows)
+    if not lines:
+        return ""
+    keys = list(lines[0])
+    head = ["| " + " | ".join(keys) + " |", "|" + "---|" * len(keys)]
+    return "\n".join(head + ["| " + " | ".join(number(row[key]) for key in keys) + " |" for row in lines])
+
+
+def versions() -> str:
+    """Two items of a configuration: versions and the date."""
+    import scipy
+
+    from mars_lidar import __version__
+
+    used = {"mars_lidar": __version__, "numpy": np.__version__, "scipy": scipy.__version__}
+    today = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
+    return "- versions: " + ", ".join(f"{name} {version}" for name, version in used.items()) + f"\n- date: {today}"
+
+
+def save_csv(path: Path, rows: Sequence[Row]) -> Path:
+    """Write rows that share their keys; floats with six significant figures. Returns `path`."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(rows[0])
+        for row in rows:
+            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in row.values()])
+    return path
+
+
+def save_figure(path: Path, figure: Figure) -> Path:
+    """Write a PNG; raises ValueError where it is too large to keep beside the text. Returns `path`."""
+    figure.savefig(path, metadata={"Software": None})
+    size = path.stat().st_size
+    if size > MAX_FIGURE_BYTES:
+        raise ValueError(f"figure {path.name} has {size} bytes, at most {MAX_FIGURE_BYTES} are allowed")
+    return path
+
+
+def machine() -> str:
+    """Processor, processors of this process, vector level and system, in one line."""
+    from mars_lidar import _core
+    from mars_lidar._base.threads import thread_count
+
+    return (
+        f"{_processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "
+        f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
+    )
+
+
+def load() -> str:
+    """Processes that wanted to run, mean of the last minute: what a timing may have been disturbed by."""
+    try:
+        return f"{os.getloadavg()[0]:.1f} on {os.cpu_count()} processors"
+    except OSError:
+        return "not known on this system"
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith(("model name", "Model")):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def configuration(settings: Mapping[str, Any]) -> str:
+    """What was run: settings, versions and the date, one line each."""
+    return "\n".join([*(f"- {name}: {value}" for name, value in settings.items()), versions()])
+
+
+def save_text(path: Path, parts: Sequence[str]) -> Path:
+    """Write paragraphs as one Markdown file; returns `path`."""
+    path.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
+    return path

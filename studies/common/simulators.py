@@ -1,0 +1,143 @@
+"""What each simulator predicts of a pixel: the law of its count and the shape of its mean histogram.
+
+The simulators are those of the MaRS paper (arXiv 2512.04924) and ours. Those with a count law in closed form are
+asked for it; any other engine of the registry is asked for a sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.engines import ENGINES
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics import CountLaw, count_law, photons_per_bin, registration_pdf
+from mars_lidar.statistics.distance import Pmf
+from mars_lidar.statistics.matched import matched_pmf
+from studies.common.sample import draw
+from studies.neural.pairs import Training
+
+if TYPE_CHECKING:
+    from studies.neural import NeuralEngine
+
+FloatArray = NDArray[np.float64]
+
+# engines whose count law is evaluated instead of sampled, and those that are the truth
+_IN_CLOSED_FORM = ("poisson", "renewal", "mars", "exact", "sequential")
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Of cells (cells,): mean and variance of the count, its pmfs, and the shape (cells, bins).
+
+    `sampled` counts the exposures behind it, 0 where it is evaluated.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    pmfs: list[Pmf]
+    shape: FloatArray
+    sampled: int = 0
+
+
+Predict = Callable[[FloatArray, FloatArray, System], Prediction]
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator by name, in words, and how it is asked."""
+
+    name: str
+    words: str
+    predict: Predict
+
+
+def simulators(sampled: int, seed: int, training: Training | None = None) -> list[Simulator]:
+    """All simulators; engines without a law in closed form are asked for `sampled` exposures.
+
+    The network of the neural stand-in is trained for each system as `training` says, once;
+    it is left out where PyTorch is not installed.
+    """
+    plan = training or Training()
+    evaluated = [
+        Simulator("poisson", "Poisson", _poisson),
+        Simulator("renewal", "renewal", _renewal),
+        Simulator("mars_centre", "MaRS, paper's, centre", lambda s, b, system: _mars(s, b, system, "centre")),
+        Simulator("mars_edge", "MaRS, paper's, edge", lambda s, b, system: _mars(s, b, system, "edge")),
+        Simulator("mars_exact", "MaRS, ours, exact law", _exact),
+        Simulator("mars_matched", "MaRS, ours, four cumulants", _matched),
+    ]
+    if find_spec("torch") is not None:  # the extra "learn"
+        evaluated.append(Simulator("neural", "neural, stand-in", lambda s, b, system: _neural(s, b, system, plan)))
+    others = [name for name in ENGINES if name not in _IN_CLOSED_FORM]
+    return evaluated + [Simulator(name, f"{name} (sampled)", _sampler(name, sampled, seed)) for name in others]
+
+
+def of_law(law: CountLaw, shape: FloatArray) -> Prediction:
+    """The prediction of a batched count law (cells,)."""
+    pmfs = [Pmf(int(first), p) for first, p in zip(law.support[:, 0], law.pmf, strict=True)]
+    return Prediction(law.mean, law.variance, pmfs, shape)
+
+
+def arrival_shape(signal: FloatArray, background: FloatArray, system: System) -> FloatArray:
+    """Shape (cells, bins) of the arrivals, which is that of the flux."""
+    flux = zip(signal, background, strict=True)
+    shape = np.stack([photons_per_bin(s, b, system, bins=system.bins) for s, b in flux])
+    return np.asarray(shape / shape.sum(-1, keepdims=True), dtype=np.float64)
+
+
+def _poisson(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+    return of_law(count_law(signal, background, system, "poisson"), arrival_shape(signal, background, system))
+
+
+def _renewal(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+    shape = registration_pdf(signal, background, system, "chain")
+    return of_law(count_law(signal, background, system, "renewal"), shape)
+
+
+def _neural(signal: FloatArray, background: FloatArray, system: System, training: Training) -> Prediction:
+    engine = _trained(system.replace(cycles=1, start="armed"), training)
+    shape = engine.registration_pdf(signal, background, system)
+    return of_law(engine.count_law(signal, background, system), shape)
+
+
+@lru_cache(maxsize=8)
+def _trained(system: System, training: Training) -> NeuralEngine:
+    from studies.neural import NeuralEngine, train
+
+    return NeuralEngine(train(system, training).map)
+
+
+def _mars(signal: FloatArray, background: FloatArray, system: System, rearm: Literal["centre", "edge"]) -> Prediction:
+    shape = registration_pdf(signal, background, system, "chain", rearm=rearm)
+    return of_law(count_law(signal, background, system, "mars", rearm=rearm), shape)
+
+
+def _exact(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+    shape = registration_pdf(signal, background, system, "exposure")
+    return of_law(count_law(signal, background, system, "exact"), shape)
+
+
+def _matched(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+    """What a table holds of the exact law, and an engine with a table draws: four cumulants."""
+    shape = registration_pdf(signal, background, system, "exposure")
+    cumulants = count_law(signal, background, system, "exact").cumulants
+    pmfs = [Pmf(window.first, window.pmf) for window in matched_pmf(cumulants)]
+    return Prediction(cumulants[:, 0], cumulants[:, 1], pmfs, shape)
+
+
+def _sampler(engine: str, realizations: int, seed: int) -> Predict:
+    def predict(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        found = draw(engine, signal, background, system, realizations=realizations, seed=seed)
+        mean = found.counts.mean(0, dtype=np.float64)
+        variance = found.counts.var(0, dtype=np.float64, ddof=1)
+        pmfs = [Pmf.of_counts(column) for column in found.counts.T]
+        return Prediction(mean, variance, pmfs, found.shape, realizations)
+
+    return predict

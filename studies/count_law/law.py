@@ -1,0 +1,284 @@
+"""Study "law": where each count law holds, total variation to exact simulation over flux, exposure and dead time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import Flux, System, count_law, simulate
+from mars_lidar.statistics import CountLaw, distance
+from mars_lidar.statistics.distance import Pmf, total_variation
+from studies import Request, Tell
+from studies.common.report import Row, write
+from studies.common.sample import PERIOD_NS, log_points, system_of
+
+FloatArray = NDArray[np.float64]
+
+LAWS = {
+    "exact": "exact",
+    "gaussian": "best Gaussian",
+    "mars": "mars, centre",
+    "mars_edge": "mars, edge",
+    "renewal": "renewal",
+    "poisson": "Poisson",
+}
+_ROUNDING = 1e-9  # of a law whose count is certain: its floor is 0
+
+FEW, STILL, VISIBLE = 10.0, 1.0, 0.01  # E N below FEW, Var N below STILL, total variation above VISIBLE
+MODERATE = 200.0  # E N from where a Poisson law is within VISIBLE of its Gaussian
+# E |z^3 - 3 z| / 12, z standard normal: total variation of the first Edgeworth term per unit of skewness
+_PER_SKEWNESS = (1.0 + 4.0 * float(np.exp(-1.5))) / (6.0 * float(np.sqrt(2.0 * np.pi)))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Configuration of the study: maps over (S, B) at one exposure and over (S, exposure)."""
+
+    signal: tuple[float, ...]
+    background: tuple[float, ...]
+    dead: tuple[float, ...]  # periods
+    cycles: tuple[int, ...]
+    realizations: int
+    draws: int  # of the bootstrap
+    map_cycles: int = 1000
+    ratio: float = 10.0  # S / B along the exposure map
+    sigma_ns: float = 0.5
+    seed: int = 20263
+
+    def system(self, dead: float, cycles: int) -> System:
+        """System of a map; dead time in periods."""
+        return system_of(dead * PERIOD_NS, cycles, sigma_ns=self.sigma_ns)
+
+
+FULL = Settings(
+    signal=log_points(8),
+    background=log_points(8),
+    dead=(0.1875, 0.6375, 0.9765, 1.0, 1.97),
+    cycles=(10, 30, 100, 300, 1000, 3000, 10000),
+    realizations=50_000,
+    draws=2000,
+)
+QUICK = Settings(
+    signal=(0.05, 5.0),
+    background=(0.1, 2.0),
+    dead=(0.1875, 0.9765),
+    cycles=(10, 100),
+    realizations=2000,
+    draws=200,
+    map_cycles=100,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One pixel: moments of its exact law, distances of every law, the sampling floor.
+
+    `to_simulation` and `to_exact` are total variations by law; `floor` and `limit` the mean and the 99.9 %
+    quantile of the bootstrap of the exact law; `p_value` its G-test.
+    """
+
+    signal: float
+    background: float
+    dead: float
+    cycles: int
+    cumulants: FloatArray
+    to_simulation: dict[str, float]
+    to_exact: dict[str, float]
+    floor: float
+    limit: float
+    p_value: float
+    mean_score: float
+    variance_score: float
+    laws: dict[str, Pmf]
+    sample: Pmf
+
+    def within(self, law: str) -> bool:
+        """Whether the simulation cannot be told from this law by total variation, at this sample size."""
+        return self.to_simulation[law] <= self.limit + _ROUNDING
+
+    def name(self) -> str:
+        """The cell in words."""
+        flux = f"S = {self.signal:.3g}, B = {self.background:.3g}"
+        return f"{flux}, t_d = {self.dead:g} t_r, {self.cycles} cycles"
+
+
+def flux_map(settings: Settings, tell: Tell) -> list[Cell]:
+    """Cells over (S, B) and dead time at `map_cycles`."""
+    signal, background = np.meshgrid(settings.signal, settings.background, indexing="ij")
+    cells = []
+    for k, dead in enumerate(settings.dead):
+        cells += _cells(settings, signal.ravel(), background.ravel(), dead, settings.map_cycles, k)
+        tell(f"law: t_d = {dead:g} t_r, {signal.size} cells over (S, B)")
+    return cells
+
+
+def exposure_map(settings: Settings, tell: Tell) -> list[Cell]:
+    """Cells over (S, cycles) and dead time at a fixed S / B."""
+    signal = np.array(settings.signal)
+    cells = []
+    for k, dead in enumerate(settings.dead):
+        for m, cycles in enumerate(settings.cycles):
+            number = 1000 + 100 * k + m
+            cells += _cells(settings, signal, signal / settings.ratio, dead, cycles, number)
+        tell(f"law: t_d = {dead:g} t_r, {signal.size * len(settings.cycles)} cells over (S, cycles)")
+    return cells
+
+
+def _cells(
+    settings: Settings, signal: FloatArray, background: FloatArray, dead: float, cycles: int, number: int
+) -> list[Cell]:
+    """All (S, B) of one system; `number` keys its simulation and its bootstrap."""
+    system = settings.system(dead, cycles)
+    counts = _simulate(settings, signal, background, system, number)
+    random = np.random.default_rng([settings.seed, number])
+    exact = count_law(signal, background, system)
+    others = {
+        "mars": count_law(signal, background, system, "mars"),
+        "mars_edge": count_law(signal, background, system, "mars", rearm="edge"),
+        "renewal": count_law(signal, background, system, "renewal"),
+        "poisson": count_law(signal, background, system, "poisson"),
+    }
+    cells = []
+    for k in range(signal.size):
+        laws = {"exact": pmf_of(exact, k)}
+        laws["gaussian"] = Pmf.gaussian(float(exact.mean[k]), float(exact.variance[k]))
+        laws |= {name: pmf_of(law, k) for name, law in others.items()}
+        sample, size = Pmf.of_counts(counts[:, k]), settings.realizations
+        noise = distance.sampling_floor(laws["exact"], size, settings.draws, random)
+        mean, variance = float(exact.mean[k]), float(exact.variance[k])
+        cells.append(
+            Cell(
+                float(signal[k]),
+                float(background[k]),
+                dead,
+                cycles,
+                exact.cumulants[k],
+                to_simulation={name: total_variation(law, sample) for name, law in laws.items()},
+                to_exact={name: total_variation(law, laws["exact"]) for name, law in laws.items()},
+                floor=float(noise.mean()),
+                limit=float(np.quantile(noise, 0.999)),
+                p_value=distance.g_test(laws["exact"], sample, size),
+                mean_score=distance.mean_score(mean, variance, float(counts[:, k].mean(dtype=np.float64)), size),
+                variance_score=distance.variance_score(exact.cumulants[k], sample, size),
+                laws=laws,
+                sample=sample,
+            )
+        )
+    return cells
+
+
+def second_look(settings: Settings, cells: list[Cell], tell: Tell) -> list[tuple[Cell, Cell]]:
+    """Cells in which the exact law looked worst, each with a fresh simulation four times as large."""
+    doubtful = [c for c in cells if not c.within("exact") or c.p_value < 1.0 / len(cells)]
+    larger = replace(settings, realizations=4 * settings.realizations)
+    found = []
+    for k, cell in enumerate(doubtful):
+        signal, background = np.array([cell.signal]), np.array([cell.background])
+        found.append((cell, _cells(larger, signal, background, cell.dead, cell.cycles, 10_000 + k)[0]))
+        tell(f"law: second look at {cell.name()}")
+    return found
+
+
+def pmf_of(law: CountLaw, k: int) -> Pmf:
+    """One cell of a batched count law."""
+    return Pmf(int(law.support[k, 0]), law.pmf[k])
+
+
+def _simulate(
+    settings: Settings, signal: FloatArray, background: FloatArray, system: System, number: int
+) -> NDArray[np.integer[Any]]:
+    """Counts (realizations, cells) by the exact engine; a histogram of one bin holds nothing else."""
+    flux = Flux(signal[None], background[None], 0.5 * system.period_ns)
+    seed = (settings.seed << 16) + number
+    cube = simulate(flux, system.replace(bins=1), realizations=settings.realizations, seed=seed)
+    return cube.reshape(settings.realizations, signal.size)
+
+
+def _regimes(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
+    """Cells by what their count is like."""
+    tests: dict[str, Callable[[float, float], bool]] = {
+        "few photons: E N < 10": lambda mean, variance: mean < FEW,
+        "locked or saturated: E N >= 10, Var N < 1": lambda mean, variance: mean >= FEW and variance < STILL,
+        "sub-Poissonian: 1 <= Var N < E N / 4": lambda mean, variance: mean >= FEW and STILL <= variance < 0.25 * mean,
+        f"moderate: 10 <= E N < {MODERATE:g}, Var N >= E N / 4": lambda mean, variance: (
+            FEW <= mean < MODERATE and variance >= max(STILL, 0.25 * mean)
+        ),
+        f"many: E N >= {MODERATE:g}, Var N >= E N / 4": lambda mean, variance: (
+            mean >= MODERATE and variance >= 0.25 * mean
+        ),
+    }
+    return {name: [c for c in cells if test(c.cumulants[0], c.cumulants[1])] for name, test in tests.items()}
+
+
+def _drawn_out(cells: Sequence[Cell]) -> list[Cell]:
+    """Cells whose laws are drawn out: the worst for the Gaussian in each regime, at different dead times."""
+    chosen: list[Cell] = []
+    # a cell with next to no counts at all is far from a Gaussian, but tells nothing
+    regimes = _regimes([c for c in cells if 0.02 < c.laws["exact"].p.max() < 0.98])
+    for regime, number in zip(regimes.values(), (2, 2, 1, 1), strict=False):
+        worst: dict[float, Cell] = {}
+        for cell in sorted(regime, key=lambda c: -c.to_exact["gaussian"]):
+            worst.setdefault(cell.dead, cell)
+        chosen += list(worst.values())[:number]
+    return chosen
+
+
+def run(request: Request) -> list[Path]:
+    """Compute, draw and write the study; returns the paths written."""
+    from studies.count_law.law_figures import draw_all
+
+    settings = QUICK if request.quick else FULL
+    flux, exposure = flux_map(settings, request.tell), exposure_map(settings, request.tell)
+    cells = [*flux, *exposure]
+    again = second_look(settings, cells, request.tell)
+    figures = draw_all(request.out, settings, flux, exposure, _drawn_out(cells))
+    plain = [c for c in cells if c.cumulants[0] >= FEW and c.cumulants[1] >= STILL]
+    skewness = np.array([abs(c.cumulants[2]) / c.cumulants[1] ** 1.5 for c in plain])
+    cost = [c.to_exact["mars"] - c.to_exact["gaussian"] for c in cells]
+    facts = {
+        "s": settings,
+        "flux": flux,
+        "exposure": exposure,
+        "cells": cells,
+        "again": again,
+        "laws": LAWS,
+        "within": {law: sum(c.within(law) for c in cells) for law in LAWS},
+        "regimes": _regimes(cells),
+        "beyond": sum(not c.within("exact") for c in cells),
+        "least": min(c.p_value for c in cells),
+        "worst_mean": max(abs(c.mean_score) for c in cells if c.cumulants[1] * settings.realizations > 20),
+        "broken": [c for c in cells if c.to_exact["gaussian"] > VISIBLE],
+        "ratio": np.array([c.to_exact["gaussian"] for c in plain]) / (_PER_SKEWNESS * skewness),
+        "per_skewness": _PER_SKEWNESS,
+        "cost": cost,
+        "costliest": cells[int(np.argmax(cost))],
+        "visible": VISIBLE,
+        "few": FEW,
+        "still": STILL,
+        "nan": float("nan"),
+    }
+    rows = [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure]
+    return write(request, "law", Path(__file__).with_name("law.md.jinja"), facts, rows=rows, figures=figures)
+
+
+def _csv_row(name: str, cell: Cell) -> Row:
+    return {
+        "map": name,
+        "signal": cell.signal,
+        "background": cell.background,
+        "dead_time_periods": cell.dead,
+        "cycles": cell.cycles,
+        **{f"cumulant_{k + 1}": float(cell.cumulants[k]) for k in range(4)},
+        "floor": cell.floor,
+        "limit": cell.limit,
+        "g_test_p": cell.p_value,
+        "z_mean": cell.mean_score,
+        "z_variance": cell.variance_score,
+        **{f"tv_simulation_{law}": cell.to_simulation[law] for law in LAWS},
+        **{f"tv_exact_{law}": cell.to_exact[law] for law in LAWS if law != "exact"},
+    }

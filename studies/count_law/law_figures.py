@@ -1,0 +1,163 @@
+"""Figures of the study of validity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from studies.common.draw import heat, panels
+from studies.common.report import save_figure
+from studies.count_law.law import LAWS, Cell, Settings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_LOW, _HIGH = 3e-3, 1.0  # total variation on the colour scales
+_LOW_EXACT = 1e-3  # where there is no sampling noise
+# law: colour, dash, width; drawn in this order, those that may coincide thick under thin
+_LINES = {
+    "gaussian": (COLOURS[5], "-", 2.4),
+    "mars": (COLOURS[1], "-", 0.9),
+    "renewal": (COLOURS[2], ":", 1.0),
+}
+Value = Callable[[Cell], float]
+
+
+def draw_all(
+    folder: Path, settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell], shown: Sequence[Cell]
+) -> list[Path]:
+    """Draw the figures into `folder`; `shown` are the cells whose laws are drawn out."""
+    with style():
+        return [
+            _gaussian(folder / "law_gaussian.png", settings, flux, exposure),
+            _rows(folder / "law_flux.png", settings, flux, "flux"),
+            _rows(folder / "law_exposure.png", settings, exposure, "exposure"),
+            _shown(folder / "law_cells.png", shown),
+            _floor(folder / "law_floor.png", [*flux, *exposure]),
+        ]
+
+
+def _heat(ax: Axes, settings: Settings, cells: Sequence[Cell], kind: str, value: Value, norm: Any) -> Any:
+    """One map: S along x; B or cycles along y."""
+    y = settings.background if kind == "flux" else settings.cycles
+    by = {(c.signal, c.background if kind == "flux" else c.cycles): value(c) for c in cells}
+    return heat(ax, settings.signal, y, [[by[s, b] for s in settings.signal] for b in y], norm)
+
+
+def _at(cells: Sequence[Cell], dead: float) -> list[Cell]:
+    return [cell for cell in cells if cell.dead == dead]
+
+
+def _rows(path: Path, settings: Settings, cells: Sequence[Cell], kind: str) -> Path:
+    """Total variation to simulation: rows for the sampling floor and each law, columns for dead times."""
+    from matplotlib.colors import LogNorm
+
+    rows: list[tuple[str, Value]] = [("sampling floor", lambda cell: cell.floor)]
+    rows += [(words, _to_simulation(name)) for name, words in LAWS.items()]
+    figure, axes = panels(8.4, len(rows), len(settings.dead), sharex=True, sharey=True)
+    norm, mesh = LogNorm(_LOW, _HIGH), None
+    for row, (words, value) in zip(axes, rows, strict=True):
+        for ax, dead in zip(row, settings.dead, strict=True):
+            mesh = _heat(ax, settings, _at(cells, dead), kind, value, norm)
+        row[0].set_ylabel(f"{words}\n{'B' if kind == 'flux' else 'cycles'}")
+    _frame(figure, axes, settings, mesh, "total variation to simulation")
+    return save_figure(path, figure)
+
+
+def _to_simulation(name: str) -> Value:
+    return lambda cell: cell.to_simulation[name]
+
+
+def _frame(figure: Any, axes: Any, settings: Settings, mesh: Any, label: str) -> None:
+    for ax, dead in zip(axes[0], settings.dead, strict=True):
+        ax.set_title(f"$t_d$ = {dead:g} $t_r$")
+    axes[-1, len(settings.dead) // 2].set_xlabel("S, photons per period")
+    figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01).set_label(label)
+
+
+def _gaussian(path: Path, settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell]) -> Path:
+    """Where the Gaussian breaks: its distance to the exact law, without noise, and why."""
+    from matplotlib.colors import LogNorm
+
+    figure, axes = panels(3.3, 2, len(settings.dead), gridspec_kw={"hspace": 0.0})
+    norm, mesh = LogNorm(_LOW_EXACT, _HIGH), None
+    for row, cells, kind in zip(axes, (flux, exposure), ("flux", "exposure"), strict=True):
+        for ax, dead in zip(row, settings.dead, strict=True):
+            here = _at(cells, dead)
+            mesh = _heat(ax, settings, here, kind, lambda cell: cell.to_exact["gaussian"], norm)
+            for cell in here:
+                y = cell.background if kind == "flux" else cell.cycles
+                mark = "." if cell.cumulants[0] < 10.0 else "_" if cell.cumulants[1] < 1.0 else ""
+                if mark:
+                    # dark on pale, pale on dark
+                    colour = COLOURS[0] if cell.to_exact["gaussian"] < 0.05 else COLOURS[5]
+                    ax.plot(cell.signal, y, mark, ms=2.4, color=colour, mew=0.8)
+            if ax is not row[0]:
+                ax.tick_params(labelleft=False)
+        row[0].set_ylabel("B" if kind == "flux" else "cycles")
+    for ax in axes[0]:
+        ax.tick_params(labelbottom=False)
+    marks = ((".", "E N < 10"), ("_", "E N at least 10, Var N < 1"))
+    for mark, words in marks:
+        axes[0, 0].plot([], [], mark, ms=4, color=COLOURS[0], label=words)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=2)
+    _frame(figure, axes, settings, mesh, "total variation,\nbest Gaussian to exact law")
+    return save_figure(path, figure)
+
+
+def _shown(path: Path, cells: Sequence[Cell]) -> Path:
+    """Count laws of a few cells beside the simulated frequencies."""
+    figure, axes = panels(3.9, 2, len(cells) // 2)
+    for ax, cell in zip(axes.flat, cells, strict=False):
+        low, high = _window(cell)
+        counts = np.arange(low, high + 1)
+        ax.bar(counts, cell.sample.on(low, high), width=1.0, color="#d9d9d9", label="simulation")
+        ax.plot(counts, cell.laws["exact"].on(low, high), "o-", ms=2.2, lw=0.8, color=INK, label="exact")
+        for name, (colour, dash, width) in _LINES.items():
+            ax.plot(counts, cell.laws[name].on(low, high), ls=dash, lw=width, color=colour, label=LAWS[name])
+        ax.set_xlim(low - 0.7, high + 0.7)
+        ax.set_ylim(0.0, 1.12 * float(max(cell.laws["exact"].p.max(), cell.sample.p.max())))
+        ax.xaxis.get_major_locator().set_params(integer=True, nbins=5)
+        ax.ticklabel_format(axis="x", useOffset=False)
+        ax.set_title(
+            f"S = {cell.signal:.3g}, B = {cell.background:.3g}, $t_d$ = {cell.dead:g} $t_r$\n"
+            f"{cell.cycles} cycles, TV of the Gaussian {cell.to_exact['gaussian']:.3f}",
+            loc="left",
+            fontsize=6.5,
+        )
+    for ax in axes[-1]:
+        ax.set_xlabel("registrations N")
+    for row in axes:
+        row[0].set_ylabel("P(N)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=5)
+    return save_figure(path, figure)
+
+
+def _window(cell: Cell) -> tuple[int, int]:
+    """Counts around the mean that hold the law, five standard deviations and at least two counts."""
+    reach = max(4.5 * float(cell.cumulants[1]) ** 0.5, 2.5)
+    return max(0, int(np.floor(cell.cumulants[0] - reach))), int(np.ceil(cell.cumulants[0] + reach))
+
+
+def _floor(path: Path, cells: Sequence[Cell]) -> Path:
+    """Distance to simulation over the sampling floor, against the spread of the count."""
+    figure, axes = panels(2.3, 1, 4, sharex=True, sharey=True)
+    spread = np.array([np.sqrt(cell.cumulants[1]) for cell in cells])
+    floor = np.array([max(cell.floor, 1e-12) for cell in cells])
+    limit = np.array([cell.limit for cell in cells])
+    for k, (ax, name) in enumerate(zip(axes[0], ("exact", "gaussian", "mars", "mars_edge"), strict=True)):
+        ratio = np.array([cell.to_simulation[name] for cell in cells]) / floor
+        seen = floor > 1e-6
+        ax.plot(spread[seen], limit[seen] / floor[seen], ".", ms=2, color=MUTED, mew=0, label="99.9 % limit")
+        ax.plot(spread[seen], ratio[seen], "o", ms=2.2, color=COLOURS[k], mew=0, alpha=0.7)
+        ax.axhline(1.0, color=INK, lw=0.6)
+        ax.set(xscale="log", yscale="log", xlabel="sd of N", ylim=(0.2, 300))
+        ax.set_title(LAWS[name], loc="left")
+    axes[0, 0].set_ylabel("total variation / floor")
+    axes[0, 0].legend(frameon=False, loc="upper left", markerscale=4, handletextpad=0.2)
+    return save_figure(path, figure)

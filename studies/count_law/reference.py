@@ -1,0 +1,131 @@
+"""Study "reference": every count law against simulated reference cases, read from JSON files.
+
+A case holds ``S``, ``B`` (photons per period); ``tau``, ``sigma``, ``dead`` (laser periods); ``cycles``; and
+``count``, {registrations: realizations}: an exposure on [0, cycles), armed at 0, Gaussian pulse.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mars_lidar import count_law
+from mars_lidar.statistics import distance
+from mars_lidar.statistics.chain import Rearm
+from mars_lidar.statistics.distance import Pmf
+from mars_lidar.statistics.law import Method
+from studies import Request
+from studies.common.report import write
+from studies.common.sample import system_of
+from studies.count_law.law import LAWS
+
+DRAWS, QUICK_DRAWS = 20_000, 500
+SEED = 20262
+_PERIOD_NS = 100.0
+_LIMIT_Z, _LIMIT_P = 4.0, 1e-4
+_KEYS = ("S", "B", "tau", "sigma", "dead", "cycles", "count")
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """One law beside one case; z in standard errors, p of the G-test."""
+
+    case: str
+    law: str
+    size: int
+    mean: float
+    variance: float
+    z_mean: float
+    z_variance: float
+    distance: float
+    floor: float
+    limit: float
+    p_value: float
+
+    @property
+    def good(self) -> bool:
+        """Mean and variance within 4 standard errors, total variation below the limit, p above 1e-4."""
+        scores = max(abs(self.z_mean), abs(self.z_variance))
+        return scores <= _LIMIT_Z and self.distance <= self.limit and self.p_value > _LIMIT_P
+
+
+def run(request: Request) -> list[Path]:
+    """Compare, and write the table; returns the paths written."""
+    if request.data is None:
+        raise ValueError("data must be the folder of the reference cases, got None")
+    paths = sorted(request.data.glob("*.json"))
+    draws = QUICK_DRAWS if request.quick else DRAWS
+    found: list[Comparison] = []
+    cases = {}
+    for k, path in enumerate(paths):
+        cases[path.stem] = case = _read(path)
+        found += compare(path.stem, case, draws, np.random.default_rng([SEED, k]))
+        request.tell(f"reference: {path.stem}")
+    facts = {
+        "cases": cases,
+        "keys": _KEYS[:-1],
+        "found": found,
+        "exact": [c for c in found if c.law == "exact"],
+        "laws": LAWS,
+        "draws": draws,
+        "seed": SEED,
+    }
+    rows = [{**vars(c), "good": c.good} for c in found]
+    return write(request, "reference", Path(__file__).with_name("reference.md.jinja"), facts, rows=rows)
+
+
+def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Generator) -> list[Comparison]:
+    """Every law beside one case, at the case's own delay."""
+    dead, sigma = case["dead"] * _PERIOD_NS, case["sigma"] * _PERIOD_NS
+    system = system_of(dead, case["cycles"], period_ns=_PERIOD_NS, sigma_ns=sigma)
+    signal, background, delay = float(case["S"]), float(case["B"]), case["tau"] * _PERIOD_NS
+    counts = np.array([int(n) for n in case["count"]])
+    times = np.array([int(m) for m in case["count"].values()])
+    size = int(times.sum())
+    frequency = np.bincount(counts - counts.min(), weights=times) / size
+    sample = Pmf(int(counts.min()), frequency)
+    mean = float((counts * (times / size)).sum())
+
+    exact = count_law(signal, background, system, delay_ns=delay)
+    laws = {"exact": (exact.cumulants, Pmf(int(exact.support[0]), exact.pmf))}
+    moments = np.array([exact.mean, exact.variance, 0.0, 0.0])
+    laws["gaussian"] = (moments, Pmf.gaussian(float(exact.mean), float(exact.variance)))
+    others: tuple[tuple[str, Method, Rearm | None], ...] = (
+        ("mars", "mars", "centre"),
+        ("mars_edge", "mars", "edge"),
+        ("renewal", "renewal", None),
+        ("poisson", "poisson", None),
+    )
+    for key, method, rearm in others:
+        law = count_law(signal, background, system, method, delay_ns=delay, rearm=rearm)
+        laws[key] = (law.cumulants, Pmf(int(law.support[0]), law.pmf))
+    noise = distance.sampling_floor(laws["exact"][1], size, draws, random)
+    return [
+        Comparison(
+            name,
+            key,
+            size,
+            float(cumulants[0]),
+            float(cumulants[1]),
+            # what the sample's mean and variance scatter by is known from the exact law
+            z_mean=distance.mean_score(float(cumulants[0]), float(exact.variance), mean, size),
+            z_variance=distance.variance_score(exact.cumulants, sample, size, float(cumulants[1])),
+            distance=distance.total_variation(pmf, sample),
+            floor=float(noise.mean()),
+            limit=float(np.quantile(noise, 0.999)),
+            p_value=distance.g_test(pmf, sample, size),
+        )
+        for key, (cumulants, pmf) in laws.items()
+    ]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    case: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    missing = [key for key in _KEYS if key not in case]
+    if missing:
+        raise ValueError(f"reference case {path.name} must hold {', '.join(_KEYS)}, it lacks {', '.join(missing)}")
+    return case

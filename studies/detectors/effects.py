@@ -1,0 +1,91 @@
+"""Study "effects": what each effect of a detector does to the same flux, simulated and in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mars_lidar import Afterpulsing, Crosstalk, Detector, Flux, GaussianPulse, Jitter, System, simulate
+from mars_lidar.statistics import constant_light_rate
+from studies import Request
+from studies.common.report import save_csv, write
+from studies.detectors.run import SEED, outcome, row, settings_of, shown_as
+
+CODES = tuple(1.0 + 0.25 * np.sin(2.0 * np.pi * k / 8.0) for k in range(8))
+SHOWN = (
+    shown_as("free running", ""),
+    shown_as("efficiency 0.3", "light", detection_efficiency=0.3),
+    shown_as("dark counts 5 MHz", "light", dark_count_hz=5e6),
+    shown_as(
+        "p 0.1, 30 ns",
+        "afterpulsing",
+        afterpulsing=Afterpulsing(probability=0.1, delay_ns=30.0),
+    ),
+    shown_as(
+        "p 0.4, 30 ns",
+        "afterpulsing",
+        afterpulsing=Afterpulsing(probability=0.4, delay_ns=30.0),
+    ),
+    shown_as(
+        "p 0.4, 200 ns",
+        "afterpulsing",
+        afterpulsing=Afterpulsing(probability=0.4, delay_ns=200.0),
+    ),
+    shown_as("alpha 3 ns", "twilight", twilight_ns=3.0),
+    shown_as("alpha 15 ns", "twilight", twilight_ns=15.0),
+    shown_as("p 0.1", "crosstalk", crosstalk=Crosstalk(probability=0.1)),
+    shown_as("p 0.5", "crosstalk", crosstalk=Crosstalk(probability=0.5)),
+    shown_as("t_e 60 ns", "electronics", electronics_dead_time_ns=60.0),
+    shown_as("t_e 130 ns", "electronics", electronics_dead_time_ns=130.0),
+    shown_as("Gaussian, 2 ns", "jitter", jitter=Jitter(sigma_ns=2.0)),
+    shown_as(
+        "Gaussian and tail of 6 ns, 40 %",
+        "jitter",
+        jitter=Jitter(sigma_ns=0.5, tail_ns=6.0, tail_fraction=0.4),
+    ),
+    shown_as("codes of 0.75 to 1.25 bins", "converter", code_density=CODES),
+    shown_as("1 event a period", "limits", max_events_per_period=1),
+    shown_as("400 events an exposure", "limits", max_events_per_exposure=400),
+)
+
+
+def run(request: Request) -> list[Path]:
+    """Write effects.md, effects.csv, effects_rate.csv and a figure for each group of effects."""
+    from studies.detectors.figures import draw_all
+
+    exposures = 400 if request.quick else 10_000
+    outcomes = []
+    for shown in SHOWN:
+        request.tell(f"effects: {shown.name}")
+        outcomes.append(outcome(shown, exposures))
+    figures = draw_all(request.out, outcomes, "effects")
+    rows = [{"effect": each.shown.figure or "none", **row(each)} for each in outcomes]
+    rates = constant_light(40 if request.quick else 4000)
+    settings = settings_of(outcomes[0].system, exposures)
+    facts = {"settings": settings, "rows": rows, "figures": figures, "rates": rates}
+    figures = [*figures, save_csv(request.out / "effects_rate.csv", rates)]
+    return write(request, "effects", Path(__file__).with_name("effects.md.jinja"), facts, rows=rows, figures=figures)
+
+
+def constant_light(exposures: int) -> list[dict[str, Any]]:
+    """Rate under constant light of the preset module: one line for each rate of photons."""
+    detector, lines = Detector.preset("excelitas-spcm-aqrh"), []
+    for rate in (1e5, 1e6, 1e7, 3e7, 1e8):
+        pulse = GaussianPulse(sigma_ns=1.0)
+        system = System(period_ns=100.0, cycles=2000, bins=2, pulse=pulse, detector=detector, start="stationary")
+        flux = Flux(np.zeros((1, exposures)), rate * 1e-9 * system.period_ns, 0.0)
+        found = simulate(flux, system, seed=SEED).sum(-1).ravel() / (system.exposure_ns * 1e-9)
+        error = float(found.std(ddof=1)) / found.size**0.5
+        expected = constant_light_rate(rate, detector)
+        lines.append(
+            {
+                "photons per s": rate,
+                "simulated per s": float(found.mean()),
+                "predicted per s": expected,
+                "z": (float(found.mean()) - expected) / error,
+                "dead time only per s": 1.0 / (1.0 / rate + detector.dead_time_ns * 1e-9),
+            }
+        )
+    return lines

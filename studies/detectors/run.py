@@ -1,0 +1,177 @@
+"""Study "detectors": what each mode of a detector does to the same flux, simulated and in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import Detector, Flux, GaussianPulse, System, count_law, simulate_timestamps
+from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
+from mars_lidar.statistics import mean_histogram
+from studies import Request
+from studies.common.report import write
+
+FloatArray = NDArray[np.float64]
+
+SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
+SEED = 20
+REACH = 3.0  # periods of inter-registration times that are shown
+_BINS_OF_INTERVALS = 150
+_SIMULATED_ONLY = (*AVALANCHE_EFFECTS, "max_events_per_period", "max_events_per_exposure")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A detector, its name in figures and tables, and the figure it belongs to."""
+
+    name: str
+    figure: str
+    detector: Detector
+
+
+def shown_as(name: str, figure: str, **changes: Any) -> Shown:
+    """A detector of the common dead time but for `changes`."""
+    return Shown(name, figure, Detector(**{"dead_time_ns": DEAD_NS, **changes}))
+
+
+SHOWN = (
+    shown_as("non-paralyzable", ""),
+    shown_as("paralyzable", "paralyzable", mode="paralyzable"),
+    shown_as("synchronous, no dead time", "synchronous", dead_time_ns=0.0, mode="synchronous"),
+    shown_as("synchronous", "synchronous", mode="synchronous"),
+    shown_as("gated", "gated", mode="gated", gate_start_ns=20.0, gate_width_ns=40.0),
+    shown_as(
+        "moving gate", "gated", mode="gated", gate_start_ns=0.0, gate_width_ns=30.0, gate_step_ns=1.0, gate_cycles=5
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One detector: simulated, and predicted where there is a prediction.
+
+    `histogram` and `intervals` are means per exposure; `counts` (exposures,). `law` (n,) is P(N = n), or None.
+    """
+
+    shown: Shown
+    system: System
+    counts: NDArray[np.int64]
+    histogram: FloatArray
+    histogram_error: FloatArray
+    intervals: FloatArray
+    expected: FloatArray | None
+    moments: tuple[float, float] | None
+    law: FloatArray | None
+
+
+def run(request: Request) -> list[Path]:
+    """Write detectors.md, detectors.csv and a figure for each mode."""
+    from studies.detectors.figures import draw_all
+
+    exposures = 400 if request.quick else 40_000
+    outcomes = []
+    for shown in SHOWN:
+        request.tell(f"detectors: {shown.name}")
+        outcomes.append(outcome(shown, exposures))
+    figures = draw_all(request.out, outcomes)
+    rows = [row(each) for each in outcomes]
+    facts = {"settings": settings_of(outcomes[0].system, exposures), "rows": rows, "figures": figures}
+    return write(request, "detectors", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+
+
+def outcome(shown: Shown, exposures: int) -> Outcome:
+    """Simulate one detector, and predict what is known of it."""
+    pulse = GaussianPulse(sigma_ns=1.0)
+    system = System(period_ns=100.0, cycles=500, bins=200, pulse=pulse, detector=shown.detector)
+    coupled = shown.detector.crosstalk is not None  # the exposures are then the pixels of one square image
+    side = round(math.sqrt(exposures))
+    flux = Flux(np.full((side, side) if coupled else (1, exposures), SIGNAL), BACKGROUND, DELAY_NS)
+    times = simulate_timestamps(flux, system, engine="sequential" if coupled else "exact", seed=SEED)
+    counts = times.counts.ravel()
+    exposures = counts.size
+    each = np.bincount(times.bin, minlength=system.bins) / exposures
+    item = np.repeat(np.arange(exposures), counts)
+    second = _mean_square(item * system.bins + times.bin, exposures, system.bins)
+    apart = np.diff(times.times_ns)[item[1:] == item[:-1]] / system.period_ns
+    intervals = np.histogram(apart, _BINS_OF_INTERVALS, (0.0, REACH))[0] / exposures
+    expected, moments, law = _predicted(system)
+    error = np.sqrt(np.maximum(second - each**2, 0.0) / exposures)
+    return Outcome(shown, system, counts, each, error, intervals, expected, moments, law)
+
+
+def _mean_square(place: NDArray[np.int64], exposures: int, bins: int) -> FloatArray:
+    """Mean of the squares of the counts in each bin, from the place (exposure, bin) of every registration."""
+    cell, number = np.unique(place, return_counts=True)
+    return np.bincount(cell % bins, number.astype(np.float64) ** 2, minlength=bins) / exposures
+
+
+def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] | None, FloatArray | None]:
+    if system.detector.gate_moves or set(system.detector.effects) & set(_SIMULATED_ONLY):
+        return None, None, None
+    expected = mean_histogram(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+    law = count_law(SIGNAL, BACKGROUND, system, delay_ns=DELAY_NS)
+    pmf = np.zeros(int(law.support[-1]) + 1)
+    pmf[law.support] = law.pmf
+    return expected, (float(law.mean), float(law.variance)), pmf
+
+
+def row(each: Outcome) -> dict[str, Any]:
+    """One line of the table."""
+    n = each.counts.size
+    mean, variance = float(each.counts.mean()), float(each.counts.var(ddof=1))
+    line: dict[str, Any] = {
+        "detector": each.shown.name,
+        "simulated mean": mean,
+        "simulated variance": variance,
+        "predicted mean": "-",
+        "predicted variance": "-",
+        "z mean": "-",
+        "z variance": "-",
+        "worst z of a bin": "-",
+        "p of the law": "-",
+    }
+    if each.moments is None or each.expected is None or each.law is None:
+        return line
+    fourth = float(np.mean((each.counts - mean) ** 4))
+    seen = each.histogram_error > 0
+    z = (each.histogram[seen] - each.expected[seen]) / each.histogram_error[seen]
+    return line | {
+        "predicted mean": each.moments[0],
+        "predicted variance": each.moments[1],
+        "z mean": (mean - each.moments[0]) / math.sqrt(each.moments[1] / n),
+        "z variance": (variance - each.moments[1]) / math.sqrt((fourth - variance**2) / n),
+        "worst z of a bin": float(np.abs(z).max()),
+        "p of the law": _fit(each.counts, each.law),
+    }
+
+
+def _fit(counts: NDArray[np.int64], law: FloatArray) -> float:
+    """Chi-squared test of counts against their law; neighbours are merged until at least 10 are expected."""
+    from scipy.stats import chisquare
+
+    size = max(int(counts.max()) + 1, law.size)
+    expected = np.pad(law, (0, size - law.size)) * counts.size
+    group = np.minimum((np.cumsum(expected) / 10.0).astype(np.int64), int(expected.sum() / 10.0) - 1)
+    group = np.unique(group, return_inverse=True)[1]
+    seen = np.bincount(group, np.bincount(counts, minlength=size))
+    wanted = np.bincount(group, expected)
+    return float(chisquare(seen, wanted * (seen.sum() / wanted.sum())).pvalue)
+
+
+def of_figure(outcomes: Sequence[Outcome], figure: str) -> list[Outcome]:
+    """The outcomes that a figure shows: the free-running pixel first."""
+    return [each for each in outcomes if each.shown.figure in ("", figure)]
+
+
+def settings_of(system: System, exposures: int) -> dict[str, Any]:
+    """The configuration, by name."""
+    told = {field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"}
+    flux = {"signal S": SIGNAL, "background B": BACKGROUND, "delay_ns": DELAY_NS}
+    return told | flux | {"dead_time_ns": DEAD_NS, "exposures": exposures, "engine": "exact", "seed": SEED}

@@ -1,0 +1,1 @@
+"""Streams calibrated and validated: matched, faulty and measured detectors (T6)."""

@@ -1,0 +1,119 @@
+"""Study "hardware", T6 of the MaRS paper: streams calibrated and validated, the paper's own figures beside them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from studies import Request
+from studies.common.report import Row, write
+from studies.hardware.alarms import ALARM_BINS, alarms
+from studies.hardware.cases import (
+    AT_FLOOR,
+    BINS,
+    DEAD_NS,
+    DELAY_NS,
+    FULL,
+    PERIOD_NS,
+    PIXELS,
+    QUICK,
+    SIGMA_NS,
+    Case,
+    example,
+    matched,
+    spreads,
+    sweeps,
+)
+from studies.hardware.mismatches import mismatches, sensitivities
+
+PAPER = {"bright": 0.0651, "dark": 0.0601}  # T6 of arXiv 2512.04924: total variation of the count law
+
+
+def run(request: Request) -> list[Path]:
+    """Compute, draw and write the study; returns the paths written."""
+    from studies.hardware.figures import draw_all
+
+    settings = QUICK if request.quick else FULL
+    began = time.process_time()
+    pixels = matched(settings, request.tell)
+    swept = sweeps(settings, request.tell)
+    faults = mismatches(settings, request.tell)
+    weak = sensitivities(settings, request.tell)
+    false = alarms(settings, request.tell)
+    many = spreads(settings, request.tell)
+    measured = None if request.stream is None else example(request.stream, settings, request.tell)
+    figures = draw_all(request.out, pixels, swept, faults, measured)
+    scores = [float(value) for case in swept for value in case.scores if not np.isnan(value)]
+    ways = [] if measured is None else measured.cases
+    free = [case for name, case in ways if name.startswith("free shape, t_e")]
+    facts = {
+        "s": settings,
+        "period_ns": PERIOD_NS,
+        "bins": BINS,
+        "sigma_ns": SIGMA_NS,
+        "dead_ns": DEAD_NS,
+        "delay_ns": DELAY_NS,
+        "lights": PIXELS,
+        "bright": PIXELS["bright"][0],
+        "paper": PAPER,
+        "paper_cycles": FULL.cycles,
+        "at_floor": AT_FLOOR,
+        "pixels": pixels,
+        "many": many,
+        "bias": max(float(np.abs(one.bias).max()) for one in many),
+        "scatters": [float(value) for one in many for value in one.scatter],
+        "stateds": [float(value) for one in many for value in one.stated],
+        "swept": swept,
+        "fits": sum(case.found.consistent for case in swept),
+        "scores": scores,
+        "square": float(np.mean(np.square(scores))),
+        "faults": faults,
+        "wrong": sum(not one.fits for one, _ in faults),
+        "missed": [case for one, case in faults if not one.fits and case.found.consistent],
+        "refused": [case for one, case in faults if one.fits and not case.found.consistent],
+        "below": [case.name for _, case in faults if not case.found.consistent and case.ratio < AT_FLOOR],
+        "weak": weak,
+        "alarm_bins": ALARM_BINS,
+        "alarms": false,
+        "measured": measured,
+        "free": free,
+        "traced": any(case.recovery.findings() for case in free),
+        "gaussian": [case for name, case in ways if name.startswith("Gaussian")],
+        "figures": figures,
+        "seconds": time.process_time() - began,
+    }
+    rows = [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))]
+    return write(request, "hardware", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+
+
+def _csv_row(case: Case) -> Row:
+    found = case.found
+    light = found.calibration
+    signal, background, delay = case.truth
+    return {
+        "stream": case.name,
+        "true_signal": signal,
+        "true_background": background,
+        "true_delay_ns": delay,
+        "registrations": light.summary.registrations,
+        "realizations": found.realizations,
+        "cycles": found.system.cycles,
+        "signal": light.signal,
+        "background": light.background,
+        "delay_ns": light.delay_ns,
+        "dead_time_ns": light.dead_time_ns,
+        "hold_off_ns": light.hold_off_ns,
+        "signal_error": light.errors.get("signal", float("nan")),
+        "background_error": light.errors["background"],
+        "rapp_total": light.rapp.total,
+        "count_tv": found.total_variation,
+        "count_tv_floor": found.total_variation_floor[0],
+        "count_kl": found.kl,
+        "count_kl_floor": found.kl_floor[0],
+        "histogram_tv": found.shape_variation,
+        "histogram_tv_floor": found.shape_floor,
+        **{f"p_{check.name}": check.p for check in found.checks},
+        "consistent": found.consistent,
+    }

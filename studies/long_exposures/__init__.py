@@ -1,0 +1,1 @@
+"""The feedback engine at a million cycles and more."""

@@ -1,0 +1,116 @@
+"""Study "long-exposures": the feedback engine's means and variances at long exposures, against the closed form."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import mars_lidar as ml
+from mars_lidar.engines.engine import Task
+from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.engines.feedback import FeedbackEngine
+from mars_lidar.engines.feedback_grid import cell_cuts, internal_cells
+from mars_lidar.engines.feedback_rule import draw_rest
+from studies import Request
+from studies.common.report import Row, write
+from studies.common.sample import PERIOD_NS, system_of
+
+GOAL = 0.05  # standard deviations of a bin that its mean may be off (engines/_feedback_grid.py)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Random systems, exposures of each, seed."""
+
+    systems: int
+    items: int
+    seed: int = 20_261
+
+
+FULL, QUICK = Settings(40, 8000), Settings(3, 1000)
+
+
+class _Sampled(FeedbackEngine):
+    """Leaves the rows of pixels that it would give to the exact engine at 0."""
+
+    def histogram(self, task: Task, out: NDArray[Any]) -> None:
+        out[...] = 0
+        rest = self.sample(task, out, np.arange(task.pixel_index.size))
+        task.report["refused"] = float(rest.pixels.size)
+        # single exposures that did not settle: a simulation would draw them again
+        draw_rest(ExactEngine(), task, out, replace(rest, pixels=rest.pixels[:0]))
+
+
+def run(request: Request) -> list[Path]:
+    """Draw, compare and write the study; returns the paths written."""
+    settings = QUICK if request.quick else FULL
+    began = time.monotonic()
+    random = np.random.default_rng(settings.seed)
+    rows = []
+    for k in range(settings.systems):
+        rows.append(compare(*_system(random), settings.items, seed=k))
+        request.tell(f"{k + 1} of {settings.systems}: {rows[-1]}")
+    drawn = [row for row in rows if row["cells"]]
+    facts = {
+        "s": settings,
+        "goal": GOAL,
+        "error": 1.0 / np.sqrt(settings.items),
+        "drawn": drawn,
+        "rows": [{key: "" if value is None else value for key, value in row.items()} for row in rows],
+        "spent": time.monotonic() - began,
+    }
+    return write(request, "long_exposures", Path(__file__).with_name("report.md.jinja"), facts, rows=rows)
+
+
+def _system(random: np.random.Generator) -> tuple[float, float, ml.System, float]:
+    signal, background, dead, sigma = 10 ** random.uniform([-1.3, -2.0, -1.3, -2.7], [1.0, 1.0, 0.4, -1.7])
+    cycles, bins = int(random.choice([10**6, 10**7, 10**8])), int(random.choice([64, 256, 1024]))
+    system = system_of(dead * PERIOD_NS, cycles, bins=bins, sigma_ns=sigma * PERIOD_NS)
+    return float(signal), float(background), system, float(random.uniform(0.0, PERIOD_NS))
+
+
+def compare(signal: float, background: float, system: ml.System, delay_ns: float, items: int, seed: int) -> Row:
+    """A row of the study for one pixel: cells of 0 where the engine refuses it."""
+    flux = ml.Flux(signal, background, delay_ns)
+    report: dict[str, float] = {}
+    cube = ml.simulate(flux, system, engine=_Sampled(), realizations=items, seed=seed, report=report)
+    x = cube.reshape(items, system.bins).astype(np.float64)
+    sigma = float(getattr(system.pulse, "sigma_ns", 0.0))
+    merge, parts = cell_cuts(flux, system)
+    row: dict[str, Any] = {
+        "S": signal,
+        "B": background,
+        "t_d": system.dead_time_periods,
+        "sigma": sigma / PERIOD_NS,
+        "cycles": f"{system.cycles:.0e}",
+        "bins": system.bins,
+        "cells": int(internal_cells(flux, system)[0, 0]),
+        "cut": f"{merge[0, 0]} x {parts[0, 0]}",
+    }
+    keys = ("largest", "rms", "count", "window", "var count", "var window", "var bins")
+    if report["refused"]:
+        return row | {"cells": 0} | dict.fromkeys(keys)
+    law = ml.joint_law(signal, background, system, delay_ns=delay_ns, tolerance=1e-4)
+    apart = ((np.arange(system.bins) + 0.5) / system.bins - delay_ns / PERIOD_NS + 0.5) % 1.0 - 0.5
+    near = np.abs(apart) < max(3.0 * sigma / PERIOD_NS, 0.51 / system.bins)
+    weights = np.stack([np.ones(system.bins), near.astype(np.float64)])
+    mean, variance = law.window(weights)
+    y = x @ weights.T
+    off = (x.mean(0) - law.mean) / np.sqrt(law.variance)
+    count, window = (y.mean(0) - mean) / np.sqrt(np.maximum(variance, 1e-300))
+    spread = y.var(0) / np.maximum(variance, 1e-300)
+    found = (
+        float(np.abs(off).max()),
+        float(np.sqrt(max(0.0, np.mean(off**2) - 1.0 / items))),
+        float(count),
+        float(window),
+        float(spread[0]),
+        float(spread[1]),
+        float(np.mean(x.var(0) / law.variance)),
+    )
+    return row | dict(zip(keys, found, strict=True))

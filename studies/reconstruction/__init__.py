@@ -1,0 +1,1 @@
+"""Bias and error of depth and signal beside the Cramer-Rao bound."""

@@ -1,0 +1,219 @@
+"""Study "reconstruction": bias and error of depth and signal by every method, beside the Cramer-Rao bound."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mars_lidar import Detector, Flux, Scene, System, simulate
+from mars_lidar.reconstruct import METHODS, Flags, Reconstruction, cramer_rao, reconstruct, window_error, window_weights
+from studies import Request
+from studies.common.report import Row, write
+from studies.common.sample import system_of
+
+SEED = 9
+SBR = 1.0
+OUTLIER_SIGMAS = 4.0  # of the pulse: further off the pulse itself was missed
+_DEAD_NS = 75.0
+_BOUNDS = 17  # delays at which the bound is computed; between them its logarithm is interpolated
+KNOWN = 10.0  # %, of S: a bound above it is not reached by any estimate (section "Near the bound")
+BRIGHT = 3.0  # mean signal photons per period of the picture
+PLAIN = system_of(_DEAD_NS, 1000)
+SYNCHRONOUS = PLAIN.replace(detector=Detector(dead_time_ns=0.0, mode="synchronous"))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Levels of signal photons per period, pixels at each, side of the picture's image, timed cubes."""
+
+    signals: tuple[float, ...]
+    pixels: int
+    size: int
+    repeats: int
+
+
+FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 48, 2)
+QUICK = Settings((0.03, 0.3, 3.0), 100, 24, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A bright room: true depth (H, W), m, and what two methods make of it."""
+
+    depth_m: Any
+    signal: Any
+    found: dict[str, Reconstruction]
+    seconds: dict[str, float]
+
+
+def run(request: Request) -> list[Path]:
+    """Write reconstruction.md, reconstruction.csv and two figures."""
+    from studies.reconstruction.bounds import lines
+    from studies.reconstruction.figures import TITLE, flux_figure, maps_figure
+
+    settings = QUICK if request.quick else FULL
+    rows = []
+    for signal in settings.signals:
+        request.tell(f"reconstruction: S = {signal:.3g}")
+        rows += sweep(PLAIN, signal, settings.pixels)
+        rows += sweep(SYNCHRONOUS, signal, settings.pixels)
+    request.tell("reconstruction: near the bound")
+    near = lines(2 * settings.pixels)
+    request.tell("reconstruction: picture")
+    shown = picture(settings)
+    request.tell("reconstruction: time")
+    out = request.out
+    figures = [flux_figure(out / "reconstruction_flux.png", rows), maps_figure(out / "reconstruction_maps.png", shown)]
+    words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
+    facts = {
+        "s": settings,
+        "plain": PLAIN,
+        "synchronous": SYNCHRONOUS,
+        "outlier_sigmas": OUTLIER_SIGMAS,
+        "sbr": SBR,
+        "bright": BRIGHT,
+        "seed": SEED,
+        "known": KNOWN,
+        "findings": [one for mode, title in TITLE.items() if (one := _finding(rows, mode, title))],
+        "chosen": _chosen(rows, settings),
+        "near": near,
+        "shown": [
+            (said, 1e3 * (found.depth_m - shown.depth_m), float(np.median(found.signal / shown.signal - 1.0)))
+            for said, found in ((said, shown.found[name]) for name, said in words.items())
+        ],
+        "window": window_lines(settings),
+        "times": timings(settings),
+    }
+    template = Path(__file__).with_name("report.md.jinja")
+    return write(request, "reconstruction", template, facts, rows=rows, figures=figures)
+
+
+def _chosen(rows: Sequence[Row], settings: Settings) -> list[Row]:
+    """Three fluxes: dim, ordinary, bright."""
+    n = len(settings.signals)
+    picked = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
+    return [row for row in rows if row["signal"] in picked]
+
+
+def _finding(rows: Sequence[Row], detector: str, title: str) -> dict[str, Any] | None:
+    """How near maximum likelihood comes to the bound where the bound can be reached."""
+    mine = [r for r in rows if r["detector"] == detector and r["method"] == "maximum_likelihood"]
+    clean = [r for r in mine if r["outliers %"] == 0.0 and r["saturated %"] == 0.0]
+    last = max((r["signal"] for r in clean if r["signal bound %"] < KNOWN), default=0.0)
+    sure = [r for r in clean if r["signal"] <= last]
+    if not sure:
+        return None
+    return {
+        "title": title.capitalize(),
+        "low": sure[0]["signal"],
+        "high": sure[-1]["signal"],
+        "depth": [r["depth RMSE mm"] / r["depth bound mm"] for r in sure],
+        "signal": [r["signal RMSE %"] / r["signal bound %"] for r in sure],
+        "raw": [r for r in rows if r["detector"] == detector and r["method"] == "matched_filter"][-1],
+    }
+
+
+def sweep(system: System, signal: float, pixels: int) -> list[dict[str, Any]]:
+    """A line for each method that suits the detector: errors over `pixels` exposures, delays all over the period."""
+    background = signal / SBR
+    period = system.period_ns
+    delay = np.random.default_rng(SEED).uniform(0.0, period, pixels)
+    cube = simulate(Flux(np.full(pixels, signal), background, delay), system, seed=SEED)[0, 0]
+    places = np.linspace(0.0, period, _BOUNDS)
+    bound = cramer_rao(signal, background, system, delay_ns=places)
+    least = {}
+    for name in ("depth_m", "signal"):  # of these delays: a synchronous pixel sees late ones less well
+        at = np.exp(np.interp(delay, places, np.log(getattr(bound, name))))
+        least[name] = float(np.sqrt(np.mean(at**2)))
+    lines = []
+    for name, method in METHODS.items():
+        if system.detector.mode not in method.modes:
+            continue
+        found = reconstruct(cube, system, method)
+        lag = (found.delay_ns - delay + 0.5 * period) % period - 0.5 * period
+        near = np.abs(lag) < OUTLIER_SIGMAS * system.pulse.sigma_ns  # type: ignore[attr-defined]
+        off = np.asarray(system.depth_m(lag))[near]
+        bounded = found.flags & Flags.SATURATED == 0
+        error = (found.signal - signal)[bounded]
+        lines.append(
+            {
+                "detector": system.detector.mode,
+                "method": name,
+                "signal": signal,
+                "outliers %": 100.0 * float(1.0 - near.mean()),
+                "depth bias mm": 1e3 * float(off.mean()) if near.any() else float("nan"),
+                "depth RMSE mm": 1e3 * float(np.sqrt(np.mean(off**2))) if near.any() else float("nan"),
+                "depth bound mm": 1e3 * least["depth_m"],
+                "saturated %": 100.0 * float(1.0 - bounded.mean()),
+                "signal bias %": 100.0 * float(error.mean()) / signal if error.size else float("nan"),
+                "signal RMSE %": 100.0 * float(np.sqrt(np.mean(error**2))) / signal if error.size else float("nan"),
+                "signal bound %": 100.0 * least["signal"] / signal,
+            }
+        )
+    return lines
+
+
+def window_lines(settings: Settings) -> list[dict[str, Any]]:
+    """The raw window estimate of the signal, predicted by the joint law of the bins: no simulation."""
+    delay = 0.37 * PLAIN.period_ns
+    weights = window_weights(PLAIN, delay)
+    lines = []
+    for signal in settings.signals[:: max(1, len(settings.signals) // 5)]:
+        mean, deviation = window_error(weights, signal, signal / SBR, PLAIN, delay_ns=delay)
+        bound = float(cramer_rao(signal, signal / SBR, PLAIN, delay_ns=delay).signal)
+        lines.append(
+            {
+                "S": signal,
+                "bias %": 100.0 * float(mean / signal - 1.0),
+                "standard deviation %": 100.0 * float(deviation) / signal,
+                "bound %": 100.0 * bound / signal,
+            }
+        )
+    return lines
+
+
+def picture(settings: Settings) -> Picture:
+    """A room of `BRIGHT` signal photons per period by the matched filter on raw counts and by maximum likelihood."""
+    scene = Scene.example("room", size=settings.size)
+    flux = scene.flux(PLAIN, signal=BRIGHT, sbr=SBR)
+    cube = simulate(flux, PLAIN, seed=SEED)[0]
+    found, seconds = {}, {}
+    for name in ("matched_filter", "maximum_likelihood"):
+        began = time.perf_counter()
+        found[name] = reconstruct(cube, PLAIN, name)
+        seconds[name] = time.perf_counter() - began
+    return Picture(scene.depth_m, flux.signal, found, seconds)
+
+
+def timings(settings: Settings) -> list[dict[str, Any]]:
+    """Seconds of each method for one 128 x 128 x 1024 cube (a quarter of the side in the quick form)."""
+    side = 128 if settings.repeats > 1 else 32
+    flux = Scene.example("room", size=side).flux(PLAIN, signal=1.0, sbr=SBR)
+    lines = []
+    for system in (PLAIN, SYNCHRONOUS):
+        cube = simulate(flux, system, seed=SEED)[0]
+        for name, method in METHODS.items():
+            if system.detector.mode not in method.modes:
+                continue
+            wall, processor = [], []
+            for _ in range(settings.repeats):
+                began, used = time.perf_counter(), time.process_time()
+                reconstruct(cube, system, method)
+                wall.append(time.perf_counter() - began)
+                processor.append(time.process_time() - used)
+            lines.append(
+                {
+                    "detector": system.detector.mode,
+                    "method": name,
+                    "pixels": side * side,
+                    "seconds": min(wall),
+                    "processor seconds": min(processor),
+                    "us a pixel": 1e6 * min(processor) / side**2,
+                }
+            )
+    return lines

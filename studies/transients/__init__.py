@@ -1,0 +1,1 @@
+"""Two returns in fog through the dead time of three detectors."""

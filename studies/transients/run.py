@@ -1,0 +1,126 @@
+"""Study "transients": two returns in fog through the dead time of three detectors, simulated and predicted."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import Detector, Flux, GaussianPulse, System, simulate
+from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.statistics import mean_histogram
+from studies import Request
+from studies.common.draw import panels
+from studies.common.report import save_figure, write
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FloatArray = NDArray[np.float64]
+
+GLASS, WALL = (0.15, 40.0), (3.0, 73.0)  # photons per period without fog, delay in ns
+FOG = {"extinction_per_m": 0.08, "backscatter": 1.2, "nearest_m": 0.6}
+BACKGROUND, DEAD_NS, SEED = 0.05, 30.0, 6
+DETECTORS = {
+    "non-paralyzable": Detector(dead_time_ns=DEAD_NS),
+    "paralyzable": Detector(dead_time_ns=DEAD_NS, mode="paralyzable"),
+    "synchronous": Detector(dead_time_ns=DEAD_NS, mode="synchronous"),
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Seen:
+    """What a detector makes of the waveform: mean counts (bins,), predicted and simulated, and its standard error."""
+
+    name: str
+    expected: FloatArray
+    simulated: FloatArray
+    error: FloatArray
+
+
+def view(detector: Detector) -> System:
+    """The system of the study."""
+    return System(period_ns=100.0, cycles=1000, bins=400, pulse=GaussianPulse(sigma_ns=0.3), detector=detector)
+
+
+def incident(system: System) -> Flux:
+    """One pixel: a pane of glass, a wall, and the fog before them."""
+    clear = Flux.multi(Flux(GLASS[0], BACKGROUND, GLASS[1]), Flux(WALL[0], 0.0, WALL[1]))
+    return clear.in_fog(system, parts=system.bins, **FOG)
+
+
+def seen_by(name: str, exposures: int) -> Seen:
+    """Simulate and predict one detector."""
+    system = view(DETECTORS[name])
+    flux = incident(system)
+    assert flux.waveform is not None
+    every = Flux(waveform=np.broadcast_to(flux.waveform, (1, exposures, system.bins)), background=BACKGROUND)
+    cube = simulate(every, system, seed=SEED)[0, 0].astype(np.float64)
+    expected = mean_histogram(None, BACKGROUND, system, waveform=flux.waveform[0, 0])
+    return Seen(name, expected, cube.mean(0), cube.std(0, ddof=1) / np.sqrt(exposures))
+
+
+def run(request: Request) -> list[Path]:
+    """Write transients.md, transients.csv and the figure."""
+    exposures = 200 if request.quick else 4000
+    shown = []
+    for name in DETECTORS:
+        request.tell(f"transients: {name}")
+        shown.append(seen_by(name, exposures))
+    rows = [row(each) for each in shown]
+    figures = [_draw(request.out / "transients.png", shown)]
+    facts = {"settings": _settings(exposures), "rows": rows}
+    return write(request, "transients", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+
+
+def row(each: Seen) -> dict[str, Any]:
+    """One line of the table."""
+    system = view(DETECTORS[each.name])
+    flux = incident(system)
+    assert flux.waveform is not None
+    arrivals = system.cycles * (flux.waveform[0, 0] + BACKGROUND / system.bins)
+    time = system.time_ns
+    line: dict[str, Any] = {"detector": each.name, "registrations": float(each.simulated.sum())}
+    for name, low, high in (("fog", 0.0, 37.0), ("glass", 37.0, 43.0), ("wall", 70.0, 76.0)):
+        inside = (time >= low) & (time < high)
+        line[name] = float(each.simulated[inside].sum() / arrivals[inside].sum())
+    often = each.error > 0
+    line["worst z"] = float(np.abs((each.simulated - each.expected)[often] / each.error[often]).max())
+    return line
+
+
+def _draw(path: Path, shown: list[Seen]) -> Path:
+    with style():
+        figure, axes = panels(2.8, 1, 2)
+        system = view(DETECTORS["non-paralyzable"])
+        flux = incident(system)
+        assert flux.waveform is not None
+        arrivals = flux.waveform[0, 0] + BACKGROUND / system.bins
+        for ax, low, high in ((axes[0, 0], 0.0, 100.0), (axes[0, 1], 66.0, 82.0)):
+            _panel(ax, system, arrivals, shown)
+            ax.set(xlabel="time in the period, ns", xlim=(low, high), yscale="log")
+        axes[0, 0].set_ylabel("per period and ns")
+        axes[0, 0].set_title("fog, glass and wall")
+        axes[0, 1].set_title("the wall")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+        return save_figure(path, figure)
+
+
+def _panel(ax: Axes, system: System, arrivals: FloatArray, shown: list[Seen]) -> None:
+    ax.plot(system.time_ns, arrivals / system.bin_ns, color=INK, lw=0.7, ls=":", label="arrivals")
+    scale = 1.0 / (system.cycles * system.bin_ns)
+    for each, colour in zip(shown, [MUTED, *COLOURS], strict=False):
+        simulated = np.where(each.simulated > 0, each.simulated * scale, np.nan)
+        ax.plot(system.time_ns, simulated, ".", ms=1.8, color=colour)
+        ax.plot(system.time_ns, each.expected * scale, color=colour, lw=0.8, label=each.name)
+
+
+def _settings(exposures: int) -> dict[str, Any]:
+    system = view(DETECTORS["non-paralyzable"])
+    told = {field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"}
+    light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND}
+    return told | light | {"dead_time_ns": DEAD_NS, "exposures": exposures, "engine": "exact", "seed": SEED}

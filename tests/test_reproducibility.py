@@ -112,7 +112,7 @@ def drawn(engine: ExactEngine, request: Task) -> tuple[NDArray[np.uint32], Recor
 
 
 def test_there_are_levels_to_compare():
-    """Widest first; the last one is what every processor of this kind runs. One number at a time: `tests/gpu`."""
+    """Widest first; the last one is what every processor of this kind runs. One number at a time: `tests/cuda`."""
     assert set(_core.levels()) <= {"avx512", "avx2", "vector128", "scalar"}
     assert _core.levels()[-1] in ("vector128", "scalar")
 

@@ -42,6 +42,7 @@ struct BlockCounters {
     MARS_INLINE uint8_t* at(int32_t bin) const { return bytes + (bin >> 2) * (4 * lanes) + (bin & 3); }
 };
 
+// Adds to a bin of a row in the device's memory.
 template <class Count>
 MARS_INLINE void count_in_row(Count* row, int32_t bin, uint32_t number) {
     if constexpr (sizeof(Count) == 4) {
@@ -52,6 +53,7 @@ MARS_INLINE void count_in_row(Count* row, int32_t bin, uint32_t number) {
     }
 }
 
+// The histogram of one item: a row of the output, counted in place or, with `block`, in the block's memory first.
 template <class Count, bool block>
 class DeviceHistogram {
  public:

@@ -73,7 +73,6 @@ def run(request: Request) -> list[Path]:
         "result": {subject: Counter(state for _, state in _states(judged, subject)) for subject in SUBJECTS},
         "failures": failures,
         "loud": sum("Error" in row["note"].split(":")[0] for row in failures),
-        "listed": _LISTED,
         "ranges": [_range(judged, subject) for subject in SUBJECTS],
         "slow": [_slow(judged, subject) for subject in LAWS],
         "drawn": _drawn(judged),
@@ -81,7 +80,7 @@ def run(request: Request) -> list[Path]:
         "outside": len(outside),
         "seconds": time.monotonic() - began,
     }
-    return write(request, "domain", Path(__file__).with_name("report.md.jinja"), facts, rows=cases, figures=figures)
+    return write(request, "domain", __name__, "report", facts, rows=cases, figures=figures)
 
 
 def case_row(judged: Judged) -> dict[str, Any]:

@@ -57,7 +57,6 @@ def run(request: Request) -> list[Path]:
         "delay_ns": DELAY_NS,
         "lights": PIXELS,
         "bright": PIXELS["bright"][0],
-        "paper": PAPER,
         "paper_cycles": FULL.cycles,
         "at_floor": AT_FLOOR,
         "pixels": pixels,
@@ -85,7 +84,7 @@ def run(request: Request) -> list[Path]:
         "seconds": time.process_time() - began,
     }
     rows = [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))]
-    return write(request, "hardware", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+    return write(request, "hardware", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _csv_row(case: Case) -> Row:

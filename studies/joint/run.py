@@ -18,29 +18,9 @@ from scipy import stats
 from studies import Request
 from studies.common.report import Row, write
 from studies.common.sample import PERIOD_NS
-from studies.joint.classifiers import (
-    LEAF,
-    REGULARISATION,
-    TREES,
-    chance_error,
-    require_sklearn,
-)
-from studies.joint.outcomes import (
-    ENGINES,
-    FINE,
-    FULL,
-    OFTEN,
-    QUICK,
-    RATIOS,
-    REACH,
-    TESTS,
-    TOLERANCE,
-    FloatArray,
-    Outcome,
-    Settings,
-    compute,
-)
-from studies.joint.table import AGAIN, COARSE
+from studies.joint import classifiers, outcomes
+from studies.joint.outcomes import ENGINES, FULL, QUICK, RATIOS, TESTS, FloatArray, Outcome, Settings
+from studies.joint.table import AGAIN
 
 _SEEN = 4.0  # standard errors beyond which a figure is marked
 _WORST = 5  # random systems listed
@@ -49,7 +29,7 @@ _LEAST_P = 1e-100  # told as a number
 
 def chance(exposures: int) -> float:
     """Standard error of the AUC of two samples of one law, half of the `exposures` of each held out."""
-    return chance_error(exposures - exposures // 2, exposures - exposures // 2)
+    return classifiers.chance_error(exposures - exposures // 2, exposures - exposures // 2)
 
 
 def auc_score(outcome: Outcome, test: str, settings: Settings) -> float:
@@ -64,24 +44,15 @@ def run(request: Request) -> list[Path]:
 
     settings = QUICK if request.quick else FULL
     began = time.monotonic()
-    outcomes = compute(settings, request.tell)
-    named, drawn = ([o for o in outcomes if o.random is kind] for kind in (False, True))
+    found = outcomes.compute(settings, request.tell)
+    named, drawn = ([o for o in found if o.random is kind] for kind in (False, True))
     facts = {
         "s": settings,
-        "engines": ENGINES,
         "period_ns": PERIOD_NS,
-        "coarse": COARSE,
-        "fine": FINE,
-        "reach": REACH,
-        "sklearn": require_sklearn(),
-        "regularisation": REGULARISATION,
-        "trees": TREES,
-        "leaf": LEAF,
-        "tolerance": TOLERANCE,
-        "often": OFTEN,
+        "sklearn": classifiers.require_sklearn(),
         "findings": [_finding(engine, named, settings) for engine in ENGINES if _judged(engine, named)],
-        "gone": given_to_exact(outcomes),
-        "asked": sum(o.engine == "feedback" for o in outcomes),
+        "gone": given_to_exact(found),
+        "asked": sum(o.engine == "feedback" for o in found),
         "band": [2 * chance(n) for n in (settings.exposures, settings.random_exposures)],
         "aucs": {test: _auc_rows(named, test, settings) for test in TESTS},
         "ratios": [_ratio_rows(named, key) for key in RATIOS],
@@ -90,14 +61,14 @@ def run(request: Request) -> list[Path]:
         "worst": _worst_rows(drawn, settings),
         "spent": time.monotonic() - began,
     }
-    figures = [figure(request.out / "joint.png", settings, outcomes)]
-    rows = [_csv_row(o) for o in outcomes]
+    figures = [figure(request.out / "joint.png", settings, found)]
+    rows = [_csv_row(o) for o in found]
     return write(request, "joint", __name__, "report", facts, rows=rows, figures=figures)
 
 
-def given_to_exact(outcomes: Sequence[Outcome]) -> list[str]:
+def given_to_exact(found: Sequence[Outcome]) -> list[str]:
     """Cases whose pixel the feedback engine gave to the exact one: they are not judged."""
-    return [o.case.name for o in outcomes if o.engine == "feedback" and o.handed]
+    return [o.case.name for o in found if o.engine == "feedback" and o.handed]
 
 
 def _p(value: float) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import sys
+import types
 from importlib import import_module
 from pathlib import Path
 
@@ -93,8 +94,17 @@ def test_a_template_is_filled_strictly(tmp_path: Path):
     text = report.render(request, template, facts)
     assert text == "# A\n\n_Quick form: a look, not for citing._\n\n- 1.00\n- 2.35\n\nend\n"
     assert "Quick" not in report.render(Request(tmp_path), template, facts)
-    written = report.write(request, "x", template, facts, rows=[{"a": 1, "b": 0.1234567}])
+
+
+def test_a_report_has_the_template_and_the_constants_of_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    module = types.ModuleType("made_up")
+    module.__file__, module.LIMIT = str(tmp_path / "made_up.py"), 3  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "made_up", module)
+    (tmp_path / "short.md.jinja").write_text("{{ word }} {{ study.LIMIT }}{{ flag }}")
+    request = Request(tmp_path, quick=True)
+    written = report.write(request, "x", "made_up", "short", {"word": "at"}, rows=[{"a": 1, "b": 0.1234567}])
     assert [path.name for path in written] == ["x.md", "x.csv"]
+    assert written[0].read_text() == "at 3 --quick\n"
     assert written[1].read_text() == "a,b\n1,0.123457\n"
 
 

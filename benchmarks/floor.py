@@ -18,8 +18,8 @@ from mars_lidar import _core
 
 LANES = {"avx512": 16, "avx2": 8, "vector128": 4, "scalar": 1}
 
-# Vector instructions for one registration of each lane, counted from native/exact/registration.h, random.h and
-# exact/kernel.cpp for one Gaussian return and a dead time that is not a whole number of periods; loads of
+# Vector instructions for one registration of each lane, counted from native/exact/{registration,wait}.h, kernel.cpp
+# and native/numbers/random.h, for one Gaussian return and a dead time that is not a whole number of periods; loads of
 # constants left out.
 PLAIN = {
     "Threefry-2x32-13: add and exclusive or of 13 rounds, key schedule": 13 * 2 + 14,

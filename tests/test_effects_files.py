@@ -224,7 +224,7 @@ def test_command_line(tmp_path):
         assert np.array_equal(np.asarray(cube.histogram), counts)
     code, told = run("info", tmp_path / "a.npz", "--verify")
     assert code == 0
-    for text in ("detection_efficiency 0.3", "electronics_dead_time_ns 60", "code_density of 2 codes", "every count"):
+    for text in ("detection_efficiency 0.3", "electronics_dead_time_ns 60", "code_density of 2 values", "every count"):
         assert text in told
 
 

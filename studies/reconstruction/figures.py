@@ -9,12 +9,12 @@ import numpy as np
 
 from mars_lidar.plot.figures import _draw_map, _limits
 from mars_lidar.plot.style import COLOURS, INK, style
+from mars_lidar.reconstruct import METHODS
 from studies.common.draw import panels
 from studies.common.report import Row, save_figure
 from studies.reconstruction.run import Picture
 
-_METHODS = ("maximum_likelihood", "generalised_coates", "mchc", "coates", "matched_filter", "peak")
-_COLOUR = dict(zip(_METHODS, COLOURS, strict=True))
+_COLOUR = dict(zip(METHODS, (*COLOURS, INK), strict=True))
 TITLE = {"nonparalyzable": "free-running, t_d = 75 ns", "synchronous": "synchronous"}
 
 

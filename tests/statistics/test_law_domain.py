@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, special, stats
 
 import mars_lidar as ml
 from benchmarks.law_map import disagreements, draw, laws
@@ -357,6 +358,37 @@ def test_corners(signal: float, background: float, dead: float, start: str):
     for method in ("exposure", "stationary"):
         shape = ml.registration_pdf(signal, background, system, method)  # type: ignore[arg-type]
         assert shape.sum() == pytest.approx(1.0, abs=1e-9)
+
+
+# Paralyzable pixels over 1e8 cycles
+
+
+def test_sum_of_a_locked_paralyzable_histogram():
+    """One registration in a pulse, all but certainly: 25 of 1e8 were missing where the standard deviation is 21."""
+    drawn = draw(158)
+    light = {"signal": drawn.signal, "background": drawn.background, "delay_ns": drawn.delay * PERIOD_NS}
+    law = ml.count_law(system=drawn.system(), **light)
+    total = mean_histogram(system=drawn.system(), **light).sum()
+    assert total == pytest.approx(float(law.mean), abs=1e-3 * math.sqrt(law.variance))
+
+    def rate(t: float) -> float:  # in units of the pulse's standard deviation
+        within = special.ndtr(t) - special.ndtr(t - drawn.dead / drawn.sigma)
+        arrivals = drawn.signal * stats.norm.pdf(t) + drawn.background * drawn.sigma
+        return float(arrivals * math.exp(-drawn.signal * within - drawn.background * drawn.dead))
+
+    edges = np.arange(-9, 15)
+    near = sum(integrate.quad(rate, low, high, epsabs=1e-15)[0] for low, high in pairwise(edges))
+    far = drawn.background * math.exp(-drawn.background * drawn.dead) * (1.0 - 23.0 * drawn.sigma)
+    assert total == pytest.approx(drawn.cycles * (near + far), abs=0.01)
+
+
+def test_law_of_the_rarest_counts():
+    """Five registrations in 1e14 cycles: what a cycle adds to the transform is below the rounding of its value."""
+    drawn = draw(191)
+    law = ml.count_law(drawn.signal, drawn.background, drawn.system(), delay_ns=drawn.delay * PERIOD_NS)
+    assert law.mean == pytest.approx(4.58244e-6, rel=1e-5)
+    assert law.pmf @ law.support == pytest.approx(float(law.mean), rel=1e-7)
+    assert law.pmf[2] == pytest.approx(0.5 * law.mean**2, rel=0.01)
 
 
 # A sweep: whatever is not refused agrees with all else

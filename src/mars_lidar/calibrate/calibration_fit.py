@@ -19,6 +19,7 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 _STEPS = 200
 _CONVERGED = 1e-8  # Newton decrement: twice what log L could still gain
 _DIGITS, _CORNERS = 1e-3, 0.5  # the same where no step gains: half a standard error, with corners
+_SLOW, _GAIN, _SCALE = 5, 1e-5, 0.2  # so many steps in turn, cut to this and gaining less, are a ridge without end
 _FEW = 20.0  # photons of the background
 _WIDTHS = 24  # pulse widths tried to begin with, where it is not known
 
@@ -46,7 +47,7 @@ def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
     """Fisher scoring with step halving from `theta`; parameters at 0 that want to be negative stay there."""
     theta = light.bounded(theta)
     best = log_likelihood(seen, light.rate(theta)) + light.known(theta)[0]
-    converged = False
+    converged, slow = False, 0
     information = np.zeros((theta.size, theta.size))
     for _ in range(_STEPS):
         rate, slopes = light.jacobian(theta)
@@ -71,7 +72,10 @@ def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
         else:  # log L is at the end of its digits, or has the corners of a sampled pulse
             converged = decrement < (_CORNERS if isinstance(light.pulse, SampledPulse) else _DIGITS)
             break
+        slow = slow + 1 if scale < _SCALE and found - best < _GAIN else 0
         theta, best = trial, found
+        if slow == _SLOW:
+            break
     return Fit(theta, _not_sure(seen, light, theta, information), best, converged)
 
 
@@ -87,7 +91,7 @@ def _not_sure(seen: ArmedTime, light: Light, theta: FloatArray, information: Flo
 
 
 def _free(light: Light, theta: FloatArray, score: FloatArray, information: FloatArray) -> FloatArray:
-    """Which parameters may move: not a light at 0 that should be less, and no delay of a return without light."""
+    """Which parameters may move: none beyond the range of its light, and no delay of a return without light."""
     k = light.returns
     free = np.ones(theta.size, bool)
     at_zero = (theta[: 1 + k] <= LEAST) & (score[: 1 + k] <= 0)

@@ -12,6 +12,7 @@ from mars_lidar.calibrate.jittered import Records, before_blur, normal_kernel, s
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 
 LEAST = 1e-9  # photons per period that stand for none
+MOST_BLURRED = 500.0  # photons per period of a jittered pixel: e^-photons is a number, and more look the same
 _SPREAD = 1e-3  # step of a numerical derivative, in widths of the pulse
 
 
@@ -129,6 +130,8 @@ class Light:
         k = self.returns
         out = theta.copy()
         out[: 1 + k] = np.maximum(out[: 1 + k], LEAST)
+        if self.jitter_ns > 0.0:
+            out[: 1 + k] *= min(1.0, MOST_BLURRED / float(out[: 1 + k].sum()))
         if self.fit_width:
             out[1 + 2 * k] = np.clip(out[1 + 2 * k], self.least_sigma_ns, 0.5 * self.period_ns)
         if self.fit_jitter:

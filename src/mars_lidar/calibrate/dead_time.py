@@ -16,7 +16,7 @@ from mars_lidar.calibrate.hidden_dead_time import hidden
 from mars_lidar.calibrate.intervals import FloatArray, Stream
 from mars_lidar.calibrate.jittered import normal_kernel, unblurred
 from mars_lidar.calibrate.recovery_edge import ORDINARY, REACH, Edge, Law, edge_of
-from mars_lidar.calibrate.shortest_intervals import FEW, Ages, Underlying, extrapolated, is_sharp, shortest
+from mars_lidar.calibrate.shortest_intervals import FEW, LEAST_REACH, Ages, Underlying, extrapolated, is_sharp, shortest
 from mars_lidar.calibrate.stream_summary import Summary
 from mars_lidar.calibrate.unknowns import is_seen
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
@@ -133,9 +133,9 @@ class Unknown:
     def _ages(self, reach_ns: float = 0.0) -> Ages:
         """The shortest intervals, up to at least `reach_ns` above the smallest."""
         smallest = float(self.counted.smallest_ns[0])
-        known = max(self._seen, default=-1.0)
-        if known < reach_ns or known < 0.0:
-            self._seen[max(reach_ns, 0.0)] = shortest(self.stream, smallest, reach_ns or None)
+        reach_ns = max(reach_ns, LEAST_REACH * self.stream.period_ns)
+        if max(self._seen, default=0.0) < reach_ns:
+            self._seen[reach_ns] = shortest(self.stream, smallest, reach_ns)
         return self._seen[max(self._seen)]
 
     def _blurred(self, first: Calibration) -> tuple[bool, Calibration | None]:
@@ -201,12 +201,19 @@ class Unknown:
             jitter = _nearer(tried)
         if edge is None or not _within_pulse(edge, found):
             return None
-        found = self._pass(self._watch(edge), found)
+        if self.jitter_ns is None and edge.jitter_error_ns > 0.0:
+            follows = self._follows(ages, found, edge, width)
+            off = edge.jitter_ns - found.jitter_ns
+            found = self._pass(self._watch(edge.followed(follows, off)), found)
+        else:
+            follows, off = (0.0, 0.0), 0.0
+            found = self._pass(self._watch(edge), found)
         if found.too_short:
             return None
         edge = self._edge(ages, found, dead, width, self._uncertain(found, width, ages.clock_ns))
         if edge is None or not edge.fits > ORDINARY:
             return None
+        edge = edge.followed(follows, off)
         if abs(found.jitter_ns - edge.jitter_ns) > _AGREE * edge.jitter_error_ns > 0.0:  # the pulse is no Gaussian
             found = self._pass(replace(self._watch(edge), jitter_error_ns=0.0), found)
             found = replace(found, jitter_error_ns=edge.jitter_error_ns)
@@ -217,6 +224,26 @@ class Unknown:
             moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
             found = replace(found, covariance=found.covariance + np.outer(moved, moved))
         return replace(found, dead_time_ns=edge.dead_time_ns, dead_time_error_ns=edge.dead_time_error_ns)
+
+    def _follows(self, ages: Ages, found: Calibration, edge: Edge, width: float) -> tuple[float, float]:
+        """By how much of a change of the jitter that the light is fitted with dead time and jitter of the edge follow.
+
+        Little where the light falls evenly on the edge. Where it is that of a bright pulse a repetition later, the
+        light that goes with a jitter makes an edge of nearly that jitter.
+        """
+        step = max(edge.jitter_error_ns, _SAME * edge.jitter_ns)
+        jitter = found.jitter_ns + step
+        if not jitter < _ALL * _width(found):
+            jitter = found.jitter_ns - step
+        if not jitter > 0.0:
+            return 0.0, 0.0
+        light = self._pass(Watch(found.dead_time_ns, found.hold_off_ns, jitter), found)
+        moved = self._edge(ages, light, edge.dead_time_ns, width)
+        same = self._edge(ages, found, edge.dead_time_ns, width)
+        if moved is None or same is None or not light.converged:
+            return 0.0, 0.0
+        change = jitter - found.jitter_ns
+        return (moved.dead_time_ns - same.dead_time_ns) / change, (moved.jitter_ns - same.jitter_ns) / change
 
     def _clocked(self, first: Calibration, edge: Edge, ages: Ages) -> Calibration | None:
         """The middle of an edge that the clock alone blurs; a jitter less than its unit may hide."""

@@ -48,7 +48,8 @@ class Records:
         place = (self._k + self._n // 2) % self._n - self._n // 2
         # e^-Lambda at the edges of bins is e^(-total k / n) times a factor that repeats; the kernel takes the rest
         before = np.concatenate([[0.0], np.cumsum(rate)[:-1]])
-        self._alive = np.exp(self._total * self._k / self._n - before)
+        alive = self._total * self._k / self._n - before
+        self._alive = np.exp(alive - alive.max())  # up to a factor, which falls out
         tilted = np.where(kernel > 0.0, kernel, 0.0) * np.exp(np.clip(self._total * place / self._n, -700.0, 700.0))
         self._kernel, self._moment = tilted, tilted * place / self._n
         self._blurred = self._convolved(self._alive, tilted)

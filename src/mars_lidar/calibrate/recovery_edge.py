@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,11 +22,16 @@ Law = Callable[[float], Underlying]
 """What lies behind a stream whose edge is so wide, ns: the same records from a narrower pulse and a wider jitter."""
 
 _BELOW, _BEYOND = 6.0, 15.0  # the window that is fitted, in widths of the edge
+LEAST_BEYOND = 5.0  # widths of the window beyond the edge without which its amplitude is not known
 REACH = _BEYOND + 1.0  # widths beyond the dead time up to which intervals are needed
 _CELLS = 8  # of it per width
+_MOST_FOLLOWED = 0.95  # of a change of the light's jitter that the edge follows: then the edge tells next to nothing
+_MOST_LOG = 300.0  # logarithm of an amplitude: trial steps where nothing is expected ask for more
 _ROUNDS = 6
 _STEPS = 60
 _CONVERGED = 1e-3  # Newton decrement
+_GAIN = 1e-4  # of log likelihood in a step, below which no further one is of use: an 80th of a standard error
+_LEAST_STEP = 1e-3  # part of a scoring step; light of single photons makes the likelihood rough
 _SAME = 0.02  # widths by which a last round may move the edge
 ORDINARY = 1e-4  # probability below which the edge is not that of a jitter
 
@@ -69,6 +74,19 @@ class Edge:
         matrix = np.array([[left + slope**2 * variance, slope * variance], [slope * variance, variance]])
         return Edge(dead, jitter_ns, matrix, self.fits)
 
+    def followed(self, follows: tuple[float, float], off_ns: float = 0.0) -> Edge:
+        """The edge with the errors that it has with a light which was fitted with the edge's own jitter.
+
+        `follows`: change of dead time and jitter by that of the light's jitter. An error e of the edge's jitter makes
+        a light with which the edge is off by s e more, s the second of the two, and so on: by e / (1 - s). `off_ns`:
+        what the jitter still differs by from that of the light.
+        """
+        dead, jitter = follows
+        gain = 1.0 / (1.0 - min(max(jitter, 0.0), _MOST_FOLLOWED))
+        turn = np.array([[1.0, dead * gain], [0.0, gain]])
+        left = off_ns * gain * np.array([dead, 1.0])
+        return replace(self, covariance=turn @ self.covariance @ turn.T + np.outer(left, left))
+
 
 def edge_of(ages: Ages, behind: Law, dead_time_ns: float, width_ns: float, off: Sequence[Law] = ()) -> Edge | None:
     """Dead time and jitter by maximum likelihood, from rough values of the dead time and of the edge's width.
@@ -82,6 +100,8 @@ def edge_of(ages: Ages, behind: Law, dead_time_ns: float, width_ns: float, off: 
     for _ in range(_ROUNDS):
         width = math.exp(theta[1])
         if width > WIDEST * behind(width).period_ns or theta[0] < _BELOW * width:
+            return None
+        if not ages.limit_ns > theta[0] + LEAST_BEYOND * width:
             return None
         fitted = _Window.about(ages, behind, float(theta[0]), width)
         found = fitted.maximum(theta) if fitted.counts.sum() >= FEW else None
@@ -109,7 +129,7 @@ class _Window:
 
     @classmethod
     def about(cls, ages: Ages, behind: Law, dead_time_ns: float, width_ns: float) -> _Window:
-        """A window about the edge, with whole cells of the clock."""
+        """A window about the edge, with whole cells of the clock, as far as all intervals are known."""
         step = width_ns / _CELLS
         number = math.ceil((_BELOW + _BEYOND) * _CELLS)
         near, far = np.arange(2 * _CELLS), np.arange(2 * _CELLS, number + _CELLS, _CELLS // 2)
@@ -117,7 +137,9 @@ class _Window:
         begin, unit = dead_time_ns - _BELOW * width_ns, ages.unit_ns
         if unit > 0.0:
             step, begin = max(round(step / unit), 1) * unit, (math.floor(begin / unit) + 0.5) * unit
-        edges = begin + step * np.arange(math.ceil((_BELOW + _BEYOND) * width_ns / step) + 1)
+        known = min((_BELOW + _BEYOND) * width_ns, ages.limit_ns - begin)
+        edges = begin + step * np.arange(math.ceil(known / step) + 1)
+        edges = edges[edges <= ages.limit_ns]  # a cell beyond the limit would be empty for want of records
         counts = np.histogram(ages.interval_ns, edges)[0].astype(np.float64)
         return cls(ages, edges.astype(np.float64), counts, after, behind)
 
@@ -136,7 +158,7 @@ class _Window:
         after = 0.5 * (self.after_ns[1:] + self.after_ns[:-1])
         below = ndtr((self.edges_ns[:, None] - dead - after) / width)
         below = below @ (self.mass(dead, width) if mass is None else mass)
-        return np.asarray(np.maximum(math.exp(theta[2]) * np.diff(below), 1e-12))
+        return np.asarray(np.maximum(math.exp(min(theta[2], _MOST_LOG)) * np.diff(below), 1e-12))
 
     def slopes(self, theta: FloatArray) -> FloatArray:
         """d log expected / d theta (m, 3)."""
@@ -167,11 +189,14 @@ class _Window:
             if abs(float(step @ score)) < _CONVERGED:
                 break
             scale = 1.0
-            while scale > 1e-6 and not (found := self.gain(theta + scale * step)) > best:
+            while scale > _LEAST_STEP and not (found := self.gain(theta + scale * step)) > best:
                 scale *= 0.5
-            if scale <= 1e-6:
+            if scale <= _LEAST_STEP:
                 break
+            gained = found - best
             theta, best = theta + scale * step, found
+            if gained < _GAIN:
+                break
             if not abs(theta[1] - start[1]) < 5.0:
                 return None
         return theta

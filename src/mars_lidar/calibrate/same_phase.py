@@ -66,9 +66,11 @@ def same_phase(stream: Stream, begin_ns: float, reach_ns: float) -> SamePhase:
     start, dt = intervals_of(stream, _MOST)
     kept = dt > edges[0]
     start, dt = start[kept], dt[kept]
-    phase = _phases(start + dt, stream.period_ns)[1]
-    order = np.argsort(phase)
-    passed = _passes(start, dt, edges, phase[order], stream.period_ns)
+    # by the phase of their start: the ends of an age are then in order too, and searched several times faster
+    order = np.argsort(_phases(start, stream.period_ns)[1])
+    start, dt = start[order], dt[order]
+    phase = np.sort(_phases(start + dt, stream.period_ns)[1])
+    passed = _passes(start, dt, edges, phase, stream.period_ns)
     age = np.searchsorted(edges, dt, side="right") - 1
     observed = np.bincount(age, minlength=_CLASSES + 1)[:_CLASSES].astype(np.float64)
     expected, second = np.zeros(_CLASSES), np.zeros((_CLASSES, _CLASSES))
@@ -93,14 +95,20 @@ def _passes(
     out = np.zeros((edges.size, at.size), np.float32)
     begin = _phases(start + edges[0], period_ns)
     for k, edge in enumerate([*edges[1:], np.inf]):
-        end = _phases(start + np.minimum(dt, edge), period_ns)
-        whole = float((end[0] - begin[0]).sum())
-        # of the last period those up to the end, of the first all but those before the beginning
-        over = np.bincount(np.searchsorted(at, end[1], side="right"), minlength=at.size + 1)
-        under = np.bincount(np.searchsorted(at, begin[1], side="left"), minlength=at.size + 1)
-        out[k] = whole + np.cumsum((over - under)[::-1])[::-1][1:]
         alive = dt > edge
-        start, dt, begin = start[alive], dt[alive], (end[0][alive], end[1][alive])
-        if start.size == 0:
+        whole, over = 0.0, np.zeros(at.size + 1, np.int64)
+        # of the last period those up to the end, of the first all but those before the beginning
+        under = np.bincount(np.searchsorted(at, begin[1], side="left"), minlength=at.size + 1)
+        for some, age in ((alive, np.full(1, edge)), (~alive, dt)):
+            if not some.any():
+                continue
+            end = _phases(start[some] + (age if age.size == 1 else age[some]), period_ns)
+            whole += float((end[0] - begin[0][some]).sum())
+            over += np.bincount(np.searchsorted(at, end[1], side="right"), minlength=at.size + 1)
+            if some is alive:
+                later = end
+        out[k] = whole + np.cumsum((over - under)[::-1])[::-1][1:]
+        if not alive.any():
             break
+        start, dt, begin = start[alive], dt[alive], later
     return out

@@ -14,24 +14,39 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar.calibrate.intervals import FloatArray, Stream
 
 FEW = 20  # intervals about an edge that tell something of it
 WIDEST = 0.2  # periods: a wider edge is a slow recovery
-_REACH = 0.2  # periods above the smallest in which an edge is judged to be sharp or not
+LEAST_REACH = 0.2  # periods above the smallest in which an edge is judged to be sharp or not
 _SHARE = 16  # of the intervals a part of so many is judged: the light is known no better
 _MOST = 400_000  # intervals that are looked at
+_SPARSE = 0.2  # of the bins that hold registrations
 
 
 @dataclass(frozen=True, eq=False)
 class Ages:
-    """The shortest intervals of a stream (m,), ns, in order of time, and of which number each of them is (m,)."""
+    """All intervals of a stream shorter than some limit.
+
+    Attributes
+    ----------
+    interval_ns, number
+        (m,) the intervals, ns, in order of time, and the number of each in the stream.
+    clock_ns
+        Standard deviation that rounding of times to the clock's unit adds to an interval, ns.
+    unit_ns
+        Unit of which intervals are multiples, ns; 0 where they are not.
+    limit_ns
+        Intervals of at least this are left out, ns.
+    """
 
     interval_ns: FloatArray
     number: FloatArray
-    clock_ns: float  # standard deviation that rounding of times to the clock's unit adds to an interval
-    unit_ns: float  # of which intervals are multiples; 0 where they are not
+    clock_ns: float
+    unit_ns: float
+    limit_ns: float
 
     @property
     def smallest_ns(self) -> float:
@@ -41,7 +56,7 @@ class Ages:
 
 def shortest(stream: Stream, smallest_ns: float, reach_ns: float | None = None) -> Ages:
     """The intervals up to `reach_ns` above the smallest (a fifth of a period), of so many records as are needed."""
-    limit = smallest_ns + (_REACH * stream.period_ns if reach_ns is None else reach_ns)
+    limit = smallest_ns + (LEAST_REACH * stream.period_ns if reach_ns is None else reach_ns)
     found: list[FloatArray] = []
     place: list[FloatArray] = []
     passed, kept = 0, 0
@@ -57,7 +72,7 @@ def shortest(stream: Stream, smallest_ns: float, reach_ns: float | None = None) 
     share = 12.0 if stream.units else 3.0
     clock = stream.unit_ns / math.sqrt(share)
     unit = stream.unit_ns if stream.units else 0.0
-    return Ages(np.concatenate(found), np.concatenate(place), clock, unit)
+    return Ages(np.concatenate(found), np.concatenate(place), clock, unit, limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +105,12 @@ class Underlying:
         n = self.rate.size
         cumulative = np.concatenate([[0.0], np.cumsum(np.tile(self.rate, 2))])
         total = float(self.rate.sum())
+        phases = self.phases
+        used: NDArray[np.int64] | None = np.flatnonzero(phases)
+        if used.size > _SPARSE * n:  # slices of neighbours are faster than a choice of a few
+            used = None
+        else:
+            phases = phases[used]
 
         def light(age: float) -> FloatArray:
             """From time 0 to an age after the middle of each bin."""
@@ -97,12 +118,15 @@ class Underlying:
             whole = math.floor(x)
             cycle, place = divmod(whole, n)
             part = x - whole
-            low, high = cumulative[place : place + n], cumulative[place + 1 : place + 1 + n]
+            if used is None:
+                low, high = cumulative[place : place + n], cumulative[place + 1 : place + 1 + n]
+            else:
+                low, high = cumulative[place + used], cumulative[place + 1 + used]
             return np.asarray(low + part * (high - low) + cycle * total)
 
         armed = light(dead_time_ns)
         # sums, not products of vectors: BLAS starts threads for these, and waits for them on a busy machine
-        return np.array([-float((self.phases * np.expm1(armed - light(dead_time_ns + u))).sum()) for u in after_ns])
+        return np.array([-float((phases * np.expm1(armed - light(dead_time_ns + u))).sum()) for u in after_ns])
 
 
 def is_sharp(ages: Ages, behind: Underlying, of: int | None = None) -> tuple[float, float]:

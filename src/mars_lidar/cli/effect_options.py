@@ -12,29 +12,19 @@ from mars_lidar.instrument.effects import FIELDS
 _EFFECTS = "Effects of the detector (off by default)"
 
 
+def _declared(name: str, *also: str) -> Any:
+    """The option of an effect that is one number, as `mars_lidar.instrument.effects.FIELDS` declares it."""
+    effect = FIELDS[name]
+    assert effect.help is not None
+    return _option(f"--{name.replace('_', '-')}", *also, panel=_EFFECTS, help=effect.help, default=effect.default)
+
+
 @dataclass(frozen=True, kw_only=True)
 class LightEffects:
     """What changes the light that a pixel counts; None: as in the file."""
 
-    detection_efficiency: Annotated[
-        float | None,
-        _option(
-            "--detection-efficiency",
-            panel=_EFFECTS,
-            default="1: --signal counts detectable photons",
-            help="Photon detection efficiency, fill factor included, in (0, 1].",
-        ),
-    ] = None
-    dark_count_hz: Annotated[
-        float | None,
-        _option(
-            "--dark-count-hz",
-            "--dark-counts",
-            panel=_EFFECTS,
-            default="0",
-            help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
-        ),
-    ] = None
+    detection_efficiency: Annotated[float | None, _declared("detection_efficiency")] = None
+    dark_count_hz: Annotated[float | None, _declared("dark_count_hz", "--dark-counts")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,28 +44,9 @@ class StreamEffects:
         float | None,
         _option("--afterpulse-delay-ns", panel=_EFFECTS, help="... and their mean delay after the avalanche, ns."),
     ] = None
-    twilight_ns: Annotated[
-        float | None,
-        _option(
-            "--twilight-ns",
-            panel=_EFFECTS,
-            default="0",
-            help="Arrivals this long before the end of the dead time fire at its end, ns.",
-        ),
-    ] = None
-    electronics_dead_time_ns: Annotated[
-        float | None,
-        _option(
-            "--electronics-dead-time-ns",
-            panel=_EFFECTS,
-            default="0",
-            help="Dead time of the electronics after an event, ns; without effect unless longer than --dead-time-ns.",
-        ),
-    ] = None
-    max_events_per_period: Annotated[
-        int | None,
-        _option("--max-events-per-period", panel=_EFFECTS, help="Events recorded of a period.", default="no limit"),
-    ] = None
+    twilight_ns: Annotated[float | None, _declared("twilight_ns")] = None
+    electronics_dead_time_ns: Annotated[float | None, _declared("electronics_dead_time_ns")] = None
+    max_events_per_period: Annotated[int | None, _declared("max_events_per_period")] = None
     jitter_fwhm_ns: Annotated[
         float | None,
         _option("--jitter-fwhm-ns", panel=_EFFECTS, help="Gaussian timing jitter: full width at half maximum, ns."),
@@ -155,12 +126,7 @@ class Effects(StreamEffects, LightEffects):
         str | None,
         _option("--crosstalk-kernel", panel=_EFFECTS, help="Which neighbours: 4 or 8.", default="8"),
     ] = None
-    max_events_per_exposure: Annotated[
-        int | None,
-        _option(
-            "--max-events-per-exposure", panel=_EFFECTS, help="Events recorded of an exposure.", default="no limit"
-        ),
-    ] = None
+    max_events_per_exposure: Annotated[int | None, _declared("max_events_per_exposure")] = None
 
     def given(self) -> dict[str, Any]:
         """Fields of `Detector`, as plain data."""

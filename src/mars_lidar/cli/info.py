@@ -170,13 +170,7 @@ def _gate(detector: Detector) -> list[tuple[str, str]]:
 
 
 def _effects(detector: Detector) -> list[tuple[str, str]]:
-    told = []
-    for name in detector.effects:
-        value = getattr(detector, name)
-        if name == "code_density":
-            told.append(f"code_density of {len(value)} codes")
-        else:
-            told.append(f"{name} {_short(value)}")
+    told = [f"{name} {_short(getattr(detector, name))}" for name in detector.effects]
     return [("effects", ", ".join(told))] if told else []
 
 
@@ -190,4 +184,6 @@ def _on_disk(cube: Cube) -> int:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"of {len(value)} values"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mars_lidar.cli.console import reported, table
+from mars_lidar.instrument.effects import FIELDS
 
 _FILE = Path("system.yaml")
 # The values are those of `system_options.DEFAULT_SYSTEM`; a test reads the file back and compares.
@@ -51,28 +52,17 @@ detector:
 #   gate_cycles: 1       # ... every so many periods (more than 1 only with a step)
 # A published detector:  preset: thorlabs-spcm20a  (others: docs/detectors.md) with other fields to change
 # Effects, off unless given, in the order in which they act (docs/detectors.md); further lines of detector:
-#   detection_efficiency: 0.25       # then S and B are photons on the pixel, not detectable ones
-#   dark_count_hz: 100.0             # counts/s of every pixel
-#   afterpulsing:                    # carriers in traps: each that is released is an arrival like a photon
-#     probability: 0.02              # mean number per avalanche, those included that are lost in the dead time
-#     delay_ns: 60.0                 # exponential after the avalanche; or  delays: [0, 3, 2, 1]  with  bin_ns: 40.0
-#   twilight_ns: 2.0                 # photons so late in the dead time fire at its end
-#   crosstalk:                       # avalanches trigger neighbours; with the sequential engine
-#     probability: 0.01              # mean number of neighbours
-#     kernel: "8"                    # or "4", or 3 x 3 weights
-#   electronics_dead_time_ns: 120.0  # of the TDC, beside that of the pixel; matters where it is longer
-#   max_events_per_period: 1         # the TDC records the first ones only, of a period ...
-#   max_events_per_exposure: 1000    # ... and of an exposure
-#   jitter:                          # of a record; leave it out of the pulse above then
-#     kind: gaussian                 # or sampled, with values, bin_ns and origin as for a pulse
-#     fwhm_ns: 0.1
-#     tail_ns: 0.2                   # exponential tail: its mean ...
-#     tail_fraction: 0.1             # ... and the share of the records that are in it
-#   code_density: [1.1, 0.9, 1.05, 0.95]  # relative widths of TDC codes, repeating; their number divides the bins
+{effects}
 
 # State of the pixel at the start of an exposure: armed (ready), or stationary (warmed up).
 start: armed
 """
+
+
+def commented(file: Path) -> str:
+    """The text of the file."""
+    effects = [f"#   {line}" for effect in FIELDS.values() for line in effect.example.splitlines()]
+    return TEMPLATE.format(name=file, effects="\n".join(effects))
 
 
 def init(
@@ -95,5 +85,5 @@ def init(
             raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
         if file.exists() and not overwrite:
             raise FileExistsError(f"{file} exists already; choose another name or give --overwrite")
-        file.write_text(TEMPLATE.format(name=file))
+        file.write_text(commented(file))
         table([("wrote", str(file))])

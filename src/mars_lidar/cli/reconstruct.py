@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mars_lidar.cli.console import progress_bar, reported, save_picture, say, table
+from mars_lidar.reconstruct import METHODS
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
@@ -23,8 +24,7 @@ RECONSTRUCT_EPILOG = "\n\n".join(
         "mars-lidar reconstruct room.zarr -o maps.zarr",
         "mars-lidar reconstruct room.zarr --method all -o maps.h5",
         "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
-        "Methods: maximum_likelihood, generalised_coates, mchc (free-running detectors), coates (synchronous), "
-        "matched_filter, peak (little light). docs/reconstruction.md says what each assumes.",
+        f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
     )
 )
 
@@ -98,7 +98,6 @@ def reconstruct(
 
 def _methods(text: str, cube: Cube) -> list[str]:
     from mars_lidar._base import checks
-    from mars_lidar.reconstruct import METHODS
 
     if text == "all":
         names = []

@@ -1,4 +1,4 @@
-"""Where kernels run: CuPy's current device. Tests put the processor in its place (tests/gpu/host_machine.py)."""
+"""Where kernels run: CuPy's current device. Tests put the processor in its place (tests/cuda/host_machine.py)."""
 
 from __future__ import annotations
 

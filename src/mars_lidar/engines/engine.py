@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.instrument.detector import MODES, Detector, Mode
-from mars_lidar.instrument.effects import LIGHT_EFFECTS, Jitter, code_edges
-from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+from mars_lidar.instrument.effects import AVALANCHE_EFFECTS, LIGHT_EFFECTS, RECORDING_EFFECTS, native_fields
+from mars_lidar.instrument.pulse import native_pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
@@ -58,7 +58,7 @@ class Task:
     @cached_property
     def pulse(self) -> _core.PulseTable:
         """The native pulse."""
-        return _pulse_table(self.system.pulse, self.system.period_ns)
+        return native_pulse(self.system.pulse, self.system.period_ns)
 
     def pixel_arrays(self) -> dict[str, Any]:
         """What kernels read of the pixels, by name: light and delays (in periods) of the returns, (returns, pixels)."""
@@ -98,20 +98,10 @@ class Task:
 
     def _avalanches(self) -> dict[str, Any]:
         """What avalanches leave behind, as the native job takes it; only what is on."""
-        detector, period = self.system.detector, self.system.period_ns
-        told: dict[str, Any] = {}
-        traps, crosstalk = detector.afterpulsing, detector.crosstalk
-        if traps is not None:
-            told |= {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period}
-            if traps.delays is not None:
-                told |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period}
-            if traps.generations is not None:
-                told["generations"] = traps.generations
-        if detector.twilight_ns:
-            told["twilight"] = detector.twilight_ns / period
-        if crosstalk is not None:
-            height, width = self.flux.shape
-            told |= {"crosstalk": crosstalk.probabilities, "height": height, "width": width}
+        detector = self.system.detector
+        told = native_fields({name: getattr(detector, name) for name in AVALANCHE_EFFECTS}, self.system.period_ns)
+        if detector.crosstalk is not None:
+            told["height"], told["width"] = self.flux.shape
         return told
 
 
@@ -182,26 +172,19 @@ class Engine(ABC):
 
 @lru_cache(maxsize=16)
 def _recording(detector: Detector, period_ns: float) -> _core.Recording:
+    """What the electronics make of registrations; times in periods."""
     from mars_lidar._base.native import _core
 
-    jitter, no_limit = detector.jitter, 2**31 - 1
-    shape: Pulse | None = None
-    tail = tail_fraction = 0.0
-    if isinstance(jitter, Jitter):
-        shape, tail, tail_fraction = GaussianPulse(sigma_ns=jitter.sigma_ns), jitter.tail_ns, jitter.tail_fraction
-    elif jitter is not None:
-        shape = jitter.shape
-    return _core.Recording(
-        electronics_dead_time=detector.electronics_dead_time_ns / period_ns,
-        most_per_period=detector.max_events_per_period or no_limit,
-        most_per_exposure=detector.max_events_per_exposure or no_limit,
-        jitter=None if shape is None else _pulse_table(shape, period_ns),
-        tail=tail / period_ns,
-        tail_fraction=tail_fraction,
-        code_edges=None if detector.code_density is None else code_edges(detector.code_density),
-    )
+    given = native_fields({name: getattr(detector, name) for name in RECORDING_EFFECTS}, period_ns)
+    return _core.Recording(**(_EVERYTHING | given))
 
 
-@lru_cache(maxsize=16)
-def _pulse_table(pulse: Pulse, period_ns: float) -> _core.PulseTable:
-    return pulse._native(period_ns)
+_EVERYTHING: dict[str, Any] = {  # recorded, when it happens
+    "electronics_dead_time": 0.0,
+    "most_per_period": 2**31 - 1,
+    "most_per_exposure": 2**31 - 1,
+    "jitter": None,
+    "tail": 0.0,
+    "tail_fraction": 0.0,
+    "code_edges": None,
+}

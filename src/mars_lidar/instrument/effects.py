@@ -1,15 +1,16 @@
 """What a real pixel and its electronics do beside dead time and mode: the optional fields of `Detector`.
 
-Every effect is off by default, and off means the bits of the ideal pixel. The order in which they act, and what each
-of them is taken to be, is in docs/detectors.md.
+Every effect is declared here once: its check, its form in files, its option, its native fields. All are off by default,
+and then the bits are those of the ideal pixel. The order in which they act, and what each of them is taken to be, is in
+docs/detectors.md; the steps that add one are in docs/architecture.md.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +20,7 @@ from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.jitter import Jitter as Jitter
 from mars_lidar.instrument.jitter import SampledJitter as SampledJitter
 from mars_lidar.instrument.jitter import jitter_from_dict
-
-LIGHT_EFFECTS = ("detection_efficiency", "dark_count_hz")
-"""What changes the flux only, `Flux.detected`: every engine and statistic takes it."""
-
-AVALANCHE_EFFECTS = ("afterpulsing", "twilight_ns", "crosstalk")
-"""What avalanches leave behind: further arrivals, in the same pixel or in its neighbours."""
-
-TIMING_EFFECTS = ("jitter", "code_density")
-"""What moves records and leaves their number as it is."""
-
-RECORDING_EFFECTS = ("electronics_dead_time_ns", "max_events_per_period", "max_events_per_exposure", *TIMING_EFFECTS)
-"""What happens to the registrations of a pixel, in order: which are recorded, and at what time."""
-
-EFFECTS = (*LIGHT_EFFECTS, *AVALANCHE_EFFECTS, *RECORDING_EFFECTS)
-"""Names of all effects: fields of `Detector`."""
+from mars_lidar.instrument.pulse import GaussianPulse, native_pulse
 
 _MAX_RATE_HZ = 1e12
 _MAX_EVENTS = 2**31 - 1
@@ -41,13 +28,40 @@ _MAX_CODES = 2**16
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Field:
-    """How a field of `Detector` that is an effect is checked, switched off, and read from plain data."""
+Kind = Literal["light", "avalanche", "recording", "timing"]
 
+
+@dataclass(frozen=True)
+class Effect:
+    """All that is declared of a field of `Detector` that is an effect.
+
+    kind
+        What it changes. ``"light"``: the flux only (`Flux.detected`), which every engine and statistic takes.
+        ``"avalanche"``: what an avalanche leaves behind, further arrivals in the same pixel or in its neighbours.
+        ``"recording"``: which registrations of a pixel are recorded; ``"timing"``: at what time, but not how many.
+    off
+        The value that switches it off: the bits of the ideal pixel.
+    checked
+        The value as it is kept; TypeError or ValueError, naming the field, for one that makes no sense.
+    example
+        Its lines in the commented file of ``mars-lidar init``.
+    read
+        The value from plain data (JSON, YAML); None: as it is.
+    native
+        The fields of the native job (avalanche) or of its recording (recording, timing) for a value and the laser
+        period, ns; times in periods. None for light.
+    help, default
+        Of the option of the command line that has its name; None: it has options of its own (cli/effect_options.py).
+    """
+
+    kind: Kind
     off: Any
     checked: Callable[[Any], Any]
-    read: Callable[[Any], Any] | None = None  # None: as it is
+    example: str
+    read: Callable[[Any], Any] | None = None
+    native: Callable[[Any, float], dict[str, Any]] | None = None
+    help: str | None = None
+    default: str | None = None
 
 
 def _jitter(value: Any) -> Jitter | SampledJitter:
@@ -77,23 +91,142 @@ def _code_density(value: Any) -> tuple[float, ...]:
     return tuple(widths.tolist())
 
 
-FIELDS: dict[str, Field] = {
-    "detection_efficiency": Field(
-        1.0, lambda v: checks.real("detection_efficiency", v, low=0.0, high=1.0, strict_low=True)
+def _native_traps(traps: Afterpulsing, period_ns: float) -> dict[str, Any]:
+    told: dict[str, Any] = {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period_ns}
+    if traps.delays is not None:
+        told |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period_ns}
+    if traps.generations is not None:
+        told["generations"] = traps.generations
+    return told
+
+
+def _native_jitter(jitter: Jitter | SampledJitter, period_ns: float) -> dict[str, Any]:
+    if isinstance(jitter, SampledJitter):
+        return {"jitter": native_pulse(jitter.shape, period_ns)}
+    return {
+        "jitter": native_pulse(GaussianPulse(sigma_ns=jitter.sigma_ns), period_ns),
+        "tail": jitter.tail_ns / period_ns,
+        "tail_fraction": jitter.tail_fraction,
+    }
+
+
+FIELDS: dict[str, Effect] = {
+    "detection_efficiency": Effect(
+        "light",
+        1.0,
+        lambda v: checks.real("detection_efficiency", v, low=0.0, high=1.0, strict_low=True),
+        "detection_efficiency: 0.25       # then S and B are photons on the pixel, not detectable ones",
+        help="Photon detection efficiency, fill factor included, in (0, 1].",
+        default="1: --signal counts detectable photons",
     ),
-    "dark_count_hz": Field(0.0, lambda v: checks.real("dark_count_hz", v, low=0.0, high=_MAX_RATE_HZ)),
-    "afterpulsing": Field(None, lambda v: _instance("afterpulsing", v, Afterpulsing), Afterpulsing.from_dict),
-    "twilight_ns": Field(0.0, lambda v: checks.real("twilight_ns", v, low=0.0)),
-    "crosstalk": Field(None, lambda v: _instance("crosstalk", v, Crosstalk), Crosstalk.from_dict),
-    "electronics_dead_time_ns": Field(0.0, lambda v: checks.real("electronics_dead_time_ns", v, low=0.0)),
-    "max_events_per_period": Field(None, lambda v: checks.integer("max_events_per_period", v, low=1, high=_MAX_EVENTS)),
-    "max_events_per_exposure": Field(
-        None, lambda v: checks.integer("max_events_per_exposure", v, low=1, high=_MAX_EVENTS)
+    "dark_count_hz": Effect(
+        "light",
+        0.0,
+        lambda v: checks.real("dark_count_hz", v, low=0.0, high=_MAX_RATE_HZ),
+        "dark_count_hz: 100.0             # counts/s of every pixel",
+        help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
+        default="0",
     ),
-    "jitter": Field(None, _jitter, jitter_from_dict),
-    "code_density": Field(None, _code_density),
+    "afterpulsing": Effect(
+        "avalanche",
+        None,
+        lambda v: _instance("afterpulsing", v, Afterpulsing),
+        """\
+afterpulsing:                    # carriers in traps: each that is released is an arrival like a photon
+  probability: 0.02              # mean number per avalanche, those included that are lost in the dead time
+  delay_ns: 60.0                 # exponential after the avalanche; or  delays: [0, 3, 2, 1]  with  bin_ns: 40.0""",
+        read=Afterpulsing.from_dict,
+        native=_native_traps,
+    ),
+    "twilight_ns": Effect(
+        "avalanche",
+        0.0,
+        lambda v: checks.real("twilight_ns", v, low=0.0),
+        "twilight_ns: 2.0                 # photons so late in the dead time fire at its end",
+        native=lambda v, period_ns: {"twilight": v / period_ns},
+        help="Arrivals this long before the end of the dead time fire at its end, ns.",
+        default="0",
+    ),
+    "crosstalk": Effect(
+        "avalanche",
+        None,
+        lambda v: _instance("crosstalk", v, Crosstalk),
+        """\
+crosstalk:                       # avalanches trigger neighbours; with the sequential engine
+  probability: 0.01              # mean number of neighbours
+  kernel: "8"                    # or "4", or 3 x 3 weights""",
+        read=Crosstalk.from_dict,
+        native=lambda v, period_ns: {"crosstalk": v.probabilities},
+    ),
+    "electronics_dead_time_ns": Effect(
+        "recording",
+        0.0,
+        lambda v: checks.real("electronics_dead_time_ns", v, low=0.0),
+        "electronics_dead_time_ns: 120.0  # of the TDC, beside that of the pixel; matters where it is longer",
+        native=lambda v, period_ns: {"electronics_dead_time": v / period_ns},
+        help="Dead time of the electronics after an event, ns; without effect unless longer than --dead-time-ns.",
+        default="0",
+    ),
+    "max_events_per_period": Effect(
+        "recording",
+        None,
+        lambda v: checks.integer("max_events_per_period", v, low=1, high=_MAX_EVENTS),
+        "max_events_per_period: 1         # the TDC records the first ones only, of a period ...",
+        native=lambda v, period_ns: {"most_per_period": v},
+        help="Events recorded of a period.",
+        default="no limit",
+    ),
+    "max_events_per_exposure": Effect(
+        "recording",
+        None,
+        lambda v: checks.integer("max_events_per_exposure", v, low=1, high=_MAX_EVENTS),
+        "max_events_per_exposure: 1000    # ... and of an exposure",
+        native=lambda v, period_ns: {"most_per_exposure": v},
+        help="Events recorded of an exposure.",
+        default="no limit",
+    ),
+    "jitter": Effect(
+        "timing",
+        None,
+        _jitter,
+        """\
+jitter:                          # of a record; leave it out of the pulse above then
+  kind: gaussian                 # or sampled, with values, bin_ns and origin as for a pulse
+  fwhm_ns: 0.1
+  tail_ns: 0.2                   # exponential tail: its mean ...
+  tail_fraction: 0.1             # ... and the share of the records that are in it""",
+        read=jitter_from_dict,
+        native=_native_jitter,
+    ),
+    "code_density": Effect(
+        "timing",
+        None,
+        _code_density,
+        "code_density: [1.1, 0.9, 1.05, 0.95]  # relative widths of TDC codes, repeated; their number divides the bins",
+        native=lambda v, period_ns: {"code_edges": code_edges(v)},
+    ),
 }
-"""One entry per effect."""
+"""Every effect by the name of its field of `Detector`, in the order in which they act."""
+
+
+def _of(*kinds: Kind) -> tuple[str, ...]:
+    return tuple(name for name, effect in FIELDS.items() if effect.kind in kinds)
+
+
+LIGHT_EFFECTS, AVALANCHE_EFFECTS, TIMING_EFFECTS = _of("light"), _of("avalanche"), _of("timing")
+RECORDING_EFFECTS = _of("recording", "timing")
+EFFECTS = tuple(FIELDS)
+"""Names of all effects."""
+
+
+def native_fields(values: Mapping[str, Any], period_ns: float) -> dict[str, Any]:
+    """The native fields of effects, by their names and values, that are on."""
+    told: dict[str, Any] = {}
+    for name, value in values.items():
+        effect = FIELDS[name]
+        if effect.native is not None and value != effect.off:
+            told |= effect.native(value, period_ns)
+    return told
 
 
 def plain(value: Any) -> Any:

@@ -9,15 +9,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-
-if TYPE_CHECKING:
-    from mars_lidar._core import PulseTable
+from mars_lidar._base.native import _core
 
 _GAUSSIAN_REACH = 8.5  # half support in sigma: what lies outside, 1e-17, is below one photon in any exposure
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
@@ -44,7 +43,7 @@ class Pulse(ABC):
         """Plain data from which `pulse_from_dict` makes an equal pulse."""
 
     @abstractmethod
-    def _native(self, period_ns: float) -> PulseTable:
+    def _native(self, period_ns: float) -> _core.PulseTable:
         """The sampler's table; built without libm, so the same to the last bit on every machine."""
 
     def wrapped_cumulative(self, t_ns: ArrayLike, period_ns: float) -> NDArray[np.float64]:
@@ -124,8 +123,7 @@ class GaussianPulse(Pulse):
         """``{"kind": "gaussian", "sigma_ns": ...}``."""
         return {"kind": "gaussian", "sigma_ns": self.sigma_ns}
 
-    def _native(self, period_ns: float) -> PulseTable:
-        from mars_lidar._base.native import _core
+    def _native(self, period_ns: float) -> _core.PulseTable:
 
         return _core.PulseTable.gaussian(self.sigma_ns / period_ns)
 
@@ -232,8 +230,7 @@ class SampledPulse(Pulse):
         """``{"kind": "sampled", "values": [...], "bin_ns": ..., "origin": ...}``."""
         return {"kind": "sampled", "values": self.values.tolist(), "bin_ns": self.bin_ns, "origin": self.origin}
 
-    def _native(self, period_ns: float) -> PulseTable:
-        from mars_lidar._base.native import _core
+    def _native(self, period_ns: float) -> _core.PulseTable:
 
         inside = np.flatnonzero(np.diff(self._cumulative) > 0)
         knots = np.ascontiguousarray(self._cumulative[inside[0] : inside[-1] + 2])
@@ -279,3 +276,9 @@ def pulse_from_dict(data: Any) -> Pulse:
             raise ValueError(f"pulse of kind 'sampled' must give {missing[0]}")
         return SampledPulse(data["values"], data["bin_ns"], data.get("origin", "peak"))
     raise ValueError(f"pulse must be a mapping with kind 'gaussian' or 'sampled', got {data!r}")
+
+
+@lru_cache(maxsize=16)
+def native_pulse(pulse: Pulse, period_ns: float) -> _core.PulseTable:
+    """The native form of a pulse for a laser period, ns."""
+    return pulse._native(period_ns)

@@ -92,8 +92,8 @@ def reconstruct(
     system
         How they were recorded. Flux is periodic, with the system's pulse.
     method
-        ``"maximum_likelihood"`` (default), ``"generalised_coates"``, ``"mchc"``, ``"coates"``, ``"matched_filter"``,
-        ``"peak"``, or a `Method` of your own settings. Each refuses detectors that it does not hold for.
+        A name in `mars_lidar.reconstruct.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says what
+        each assumes), or a `Method` of your own settings. Each refuses detectors that it does not hold for.
     level
         Detectable signal photons per period of a surface of reflectivity 1 (at 1 m, with
         ``attenuation="inverse_square"``).

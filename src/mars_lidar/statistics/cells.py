@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.gate import PLAIN, require_mode
 from mars_lidar.statistics.gated_light import photons_before
+from mars_lidar.statistics.narrow_pulse import followed_bins, followed_edges, needed_bins
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
@@ -39,7 +40,8 @@ class Cells:
     """Pixels (S, B, delay or waveform) seen by one system, flat, with the shape they came in.
 
     `signal`, `background`, `delay` (periods) are (cells,); `waveform` is (rows, T) of unit sum with `row`
-    (cells,) its row of each cell, or None.
+    (cells,) its row of each cell, or None. Where `follow` is not 0, bins of grids are narrow on the pulse, and those of
+    a histogram of `follow` bins are whole numbers of them.
     """
 
     system: System
@@ -49,6 +51,7 @@ class Cells:
     delay: FloatArray
     waveform: FloatArray | None
     row: IndexArray
+    follow: int = 0
 
     @classmethod
     def of(
@@ -116,12 +119,16 @@ class Cells:
     def native_flux(self) -> tuple[FloatArray, FloatArray]:
         """Photons (cells,) of the shapes of `energies`, and of a flat background, as the native core adds them.
 
-        Behind a gate nothing is flat: all is in the shapes.
+        Behind a gate, and in uneven bins, nothing is flat: all is in the shapes.
         """
-        if self.system.detector.mode != "gated":
+        if not self._all_in_shapes:
             return self.signal, self.background
         total = photons_before(self, np.ones(1))[:, 0]
         return total, np.zeros_like(total)
+
+    @property
+    def _all_in_shapes(self) -> bool:
+        return self.system.detector.mode == "gated" or self.follow > 0
 
     @property
     def total(self) -> FloatArray:
@@ -139,7 +146,14 @@ class Cells:
             self.delay[index],
             self.waveform,
             self.row[index],
+            self.follow,
         )
+
+    def resolved(self, out_bins: int) -> Cells:
+        """These cells with bins that follow the pulse where equal ones would have to be too many."""
+        even = replace(self, follow=0)
+        follow = out_bins if followed_bins(even, max(_MAX_FIRST_BINS, out_bins), out_bins) else 0
+        return self if follow == self.follow else replace(self, follow=follow)
 
     def name(self, index: int) -> str:
         """One cell in words, for errors."""
@@ -176,13 +190,25 @@ class Cells:
         return float(1.0 / (2.0 * math.sqrt(math.pi) * max(self._sharpness, 1.0)))
 
     def first_bins(self, out_bins: int) -> int:
-        """Bins of the first grid: even, a multiple of `out_bins`, a bin at most half a sigma of the pulse."""
+        """Bins of the first grid: as `usual_bins`, but where a pulse narrower than those must be resolved."""
+        most = max(_MAX_FIRST_BINS, out_bins)
+        if self.follow:
+            return followed_bins(self, most, out_bins)
+        return _multiple(max(self.usual_bins(out_bins), needed_bins(self, most)), out_bins)
+
+    def usual_bins(self, out_bins: int) -> int:
+        """Bins, even, a multiple of `out_bins`, at most half a sigma of the pulse wide, or of 2^-14 of a period."""
         sharpness = self._sharpness
         gate_width = self.system.detector.gate_periods(self.system.period_ns)[2]
         sharpness = max(sharpness, 1.0 / max(gate_width, 1.0 / _MAX_FIRST_BINS))
         wanted = min(max(_MIN_BINS, _BINS_PER_WIDTH * sharpness), _MAX_FIRST_BINS)
-        step = out_bins if out_bins % 2 == 0 else 2 * out_bins
-        return step * math.ceil(wanted / step)
+        return _multiple(wanted, out_bins)
+
+    def edges(self, bins: int) -> FloatArray:
+        """Edges (bins + 1,) of a grid of the period, of cells of one delay."""
+        return (
+            followed_edges(self.part(slice(0, 1)), bins, self.follow)[0] if self.follow else np.arange(bins + 1) / bins
+        )
 
     def grid(self, bins: int, out_bins: int, steps: int | None = None) -> _core.ExposureGrid:
         """The native grid of `bins` bins per period; a cell is given up after `steps` bins x periods (None: many)."""
@@ -218,7 +244,7 @@ class Cells:
         least = 64
         if self.system.detector.mode == "paralyzable":  # kinds x moments of the rate, and what they are made of
             per_cell, least = 8 * (40 * bins + 2 * out_bins), 1
-        elif self.waveform is None and np.unique(self.delay).size == 1 and self.system.detector.mode != "gated":
+        elif self.waveform is None and np.unique(self.delay).size == 1 and not self._all_in_shapes:
             per_cell = 16 * out_bins + 128
         step = max(least, _CHUNK_BYTES // per_cell)
         for start in range(0, self.size, step):
@@ -239,10 +265,13 @@ class Cells:
         from mars_lidar._base.native import _core
 
         parts = bins * int(_core.EXPOSURE_PARTS)
+        if self.follow:
+            edges = followed_edges(self, parts, self.follow)
+            before = np.concatenate([photons_before(self.part(np.array([k])), row) for k, row in enumerate(edges)])
+            return _unit_energies(before), np.arange(self.size, dtype=np.int32)
         if self.system.detector.mode == "gated":
             before = photons_before(self, np.arange(parts + 1) / parts)
-            unit = np.diff(before) / np.maximum(before[:, -1:], np.finfo(float).tiny)
-            return np.ascontiguousarray(np.maximum(unit, 0.0)), np.arange(self.size, dtype=np.int32)
+            return _unit_energies(before), np.arange(self.size, dtype=np.int32)
         if self.waveform is None:
             delays, rows = np.unique(self.delay, return_inverse=True)
             energy = self.system.pulse.bin_energy(delays * self.system.period_ns, self.system.period_ns, parts)
@@ -255,6 +284,18 @@ class Cells:
             knots = np.arange(samples + 1)
             energy = np.diff(np.stack([np.interp(edges, knots, c) for c in cumulative]), axis=-1)
         return np.ascontiguousarray(np.maximum(energy, 0.0)), rows.reshape(-1).astype(np.int32)
+
+
+def _multiple(wanted: float, out_bins: int) -> int:
+    """The next even multiple of `out_bins`."""
+    step = out_bins if out_bins % 2 == 0 else 2 * out_bins
+    return step * math.ceil(wanted / step)
+
+
+def _unit_energies(before: FloatArray) -> FloatArray:
+    """Shares (cells, parts) of a period's photons, from those before each edge (cells, parts + 1)."""
+    unit = np.diff(before) / np.maximum(before[:, -1:], np.finfo(float).tiny)
+    return np.ascontiguousarray(np.maximum(unit, 0.0))
 
 
 def _reals(name: str, value: ArrayLike) -> FloatArray:

@@ -21,7 +21,7 @@ from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
-from mars_lidar.statistics.paralyzable_rate import registration_rates
+from mars_lidar.statistics.paralyzable_rate import RATES_STEPS, registration_rates
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.warm import NOT_WARM, warm_history
@@ -171,20 +171,22 @@ def refined_moments(
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:
         return _poisson(cells, out_bins)
+    cells = cells.resolved(out_bins)
     result = _blank(cells, out_bins)
     pending = np.flatnonzero(cells.total > 0.0)
     bins = cells.first_bins(out_bins)
+    most = max(MOST_BINS, 4 * out_bins, 2 * bins)
     if pending.size < cells.size:
         _darkness(result, cells.total == 0.0, bins)
         if not pending.size:
             return _shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _run(cells.part(pending), bins // 2, shared, team, progress, steps)
-    last = spent = _spent(coarse, cells.system.cycles)
+    last = spent = _spent(coarse, cells.system)
     while True:
         _affordable(cells, pending, spent + 2.0 * last, steps)
         fine = _run(cells.part(pending), bins, out_bins, team, progress, steps)
-        last = _spent(fine, cells.system.cycles)
+        last = _spent(fine, cells.system)
         spent = spent + last
         moved = _movement(coarse, fine)
         good = moved <= tolerance
@@ -194,7 +196,7 @@ def refined_moments(
         pending, coarse = pending[~good], _take(fine, ~good)
         last, spent = last[~good], spent[~good]
         bins *= 2
-        if bins > max(MOST_BINS, 4 * out_bins):
+        if bins > most:
             worst = int(np.argmax(moved[~good]))
             raise ConvergenceError(
                 f"exposure statistics of {cells.name(int(pending[worst]))}: with {bins // 2} bins per period "
@@ -210,9 +212,14 @@ def refined_moments(
     return _shaped(result, cells.shape)
 
 
-def _spent(done: Exposure, cycles: int) -> FloatArray:
-    """Bins x periods (cells,) of one pass."""
-    return np.where(done.settled >= 0, done.settled, cycles) * done.bins.astype(np.float64)
+def _spent(done: Exposure, system: System) -> FloatArray:
+    """Bins x periods (cells,) of one pass, and as many as what comes before it costs."""
+    periods = np.where(done.settled >= 0, done.settled, system.cycles)
+    return (periods + _before(system)) * done.bins.astype(np.float64)
+
+
+def _before(system: System) -> float:
+    return RATES_STEPS if system.detector.mode == "paralyzable" else 0.0
 
 
 def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, steps: int | None) -> None:
@@ -258,7 +265,8 @@ def _run(
     from mars_lidar._base.native import _core
 
     cells.check_history(bins)
-    if steps is not None and min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) * bins > steps:
+    periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _before(cells.system)
+    if steps is not None and periods * bins > steps:
         raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, steps)}")
     result = _blank(cells, out_bins)
     paralyzable = cells.system.detector.mode == "paralyzable"

@@ -20,7 +20,7 @@ from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, FloatArray
-from mars_lidar.statistics.joint_pixel import Pixel, movement
+from mars_lidar.statistics.joint_pixel import INSTEAD, Pixel, movement
 from mars_lidar.statistics.joint_timed import TimedPixel
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
@@ -97,7 +97,13 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
     if system.dead_time_periods == 0.0 or cells.signal[0] + cells.background[0] == 0.0:
         return _poisson(cells)
     out = system.bins
+    cells = cells.resolved(out)
     bins = cells.first_bins(out)
+    if bins > max(_MAX_BINS, 4 * out):
+        raise ConvergenceError(
+            f"joint law of {cells.name(0)}: {bins} bins per period are needed to resolve the pulse, which meets itself "
+            f"a dead time later; {INSTEAD}"
+        )
     coarse = Pixel(cells, bins // 2, math.gcd(bins // 2, out))
     while True:
         fine = Pixel(cells, bins, out)
@@ -108,8 +114,7 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
         if bins > max(_MAX_BINS, 4 * out):
             raise ConvergenceError(
                 f"joint law of {cells.name(0)}: with {bins // 2} bins per period it still moves by {moved:.2g} "
-                f"(tolerance {tolerance:g}); use exposure_moments (count and mean histogram), or simulate it with "
-                "engine 'exact'"
+                f"(tolerance {tolerance:g}); {INSTEAD}"
             )
         coarse = fine
 

@@ -11,7 +11,7 @@ from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.joint_window import SettledLaw, Windows
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
-_INSTEAD = "use exposure_moments (count and mean histogram), or simulate it with engine 'exact'"
+INSTEAD = "use exposure_moments (count and mean histogram), or simulate it with engine 'exact'"
 _SETTLED = 1e-9  # distance from the stationary state (total variation) at which the start is forgotten
 _MAX_STEPS = 40_000_000  # bins x periods after which an exposure counts as not settling: half a second
 _MAX_RECURSION = 2**22  # bins x periods of an exposure that is run through for every window
@@ -44,12 +44,12 @@ class Pixel:
             )
             self.law = SettledLaw(grid) if self.settled >= 0 else None
         except ConvergenceError as error:
-            raise ConvergenceError(f"joint law of {cells.name(0)}: {error}; {_INSTEAD}") from None
+            raise ConvergenceError(f"joint law of {cells.name(0)}: {error}; {INSTEAD}") from None
         if self.law is None:
             if self.settled == -2 or bins * (grid.cycles + grid.whole) > _MAX_RECURSION:
                 raise ConvergenceError(
                     f"joint law of {cells.name(0)}: the pixel does not forget its start before the exposure ends, "
-                    f"and {bins} bins x {grid.cycles} periods are too many to run through; {_INSTEAD}"
+                    f"and {bins} bins x {grid.cycles} periods are too many to run through; {INSTEAD}"
                 )
             fine = grid.cycles * grid.state[0] if grid.warm else total
         else:
@@ -82,7 +82,7 @@ class Pixel:
         try:
             return self.law.windows(np.repeat(weights, self.grid.bins // self.out, axis=-1))
         except ConvergenceError as error:
-            raise ConvergenceError(f"joint law of {self.cells.name(0)}: {error}; {_INSTEAD}") from None
+            raise ConvergenceError(f"joint law of {self.cells.name(0)}: {error}; {INSTEAD}") from None
 
     def _columns(self, weights: FloatArray) -> FloatArray:
         """(m, out) covariances of windows with every bin (6.1)-(6.4)."""

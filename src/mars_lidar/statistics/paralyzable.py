@@ -18,9 +18,12 @@ from mars_lidar._base.brief import brief
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, FloatArray
 from mars_lidar.statistics.gated_light import photons_before
+from mars_lidar.statistics.narrow_pulse import knots
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 _MAX_BINS = 2**20
+_LEAST_SPREAD = 1e-3  # standard deviation of a count, of a Poisson count's: that of the best locked pixels
+_ROUNDING = 1e-12  # of a mean
 _MAX_WHOLE = 20_000  # whole periods of a dead time: each is a step of the variance's start-up
 
 
@@ -95,7 +98,11 @@ def paralyzable_moments(
 
 
 def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
-    """Mean histograms (cells, bins) of checked cells, any dead time; sums to 10 x `tolerance` standard deviations."""
+    """Mean histograms (cells, bins) of checked cells, any dead time.
+
+    They sum to the mean count within 10 x `tolerance` standard deviations, down to 1e-3 of a Poisson count's, or 1e-12
+    of itself.
+    """
     return _refined(cells, tolerance, with_variance=False).histogram.reshape(cells.size, -1)
 
 
@@ -106,15 +113,19 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
     histogram = np.empty((cells.size, system.bins))
     for k in range(cells.size):
         cell = cells.part(slice(k, k + 1))
-        n = cell.first_bins(system.bins)
+        n = cell.usual_bins(system.bins)
+        usual = n
         if n // 2 < system.bins:  # every grid has the edges of the histogram: with no others two grids are the same
             n *= 2
-        coarse = _Grid(cell, n // 2, with_variance)
+        start = n
+        coarse, before = _Grid(cell, n // 2, knots(cell, usual, 0.5), with_variance), math.inf
         while True:
-            fine = _Grid(cell, n, with_variance)
-            if _moved(coarse, fine) <= tolerance and (with_variance or _total_moved(coarse, fine) <= 10.0 * tolerance):
+            fine = _Grid(cell, n, knots(cell, usual, n / start), with_variance)
+            limit = fine.mean + (fine.mean - coarse.mean) / 3.0  # grids err by the square of their step
+            still = with_variance or abs(limit - before) <= _total_allowed(limit, tolerance)
+            if still and _moved(coarse, fine) <= tolerance:
                 break
-            coarse, n = fine, 2 * n
+            coarse, before, n = fine, limit, 2 * n
             if n > max(_MAX_BINS, 4 * system.bins):
                 raise ConvergenceError(
                     f"paralyzable statistics of {cells.name(k)}: with {n // 2} bins per period they still move by "
@@ -130,16 +141,20 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
 
 
 class _Grid:
-    """One pixel on a grid of the period, with edges where the dead time of a start at 0 ends."""
+    """One pixel on a grid of the period, with edges where the dead time of a start at 0, or of a step, ends.
 
-    def __init__(self, cell: Cells, bins: int, with_variance: bool) -> None:
+    `steps` (n,) are phases at which the light steps: between them, and a dead time after them, it is smooth.
+    """
+
+    def __init__(self, cell: Cells, bins: int, steps: FloatArray, with_variance: bool) -> None:
         system = cell.system
         dead = system.dead_time_periods
         self.cell, self.cycles, self.armed = cell, system.cycles, system.start == "armed"
         self.whole = math.floor(dead)
         self.rest = dead - self.whole
         out = np.arange(system.bins + 1) / system.bins
-        self.edges = np.unique(np.concatenate([np.arange(bins + 1) / bins, out, [self.rest]]))
+        edges = [np.arange(bins + 1) / bins, out, np.array([self.rest]), steps, (steps + self.rest) % 1.0]
+        self.edges = np.unique(np.concatenate(edges))
         self.before = self._photons(self.edges)  # C(x)
         self.total = float(self.before[-1])
         photons = np.diff(self.before)
@@ -150,7 +165,7 @@ class _Grid:
         keep = np.exp(-within)
         rise = np.diff(within)
         # integral of exp(-within) over a bin where it is linear in the exponent: (1 - e^-d) / d
-        flat = np.abs(rise) < 1e-8
+        flat = rise == 0.0
         mean_keep = np.where(flat, 1.0, -np.expm1(-rise) / np.where(flat, 1.0, rise))
         self.rate = photons * keep[:-1] * mean_keep  # registrations of each bin and period, warmed up
         self.alone = np.exp(-self.before[:-1]) * -np.expm1(-photons)  # the first arrival is there, one period
@@ -217,13 +232,9 @@ class _Grid:
         return float(np.sum(0.5 * (apart[1:] + apart[:-1]) * np.diff(now)))
 
 
-def _total_moved(coarse: _Grid, fine: _Grid) -> float:
-    """Error of the limit's mean, in standard deviations of a Poisson count: grids err by the square of their step.
-
-    The limit errs by the fourth power: by some fifteenth of what it is away from the fine grid.
-    """
-    spread = max(min(fine.mean, math.sqrt(fine.mean)), np.finfo(float).tiny)
-    return abs(fine.mean - coarse.mean) / 45.0 / spread
+def _total_allowed(mean: float, tolerance: float) -> float:
+    """By how much the mean may move: the standard deviation may be a thousandth of a Poisson count's."""
+    return max(10.0 * tolerance * min(mean, _LEAST_SPREAD * math.sqrt(mean)), _ROUNDING * mean)
 
 
 def _moved(coarse: _Grid, fine: _Grid) -> float:

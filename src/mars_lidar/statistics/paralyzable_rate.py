@@ -12,6 +12,7 @@ from mars_lidar.statistics.gated_light import photons_before
 _PARTS = 4  # of a bin, in each of which the rates of arrivals now and a dead time ago are taken as constant
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _ORDERS = 4  # moments 0 to 3
+RATES_STEPS = 120.0  # of the native recursion, that the rates of a bin cost at most
 
 
 def registration_rates(cells: Cells, bins: int) -> FloatArray:
@@ -20,9 +21,16 @@ def registration_rates(cells: Cells, bins: int) -> FloatArray:
     Kinds: of the steady rate; for an armed start also of the first period, as it would be without a dead time's end,
     and of the period in which the first dead time ends.
     """
+    if cells.follow:  # each cell has bins of its own
+        rows = [cells.part(slice(k, k + 1)) for k in range(cells.size)]
+        return np.concatenate([_rates(row, row.edges(_PARTS * bins)) for row in rows])
+    return _rates(cells, np.arange(_PARTS * bins + 1) / (_PARTS * bins))
+
+
+def _rates(cells: Cells, edges: FloatArray) -> FloatArray:
+    """`registration_rates` on quarters of bins with these edges (4 bins + 1,)."""
     dead = cells.system.dead_time_periods
     whole = math.floor(dead)
-    edges = np.arange(_PARTS * bins + 1) / (_PARTS * bins)
     before = photons_before(cells, edges)
     total = before[:, -1:]
     past = edges - (dead - whole)

@@ -98,6 +98,7 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
     """Exact pmf of each cell, on the grid of `bins` (cells,) that its `cumulants` (cells, 4) needed."""
     if cells.system.dead_time_periods == 0.0:
         return [poisson_window(float(mean)) for mean in cumulants[:, 0]]
+    cells = cells.resolved(1)
     dark = cells.total == 0.0
     windows: list[Window | None] = [Window(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
     for n in np.unique(bins[~dark]):
@@ -125,6 +126,7 @@ def guessed_windows(
     The support is guessed by them and the result tells whether the guess was right; where not, `exact_windows` of the
     cell's own cumulants. That is several times faster for narrow laws. `waiting` is called with the cells done.
     """
+    cells = cells.resolved(1)
     spread = np.sqrt(np.maximum(cumulants[:, 1], 0.0))
     half = np.ceil(_REACH * spread + _MARGIN)
     size = (8.0 * np.ceil((2.0 * half + 1.0) / 8.0)).astype(np.int64)

@@ -20,9 +20,11 @@ def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threa
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:  # the light itself
         return recorded_light(cells, out_bins)
+    cells = cells.resolved(out_bins)
     result = np.empty((cells.size, out_bins))
     pending = np.arange(cells.size)
     bins = cells.first_bins(out_bins)
+    most = max(MOST_BINS, 4 * out_bins, 2 * bins)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _stationary(cells, bins // 2, shared, team)
     while pending.size:
@@ -34,7 +36,7 @@ def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threa
         result[pending[good]] = np.maximum(fine[good], 0.0)
         pending, coarse = pending[~good], fine[~good]
         bins *= 2
-        if pending.size and bins > max(MOST_BINS, 4 * out_bins):
+        if pending.size and bins > most:
             raise ConvergenceError(
                 f"stationary histogram of {cells.name(int(pending[0]))}: with {bins // 2} bins per period it "
                 f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g}); {cells.instead}"

@@ -89,7 +89,7 @@ def start_phases(
         return StartPhases.none()  # Poisson: no memory
     row, column = thinned(signal, _STEP), thinned(background, _STEP)
     index = (row[:, None] * background.size + column[None, :]).reshape(-1)
-    cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system)
+    cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system).resolved(1)
     own = bins[index]
     grids = np.maximum(own, _phase_grid(cells, int(own.min())))
     spread = np.sqrt(np.maximum(cumulants[index, 1], 0.25))  # of small counts half a count is what matters
@@ -142,15 +142,16 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
 
     cells.check_history(bins)
     energy, shape = cells.energies(bins)
+    signal, background = cells.native_flux
     out = np.zeros((cells.size, phase.size * 4))
     settled = np.empty(cells.size, np.int64)
     _core.exposure_phases(
         grid=cells.grid(bins, 1),
-        signal=cells.signal,
-        background=cells.background,
+        signal=signal,
+        background=background,
         shape=shape,
         shapes=energy,
-        phase=np.rint(phase * bins).astype(np.int32),
+        phase=np.rint(np.interp(phase, cells.edges(bins), np.arange(bins + 1))).astype(np.int32),
         cumulants=np.empty((cells.size, 4)),
         correction=out,
         settled=settled,
@@ -173,8 +174,8 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
     """Phases between which linear interpolation is good enough for a sample of cells, the worst one first."""
     coarsest = int(grids.min())
     stride = next(k for k in range(1, coarsest + 1) if coarsest % k == 0 and coarsest // k <= _MAX_EDGES)
+    edges = cells.edges(coarsest)[::stride]  # of every finer grid as well: those are multiples of it
     coarsest //= stride
-    edges = np.arange(coarsest + 1) / coarsest  # of every finer grid as well: those are multiples of it
     curves = []
     for block, n in _blocks(grids[sample]):
         index = sample[block]
@@ -232,6 +233,6 @@ def _directly(cells: Cells, cell: int, bins: int, phase: FloatArray, threads: in
         cells.background[cell],
         cells.system,
         delay_ns=(0.5 - np.concatenate([[0.0], phase])) * period,
-    )
+    ).resolved(1)
     cumulants = _run(whole, bins, 1, threads, None).cumulants
     return np.asarray(cumulants[1:] - cumulants[0], dtype=np.float64)

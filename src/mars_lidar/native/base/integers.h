@@ -1,4 +1,5 @@
-// Integers of fixed width, also where there is no standard library: NVRTC compiles the kernels for CUDA without one.
+// Integers of fixed width for code that also runs on a GPU. NVRTC, which compiles the kernels for CUDA, has no
+// standard library, and so no <cstdint>.
 #pragma once
 #if defined(__CUDACC_RTC__)
 using int32_t = int;

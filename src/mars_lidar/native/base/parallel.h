@@ -1,9 +1,12 @@
-// Runs numbered chunks of work on threads while the calling thread keeps Python alive.
+// Runs numbered chunks of work on threads, while the calling thread looks after them: progress, and Ctrl-C
+// (python/watched.h).
 #pragma once
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <mutex>
 #include <thread>
 #include <vector>
@@ -11,8 +14,6 @@
 #if defined(__linux__)
 #include <sched.h>
 #endif
-
-#include <nanobind/nanobind.h>
 
 namespace mars {
 
@@ -35,13 +36,20 @@ inline void spread_out(int k) {
 #endif
 }
 
-// Calls work(chunk, stop) for chunk = 0 .. chunks-1 on `threads` threads, in any order. The GIL is released;
-// every 50 ms the calling thread looks for Ctrl-C and calls progress(done, chunks) unless it is None. On a
-// signal, or an exception from work or progress, `stop` turns true, the threads are joined and the exception
-// is raised: long chunks must poll `stop`. Work must not touch Python.
+// Looks after a run from the calling thread: called with the chunks done, and all, every 50 ms and once when all are done.
+// Returns whether to stop. May be empty.
+using Watch = std::function<bool(int64_t done, int64_t chunks)>;
+
+// Thrown by a run that its watch has stopped.
+struct Stopped : std::exception {
+    const char* what() const noexcept override { return "stopped"; }
+};
+
+// Calls work(chunk, stop) for chunk = 0 .. chunks-1 on `threads` threads, in any order. Where the watch asks for it, or
+// `work` throws, `stop` turns true, the threads are joined, and Stopped or the exception is thrown: long chunks must
+// poll `stop`.
 template <class Work>
-void run_chunks(int64_t chunks, int threads, const nanobind::object& progress, const Work& work) {
-    namespace nb = nanobind;
+void run_chunks(int64_t chunks, int threads, const Watch& watch, const Work& work) {
     std::atomic<int64_t> next{0}, done{0};
     std::atomic<bool> stop{false};
     std::exception_ptr failure;
@@ -69,47 +77,31 @@ void run_chunks(int64_t chunks, int threads, const nanobind::object& progress, c
 
     const int team = static_cast<int>(threads < chunks ? threads : chunks);
     std::vector<std::thread> pool;
-    bool interrupted = false;
+    bool stopped = false;
     {
-        nb::gil_scoped_release release;
-        {
-            const std::lock_guard<std::mutex> lock(mutex);
-            try {
-                for (int k = 0; k < team; ++k) {
-                    ++running;
-                    pool.emplace_back(worker, k);
-                }
-            } catch (...) {  // no more threads to be had: carry on with those there are, if any
-                --running;
-                if (pool.empty()) throw;
+        const std::lock_guard<std::mutex> lock(mutex);
+        try {
+            for (int k = 0; k < team; ++k) {
+                ++running;
+                pool.emplace_back(worker, k);
             }
+        } catch (...) {  // no more threads to be had: carry on with those there are, if any
+            --running;
+            if (pool.empty()) throw;
         }
+    }
+    {
         std::unique_lock<std::mutex> lock(mutex);
         while (!wake.wait_for(lock, std::chrono::milliseconds(50), [&] { return running == 0; })) {
             lock.unlock();
-            {
-                nb::gil_scoped_acquire acquire;
-                if (!interrupted && PyErr_CheckSignals() != 0) {
-                    interrupted = true;
-                    stop = true;
-                } else if (!interrupted && !progress.is_none()) {
-                    try {
-                        progress(done.load(), chunks);
-                    } catch (nb::python_error& error) {
-                        error.restore();
-                        interrupted = true;
-                        stop = true;
-                    }
-                }
-            }
+            if (!stopped && watch && watch(done.load(), chunks)) stop = stopped = true;
             lock.lock();
         }
-        lock.unlock();
-        for (std::thread& thread : pool) thread.join();
     }
-    if (interrupted) throw nb::python_error();
+    for (std::thread& thread : pool) thread.join();
+    if (stopped) throw Stopped();
     if (failure) std::rethrow_exception(failure);
-    if (!progress.is_none()) progress(chunks, chunks);
+    if (watch && watch(chunks, chunks)) throw Stopped();
 }
 
 }  // namespace mars

@@ -1,5 +1,6 @@
-// What kernels take from the standard library. NVRTC has none: there it is this, on a GPU's own functions, of which those
-// of one operation (square roots, whole numbers) are exact by IEEE 754.
+// What kernels take from the standard library, where there is none. NVRTC, which compiles the kernels for CUDA, has
+// no headers: there the names of std are these, on a GPU's own functions, of which those of one operation (square
+// roots, whole numbers) are exact by IEEE 754. Elsewhere this is the standard library itself.
 #pragma once
 #include "base/integers.h"
 #if !defined(__CUDACC_RTC__)
@@ -57,7 +58,8 @@ inline double erfc(double x) { return ::erfc(x); }
 }  // namespace std
 #endif
 
-// A function of its own on a GPU, where all that is called once is taken into the caller otherwise, for minutes of compiling.
+// A function of its own on a GPU, where all that is called once is taken into the caller otherwise, for minutes of
+// compiling.
 #if defined(__CUDACC_RTC__)
 #define MARS_APART __noinline__
 #else

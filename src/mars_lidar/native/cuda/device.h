@@ -1,5 +1,5 @@
-// What a kernel asks of the machine it runs on: a GPU, or threads counted in a loop (cuda/exact_host.cpp), which lets the
-// tests compare the bits of the same source without a GPU.
+// What a kernel asks of the machine it runs on: a GPU, or threads counted in a loop (tests/emulation), which lets
+// the tests compare the bits of the same source without a GPU.
 #pragma once
 #include "lanes/lanes.h"
 

@@ -1,6 +1,6 @@
 // The threads of a block that share one pixel. Every loop ends with a barrier; what is computed outside of loops, each
-// thread computes for itself. On the processor (cuda/exact_host.cpp) one thread stands for the block, and goes through every
-// loop backwards: a result that depends on the order of the threads would show.
+// thread computes for itself. On the processor (tests/emulation) one thread stands for the block, and goes through
+// every loop backwards: a result that depends on the order of the threads would show.
 #pragma once
 #include "cuda/device.h"
 #include "lanes/team.h"

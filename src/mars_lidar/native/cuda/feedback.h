@@ -1,8 +1,9 @@
-// The engine "feedback" on a GPU: a stream of exposures of one pixel for each thread, with the sweeps of the processor's
-// batches (feedback/batch.h) at one lane. The rows of a warp's threads lie side by side in memory, as those of a batch.
+// The engine "feedback" on a GPU: a stream of exposures of one pixel for each thread, with the sweeps of the
+// processor's batches (feedback/batch.h) at one lane. The rows of a warp's threads lie side by side in memory, as those
+// of a batch.
 //
-// Sweeps differ in number, and a warp waits for its slowest: the host hands out pixels in the order of their background.
-// As many warps as the machine holds take the next 32 streams when they are done.
+// Sweeps differ in number, and a warp waits for its slowest: the host hands out pixels in the order of their
+// background. As many warps as the machine holds take the next 32 streams when they are done.
 #pragma once
 #define MARS_FEEDBACK_TEAM 1
 #include "cuda/device_team.h"

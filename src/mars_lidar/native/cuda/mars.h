@@ -1,5 +1,5 @@
-// The engine "mars" on a GPU: laws of the counts, one pixel a thread, then histograms, one pixel a block. What is drawn is
-// what the processor draws: the same headers, other teams (team.h).
+// The engine "mars" on a GPU: laws of the counts, one pixel a thread, then histograms, one pixel a block. What is drawn
+// is what the processor draws: the same headers, other teams (team.h).
 #pragma once
 #include "cuda/device_team.h"
 #include "laws/count_laws.h"

@@ -1,4 +1,5 @@
-// The kernels of detectors whose avalanches leave something behind: afterpulses and twilight pulses, for every mode.
+// The exact engine's kernels of detectors whose avalanches leave something behind: afterpulses (exact/trap_law.h)
+// and twilight pulses. For every mode of the detector (docs/detectors.md, "What avalanches leave behind").
 #include "exact/runner.h"
 
 namespace mars {

@@ -1,22 +1,14 @@
-// The exact engine: chunks of pixels on threads, each through the widest kernel that the processor runs.
+// The exact engine's host side: cuts a job into blocks of consecutive items, finds where warmed-up ones begin, and hands
+// them to the kernel of the detector's mode at the widest level that the processor runs.
+#include "exact/engine.h"
+
 #include <algorithm>
-#include <cmath>
 #include <stdexcept>
-#include <string>
-#include <utility>
-#include <vector>
 
-#include <nanobind/stl/pair.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
-
-#include "base/parallel.h"
-#include "exact/kernel.h"
 #include "exact/start.h"
 #include "exact/trap_law.h"
 #include "instrument/pulse_table.h"
 #include "lanes/levels.h"
-#include "python/bindings.h"
 
 namespace mars {
 namespace {
@@ -48,15 +40,24 @@ ExactKernel kernel_of(const std::string& name, const Job& job) {
     throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
 }
 
-// Cuts a job into blocks of consecutive items and runs them.
-void run_exact(const BoundJob& job, const PulseTable& pulse, ExactBlock proto, int threads, const std::string& level,
-               const nb::object& progress) {
+}  // namespace
+
+std::vector<std::string> exact_levels() {
+    std::vector<std::string> names;
+    for (const Level& level : levels()) names.emplace_back(level.name);
+    return names;
+}
+
+void run_exact(const Job& job, const PulseTable& pulse, const Output& output, int threads, const std::string& level,
+               const Watch& watch) {
     const ExactKernel kernel = kernel_of(level, job);
+    ExactBlock proto{};
+    proto.output = output;
     proto.job = &job;
     proto.pulse = &pulse;
     const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));
     const int64_t items = std::min(kMaxItems, share);
-    run_chunks((job.items() + items - 1) / items, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+    run_chunks((job.items() + items - 1) / items, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {
         ExactBlock block = proto;
         block.first_item = chunk * items;
         block.items = std::min(items, job.items() - block.first_item);
@@ -80,91 +81,20 @@ void run_exact(const BoundJob& job, const PulseTable& pulse, ExactBlock proto, i
     });
 }
 
-template <class Count>
-void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, int threads, const std::string& level,
-               const nb::object& progress) {
-    if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
-        throw nb::value_error("out must be (items, bins)");
-    ExactBlock block{};
-    block.output.sink = sizeof(Count) == 2 ? Sink::kHistogram16 : Sink::kHistogram32;
-    block.output.out = out.data();
-    run_exact(job, pulse, block, threads, level, progress);
-}
-
-#if defined(__GNUC__)
-// `rounds` times 16 additions, each of which waits for the one before it: a cycle each. The number that is added comes from
-// a register, because some processors do additions of constants beside the others.
-uint64_t addition_chain(int64_t rounds) {
-    uint64_t sum = 0, step = 1;
-    for (int64_t k = 0; k < rounds; ++k) {
-#pragma GCC unroll 16
-        for (int addition = 0; addition < 16; ++addition) {
-            sum += step;
-            asm volatile("" : "+r"(sum), "+r"(step));  // one by one
-        }
-    }
-    return sum;
-}
-#endif
-
-}  // namespace
-
-void bind_exact(nb::module_& module) {
-    module.def(
-        "levels",
-        [] {
-            std::vector<std::string> names;
-            for (const Level& level : levels()) names.emplace_back(level.name);
-            return names;
-        },
-        "Vector levels that this processor runs, widest first; all give the same bits.");
-    module.def("exact_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none());
-    module.def("exact_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none());
-    module.def(
-        "exact_counts",
-        [](const BoundJob& job, const PulseTable& pulse, Vector<int64_t> out, int threads, const std::string& level,
-           const nb::object& progress) {
-            if (static_cast<int64_t>(out.shape(0)) != job.items()) throw nb::value_error("out must be (items,)");
-            ExactBlock block{};
-            block.output.sink = Sink::kCounts;
-            block.output.out = out.data();
-            run_exact(job, pulse, block, threads, level, progress);
-        },
-        nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("level") = "",
-        nb::arg("progress").none() = nb::none());
-    module.def(
-        "exact_timestamps",
-        [](const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> offsets, Vector<double> times,
-           Vector<int32_t> cycle, Vector<int32_t> bin, int threads, const std::string& level,
-           const nb::object& progress) {
-            if (static_cast<int64_t>(offsets.shape(0)) != job.items() + 1)
-                throw nb::value_error("offsets must be (items + 1,)");
-            ExactBlock block{};
-            block.output.sink = Sink::kTimestamps;
-            block.output.offsets = offsets.data();
-            block.output.times = times.data();
-            block.output.cycles = cycle.data();
-            block.output.bins = bin.data();
-            run_exact(job, pulse, block, threads, level, progress);
-        },
-        nb::arg("job"), nb::arg("pulse"), nb::arg("offsets"), nb::arg("times").noconvert(),
-        nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("level") = "",
-        nb::arg("progress").none() = nb::none());
-    module.def(
-        "threefry",
-        [](uint32_t c0, uint32_t c1, uint32_t k0, uint32_t k1, int rounds) {
-            const Pair<uint32_t> x =
-                rounds == 13 ? threefry<13, uint32_t>(c0, c1, k0, k1) : threefry<20, uint32_t>(c0, c1, k0, k1);
-            return std::make_pair(x.first, x.second);
-        },
-        nb::arg("c0"), nb::arg("c1"), nb::arg("k0"), nb::arg("k1"), nb::arg("rounds"),
-        "Threefry-2x32, for the known-answer tests.");
-#if defined(__GNUC__)
-    module.def("addition_chain", &addition_chain, nb::arg("rounds"),
-               "16 dependent additions a round, a cycle each: the processor's clock, for the benchmarks.");
-#endif
+void exact_starts(const Job& job, const PulseTable& pulse, int32_t* cycles, float* phases, int threads,
+                  const Watch& watch) {
+    const int64_t items = job.items(), step = kMaxItems;
+    run_chunks((items + step - 1) / step, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {
+        ExactBlock block{};
+        block.first_item = chunk * step;
+        block.items = std::min(step, items - block.first_item);
+        block.stop = &stop;
+        std::vector<int32_t> c;
+        std::vector<float> p;
+        draw_starts(job, pulse, block, c, p);
+        std::copy(c.begin(), c.end(), cycles + block.first_item);
+        std::copy(p.begin(), p.end(), phases + block.first_item);
+    });
 }
 
 }  // namespace mars

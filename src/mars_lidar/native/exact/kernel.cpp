@@ -1,4 +1,6 @@
-// The kernels of free-running, non-paralyzable pixels.
+// The exact engine's kernels of free-running, non-paralyzable pixels, which record every registration as it is: what
+// most simulations ask for, and what the benchmarks measure. Dead times of whole periods have a kernel of their own,
+// because the pulse's energy at the end of such a dead time is that of the registration.
 #include "exact/runner.h"
 
 namespace mars {

@@ -86,8 +86,8 @@ class LaneLog {
         return static_cast<Count*>(output_.out) + static_cast<size_t>(item) * bins_;
     }
 
-    // The next row is asked for meanwhile: a cube is larger than the caches, and to wait for its lines took a seventh of
-    // the time of dim light.
+    // The next row is asked for meanwhile: a cube is larger than the caches, and to wait for its lines took a seventh
+    // of the time of dim light.
     template <class Count>
     void clear_row(int64_t item) const {
         constexpr size_t most = 4096, line = 64;

@@ -1,4 +1,5 @@
-// Pixels that are warmed up at the start of the exposure, by mode; free-running and gated ones are in stationary.h.
+// The state at the start of the exposure of pixels that have been running for long: paralyzable and synchronous
+// ones, and bright ones that lock to the pulse. Free-running and gated pixels are in laws/stationary.h.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -6,6 +7,8 @@
 #include <vector>
 
 #include "instrument/job.h"
+#include "lanes/lanes.h"
+#include "lanes/levels.h"
 #include "laws/exposure_kernel.h"
 #include "laws/stationary.h"
 
@@ -69,7 +72,7 @@ inline StationaryState locked_state(const std::vector<double>& photons, double d
     std::vector<double> registrations(n);
     int64_t settled = 0;
     const std::atomic<bool> stop{false};
-    exposure_stationary_scalar({&grid, &flux, 0, 1, registrations.data(), &settled, &stop});
+    MARS_JOIN(exposure_stationary_, MARS_BASE_LEVEL)({&grid, &flux, 0, 1, registrations.data(), &settled, &stop});
     if (settled != kUnsettled) return StationaryState(dead_time, registrations);
     std::vector<double> coarse(n);
     for (int32_t j = 0; j < n; ++j)

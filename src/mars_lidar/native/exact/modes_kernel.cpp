@@ -1,4 +1,5 @@
-// The kernels of the other modes of a detector.
+// The exact engine's kernels of the other modes of a detector (paralyzable, synchronous, gated: docs/detectors.md),
+// which record every registration as it is.
 #include "exact/runner.h"
 
 namespace mars {

@@ -1,4 +1,5 @@
-// The tables of a pulse as the sampler sees them.
+// The tables of a pulse as plain pointers and numbers, which the lanes of the exact engine look into:
+// instrument/pulse_table.h builds them.
 #pragma once
 #include "exact/registration.h"
 #include "instrument/pulse_table.h"

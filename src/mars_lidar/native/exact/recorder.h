@@ -1,5 +1,9 @@
-// The recording of registrations, lane by lane: beside the loops of exact/runner.h and waveform/runner.h, after each of
-// their rounds.
+// The recorder: what the electronics make of registrations, lane by lane. Registrations may be lost to the dead time
+// of the electronics or to limits per period and exposure; those that are left are moved by jitter and get the code
+// of a converter whose bins are not all alike (docs/detectors.md, "Effects").
+//
+// Runs beside the loops of exact/runner.h and waveform/runner.h, on what they registered in each of their rounds, so
+// that registrations themselves are the same with and without it.
 #pragma once
 #include "exact/recording_view.h"
 #include "instrument/job.h"

@@ -1,4 +1,5 @@
-// How the recorder sees the times of exact/runner.h.
+// The times of the exact engine for pulses, as the recorder and the traps handle them: frames of one period and
+// phases in single precision. waveform/recorder_clock.h is the same for waveforms.
 #pragma once
 #include "exact/recorder.h"
 

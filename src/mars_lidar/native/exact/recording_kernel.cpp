@@ -1,4 +1,6 @@
-// The kernels of detectors whose registrations are not simply recorded, for every mode.
+// The exact engine's kernels of detectors whose electronics stand between a registration and its record: a dead time
+// of their own, limits per period and exposure, jitter, codes of unequal width (exact/recorder.h). For every mode of
+// the detector.
 #include "exact/runner.h"
 
 namespace mars {

@@ -1,4 +1,5 @@
-// Jitter and codes as the exact engine's loops see them.
+// Jitter and the codes of a converter for the lanes of the exact engine: instrument/recording.h holds what is asked
+// for, these functions move and code the phases of registrations (docs/detectors.md, "Effects").
 #pragma once
 #include <algorithm>
 
@@ -70,8 +71,8 @@ MARS_INLINE Int split_off_periods(Float& phase) {
     return whole;
 }
 
-// The bin of a phase, which becomes, if `timed`, the phase that the converter tells: as far into its code, one bin wide,
-// as the time is into the code's width.
+// The bin of a phase, which becomes, if `timed`, the phase that the converter tells: as far into its code, one bin
+// wide, as the time is into the code's width.
 MARS_INLINE Int convert(const CodeTable& codes, int32_t bins, Float& phase, bool timed) {
     const int32_t n = static_cast<int32_t>(codes.upper.size());
     const Float x = phase * static_cast<float>(bins);

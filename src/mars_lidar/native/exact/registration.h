@@ -8,60 +8,15 @@
 // Time is counted in frames: a frame is one period around a return of the first echo, [-1/2, 1/2) periods before
 // and after it. One pixel per lane (lanes.h); this header also compiles for CUDA with one lane.
 #pragma once
-#include "numbers/random.h"
+#include "exact/system.h"
+#include "exact/wait.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
 
-// Streams of draws of one pixel: the second counter word; the first is the number of the registration.
-constexpr uint32_t kStageArrival = 0;      // background and first return
-constexpr uint32_t kStageArrivalFine = 1;  // fresh fractions for long waits of those two
-constexpr uint32_t kStageStart = 2;        // arrivals before a stationary exposure: waits and components; + 1: phases
-constexpr uint32_t kStageJitter = 4;       // first word of the counter: half the number; + 1: tails
-constexpr uint32_t kStageReturns = 16;     // + 2 k: returns 2 k + 1 and 2 k + 2; + 2 k + 1: their fractions
-
-constexpr uint32_t kStageTails = 64;          // + k: place of an arrival in the tails of return k
-constexpr uint32_t kStageTraps = 0x40000000;  // afterpulses, by the number of the avalanche that leaves carriers (+ k)
-
-constexpr float kLongWait = 256.0f;       // periods; `split_wait` resolves 2^-24 of one up to here
-constexpr float kForever = 134217728.0f;  // 2^27 periods: beyond every exposure
-constexpr float kDarkInverse = 1e30f;     // 1 / rate of a component without photons: every wait is kForever
-
 // Energies nearer to 0 than this are drawn afresh: between two numbers of the lattice of 2^-24 of energies near 1.
 constexpr float kTail = 0x1p-14f - 0x1p-25f;
 constexpr int kEnergyShift = 16;  // the leading bits of an energy name its cell in the tables
-
-// Tables of the pulse, see pulse_table.h.
-struct PulseView {
-    const float* forward;
-    const float* inverse;
-    const int32_t* guide;
-    const float* upper;
-    const float* end;
-    const float* periods_per_energy;
-    float cell_of_centre, cells_per_period, last_cell, split;
-    int32_t late_cell, guides, last_early, last_late;
-};
-
-// Positions of the gate in units of 2^-64 period, which add up and wrap exactly.
-struct GateView {
-    uint64_t start, step;
-    float width;
-    uint32_t cycles;  // periods at each position
-};
-
-struct SystemView {
-    PulseView pulse;
-    GateView gate;
-    int32_t cycles, bins, returns;
-    int32_t dead_whole;   // dead time: whole periods ...
-    float dead_fraction;  // ... and the rest
-};
-
-// Flux of one component at the lane's pixel. A component without photons has rate = 0 and inverse = kDarkInverse.
-struct Rate {
-    Float rate, inverse;
-};
 
 struct Return {
     Rate flux;
@@ -71,11 +26,6 @@ struct Return {
 struct Time {
     Int frame;
     Float phase;  // in [-1/2, 1/2)
-};
-
-struct Wait {
-    Int whole;
-    Float fraction;  // in [0, 1)
 };
 
 MARS_INLINE Float magnitude(Float x) { return from_bits(bits(x) & 0x7fffffffu); }
@@ -102,54 +52,6 @@ MARS_INLINE Float quantile(const PulseView& pulse, Float p, Float size) {
         }
         return gather(pulse.end, k) + minimum(p - upper, splat(0.0f)) * gather(pulse.periods_per_energy, k);
     }
-}
-
-// Whole periods and rest of a wait. A float32 knows waits of 64 periods to 2^-17 of one, and the random numbers that it
-// is made of have a lattice of their own. So only the 16 leading bits are kept. They name a cell of 2^-15 times the
-// power of two below the wait, in which its law is uniform but for a slope of 2^-15 times the exponential number; `place`,
-// uniform in (0, 2^-15) and independent of the wait, draws afresh where in the cell it ends.
-MARS_INLINE Wait split_wait(Float wait, Float place) {
-    const Float cell = from_bits(bits(wait) & 0xffffff00u), power = from_bits(bits(wait) & 0x7f800000u);
-    const Int whole = truncate(cell);
-    return {whole, (cell - to_float(whole)) + power * place};
-}
-
-// The fraction of a long wait afresh. Exact, since whole periods and fraction of an exponential wait are independent;
-// the fraction has the density ~ e^(-rate r) on [0, 1).
-MARS_INLINE void refresh(Wait& wait, Mask lanes, UInt word, Float rate) {
-    const Float v = uniform(word);
-    const Float bend = 0.5f * rate * v * (1.0f - v) * (1.0f - rate * (1.0f - 2.0f * v) * 0.33333334f);
-    wait.fraction = select(lanes, v - bend, wait.fraction);
-}
-
-// Of waits beyond kLongWait, where cells grow longer than a period: whole periods of float32, fractions of their own.
-MARS_INLINE void refresh_long(Float wait_a, Float wait_b, const Rate& a, const Rate& b, UInt key0, UInt key1,
-                              UInt event, uint32_t stage, Wait& split_a, Wait& split_b) {
-    const Mask long_a = wait_a >= kLongWait, long_b = wait_b >= kLongWait;
-    split_a = {select(long_a, truncate(wait_a), split_a.whole), select(long_a, splat(0.5f), split_a.fraction)};
-    split_b = {select(long_b, truncate(wait_b), split_b.whole), select(long_b, splat(0.5f), split_b.fraction)};
-    const Mask fresh_a = long_a & (wait_a < kForever), fresh_b = long_b & (wait_b < kForever);
-    if (!any(fresh_a | fresh_b)) return;
-    const Pair<UInt> fine = threefry<13>(event, splat(stage + 1), key0, key1);
-    refresh(split_a, fresh_a, fine.first, a.rate);
-    refresh(split_b, fresh_b, fine.second, b.rate);
-}
-
-// Waits of two components, in periods (background) or pulse energies (returns). The place in their cells comes from the
-// low bits of the sum of their words: given either word it is uniform by the other.
-MARS_INLINE void draw_waits(UInt key0, UInt key1, UInt event, uint32_t stage, const Rate& a, const Rate& b,
-                            Wait& wait_a, Wait& wait_b) {
-    const Pair<UInt> words = threefry<13>(event, splat(stage), key0, key1);
-    const Float place = dither(words.first + words.second), rest = place * 0x1p15f;
-    Float wa = exponential(words.first, rest) * a.inverse, wb = exponential(words.second, rest) * b.inverse;
-    const bool far = any_reaches(wa, wb, kLongWait);
-    if (far) {
-        wa = minimum(wa, splat(kForever));
-        wb = minimum(wb, splat(kForever));
-    }
-    wait_a = split_wait(wa, place);
-    wait_b = split_wait(wb, place);
-    if (far) refresh_long(wa, wb, a, b, key0, key1, event, stage, wait_a, wait_b);
 }
 
 // One draw of a pixel's stream that is seldom needed.

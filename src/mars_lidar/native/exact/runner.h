@@ -13,9 +13,6 @@
 #include "exact/system_view.h"
 #include "exact/trap_lanes.h"
 
-#define MARS_JOIN2(a, b) a##b
-#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
-
 namespace mars {
 inline namespace MARS_LEVEL {
 namespace {

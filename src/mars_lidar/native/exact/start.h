@@ -1,4 +1,6 @@
-// Where the lanes of the exact engine begin when the pixel is warmed up at the start of the exposure.
+// Where an item of the exact engine begins when its pixel is warmed up at the start of the exposure: the period and
+// the phase at which it re-arms next. Drawn photon by photon (exact/backward.h) where few arrive in a dead time, and
+// from the stationary law (laws/stationary.h, exact/mode_start.h) where many do.
 #pragma once
 #include <algorithm>
 #include <cmath>

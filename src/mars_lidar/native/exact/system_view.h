@@ -1,4 +1,5 @@
-// A job's system as the exact engine's loop sees it.
+// A job's system as plain numbers for the exact engine's loop: dead time in whole periods and a rest, gates in units
+// of 2^-64 period, the tables of the pulse.
 #pragma once
 #include "exact/detector_modes.h"
 #include "exact/pulse_view.h"

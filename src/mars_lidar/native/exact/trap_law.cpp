@@ -1,3 +1,5 @@
+// The law of afterpulses, worked out once for a job: which of an avalanche's carriers matter, how many there are,
+// and when they are released (exact/trap_law.h has the model).
 #include "exact/trap_law.h"
 
 #include <algorithm>

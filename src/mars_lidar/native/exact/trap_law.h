@@ -2,10 +2,10 @@
 //
 // Every avalanche leaves Poisson(p) carriers (Straka et al., arXiv 2001.10036), each of which is released after a delay
 // of its own; a release is an arrival like a photon. Those of an avalanche that are released in its own dead time do
-// nothing, unless they prolong it (mode paralyzable). The others are Poisson too, of mean p P(delay >= t_d - alpha) with
-// the twilight alpha, and their delays have the law of those beyond t_d - alpha: only they are drawn. Few avalanches
-// leave any, so the number of avalanches up to the next one that does is drawn, which is geometric, instead of a number
-// for each.
+// nothing, unless they prolong it (mode paralyzable). The others are Poisson too, of mean p P(delay >= t_d - alpha)
+// with the twilight alpha, and their delays have the law of those beyond t_d - alpha: only they are drawn. Few
+// avalanches leave any, so the number of avalanches up to the next one that does is drawn, which is geometric, instead
+// of a number for each.
 #pragma once
 #include <cmath>
 #include <cstdint>

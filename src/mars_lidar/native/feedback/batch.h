@@ -1,4 +1,9 @@
 // A batch of the feedback engine: from mean histograms to integer ones.
+//
+// Each draw gives every cell of the period a quantile of its count, as a linear function of its mean
+// (feedback/quantile.h), and then sweeps round the circle until the integers repeat (feedback/sweeps.h): a history
+// of all exposures' registrations that agrees with itself. What does not settle, or is not allowed by the law of its
+// count, is refused and left to the exact engine (docs/feedback.md).
 #pragma once
 #include "feedback/output.h"
 #include "feedback/pixels.h"

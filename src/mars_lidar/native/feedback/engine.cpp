@@ -1,65 +1,46 @@
-// The feedback engine: expected photons of every pixel, and batches of exposures on threads.
+// The feedback engine's host side: expected photons of every pixel, and batches of exposures on threads, each through the
+// widest kernel that the processor runs.
+#include "feedback/engine.h"
+
 #include <algorithm>
 #include <cmath>
 #include <stdexcept>
-#include <string>
 #include <vector>
 
-#include <nanobind/stl/string.h>
-
-#include "base/parallel.h"
+#include "base/full.h"
 #include "feedback/grid.h"
 #include "feedback/pulse_energy.h"
 #include "instrument/pulse_table.h"
-#include "python/bindings.h"
-#include "python/histogram_output.h"
+#include "lanes/levels.h"
 
 namespace mars {
-
 namespace {
 
 using Kernel = bool (*)(const FeedbackBatch&);
 
-Kernel kernel_of(const std::string& name) {
-    auto asked = [&name](const char* level) { return name.empty() || name == level; };
-#if defined(MARS_HAS_avx512)
-    if (asked("avx512") && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        return feedback_kernel_avx512;
-#endif
-#if defined(MARS_HAS_avx2)
-    if (asked("avx2") && __builtin_cpu_supports("avx2")) return feedback_kernel_avx2;
-#endif
-#if defined(MARS_HAS_vector128)
-    if (asked("vector128")) return feedback_kernel_vector128;
-#endif
-    if (asked("scalar")) return feedback_kernel_scalar;
-    throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
+Kernel kernel_of(const std::string& asked) {
+#define MARS_TRY_LEVEL(level, runs) \
+    if ((asked.empty() || asked == #level) && (runs)) return feedback_kernel_##level;
+    MARS_EACH_LEVEL(MARS_TRY_LEVEL)
+#undef MARS_TRY_LEVEL
+    throw std::invalid_argument("level must be one that this processor runs, got '" + asked + "'");
 }
 
+}  // namespace
+
 template <class Count>
-void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, Vector<const int64_t> pixels,
-               Matrix<uint8_t> status, int32_t merge, int32_t parts, Vector<const uint8_t> narrow, int32_t laps,
-               int threads, const std::string& level, const nb::object& progress) {
-    check_histogram(job, out);
-    if (static_cast<int64_t>(status.shape(0)) != job.realizations || status.shape(1) != pixels.shape(0))
-        throw nb::value_error("status must be (realizations, pixels)");
-    if (merge < 1 || parts < 1 || static_cast<int64_t>(narrow.shape(0)) != int64_t{job.bins} * merge)
-        throw nb::value_error("narrow must be (bins * merge)");
-    const int64_t number = static_cast<int64_t>(pixels.shape(0));
-    for (int64_t k = 0; k < number; ++k)
-        if (pixels.data()[k] < 0 || pixels.data()[k] >= job.pixels) throw nb::value_error("pixels must be of the job");
+void feedback_histogram(const Job& job, const PulseTable& pulse, Count* out, const FeedbackCall& call, int threads,
+                        const std::string& level, const Watch& watch) {
+    const int64_t number = call.number;
     if (number == 0) return;
     const Kernel kernel = kernel_of(level);
-    const CellGrid cells(job, merge, parts, narrow.data(), laps);
+    const CellGrid cells(job, call.merge, call.parts, call.narrow, call.laps);
     const PulseEnergyTables energy(pulse.shape);
-    Count* const cube = out.data();
 
     // A stream is every `splits`-th realization of one pixel; a batch is kTeam streams.
     const int64_t wanted = int64_t{kTeam} * 4 * threads;
     const int64_t splits = std::min(job.realizations, (wanted + number - 1) / number), streams = number * splits;
-    FeedbackStatus* const statuses = reinterpret_cast<FeedbackStatus*>(status.data());
-    run_chunks((streams + kTeam - 1) / kTeam, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+    run_chunks((streams + kTeam - 1) / kTeam, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {
         thread_local std::vector<unsigned char> memory;
         thread_local std::vector<double> lit;
         int64_t lane_pixel[kTeam];
@@ -68,19 +49,19 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
         void* rows[kTeam];
         FeedbackStatus* lane_status[kTeam];
         for (int i = 0; i < kTeam; ++i) {
-            const int64_t stream = std::min(chunk * kTeam + i, streams - 1), pixel = pixels.data()[stream / splits];
+            const int64_t stream = std::min(chunk * kTeam + i, streams - 1), pixel = call.pixels[stream / splits];
             const int64_t part = stream % splits;
             lane_pixel[i] = pixel;
             draws[i] =
                 chunk * kTeam + i < streams ? static_cast<int32_t>((job.realizations - part + splits - 1) / splits) : 0;
             index[i] = job.pixel_index[pixel];
             realization[i] = job.first_realization + static_cast<uint32_t>(part);
-            rows[i] = cube + (part * job.pixels + pixel) * job.bins;
-            lane_status[i] = statuses + part * number + stream / splits;
+            rows[i] = out + (part * job.pixels + pixel) * job.bins;
+            lane_status[i] = call.status + part * number + stream / splits;
         }
         lit.resize(std::max(lit.size(), static_cast<size_t>(cells.grid.cells) * kTeam));
         const LanePhotons photons(job, energy.energy, cells.grid, lane_pixel, lit.data(), kTeam);
-        const int64_t bytes = feedback_bytes(cells.grid.cells, laps, photons.lit_end - photons.lit_begin);
+        const int64_t bytes = feedback_bytes(cells.grid.cells, call.laps, photons.lit_end - photons.lit_begin);
         memory.resize(std::max(memory.size(), static_cast<size_t>(bytes)));
         FeedbackBatch batch{};
         batch.grid = &cells.grid;
@@ -106,26 +87,9 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
         if (!kernel(batch)) throw_full<Count>();
     });
 }
-
-}  // namespace
-
-template <class Count>
-void define(nb::module_& module, const char* about) {
-    module.def("feedback_histogram", &histogram<Count>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("parts"), nb::arg("narrow"),
-               nb::arg("laps"), nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none(),
-               about);
-}
-
-void bind_feedback(nb::module_& module) {
-    const char* about =
-        "Histograms out (realizations * pixels, bins) of some pixels by cyclic feedback on bins * merge internal "
-        "cells, cut into parts again where narrow (bins * merge) is not 0 (counted from half a period before the "
-        "pixel's strongest return on), in pieces of some laps. status (realizations, pixels) tells what became of "
-        "each: "
-        "0 drawn, else why its row is not written; 64 and more: it needs that many laps less 64.";
-    define<uint16_t>(module, about);
-    define<uint32_t>(module, about);
-}
+template void feedback_histogram(const Job&, const PulseTable&, uint16_t*, const FeedbackCall&, int, const std::string&,
+                                 const Watch&);
+template void feedback_histogram(const Job&, const PulseTable&, uint32_t*, const FeedbackCall&, int, const std::string&,
+                                 const Watch&);
 
 }  // namespace mars

@@ -2,10 +2,11 @@
 #pragma once
 #include <algorithm>
 #include <cmath>
+#include <stdexcept>
 #include <vector>
 
 #include "feedback/kernel.h"
-#include "python/bindings.h"
+#include "instrument/job.h"
 
 namespace mars {
 
@@ -16,7 +17,7 @@ class CellGrid {
     // `narrow` (bins * merge): base cells that are cut into `parts`; `laps` of the integer sweeps.
     CellGrid(const Job& job, int32_t merge, int32_t parts, const uint8_t* narrow, int32_t laps) {
         if (laps < 1 || laps > kMostLaps || (laps > 1 && job.dead_time >= 1.0))
-            throw nb::value_error("laps must be 1 to 64, and 1 where the dead time is a period or longer");
+            throw std::invalid_argument("laps must be 1 to 64, and 1 where the dead time is a period or longer");
         const int32_t base = job.bins * merge;
         grid.width[0] = 1.0 / base;
         grid.width[1] = grid.width[0] / parts;
@@ -80,7 +81,7 @@ class CellGrid {
             const float share = part > 1e-9 ? static_cast<float>(std::min(part, 1.0 - 0x1p-22)) : 0.0f;
             const FeedbackEdge edge{first + s + 1, first + s, turns, share};
             if (turns == 0 && edge.late >= e)
-                throw nb::value_error("merge must make the cells shorter than the dead time");
+                throw std::invalid_argument("merge must make the cells shorter than the dead time");
             if (turns > 0 && edge.early < grid.watch) grid.watch = edge.early;
             edge_.push_back(edge);
         }

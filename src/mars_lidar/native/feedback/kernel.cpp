@@ -1,8 +1,6 @@
-// The feedback engine at one vector level: a batch of lanes.
+// The feedback engine at one vector level: a batch of lanes (feedback/batch.h), each of which draws exposures of a
+// pixel of its own.
 #include "feedback/batch.h"
-
-#define MARS_JOIN2(a, b) a##b
-#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
 
 namespace mars {
 

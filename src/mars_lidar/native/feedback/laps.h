@@ -18,8 +18,8 @@ constexpr float kModes = 3.0f;  // that a lap remembers, where ghosts are not co
 constexpr double kFewestLapCycles = 1e4, kFewestPieces = 1000.0;
 constexpr int32_t kFewestLaps = 3;
 
-// Ghosts of every lane with one lap, for K = 0. Above half a period of dead time, where an exposure fires at most once a
-// lap, from the density of those that fire at the same phase a period later, less that of the registrations:
+// Ghosts of every lane with one lap, for K = 0. Above half a period of dead time, where an exposure fires at most once
+// a lap, from the density of those that fire at the same phase a period later, less that of the registrations:
 //     int max(lambda(x) exp(-[Lambda(x + 1) - Lambda(x + t_d)]) - r(x) / int r, 0) dx + e^-Lambda,
 // the integral over what re-arms between two edges. `means` (n + 1): registrations before each edge, `photons` (n + 1)
 // scratch.

@@ -1,4 +1,6 @@
-// Laws of a pixel that its sweeps need: rates, means, variance of the count, blind time at the ends of the exposure.
+// Laws of a pixel that the feedback engine's sweeps need: firing probabilities of the cells, mean and variance of
+// their counts, variance of the count of the exposure by the adjoint of the sweeps, and the blind time at the ends
+// of the exposure (docs/feedback.md).
 #pragma once
 #include "base/standard.h"
 #include "feedback/sweeps.h"

@@ -28,20 +28,13 @@ MARS_INLINE float bits_float(uint32_t u) {
 #endif
 }
 
-// log(x), x > 0 and normal: x = m 2^e, m in [sqrt(1/2), sqrt(2)); log(1 + t) = t - t^2/2 + t^3 P(t), the polynomial
-// of random.h (relative error 2.6e-7).
+// log(x), x > 0 and normal: x = m 2^e, m in [sqrt(1/2), sqrt(2)), relative error 2.6e-7.
 MARS_INLINE float log_of(float x) {
-    const uint32_t shifted = float_bits(x) - 0x3f3504f3u;
+    const uint32_t shifted = float_bits(x) - kRootHalfBits;
     const int32_t e = static_cast<int32_t>(shifted) >> 23;
-    const float t = bits_float((shifted & 0x007fffffu) + 0x3f3504f3u) - 1.0f;
-    float p = -0.10191701352596283f;
-    p = p * t + 0.16024371981620789f;
-    p = p * t - 0.17137131094932556f;
-    p = p * t + 0.19924505054950714f;
-    p = p * t - 0.24983267486095428f;
-    p = p * t + 0.33334246277809143f;
-    const float z = t * t;
-    return static_cast<float>(e) * 0.693147182464599609375f + ((t - 0.5f * z) + (z * t) * p);
+    const float t = bits_float((shifted & kMantissaBits) + kRootHalfBits) - 1.0f;
+    const float p = log_polynomial(t), z = t * t;
+    return static_cast<float>(e) * kLogTwo + ((t - 0.5f * z) + (z * t) * p);
 }
 
 // log(1 - p), 0 <= p < 1/8, relatively accurate; beyond, log_of(1 - p) is.

@@ -1,4 +1,5 @@
-// Histograms from prefix sums.
+// Histograms of the feedback engine, written from prefix sums of the counts in its internal cells: a bin is the
+// difference of two of them, and wraps where the lane's period does.
 #pragma once
 #include "feedback/kernel.h"
 #include "feedback/math.h"

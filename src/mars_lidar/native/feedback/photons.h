@@ -1,4 +1,5 @@
-// Expected photons per period in the internal cells of a batch's pixels.
+// Expected photons per period in the internal cells of a batch's pixels: returns of a pulse or a waveform, and
+// background. Cells that no pulse reaches share one number.
 #pragma once
 #include "base/standard.h"
 #include "feedback/kernel.h"

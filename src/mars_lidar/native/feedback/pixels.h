@@ -98,10 +98,10 @@ class BatchPixels {
         }
     }
 
-    // How far a count may be from its mean: 8 standard deviations, the ends of the exposure, and the mean's own error. Where sweeps settle
-    // slowly, or in laps, by the variance of the count's law; elsewhere by what a contraction of rho allows it to be,
-    // N (1 + rho) / (1 - rho). Where whole periods of the dead time are blind, the total is found by a fixed point to
-    // half a count: such pixels are refused where the law is narrower.
+    // How far a count may be from its mean: 8 standard deviations, the ends of the exposure, and the mean's own error.
+    // Where sweeps settle slowly, or in laps, by the variance of the count's law; elsewhere by what a contraction of
+    // rho allows it to be, N (1 + rho) / (1 - rho). Where whole periods of the dead time are blind, the total is found
+    // by a fixed point to half a count: such pixels are refused where the law is narrower.
     void bound_counts() {
         bool some = false;
         for (int i = 0; i < kTeam; ++i) some = some || variance_matters(i);
@@ -133,8 +133,8 @@ class BatchPixels {
 
     bool variance_matters(int i) const { return grid_.whole > 0 || grid_.laps > 1 || rate_[i] > kLinearFrom; }
 
-    // Lanes for which one lap is not enough, or not this number, are refused with the number that is. `armed`: the fewest
-    // exposures armed in any cell. Also how many sweeps a lane goes through at least.
+    // Lanes for which one lap is not enough, or not this number, are refused with the number that is. `armed`: the
+    // fewest exposures armed in any cell. Also how many sweeps a lane goes through at least.
     void choose_laps(const float* armed) {
         alignas(64) float ghosts[kTeam];
         bool some = grid_.laps > 1;

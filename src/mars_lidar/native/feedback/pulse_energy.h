@@ -1,4 +1,5 @@
-// A pulse's energy with its tables, as the feedback engine needs it.
+// A pulse's energy with the tables that it points into, built once for a call of the feedback engine;
+// feedback/photons.h looks it up.
 #pragma once
 #include <vector>
 

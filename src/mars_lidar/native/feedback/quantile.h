@@ -112,8 +112,8 @@ MARS_INLINE bool any_few(const float* mean) {
     return some != 0;
 }
 
-// The steepest line that a count may follow: one exposure more armed (p of mu), or re-armed (q), adds at most one count.
-// Beyond it deviations could grow from sweep to sweep (docs/feedback.md). The count at the mean stays.
+// The steepest line that a count may follow: one exposure more armed (p of mu), or re-armed (q), adds at most one
+// count. Beyond it deviations could grow from sweep to sweep (docs/feedback.md). The count at the mean stays.
 MARS_NOINLINE void limit_slopes(const float* __restrict__ p, const float* __restrict__ q,
                                 const float* __restrict__ mean, float* __restrict__ alpha, float* __restrict__ beta) {
     for (int i = 0; i < kTeam; ++i) {
@@ -124,8 +124,8 @@ MARS_NOINLINE void limit_slopes(const float* __restrict__ p, const float* __rest
     }
 }
 
-// alpha and beta of a cell that fires with probability p, or q where it was re-armed within, for all lanes. `bursts`: its
-// mean may well be several times what it is expected to be, because few exposures are armed.
+// alpha and beta of a cell that fires with probability p, or q where it was re-armed within, for all lanes. `bursts`:
+// its mean may well be several times what it is expected to be, because few exposures are armed.
 MARS_INLINE void follow_quantile(const float* mean, const float* variance, const float* p, const float* q, bool bursts,
                                  const Uniforms& uniforms, float* alpha, float* beta) {
     int32_t steep = 0;

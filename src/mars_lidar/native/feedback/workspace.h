@@ -1,4 +1,5 @@
-// Rates and scratch of a batch of the feedback engine.
+// The memory of a batch of the feedback engine, cut into rows of lanes: firing probabilities, prefix sums,
+// quantiles, histories. `feedback_bytes` of feedback/kernel.h says how much it takes.
 #pragma once
 #include "feedback/laws.h"
 

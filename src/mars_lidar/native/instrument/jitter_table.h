@@ -1,6 +1,6 @@
 // Jitter of a sampled density, drawn from one random word: the alias method of A. J. Walker, "An efficient method for
-// generating discrete random variables with general distributions", ACM Trans. Math. Softw. 3 (1977), for densities that
-// are constant on samples.
+// generating discrete random variables with general distributions", ACM Trans. Math. Softw. 3 (1977), for densities
+// that are constant on samples.
 #pragma once
 #include <cstdint>
 #include <vector>
@@ -9,8 +9,8 @@
 
 namespace mars {
 
-// A uniform number in [0, samples) names a column k and a place v in [0, 1) in it. Below `bound` of the column the time is
-// line[0] + line[1] v, of sample k itself, and above it line[2] + line[3] v, of the column's alias.
+// A uniform number in [0, samples) names a column k and a place v in [0, 1) in it. Below `bound` of the column the time
+// is line[0] + line[1] v, of sample k itself, and above it line[2] + line[3] v, of the column's alias.
 struct JitterTable {
     std::vector<float> bound;  // (samples)
     std::vector<float> line;   // (samples, 2, 2)

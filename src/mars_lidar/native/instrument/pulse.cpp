@@ -6,8 +6,6 @@
 #include <cmath>
 #include <cstring>
 
-#include "python/bindings.h"
-
 namespace mars {
 namespace {
 
@@ -227,22 +225,4 @@ PulseTable PulseTable::sampled(std::vector<double> knots, double width, double s
 }
 
 const PulseShape& shape_of(const PulseTable& table) { return table.shape; }
-
-void bind_pulse(nb::module_& module) {
-    nb::class_<PulseTable>(module, "PulseTable", "Pulse shape and sampling tables; times in laser periods.")
-        .def_static("gaussian", &PulseTable::gaussian, nb::arg("sigma"))
-        .def_static(
-            "sampled",
-            [](Vector<const double> knots, double width, double start) {
-                return PulseTable::sampled({knots.data(), knots.data() + knots.shape(0)}, width, start);
-            },
-            nb::arg("knots"), nb::arg("width"), nb::arg("start"))
-        .def(
-            "periodic", [](const PulseTable& self, double t) { return self.shape.periodic(t); },
-            "Energy of the pulse train up to t.")
-        .def(
-            "cumulative", [](const PulseTable& self, double t) { return self.shape.cumulative(t); },
-            "Energy of one pulse up to t.");
-}
-
 }  // namespace mars

@@ -1,6 +1,6 @@
-// Looking things up for the lanes of waveforms: neighbouring integers from places of the lanes' own, loads of 64 bits put in
-// order by shuffles, and the place of a number among ascending ones. As in lanes/vector.h the gather instructions are left
-// alone: they are slow where processors guard against data sampling.
+// Looking things up for the lanes of waveforms: neighbouring integers from places of the lanes' own, loads of 64 bits
+// put in order by shuffles, and the place of a number among ascending ones. As in lanes/vector.h the gather
+// instructions are left alone: they are slow where processors guard against data sampling.
 #pragma once
 #include "lanes/lanes.h"
 
@@ -60,8 +60,8 @@ MARS_INLINE __m128i load_two(const int32_t* table, int32_t a, int32_t b) {
 }
 #endif
 
-// find(0), find(1), ... as a vector, and entries k and k + 1 of a table for each of them. Nothing goes through memory: loads of
-// vectors that were stored number by number wait for the cache.
+// find(0), find(1), ... as a vector, and entries k and k + 1 of a table for each of them. Nothing goes through memory:
+// loads of vectors that were stored number by number wait for the cache.
 #if defined(MARS_LEVEL_avx512)
 MARS_INLINE __m512i join(__m128i a, __m128i b, __m128i c, __m128i d) {
     const __m256i low = _mm256_inserti128_si256(_mm256_castsi128_si256(a), b, 1);

@@ -18,6 +18,11 @@
 #define MARS_LEVEL portable
 #endif
 
+// Pastes two names after expanding them: MARS_JOIN(exact_kernel_, MARS_LEVEL) is exact_kernel_avx2 at that level. The
+// entry points of kernels carry the name of their level, by which lanes/levels.h finds them at run time.
+#define MARS_JOIN2(a, b) a##b
+#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
+
 // 32-bit numbers in a hardware vector
 #if defined(MARS_LEVEL_avx512)
 #define MARS_LANES 16
@@ -43,7 +48,8 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-// Asks for the line of memory that holds `at` before it is read or, with `write`, written; `locality` 3: into all caches.
+// Asks for the line of memory that holds `at` before it is read or, with `write`, written; `locality` 3: into all
+// caches.
 template <int write = 0, int locality = 3>
 MARS_INLINE void prefetch([[maybe_unused]] const void* at) {
 #if defined(__GNUC__) && !defined(__CUDACC__)

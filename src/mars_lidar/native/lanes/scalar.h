@@ -1,4 +1,5 @@
-// One lane: plain numbers. Included by lanes.h only.
+// One lane: plain numbers in the place of vectors, for a GPU's threads and for compilers without vector extensions.
+// Included by lanes/lanes.h only; lanes/vector.h has the same functions for vectors.
 #pragma once
 
 namespace mars {

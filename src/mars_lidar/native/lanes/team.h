@@ -1,6 +1,6 @@
-// How the loops over one pixel's bins are dealt out. The processor's kernels give all of a pixel to one thread; on a GPU the
-// threads of a block share it (device_team.h). The results are the same, because what a loop does at one index depends on
-// no other index of the same loop.
+// How the loops over one pixel's bins are dealt out. The processor's kernels give all of a pixel to one thread; on a
+// GPU the threads of a block share it (device_team.h). The results are the same, because what a loop does at one index
+// depends on no other index of the same loop.
 #pragma once
 #include "lanes/lanes.h"
 

@@ -1,4 +1,6 @@
-// What one bin of the grid does: linear maps from (armed probability, re-arming) to registrations.
+// What one bin of the grid does in the exposure recursion: linear maps from what is armed at its start, and what
+// re-arms in it, to what it registers (docs/theory_exposure.md, (7) to (13)). Registrations in a bin are a total and
+// a first moment.
 #pragma once
 #include "laws/exposure_kernel.h"
 #include "laws/exposure_numbers.h"

@@ -1,4 +1,5 @@
-// Generating function E[z^N] of the count of a finite exposure.
+// Generating function E[z^N] of the count of a finite exposure: the delay recursion with complex numbers, on the
+// unit circle for probabilities by Fourier's series, and at real z for tails (docs/theory_exposure.md).
 #pragma once
 #include <cmath>
 #include <complex>
@@ -112,7 +113,7 @@ class CharacteristicRun {
             if (block_.stop->load(std::memory_order_relaxed)) return;
             recursion.period(q, factor(q, grid_.whole + 1), factor(q, grid_.whole), nullptr);
             Real growth{};
-            const Complex before = value;
+            Complex step{};       // of the value in this period
             if (block_.tilted) {  // growth as a sum of positive terms, then divided out (eq. 25)
                 growth = state.re;
                 if constexpr (!kParalyzable) {
@@ -127,7 +128,8 @@ class CharacteristicRun {
                 logs_[slot(q)] = growth;
                 slide(q);
             } else {  // (eq. 22)
-                value = value + weighted(z_ - Complex{splat(1.0), Real{}}, recursion.total);
+                step = weighted(z_ - Complex{splat(1.0), Real{}}, recursion.total);
+                value = value + step;
             }
             const Projection p = project(recursion.repeated, repeated);
             const Real moved = p.rest + length1(p.ratio - ratio) * p.size;
@@ -154,8 +156,8 @@ class CharacteristicRun {
                     block_.re[k] = block_.im[k] = 0.0;
                 } else {
                     const Point now{lane(value.re, k), lane(value.im, k)};
-                    const Point was{lane(before.re, k), lane(before.im, k)};
-                    put(k, extrapolated(now, was, {lane(ratio.re, k), lane(ratio.im, k)}, rest));
+                    const Point last{lane(step.re, k), lane(step.im, k)};
+                    put(k, extrapolated(now, last, {lane(ratio.re, k), lane(ratio.im, k)}, rest));
                 }
             }
         }
@@ -165,13 +167,14 @@ class CharacteristicRun {
 
     using Point = std::complex<double>;
 
-    // now * ratio^rest (eq. 26). Near z = 1 the ratio is 1 + small: taken from the values themselves, whose
-    // difference is accurate relative to z - 1, so that millions of periods do not add up its rounding.
-    static Point extrapolated(Point now, Point was, Point ratio, double rest) {
+    // now * ratio^rest (eq. 26). Near z = 1 the ratio is 1 + small: taken from the last step of the value, which is
+    // accurate relative to itself, so that millions of periods do not add up its rounding.
+    static Point extrapolated(Point now, Point step, Point ratio, double rest) {
         if (rest == 0.0) return now;
         Point log_ratio = std::log(ratio);
+        const Point was = now - step;
         if (std::abs(was) > 0.5) {
-            const Point w = (now - was) / was;
+            const Point w = step / was;
             log_ratio = {0.5 * std::log1p(2.0 * w.real() + std::norm(w)), std::atan2(w.imag(), 1.0 + w.real())};
         }
         return now * std::exp(rest * log_ratio);

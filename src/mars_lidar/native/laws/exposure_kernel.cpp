@@ -1,12 +1,10 @@
-// The exposure recursion at one vector level: entry points.
+// The exposure recursion at one vector level: its entry points. Lanes are entries (pixels); for the generating
+// function they are points z.
 #include "laws/exposure_kernel.h"
 
 #include "laws/exposure_backward.h"
 #include "laws/exposure_characteristic.h"
 #include "laws/exposure_moments.h"
-
-#define MARS_JOIN2(a, b) a##b
-#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
 
 namespace mars {
 

@@ -1,4 +1,6 @@
-// Cumulants of the count and mean histogram of a finite exposure.
+// Cumulants of the count, up to the fourth, and the mean histogram of a finite exposure: the delay recursion with
+// Taylor series in s in the place of numbers, normalised after every period (docs/theory_exposure.md, section 5),
+// until the increments of a dead time repeat.
 #pragma once
 #include <limits>
 #include <type_traits>

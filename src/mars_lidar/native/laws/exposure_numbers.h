@@ -1,4 +1,5 @@
-// Numbers of the exposure recursion: doubles in lanes, truncated Taylor series in s, complex numbers.
+// Numbers of the exposure recursion: doubles in lanes, truncated Taylor series in s, and complex numbers, with IEEE
+// operations alone, so that every level gives the same bits.
 #pragma once
 #include <cmath>
 

@@ -1,4 +1,6 @@
-// The delay recursion through one laser period: armed probability and registrations, bin after bin.
+// The delay recursion through one laser period of a free-running pixel: what of it is armed, and what each bin
+// registers, which re-arms a dead time later (docs/theory_exposure.md, (7) to (15)). The numbers are a template's:
+// series for cumulants, complex ones for the generating function.
 #pragma once
 #include <algorithm>
 #include <vector>

@@ -1,5 +1,5 @@
-// What a run of the exposure recursion starts from: responses of the bins, the stationary state; and the test
-// whether a state repeats.
+// What a run of the exposure recursion starts from: the responses of the bins, the stationary state of a warmed-up
+// pixel, and the test whether a state repeats (docs/theory_exposure.md).
 #pragma once
 #include <algorithm>
 

@@ -1,4 +1,5 @@
-// The joint law of an exposure that does not forget its start: through all periods, backward and forward.
+// The joint law of an exposure that does not forget its start: all periods backward for what a registration is
+// worth, then forward for the noise of every bin and its consequences (docs/joint_law.md, section 6).
 #pragma once
 #include <algorithm>
 #include <atomic>

@@ -1,12 +1,10 @@
-// Gauss-Seidel sweeps of the transposed feedback equation at one vector level; lanes are windows.
+// Gauss-Seidel sweeps of the transposed feedback equation (docs/joint_law.md) at one vector level; lanes are
+// windows.
 #include "laws/joint_kernel.h"
 
 #include <vector>
 
 #include "laws/joint_period.h"
-
-#define MARS_JOIN2(a, b) a##b
-#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
 
 namespace mars {
 

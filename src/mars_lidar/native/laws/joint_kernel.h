@@ -1,4 +1,5 @@
-// Solutions of the transposed feedback equation for several windows at once, one function per vector level.
+// Solutions of the transposed feedback equation of the joint law (docs/joint_law.md) for several windows at once,
+// one function per vector level.
 #pragma once
 #include <atomic>
 #include <cstdint>

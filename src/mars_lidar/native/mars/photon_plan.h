@@ -1,5 +1,6 @@
-// What is known of a pixel whose photons are drawn one by one, and the choices that each of them makes: shared by the
-// processor's loops (shape_photons.h) and those of a GPU (cuda/mars.h).
+// What is known of a pixel whose photons are drawn one by one, and the choices that each of them makes: inside of
+// the pulse's frame or outside, proposed where, accepted or not. Shared by the processor's loops
+// (mars/shape_photons.h) and those of a GPU (cuda/mars.h).
 #pragma once
 #include "mars/shape_alignment.h"
 #include "numbers/random.h"
@@ -19,9 +20,9 @@ constexpr int kSlots = 4;                  // counters of what is rejected, so t
 constexpr int kGuideBits = 8;              // of a word, that name where the inversion begins
 constexpr int kStride = 32;
 
-// How many of the photons lie in the frame, by its share of them. Each of them compares a uniform number with the share bit
-// by bit, from the highest on, until the bits differ: those that still agree are as many random bits as there are of them.
-// `ones(n)`: how many of the next n random bits are 1.
+// How many of the photons lie in the frame, by its share of them. Each of them compares a uniform number with the share
+// bit by bit, from the highest on, until the bits differ: those that still agree are as many random bits as there are
+// of them. `ones(n)`: how many of the next n random bits are 1.
 template <class Ones>
 MARS_INLINE int64_t framed_photons(double share, int64_t photons, const Ones& ones) {
     if (share >= 1.0) return photons;

@@ -1,4 +1,5 @@
-// What histograms from a count and a shape are drawn from: rows of a table, and how pixels mix and move them.
+// What histograms from a count and a shape are drawn from: rows of a table, how pixels mix and move them, and what
+// is known of the pulse that they hold. Plain numbers and pointers, which a GPU takes as they are.
 #pragma once
 #include "base/integers.h"
 

@@ -1,11 +1,9 @@
-// Multinomial histograms at one vector level: in rounds (shape_rounds.h), or photon by photon (shape_photons.h).
+// Multinomial histograms at one vector level: in rounds of Poisson numbers for many photons (mars/shape_rounds.h),
+// or photon by photon for moderate counts (mars/shape_photons.h).
 #include "mars/shape_kernel.h"
 
 #include "mars/shape_photons.h"
 #include "mars/shape_rounds.h"
-
-#define MARS_JOIN2(a, b) a##b
-#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
 
 namespace mars {
 inline namespace MARS_LEVEL {

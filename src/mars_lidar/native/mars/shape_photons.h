@@ -5,23 +5,13 @@
 // and accepted by what the mixture holds there: nearly always its least and largest value in a part of the bins
 // (RowGuide) decide, and it is formed in that one bin otherwise. So N independent draws from the shape.
 #pragma once
+#include "lanes/bits.h"
+#include "lanes/streaming.h"
 #include "mars/photon_plan.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
-
-#if defined(_MSC_VER)
-inline int popcount(uint64_t x) {
-    int n = 0;
-    for (; x; x &= x - 1) ++n;
-    return n;
-}
-inline int lowest_bit(uint64_t x) { return popcount(~x & (x - 1)); }
-#else
-MARS_INLINE int popcount(uint64_t x) { return __builtin_popcountll(x); }
-MARS_INLINE int lowest_bit(uint64_t x) { return __builtin_ctzll(x); }
-#endif
 
 class Photons : public PhotonPlan<OneThread> {
  public:
@@ -66,11 +56,7 @@ class Photons : public PhotonPlan<OneThread> {
     }
 
     // Before other threads may read what `draw` wrote.
-    static void written() {
-#if defined(MARS_X86)
-        _mm_sfence();
-#endif
-    }
+    static void written() { finish_streaming(); }
 
  private:
     // 64 words of 32 events.
@@ -196,16 +182,7 @@ class Photons : public PhotonPlan<OneThread> {
         for (int64_t j = 0; j < n_; ++j) counts_[j] = 0;
     }
     void write(uint16_t* out) {
-        int64_t j = 0;
-#if defined(MARS_X86)
-        if (reinterpret_cast<uintptr_t>(out) % 16 == 0)  // past the cache: nobody reads it before all of it is done
-            for (; j + 32 <= n_; j += 32) {
-                __m128i* from = reinterpret_cast<__m128i*>(counts_ + j);
-                __m128i* to = reinterpret_cast<__m128i*>(out + j);
-                for (int k = 0; k < 4; ++k) _mm_stream_si128(to + k, from[k]);
-                for (int k = 0; k < 4; ++k) from[k] = _mm_setzero_si128();
-            }
-#endif
+        int64_t j = stream_counters(counts_, out, n_);
         for (; j < n_; ++j) {
             out[j] = counts_[j];
             counts_[j] = 0;

@@ -1,5 +1,5 @@
-// Multinomial histograms of many photons: Poisson numbers in the bins whose total falls a little short of N, and the rest
-// photon by photon.
+// Multinomial histograms of many photons: Poisson numbers in the bins whose total falls a little short of N, and the
+// rest photon by photon.
 //
 // Independent Poisson numbers of means m pi_j are, given their total M, Multinomial(M, pi); N - M more draws from pi
 // make it Multinomial(N, pi), as do M - N of them taken away at random, whatever M was. So the cost is O(bins), not

@@ -4,7 +4,9 @@
 
 namespace mars {
 
-// e^x for x <= 700; 0 below -708. x = k log 2 + r, Taylor series to r^13 for |r| <= log(2)/2 (error 1e-16).
+// e^x for x <= 700; 0 below -708. x = k log 2 + r, Taylor series to r^13 for |r| <= log(2)/2 (error 1e-16). Multiplies
+// by 1/n and by 1/log 2 where `exponential_function` (numbers/normal_law.h) divides: faster, and rounded otherwise.
+// Count laws and traps rest on the bits of this one, pulses and the normal law on those of the other, so both stay.
 MARS_APART inline double ieee_exp(double x) {
     if (!(x > -708.0)) return 0.0;
     constexpr double kLog2High = 0x1.62e42fefa39efp-1, kLog2Low = 0x1.abc9e3b39803fp-56;

@@ -1,4 +1,5 @@
-// Words of 64 random bits by name, for numbers that are drawn in double precision.
+// Words of 64 random bits by name, for numbers that are drawn in double precision. A function of (seed, domain,
+// realization, pixel, event), as in numbers/random.h.
 #pragma once
 #include "numbers/random.h"
 

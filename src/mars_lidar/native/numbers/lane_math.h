@@ -1,4 +1,5 @@
-// Elementary functions of lanes, by IEEE arithmetic alone: every vector width gives the same bits.
+// Elementary functions of lanes in single precision: exponential, logarithm, roots, normal numbers. IEEE arithmetic
+// alone, so that every vector width gives the same bits.
 #pragma once
 #include "numbers/random.h"
 
@@ -36,34 +37,27 @@ MARS_INLINE Float one_minus_exp(Float x, Float decay) {
 
 // -log x for positive normal x <= 1.
 MARS_INLINE Float minus_log(Float x) {
-    // x = m 2^e with m in [sqrt(1/2), sqrt(2)); sqrt(1/2) has the bits 0x3f3504f3
-    const UInt shifted = bits(x) - 0x3f3504f3u;
+    // x = m 2^e with m in [sqrt(1/2), sqrt(2))
+    const UInt shifted = bits(x) - kRootHalfBits;
     const Int e = as_int(shifted) >> 23;
-    const Float t = from_bits((shifted & 0x007fffffu) + 0x3f3504f3u) - 1.0f;
-    // log(1 + t) = t - t^2/2 + t^3 P(t), as in `exponential`
-    Float p = splat(-0.10191701352596283f);
-    p = p * t + 0.16024371981620789f;
-    p = p * t - 0.17137131094932556f;
-    p = p * t + 0.19924505054950714f;
-    p = p * t - 0.24983267486095428f;
-    p = p * t + 0.33334246277809143f;
-    const Float z = t * t;
+    const Float t = from_bits((shifted & kMantissaBits) + kRootHalfBits) - 1.0f;
+    const Float p = log_polynomial(t), z = t * t;
     const Float log1p = (t - 0.5f * z) + (z * t) * p;
-    return 0.0f - (to_float(e) * 0.693147182464599609375f + log1p);
+    return 0.0f - (to_float(e) * kLogTwo + log1p);
 }
 
 // 1 / sqrt(x) for positive normal x: three steps of Newton's iteration.
 MARS_INLINE Float inverse_root(Float x) {
     const Float half = 0.5f * x;
-    Float y = from_bits(0x5f375a86u - (bits(x) >> 1));
+    Float y = from_bits(0x5f375a86u - (bits(x) >> 1));  // within 3.5 %: -1/2 times the logarithm, in the bits
     for (int k = 0; k < 3; ++k) y = y * (1.5f - half * (y * y));
     return y;
 }
 
-// Two independent standard normal numbers of two words, by a radius and an angle: G. E. P. Box, M. E. Muller, "A note on
-// the generation of random normal deviates", Ann. Math. Statist. 29 (1958). Two bits of the second word are the signs, the
-// others an angle pi/4 + a in the first quadrant, whose cosine and sine are (cos a -+ sin a) / sqrt(2). Polynomials of S. L.
-// Moshier's Cephes library, absolute errors below 1e-7.
+// Two independent standard normal numbers of two words, by a radius and an angle: G. E. P. Box, M. E. Muller, "A note
+// on the generation of random normal deviates", Ann. Math. Statist. 29 (1958). Two bits of the second word are the
+// signs, the others an angle pi/4 + a in the first quadrant, whose cosine and sine are (cos a -+ sin a) / sqrt(2).
+// Polynomials of S. L. Moshier's Cephes library, absolute errors below 1e-7.
 MARS_INLINE Pair<Float> normal_pair(Pair<UInt> words) {
     const Float radius = square_root(exponential(words.first));  // that of two normal numbers, over sqrt(2)
     const Float a = (to_float(as_int(words.second << 2)) + 2.0f) * (0x1p-32f * 1.57079632679f);

@@ -4,7 +4,9 @@
 
 namespace mars {
 
-// e^x for x <= 0: x = k log 2 + r, Taylor series to r^13 for |r| <= log(2)/2 (error below 1e-16).
+// e^x for x <= 0; 0 below -745. x = k log 2 + r, Taylor series to r^13 for |r| <= log(2)/2 (error below 1e-16). Divides
+// where `ieee_exp` (numbers/elementary.h) multiplies, and so rounds otherwise: the tables of every pulse, and with them
+// every cube, rest on these bits.
 inline double exponential_function(double x) {
     if (x < -745.0) return 0.0;
     constexpr double kLog2High = 0x1.62e42fefa39efp-1, kLog2Low = 0x1.abc9e3b39803fp-56;

@@ -3,7 +3,7 @@
 // Threefry-2x32 of Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011:
 // 20 rounds for keys, 13 for the draws of one stream (13 is the smallest number that passes BigCrush there).
 #pragma once
-#include "lanes/lanes.h"
+#include "numbers/log_polynomial.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -64,27 +64,21 @@ MARS_INLINE Pair<uint32_t> stream_key(uint64_t seed, uint32_t realization, uint3
 MARS_INLINE Float uniform(UInt x) { return (to_float(as_int(x >> 1)) + 0.5f) * 0x1p-31f; }
 
 // A standard exponential number, -log(u), u = (n + rest) 2^-31 with the upper 31 bits n of a word and `rest` in (0, 1);
-// relatively fine at both ends: what registers in a pulse's early tail, and up to 22. With a random rest, small ones have
-// no lattice.
+// relatively fine at both ends: what registers in a pulse's early tail, and up to 22. With a random rest, small ones
+// have no lattice.
 MARS_INLINE Float exponential(UInt x, Float rest) {
     const Int n = as_int(x >> 1);
     const Float f = to_float(n) + rest;
-    // f = m 2^e with m in [sqrt(1/2), sqrt(2)); sqrt(1/2) has the bits 0x3f3504f3
-    const UInt shifted = bits(f) - 0x3f3504f3u;
+    // f = m 2^e with m in [sqrt(1/2), sqrt(2))
+    const UInt shifted = bits(f) - kRootHalfBits;
     const Int e = as_int(shifted) >> 23;
-    Float t = from_bits((shifted & 0x007fffffu) + 0x3f3504f3u) - 1.0f;
+    Float t = from_bits((shifted & kMantissaBits) + kRootHalfBits) - 1.0f;
     // u above sqrt(1/2): 1 - u comes from the integer, exactly
     t = select(e == 31, (to_float(0x7fffffff - n) + rest) * -0x1p-31f, t);
-    // log(1 + t) = t - t^2/2 + t^3 P(t), P minimax for the relative error (2.6e-7)
-    Float p = splat(-0.10191701352596283f);
-    p = p * t + 0.16024371981620789f;
-    p = p * t - 0.17137131094932556f;
-    p = p * t + 0.19924505054950714f;
-    p = p * t - 0.24983267486095428f;
-    p = p * t + 0.33334246277809143f;
-    p = p * t - 0.5f;
+    // grouped otherwise than in `minus_log` (numbers/lane_math.h): the roundings, and so the bits, are not the same
+    const Float p = log_polynomial(t) * t - 0.5f;
     const Float log1p = t + (t * t) * p;
-    return to_float(31 - e) * 0.693147182464599609375f - log1p;
+    return to_float(31 - e) * kLogTwo - log1p;
 }
 MARS_INLINE Float exponential(UInt x) { return exponential(x, splat(0.5f)); }
 

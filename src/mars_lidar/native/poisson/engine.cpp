@@ -1,21 +1,18 @@
-// The Poisson engine: no dead time. N ~ Poisson(N_r Lambda) photons with phases distributed as lambda /
-// Lambda, that is, independent Poisson numbers in the bins, of mean N_r l_j.
+// The Poisson engine's means and draws: expected counts of a pixel's bins, then a number for each, by the way that is
+// cheapest for its mean.
+#include "poisson/engine.h"
+
 #include <algorithm>
 #include <cmath>
-#include <cstdint>
 #include <vector>
 
-#include "base/parallel.h"
-#include "instrument/pulse_table.h"
+#include "base/full.h"
 #include "numbers/poisson_sampler.h"
-#include "python/bindings.h"
-#include "python/histogram_output.h"
 
 namespace mars {
 namespace {
 
-constexpr uint64_t kDomain = 0x506f6973736f6e00u;  // "Poisson": not the exact engine's numbers at one seed
-constexpr int64_t kChunkBins = 1 << 20;            // a few ms of work
+constexpr int64_t kChunkBins = 1 << 20;  // a few ms of work
 
 // How the uniform background of a bin is drawn, by its mean: as photons placed at random, by table, by
 // rejection.
@@ -207,23 +204,21 @@ void fill(const EventStream& stream, const Means& means, const PoissonTable* tab
     }
 }
 
+}  // namespace
+
 template <class Count>
-void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, int threads,
-               const nb::object& progress) {
-    check_histogram(job, out);
-    const PulseShape& shape = shape_of(pulse);
-    Count* const cube = out.data();
+void poisson_histogram(const Job& job, const PulseShape& pulse, Count* out, int threads, const Watch& watch) {
     // Chunks are runs of pixels, all realizations of each, so that a pixel's means are worked out once; with
     // few pixels, runs of realizations.
     const int64_t size = std::max<int64_t>(1, kChunkBins / job.bins);
     const int64_t deep = std::min(job.realizations, size), wide = std::max<int64_t>(1, size / deep);
     const int64_t layers = (job.realizations + deep - 1) / deep, strips = (job.pixels + wide - 1) / wide;
-    run_chunks(layers * strips, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+    run_chunks(layers * strips, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {
         Means means(job);
         PoissonTable memory;
         const int64_t strip = chunk % strips, layer = chunk / strips;
         for (int64_t p = strip * wide; p < std::min(job.pixels, (strip + 1) * wide); ++p) {
-            means.set(shape, p);
+            means.set(pulse, p);
             const PoissonTable* table = nullptr;
             if (use_table(means.background, job.bins)) {
                 memory.set(means.background);
@@ -231,31 +226,14 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
             }
             for (int64_t r = layer * deep; r < std::min(job.realizations, (layer + 1) * deep) && !stop; ++r) {
                 const int64_t item = r * job.pixels + p;
-                const EventStream stream(job.seed, kDomain, job.realization(item), job.pixel_index[p]);
-                fill(stream, means, table, job.bins, cube + item * job.bins);
+                const EventStream stream(job.seed, kPoissonDomain, job.realization(item), job.pixel_index[p]);
+                fill(stream, means, table, job.bins, out + item * job.bins);
             }
             if (stop) return;
         }
     });
 }
-
-}  // namespace
-
-void bind_poisson(nb::module_& module) {
-    const char* about = "Histograms out (realizations * pixels, bins) without dead time.";
-    module.def("poisson_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("threads"), nb::arg("progress").none(), about);
-    module.def("poisson_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("threads"), nb::arg("progress").none(), about);
-    module.def(
-        "poisson_sample",
-        [](uint64_t seed, double mean, Vector<int64_t> out) {
-            const EventStream stream(seed, kDomain, 0, 0);
-            PoissonSampler sampler(mean);
-            for (size_t k = 0; k < out.shape(0); ++k) out.data()[k] = sampler(stream, static_cast<uint32_t>(k));
-        },
-        nb::arg("seed"), nb::arg("mean"), nb::arg("out").noconvert(),
-        "Independent Poisson numbers out (n): the sampler by itself, for its tests.");
-}
+template void poisson_histogram(const Job&, const PulseShape&, uint16_t*, int, const Watch&);
+template void poisson_histogram(const Job&, const PulseShape&, uint32_t*, int, const Watch&);
 
 }  // namespace mars

@@ -1,4 +1,5 @@
-// What the Python bindings of the engines share.
+// What the bindings share: nanobind's arrays by short names, and objects of Python together with the arrays into which they
+// point. Bindings check shapes and convert; algorithms are in the other folders and know no Python.
 #pragma once
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -16,6 +17,12 @@ using Vector = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Matrix = nb::ndarray<T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
+// The length of a vector, as the algorithms count.
+template <class T>
+int64_t size_of(const Vector<T>& vector) {
+    return static_cast<int64_t>(vector.shape(0));
+}
+
 // A job together with the arrays that it points into.
 struct BoundJob : Job {
     nb::object arrays;
@@ -27,8 +34,10 @@ struct BoundRecording : Recording {
 };
 
 void bind_pulse(nb::module_& module);
+void bind_recording(nb::module_& module);
+void bind_job(nb::module_& module);
 void bind_exact(nb::module_& module);
-void bind_device(nb::module_& module);
+void bind_exact_device(nb::module_& module);
 void bind_mars_device(nb::module_& module);
 void bind_feedback_device(nb::module_& module);
 void bind_waveform(nb::module_& module);

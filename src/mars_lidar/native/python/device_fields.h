@@ -1,11 +1,11 @@
-// What hosts of kernels share: arguments from arrays and numbers by name, and a launch as a loop on the processor.
+// What the tasks of kernels on a GPU are made of: addresses of device arrays and numbers by name, and arrays to be copied to
+// the device.
 #pragma once
 #include <algorithm>
-#include <cstring>
+#include <cstdint>
 #include <string>
 #include <vector>
 
-#include "cuda/device.h"
 #include "python/bindings.h"
 
 namespace mars {
@@ -33,14 +33,6 @@ nb::bytes as_bytes(const Task& task) {
     return nb::bytes(reinterpret_cast<const char*>(&task), sizeof task);
 }
 
-template <class Task>
-Task argument_of(const nb::bytes& told) {
-    if (told.size() != sizeof(Task)) throw nb::value_error("argument must be that of the kernel");
-    Task task;
-    std::memcpy(&task, told.c_str(), sizeof task);
-    return task;
-}
-
 template <class T>
 nb::object copied(const std::vector<T>& from) {
     T* data = new T[from.size()];
@@ -48,29 +40,5 @@ nb::object copied(const std::vector<T>& from) {
     nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
     return nb::cast(nb::ndarray<nb::numpy, T, nb::ndim<1>>(data, {from.size()}, owner));
 }
-
-inline namespace MARS_LEVEL {
-
-// Blocks one after another, `at_once` threads of each; the blocks' memory holds anything when one begins.
-struct HostLaunch {
-    int64_t blocks;
-    int32_t lanes;
-    int64_t shared;
-
-    template <class Kernel, class Task>
-    void operator()(const Kernel& kernel, const Task& task, int32_t at_once) const {
-        std::vector<uint64_t> memory(static_cast<size_t>(shared / 8 + 16));
-        uint8_t* const begin = reinterpret_cast<uint8_t*>((reinterpret_cast<uintptr_t>(memory.data()) + 63) / 64 * 64);
-        for (int64_t block = 0; block < blocks; ++block) {
-            std::fill(memory.begin(), memory.end(), 0xdeadbeefdeadbeefu);
-            for (int32_t lane = 0; lane < at_once; ++lane) {
-                host_device = {{block * lanes + lane, lane, lanes}, begin};
-                kernel(task);
-            }
-        }
-    }
-};
-
-}  // namespace MARS_LEVEL
 
 }  // namespace mars

@@ -7,9 +7,10 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
-#include "base/parallel.h"
+#include "lanes/levels.h"
 #include "laws/exposure_kernel.h"
 #include "python/bindings.h"
+#include "python/watched.h"
 
 namespace mars {
 
@@ -28,34 +29,21 @@ struct Level {
     void (*characteristic)(const CharacteristicBlock&);
 };
 
-#define MARS_EXPOSURE_LEVEL(level, lanes) \
-    {#level,                              \
-     lanes,                               \
-     exposure_moments_##level,            \
-     exposure_phases_##level,             \
-     exposure_stationary_##level,         \
-     exposure_characteristic_##level}
-
 // Widest first.
 std::vector<Level> levels() {
     std::vector<Level> found;
-#if defined(MARS_HAS_avx512)
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
-        __builtin_cpu_supports("avx512vl"))
-        found.push_back(MARS_EXPOSURE_LEVEL(avx512, 8));
-#endif
-#if defined(MARS_HAS_avx2)
-    if (__builtin_cpu_supports("avx2")) found.push_back(MARS_EXPOSURE_LEVEL(avx2, 4));
-#endif
-#if defined(MARS_HAS_vector128)
-    found.push_back(MARS_EXPOSURE_LEVEL(vector128, 2));
-#endif
-    found.push_back(MARS_EXPOSURE_LEVEL(scalar, 1));
+#define MARS_ADD_LEVEL(level, runs)                                                                   \
+    if (runs)                                                                                         \
+        found.push_back({#level, kDoubles_##level, exposure_moments_##level, exposure_phases_##level, \
+                         exposure_stationary_##level, exposure_characteristic_##level});
+    MARS_EACH_LEVEL(MARS_ADD_LEVEL)
+#undef MARS_ADD_LEVEL
     return found;
 }
 
 // The widest level, or the one named, whose batches do not remember more than kBatchBytes and whose lanes are filled by
-// `jobs`: a lane without work costs as much as another. Scalar if none.
+// `jobs`: a lane without work costs as much as another. The narrowest if
+// none.
 Level level_for(const std::string& name, int64_t bytes_per_lane, int64_t jobs) {
     Level chosen{};
     for (const Level& level : levels()) {
@@ -129,7 +117,7 @@ void run_moments(const ExposureGrid& grid, const ExposureFlux* flux, const Expos
     if (static_cast<int64_t>(settled.shape(0)) != entries) throw nb::value_error("settled has the wrong shape");
     const Level level = level_for(level_name, bytes_per_lane(grid, kExposureOrders + 1), entries);
     const int64_t batches = (entries + level.lanes - 1) / level.lanes;
-    run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
+    run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
         MomentsBlock block{&grid,
                            flux,
@@ -184,7 +172,7 @@ void phases(const ExposureGrid& grid, Vector<const double> signal, Vector<const 
     std::vector<double> rates(cells * kExposureOrders), histogram(cells * grid.out_bins), rate(cells * grid.out_bins);
     const Level level = level_for(level_name, 2 * bytes_per_lane(grid, kExposureOrders + 1), flux.entries);
     const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
-    run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
+    run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
         const MomentsBlock forward{&grid,
                                    &flux,
@@ -211,7 +199,7 @@ void stationary(const ExposureGrid& grid, Vector<const double> signal, Vector<co
     if (static_cast<int64_t>(settled.shape(0)) != flux.entries) throw nb::value_error("settled has the wrong shape");
     const Level level = level_for(level_name, 0, flux.entries);
     const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
-    run_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
+    run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
         const int64_t first = batch * level.lanes;
         level.stationary({&grid, &flux, first, std::min<int64_t>(level.lanes, flux.entries - first), histogram.data(),
                           settled.data(), &stop});
@@ -230,7 +218,7 @@ void run_characteristic(const ExposureGrid& grid, const ExposureFlux* flux, cons
     expect("settled", settled, entries, points);
     const Level level = level_for(level_name, bytes_per_lane(grid, 2), points);
     const int64_t batches = (points + level.lanes - 1) / level.lanes;
-    run_chunks(entries * batches, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+    run_watched_chunks(entries * batches, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
         const int64_t entry = chunk / batches, first = chunk % batches * level.lanes, at = entry * points + first;
         level.characteristic({&grid, flux, entry, std::min<int64_t>(level.lanes, points - first), tilted,
                               z_re.data() + at, z_im.data() + at, re.data() + at, im.data() + at, settled.data() + at,

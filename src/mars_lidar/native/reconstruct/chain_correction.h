@@ -12,7 +12,8 @@ class ChainCorrection {
     ChainCorrection(const HistogramRecord& recording, int steps, double tolerance)
         : r_(recording), steps_(steps), tolerance_(tolerance), rearmed_(recording.bins), armed_(recording.bins) {}
 
-    // Rates `l` (bins) of a histogram, of `total` > 0 photons per period in all. Returns whether the steps came to rest.
+    // Rates `l` (bins) of a histogram, of `total` > 0 photons per period in all. Returns whether the steps came to
+    // rest.
     bool operator()(const ArmedPasses& passes, double total, std::vector<double>& l) {
         const int64_t n = r_.bins;
         l.assign(n, 0.0);

@@ -1,14 +1,10 @@
-// The sequential engine, this project's gold standard: every arrival of the exposure is drawn and sorted, and
-// a dead-time filter passes over them photon by photon.
-//
-// It is what the MaRS paper (arXiv 2512.04924) measures simulators against. Slow where the flux is bright, by
-// its nature; otherwise as fast as we know how. Written apart from the exact engine, see arrivals.h.
+// The sequential engine's loops: one item after the other, each from its own random numbers, for every mode of the detector;
+// warmed-up pixels live through some 300 dead times before the exposure.
+#include "sequential/engine.h"
+
 #include <stdexcept>
 
-#include "base/parallel.h"
-#include "instrument/pulse_table.h"  // nanobind wants the complete type; only the shape inside is used
-#include "python/bindings.h"
-#include "python/histogram_output.h"
+#include "base/full.h"
 #include "sequential/events.h"
 #include "sequential/pixel.h"
 #include "sequential/recorder.h"
@@ -113,7 +109,7 @@ class Simulator {
 
 // Calls work(simulator, item, stop) for all items, in chunks of about equal work.
 template <template <class> class Simulation, class Pixel, class Work>
-void for_pixels(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress, const Work& work) {
+void for_pixels(const Job& job, const PulseShape& pulse, int threads, const Watch& watch, const Work& work) {
     double photons = 0.0;
     const int64_t looks = std::min<int64_t>(job.pixels, 64);  // a sample of the image will do
     for (int64_t k = 0; k < looks; ++k) photons += Arrivals(job, pulse, k * job.pixels / looks).photons_per_period();
@@ -122,7 +118,7 @@ void for_pixels(const Job& job, const PulseShape& pulse, int threads, const nb::
                              ? job.pixels  // an image at a time, since its pixels influence each other
                              : std::max<int64_t>(1, static_cast<int64_t>(std::min(kChunkPhotons / per_item, 4096.0)));
     const int64_t items = job.items();
-    run_chunks((items + size - 1) / size, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+    run_chunks((items + size - 1) / size, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {
         Simulation<Pixel> simulator(job, pulse, stop);
         for (int64_t item = chunk * size; item < std::min(items, (chunk + 1) * size) && !stop; ++item)
             work(simulator, item, stop);
@@ -130,34 +126,33 @@ void for_pixels(const Job& job, const PulseShape& pulse, int threads, const nb::
 }
 
 template <template <class> class Simulation, class Work>
-void for_modes(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress, const Work& work) {
+void for_modes(const Job& job, const PulseShape& pulse, int threads, const Watch& watch, const Work& work) {
     switch (job.mode) {
         case DetectorMode::kNonparalyzable:
-            return for_pixels<Simulation, FreePixel>(job, pulse, threads, progress, work);
+            return for_pixels<Simulation, FreePixel>(job, pulse, threads, watch, work);
         case DetectorMode::kParalyzable:
-            return for_pixels<Simulation, ParalyzablePixel>(job, pulse, threads, progress, work);
+            return for_pixels<Simulation, ParalyzablePixel>(job, pulse, threads, watch, work);
         case DetectorMode::kSynchronous:
-            return for_pixels<Simulation, SynchronousPixel>(job, pulse, threads, progress, work);
+            return for_pixels<Simulation, SynchronousPixel>(job, pulse, threads, watch, work);
         case DetectorMode::kGated:
-            return for_pixels<Simulation, GatedPixel>(job, pulse, threads, progress, work);
+            return for_pixels<Simulation, GatedPixel>(job, pulse, threads, watch, work);
     }
 }
 
 template <class Work>
-void for_items(const Job& job, const PulseShape& pulse, int threads, const nb::object& progress, const Work& work) {
-    job.avalanches_matter() ? for_modes<EventSimulator>(job, pulse, threads, progress, work)
-                            : for_modes<Simulator>(job, pulse, threads, progress, work);
+void for_items(const Job& job, const PulseShape& pulse, int threads, const Watch& watch, const Work& work) {
+    job.avalanches_matter() ? for_modes<EventSimulator>(job, pulse, threads, watch, work)
+                            : for_modes<Simulator>(job, pulse, threads, watch, work);
 }
 
 inline int32_t bin_of(double phase, int32_t bins) { return std::min(static_cast<int32_t>(phase * bins), bins - 1); }
 
+}  // namespace
+
 template <class Count>
-void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, int threads,
-               const nb::object& progress) {
-    check_histogram(job, out);
-    Count* const cube = out.data();
-    for_items(job, shape_of(pulse), threads, progress, [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
-        Count* const row = cube + item * job.bins;
+void sequential_histogram(const Job& job, const PulseShape& pulse, Count* out, int threads, const Watch& watch) {
+    for_items(job, pulse, threads, watch, [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
+        Count* const row = out + item * job.bins;
         std::fill_n(row, job.bins, Count{0});
         simulator.run(item, [&](int64_t, double phase) {
             Count& count = row[bin_of(phase, job.bins)];
@@ -165,54 +160,31 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
         });
     });
 }
+template void sequential_histogram(const Job&, const PulseShape&, uint16_t*, int, const Watch&);
+template void sequential_histogram(const Job&, const PulseShape&, uint32_t*, int, const Watch&);
 
-void counts(const BoundJob& job, const PulseTable& pulse, Vector<int64_t> out, int threads,
-            const nb::object& progress) {
-    if (static_cast<int64_t>(out.shape(0)) != job.items()) throw nb::value_error("out must have one count per item");
-    int64_t* const total = out.data();
-    for_items(job, shape_of(pulse), threads, progress, [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
+void sequential_counts(const Job& job, const PulseShape& pulse, int64_t* out, int threads, const Watch& watch) {
+    for_items(job, pulse, threads, watch, [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
         int64_t count = 0;
         simulator.run(item, [&](int64_t, double) { ++count; });
-        total[item] = count;
+        out[item] = count;
     });
 }
 
-void timestamps(const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> offsets, Vector<double> times_ns,
-                Vector<int32_t> cycle, Vector<int32_t> bin, double period_ns, int threads, const nb::object& progress) {
-    const int64_t* const offset = offsets.data();
-    const size_t total = offsets.shape(0) == 0 ? 0 : static_cast<size_t>(offset[offsets.shape(0) - 1]);
-    if (static_cast<int64_t>(offsets.shape(0)) != job.items() + 1 || times_ns.shape(0) != total ||
-        cycle.shape(0) != total || bin.shape(0) != total)
-        throw nb::value_error("offsets must have items + 1 values, and the other arrays offsets[-1]");
-    for_items(job, shape_of(pulse), threads, progress,
-              [&](auto& simulator, int64_t item, const std::atomic<bool>& stop) {
-                  int64_t k = offset[item];
-                  const int64_t end = offset[item + 1];
-                  simulator.run(item, [&](int64_t c, double phase) {
-                      if (k == end) throw std::invalid_argument("offsets are not those of this job's counts");
-                      times_ns.data()[k] = (static_cast<double>(c) + phase) * period_ns;
-                      cycle.data()[k] = static_cast<int32_t>(c);
-                      bin.data()[k] = bin_of(phase, job.bins);
-                      ++k;
-                  });
-                  if (k != end && !stop) throw std::invalid_argument("offsets are not those of this job's counts");
-              });
-}
-
-}  // namespace
-
-void bind_sequential(nb::module_& module) {
-    const char* about = "Histograms out (realizations * pixels, bins) by the sequential engine.";
-    module.def("sequential_histogram", &histogram<uint16_t>, nb::arg("job"), nb::arg("pulse"),
-               nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("progress").none(), about);
-    module.def("sequential_histogram", &histogram<uint32_t>, nb::arg("job"), nb::arg("pulse"),
-               nb::arg("out").noconvert(), nb::arg("threads"), nb::arg("progress").none(), about);
-    module.def("sequential_counts", &counts, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("threads"), nb::arg("progress").none(), "Registrations out (items) by the sequential engine.");
-    module.def("sequential_timestamps", &timestamps, nb::arg("job"), nb::arg("pulse"), nb::arg("offsets").noconvert(),
-               nb::arg("times_ns").noconvert(), nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(),
-               nb::arg("period_ns"), nb::arg("threads"), nb::arg("progress").none(),
-               "Registrations item after item, item i in [offsets[i], offsets[i + 1]): the draws of the histogram.");
+void sequential_timestamps(const Job& job, const PulseShape& pulse, const SequentialTimes& to, int threads,
+                           const Watch& watch) {
+    for_items(job, pulse, threads, watch, [&](auto& simulator, int64_t item, const std::atomic<bool>& stop) {
+        int64_t k = to.offsets[item];
+        const int64_t end = to.offsets[item + 1];
+        simulator.run(item, [&](int64_t c, double phase) {
+            if (k == end) throw std::invalid_argument("offsets are not those of this job's counts");
+            to.times_ns[k] = (static_cast<double>(c) + phase) * to.period_ns;
+            to.cycle[k] = static_cast<int32_t>(c);
+            to.bin[k] = bin_of(phase, job.bins);
+            ++k;
+        });
+        if (k != end && !stop) throw std::invalid_argument("offsets are not those of this job's counts");
+    });
 }
 
 }  // namespace mars

@@ -1,4 +1,8 @@
-// From one time to the next arrival at a pixel with a waveform, one pixel per lane.
+// From one time to the next arrival at a pixel with a waveform, one pixel per lane: C^-1(C(from) + E), E
+// exponential, C the integrated rate in the pixel's own table (waveform/table.h).
+//
+// A time is a period, a part of the waveform and a place in it. Waits are drawn in double precision, because what
+// lies beyond their whole periods has to be right to 2^-31 of a period's energy (docs/theory_exact.md).
 #pragma once
 #include "base/standard.h"
 #include "exact/registration.h"
@@ -67,7 +71,8 @@ struct WaveRates {
     double total[kLanes], inverse[kLanes];
 };
 
-// `cell`, of which 16 bits are left, continued by a random word: a number in the cell, as in `split_wait` of registration.h.
+// `cell`, of which 16 bits are left, continued by a random word: a number in the cell, as in `split_wait` of
+// registration.h.
 MARS_INLINE double continued(float cell, uint32_t word) {
     return bits_double(double_bits(static_cast<double>(cell)) | static_cast<uint64_t>(word) << 5 | 16u);
 }

@@ -1,4 +1,5 @@
-// The kernels of waveforms for detectors whose avalanches leave something behind, for every mode.
+// The kernels of the exact engine for waveforms and detectors whose avalanches leave something behind: afterpulses
+// and twilight pulses. For every mode of the detector.
 #include "waveform/runner.h"
 
 namespace mars {

@@ -1,4 +1,5 @@
-// The kernels of waveforms: every mode of the detector, every registration recorded as it is.
+// The kernels of the exact engine for waveforms that record every registration as it is, for every mode of the
+// detector.
 #include "waveform/runner.h"
 
 namespace mars {

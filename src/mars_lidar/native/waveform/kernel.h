@@ -1,5 +1,6 @@
-// The exact engine's inner loop for waveforms, one function per vector level (waveform/runner.h is compiled once for
-// each), and others with a recorder and with traps.
+// The exact engine's inner loop for waveforms, as the host calls it: for each vector level a kernel that records
+// every registration as it is, one with a recorder, and one with traps (waveform/kernel.cpp and its two neighbours
+// are compiled once for each level).
 #pragma once
 #include <atomic>
 #include <cstdint>

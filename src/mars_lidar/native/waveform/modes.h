@@ -1,4 +1,5 @@
-// The modes of a detector for waveforms: detector_modes.h says what they do. Times are those of waveform/arrival.h.
+// The modes of a detector for waveforms: which arrivals are registered, and from when on the next one matters. The
+// rules are those of exact/detector_modes.h (docs/detectors.md), the times those of waveform/arrival.h.
 #pragma once
 #include "instrument/job.h"
 #include "waveform/arrival.h"

@@ -1,4 +1,6 @@
-// How the recorder sees the times of waveform/runner.h.
+// The times of the exact engine for waveforms, as the recorder and the traps handle them: periods, parts of the
+// waveform and the place in a part; what is recorded in double precision, lane by lane. exact/recorder_clock.h is
+// the same for pulses.
 #pragma once
 #include <algorithm>
 

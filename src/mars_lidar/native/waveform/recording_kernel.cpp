@@ -1,4 +1,5 @@
-// The kernels of waveforms with a recorder between registrations and log (recorder.h), for every mode of the detector.
+// The kernels of the exact engine for waveforms with a recorder between registrations and log (exact/recorder.h),
+// for every mode of the detector.
 #include "waveform/runner.h"
 
 namespace mars {

@@ -1,6 +1,7 @@
 // The inner loop of waveforms. As in exact/runner.h lanes work on different items and a lane whose exposure has ended
-// takes the next one, and registrations are logged before they are counted; but here every pixel has a table of its own,
-// which its realizations share (waveform/feed.h). Compiled once more with a recorder between registrations and log.
+// takes the next one, and registrations are logged before they are counted; but here every pixel has a table of its
+// own, which its realizations share (waveform/feed.h). Compiled once more with a recorder between registrations and
+// log.
 #pragma once
 #include <cstring>
 #include <type_traits>
@@ -10,9 +11,6 @@
 #include "waveform/feed.h"
 #include "waveform/modes.h"
 #include "waveform/recorder_clock.h"
-
-#define MARS_JOIN2(a, b) a##b
-#define MARS_JOIN(a, b) MARS_JOIN2(a, b)
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -76,8 +74,8 @@ class WaveRunner {
         return draw_wave(rates_, key0_, key1_, event_ + static_cast<uint32_t>(k));
     }
 
-    // A function of its own: in the loop over a round compilers keep several steps' numbers in too few registers, which costs
-    // a quarter of the time where there are 16 of them.
+    // A function of its own: in the loop over a round compilers keep several steps' numbers in too few registers, which
+    // costs a quarter of the time where there are 16 of them.
     MARS_NOINLINE void draw_and_step(int k) { step(draw(k), k); }
 
     MARS_INLINE void step(const WaveWait& wait, int k) {

@@ -1,4 +1,5 @@
-// What a pixel with a waveform that has been running for long is doing at the start of the exposure.
+// The state at the start of the exposure of a pixel with a waveform that has been running for long: when it re-arms,
+// drawn from its own stationary law, or photon by photon where few arrive in a dead time.
 #pragma once
 #include <algorithm>
 #include <cmath>

@@ -1,0 +1,31 @@
+// The feedback engine: histograms of all exposures of a pixel at once, by sweeps round the laser period until integers agree
+// with themselves, at a cost that does not grow with the exposure (docs/feedback.md).
+#pragma once
+#include <cstdint>
+#include <string>
+
+#include "base/parallel.h"
+#include "feedback/kernel.h"
+#include "instrument/job.h"
+
+namespace mars {
+
+struct PulseTable;
+
+// Which pixels of a job are drawn, and on which internal grid.
+struct FeedbackCall {
+    const int64_t* pixels;  // (number) of the job
+    int64_t number;
+    FeedbackStatus* status;  // (realizations, number): what became of each
+    int32_t merge, parts;    // base cells of a bin; parts of a narrow one
+    const uint8_t* narrow;   // (bins * merge): base cells that are cut again
+    int32_t laps;            // periods of a piece
+};
+
+// Histograms out (items, bins), of the pixels and realizations whose status is kDrawn; the other rows are left alone.
+// std::overflow_error where a count does not fit. For uint16_t and uint32_t.
+template <class Count>
+void feedback_histogram(const Job& job, const PulseTable& pulse, Count* out, const FeedbackCall& call, int threads,
+                        const std::string& level, const Watch& watch);
+
+}  // namespace mars

@@ -1,0 +1,124 @@
+// Bindings of the record of a histogram, of corrected rates and of the estimates from their windows; reconstruct/corrector.h
+// has the loops over a pixel.
+#include "reconstruct/corrector.h"
+
+#include <optional>
+
+#include <nanobind/stl/optional.h>
+
+#include "python/bindings.h"
+#include "python/watched.h"
+
+namespace mars {
+namespace {
+
+constexpr int64_t kChunk = 64;  // pixels
+
+CorrectionSettings settings_of(int correction, int steps, double tolerance,
+                               const std::optional<Vector<const double>>& total, size_t pixels) {
+    if (total && total->shape(0) != pixels) throw nb::value_error("total must be (pixels)");
+    return {static_cast<Correction>(correction), steps, tolerance, total ? total->data() : nullptr};
+}
+
+template <class Count>
+void rates(const HistogramRecord& recording, Matrix<const Count> histogram, int correction, int steps, double tolerance,
+           std::optional<Vector<const double>> total, Matrix<double> out, Vector<uint8_t> flags, int threads) {
+    const size_t pixels = histogram.shape(0), bins = static_cast<size_t>(recording.bins);
+    if (histogram.shape(1) != bins || out.shape(0) != pixels || out.shape(1) != bins || flags.shape(0) != pixels)
+        throw nb::value_error("histogram and out must be (pixels, bins), flags (pixels)");
+    const CorrectionSettings settings = settings_of(correction, steps, tolerance, total, pixels);
+    const int64_t count = static_cast<int64_t>(pixels);
+    run_watched_chunks((count + kChunk - 1) / kChunk, threads, nb::none(),
+                       [&](int64_t chunk, const std::atomic<bool>& stop) {
+                           Corrector correct(recording, settings);
+                           for (int64_t p = chunk * kChunk; p < std::min(count, (chunk + 1) * kChunk); ++p) {
+                               if (stop) return;
+                               flags.data()[p] = correct(histogram.data() + p * recording.bins, p, false);
+                               std::copy(correct.rate.begin(), correct.rate.end(), out.data() + p * recording.bins);
+                           }
+                       });
+}
+
+template <class Count>
+void windows(const HistogramRecord& recording, Matrix<const Count> histogram, int correction, int locator, int steps,
+             double tolerance, std::optional<Vector<const double>> total, Matrix<double> out, Vector<uint8_t> flags,
+             int threads, nb::object progress) {
+    const size_t pixels = histogram.shape(0);
+    if (histogram.shape(1) != static_cast<size_t>(recording.bins) || out.shape(0) != pixels ||
+        out.shape(1) != kWindowColumns || flags.shape(0) != pixels)
+        throw nb::value_error("histogram must be (pixels, bins), out (pixels, 5), flags (pixels)");
+    const CorrectionSettings settings = settings_of(correction, steps, tolerance, total, pixels);
+    const int64_t count = static_cast<int64_t>(pixels);
+    run_watched_chunks(
+        (count + kChunk - 1) / kChunk, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+            Corrector correct(recording, settings);
+            WindowEstimate estimate(recording, static_cast<Locator>(locator));
+            for (int64_t p = chunk * kChunk; p < std::min(count, (chunk + 1) * kChunk); ++p) {
+                if (stop) return;
+                flags.data()[p] =
+                    estimate_window(correct, estimate, settings.correction == Correction::kPasses,
+                                    histogram.data() + p * recording.bins, p, out.data() + p * kWindowColumns);
+            }
+        });
+}
+
+std::vector<double> values_of(const Vector<const double>& values) {
+    return {values.data(), values.data() + values.shape(0)};
+}
+
+}  // namespace
+
+void bind_corrected_rates(nb::module_& module) {
+    nb::class_<HistogramRecord>(module, "HistogramRecord", "How histograms were recorded; times in laser periods.")
+        .def(
+            "__init__",
+            [](HistogramRecord* self, int64_t bins, int64_t cycles, int64_t whole, int64_t shift, double fraction,
+               bool stationary, bool synchronous, double pulse_low, double pulse_cell, Vector<const double> energy,
+               Vector<const double> slope, double peak, double width, double core_low, double core_high,
+               Vector<const double> open_low, Vector<const double> open_high) {
+                const size_t parts = open_low.shape(0);
+                if (energy.shape(0) < 2 || slope.shape(0) != energy.shape(0))
+                    throw nb::value_error("energy and slope must be (cells + 1)");
+                if (open_high.shape(0) != parts || (parts > 0 && static_cast<int64_t>(parts) != bins))
+                    throw nb::value_error("open_low and open_high must be (bins) or empty");
+                if (bins < 1 || cycles < 1 || whole < 0 || shift < 0 || shift >= bins)
+                    throw nb::value_error("bins, cycles, whole or shift out of range");
+                new (self) HistogramRecord();
+                self->bins = bins;
+                self->cycles = cycles;
+                self->whole = whole;
+                self->shift = shift;
+                self->fraction = fraction;
+                self->stationary = stationary;
+                self->synchronous = synchronous;
+                self->peak = peak;
+                self->width = width;
+                self->core_low = core_low;
+                self->core_high = core_high;
+                self->pulse = {pulse_low, pulse_cell, values_of(energy), values_of(slope)};
+                self->low = values_of(open_low);
+                self->high = values_of(open_high);
+                for (size_t j = 0; j < parts; ++j)
+                    self->open.push_back((self->high[j] - self->low[j]) * static_cast<double>(bins));
+            },
+            nb::kw_only(), nb::arg("bins"), nb::arg("cycles"), nb::arg("whole"), nb::arg("shift"), nb::arg("fraction"),
+            nb::arg("stationary"), nb::arg("synchronous"), nb::arg("pulse_low"), nb::arg("pulse_cell"),
+            nb::arg("energy"), nb::arg("slope"), nb::arg("peak"), nb::arg("width"), nb::arg("core_low"),
+            nb::arg("core_high"), nb::arg("open_low"), nb::arg("open_high"));
+    auto add = [&](auto* rate_function, auto* window_function) {
+        module.def("corrected_rates", rate_function, nb::arg("recording"), nb::arg("histogram").noconvert(),
+                   nb::kw_only(), nb::arg("correction"), nb::arg("steps"), nb::arg("tolerance"),
+                   nb::arg("total").none(), nb::arg("out").noconvert(), nb::arg("flags").noconvert(),
+                   nb::arg("threads"), "Photons per period of each bin: out (pixels, bins).");
+        module.def("window_estimates", window_function, nb::arg("recording"), nb::arg("histogram").noconvert(),
+                   nb::kw_only(), nb::arg("correction"), nb::arg("locator"), nb::arg("steps"), nb::arg("tolerance"),
+                   nb::arg("total").none(), nb::arg("out").noconvert(), nb::arg("flags").noconvert(),
+                   nb::arg("threads"), nb::arg("progress").none(),
+                   "Signal, background, delay and errors of the first two: out (pixels, 5).");
+    };
+    add(&rates<uint16_t>, &windows<uint16_t>);
+    add(&rates<uint32_t>, &windows<uint32_t>);
+    add(&rates<double>, &windows<double>);
+}
+
+}  // namespace mars

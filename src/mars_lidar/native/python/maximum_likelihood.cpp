@@ -1,0 +1,71 @@
+// Bindings of the maximum-likelihood estimator and of its likelihood; reconstruct/maximizer.h has the loops over a pixel.
+#include "reconstruct/maximizer.h"
+
+#include "python/bindings.h"
+#include "python/watched.h"
+
+namespace mars {
+namespace {
+
+constexpr int64_t kChunk = 64;  // pixels
+template <class Count>
+void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> histogram, int starts, double least_gain,
+                        bool less_bias, Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
+    const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
+    if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
+        throw nb::value_error("histogram must be (pixels, bins)");
+    if (out.shape(0) != histogram.shape(0) || out.shape(1) != kMaximumColumns || flags.shape(0) != histogram.shape(0))
+        throw nb::value_error("out must be (pixels, 8), flags (pixels)");
+    const ReconstructionJob job{starts, least_gain, less_bias};
+    run_watched_chunks(
+        (pixels + kChunk - 1) / kChunk, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
+            Maximizer<Count> maximizer(recording, job);
+            for (int64_t p = chunk * kChunk; p < std::min(pixels, (chunk + 1) * kChunk); ++p) {
+                if (stop) return;
+                maximizer(histogram.data() + p * recording.bins, out.data() + p * kMaximumColumns, flags.data() + p);
+            }
+        });
+}
+
+void log_likelihood(const HistogramRecord& recording, Vector<const double> histogram, Matrix<const double> at,
+                    Matrix<double> out, bool whole) {
+    if (static_cast<int64_t>(histogram.shape(0)) != recording.bins || at.shape(1) != 3 || out.shape(1) != 13 ||
+        out.shape(0) != at.shape(0))
+        throw nb::value_error("histogram must be (bins), at (points, 3), out (points, 13)");
+    ArmedPasses passes(recording.bins);
+    passes.set(recording, histogram.data());
+    PixelLikelihood pixel(recording, passes);
+    ExposureEnds ends;
+    BackgroundSeries series;
+    for (size_t k = 0; k < at.shape(0); ++k) {
+        const double* x = at.data() + 3 * k;
+        ends.set(recording, passes, x[2]);
+        pixel.expect(x[1], series);
+        const Likelihood found = pixel(x[0], x[1], x[2], ends, whole);
+        double* to = out.data() + 13 * k;
+        *to++ = found.value;
+        for (int a = 0; a < 3; ++a) *to++ = found.gradient[a];
+        for (int a = 0; a < 3; ++a)
+            for (int b = 0; b < 3; ++b) *to++ = found.information[a][b] - found.hidden[a][b];
+    }
+}
+
+}  // namespace
+
+void bind_maximum_likelihood(nb::module_& module) {
+    constexpr const char* kText = "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).";
+    auto add = [&](auto* function) {
+        module.def("maximum_likelihood", function, nb::arg("recording"), nb::arg("histogram").noconvert(),
+                   nb::kw_only(), nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"),
+                   nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"),
+                   nb::arg("progress").none(), kText);
+    };
+    add(&maximum_likelihood<uint16_t>);
+    add(&maximum_likelihood<uint32_t>);
+    add(&maximum_likelihood<double>);
+    module.def("histogram_log_likelihood", &log_likelihood, nb::arg("recording"), nb::arg("histogram"), nb::arg("at"),
+               nb::arg("out").noconvert(), nb::arg("whole") = true,
+               "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");
+}
+
+}  // namespace mars

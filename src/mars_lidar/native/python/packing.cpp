@@ -1,0 +1,58 @@
+// Bindings of packed counts; storage/packing.h has the format.
+#include "storage/packing.h"
+
+#include "python/bindings.h"
+
+namespace mars {
+namespace {
+
+template <class Count>
+nb::bytes pack(Vector<const Count> counts) {
+    const size_t size = counts.shape(0);
+    if (size > UINT32_MAX) throw nb::value_error("a chunk must have fewer than 2**32 counts");
+    static thread_local std::vector<uint8_t> out;  // kept: fresh pages would cost as much as the packing
+    size_t used = 0;
+    {
+        const nb::gil_scoped_release release;
+        used = pack_counts(counts.data(), size, out);
+    }
+    return nb::bytes(out.data(), used);
+}
+
+template <class Count>
+void unpack(Vector<const uint8_t> packed, Vector<Count> out) {
+    const nb::gil_scoped_release release;
+    const Packed source(packed.data(), packed.shape(0));
+    if (source.size != out.shape(0)) throw std::invalid_argument("packed counts are of another size than their chunk");
+    unpack_counts(source, out.data());
+}
+
+uint64_t events_of(Vector<const uint8_t> packed) { return Packed(packed.data(), packed.shape(0)).events; }
+
+void unpack_events(Vector<const uint8_t> packed, Vector<int64_t> position, Vector<uint32_t> count) {
+    const nb::gil_scoped_release release;
+    const Packed source(packed.data(), packed.shape(0));
+    if (position.shape(0) != source.events || count.shape(0) != source.events)
+        throw std::invalid_argument("position and count must have one element per event");
+    int64_t* const where = position.data();
+    uint32_t* const number = count.data();
+    source.for_each([&](uint64_t k, uint64_t at, uint32_t more) {
+        where[k] = static_cast<int64_t>(at);
+        number[k] = more + 1;
+    });
+}
+
+}  // namespace
+
+void bind_packing(nb::module_& module) {
+    module.def("pack_counts", &pack<uint16_t>, nb::arg("counts").noconvert(), "Packed counts (n,).");
+    module.def("pack_counts", &pack<uint32_t>, nb::arg("counts").noconvert());
+    module.def("unpack_counts", &unpack<uint16_t>, nb::arg("packed"), nb::arg("out").noconvert(),
+               "Fill `out` (n,) with what `pack_counts` packed.");
+    module.def("unpack_counts", &unpack<uint32_t>, nb::arg("packed"), nb::arg("out").noconvert());
+    module.def("packed_events", &events_of, nb::arg("packed"), "Elements that are not zero.");
+    module.def("unpack_events", &unpack_events, nb::arg("packed"), nb::arg("position").noconvert(),
+               nb::arg("count").noconvert(), "Fill position and count (events,) of the elements that are not zero.");
+}
+
+}  // namespace mars

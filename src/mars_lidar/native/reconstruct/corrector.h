@@ -1,0 +1,97 @@
+// Rates behind a histogram, by each correction: none, the passes in which the pixel was armed (docs/reconstruction.md, section
+// 1), and the Markov chain (section 4); and the estimates from their windows (section 5).
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "reconstruct/chain_correction.h"
+#include "reconstruct/pixel_flags.h"
+#include "reconstruct/window_estimate.h"
+
+namespace mars {
+
+enum class Correction : int32_t { kNone, kPasses, kChain };
+
+struct CorrectionSettings {
+    Correction correction;
+    int steps;
+    double tolerance;
+    const double* total;  // (pixels) photons per period, or null
+};
+
+// Rates of one histogram after another.
+class Corrector {
+ public:
+    Corrector(const HistogramRecord& recording, const CorrectionSettings& settings)
+        : r_(recording),
+          settings_(settings),
+          passes_(recording.bins),
+          chain_(recording, settings.steps, settings.tolerance) {}
+
+    std::vector<double> rate, variance;
+
+    // `finite`: no rate is infinite.
+    template <class Count>
+    uint8_t operator()(const Count* histogram, int64_t pixel, bool finite) {
+        passes_.set(r_, histogram);
+        rate.resize(r_.bins);
+        variance.assign(r_.bins, 0.0);
+        std::fill(rate.begin(), rate.end(), 0.0);
+        uint8_t flag = passes_.total > 0.0 ? 0 : kEmpty;
+        if (settings_.correction == Correction::kChain) {
+            double total = settings_.total ? settings_.total[pixel] : 0.0;
+            for (int64_t j = 0; j < r_.bins && !settings_.total; ++j) total += finite_rate(j, &flag);  // (R15)
+            if (total > 0.0 && !chain_(passes_, total, rate)) flag |= kUnconverged;
+            return flag;
+        }
+        for (int64_t j = 0; j < r_.bins; ++j) {
+            const double h = passes_.count[j];
+            if (settings_.correction == Correction::kNone) {
+                rate[j] = h / static_cast<double>(r_.cycles);
+                continue;
+            }
+            rate[j] = finite_rate(j, &flag);
+            if (!finite && (flag & kSaturated) && !std::isfinite(corrected_rate(r_, passes_, j, h))) rate[j] = HUGE_VAL;
+            variance[j] = h > 0.0 ? rate[j] * rate[j] / h : 0.0;  // (R13)
+        }
+        return flag;
+    }
+
+ private:
+    // A bin that registered whenever it could gets the rate of half a registration less, and the pixel a flag.
+    double finite_rate(int64_t j, uint8_t* flag) const {
+        const double h = passes_.count[j];
+        double found = corrected_rate(r_, passes_, j, h);
+        if (std::isfinite(found)) return found;
+        *flag |= kSaturated;
+        found = corrected_rate(r_, passes_, j, h - 0.5);
+        return std::isfinite(found) ? found : 0.0;
+    }
+
+    const HistogramRecord& r_;
+    const CorrectionSettings settings_;
+    ArmedPasses passes_;
+    ChainCorrection chain_;
+};
+
+// Signal, background, delay of one pixel, and the standard errors of the first two, from its corrected rates.
+constexpr int kWindowColumns = 5;
+
+template <class Count>
+uint8_t estimate_window(Corrector& correct, WindowEstimate& estimate, bool known, const Count* histogram, int64_t pixel,
+                        double* out) {
+    const uint8_t flag = correct(histogram, pixel, true);
+    WindowResult found;
+    if (flag & kEmpty)
+        found.signal = found.background = 0.0;
+    else
+        found = estimate(correct.rate.data(), known ? correct.variance.data() : nullptr);
+    const double row[kWindowColumns] = {found.signal, found.background, found.delay, found.signal_error,
+                                        found.background_error};
+    std::copy(row, row + kWindowColumns, out);
+    return static_cast<uint8_t>(flag | (found.signal == 0.0 ? kNoSignal : 0));
+}
+
+}  // namespace mars

@@ -1,0 +1,236 @@
+// Maximum likelihood of signal, background and delay of one pixel: docs/reconstruction.md, section 3. Climbs by Fisher scoring
+// from several delays, compares with no signal at all, and takes off the first-order bias where that is asked for.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "reconstruct/delay_search.h"
+#include "reconstruct/likelihood_bias.h"
+#include "reconstruct/pixel_flags.h"
+
+namespace mars {
+
+struct ReconstructionJob {
+    int starts = 1;           // delays to begin at
+    double least_gain = 0.0;  // twice the gain of the log likelihood below which a signal counts as not seen
+    bool less_bias = false;   // take off the first-order bias of the maximum
+};
+
+constexpr int kMostSteps = 80;        // of a climb; most end within ten
+constexpr double kGain = 5e-7;        // of the log likelihood that a further step promises: 1e-3 of a standard error
+constexpr double kMostPhotons = 1e4;  // per period: a bound on S and on B
+constexpr int kMaximumColumns = 8;    // of the output: see Maximizer
+
+// Solves A x = b, A symmetric 3 x 3 and positive definite where `free`; x = 0 elsewhere. False where it is singular.
+inline bool solve(const double a[3][3], const double* b, const bool* free, double* x) {
+    double l[3][3] = {}, y[3] = {};
+    for (int i = 0; i < 3; ++i) {
+        if (!free[i]) continue;
+        for (int j = 0; j <= i; ++j) {
+            if (!free[j]) continue;
+            double sum = a[i][j];
+            for (int k = 0; k < j; ++k) sum -= l[i][k] * l[j][k];
+            if (i == j) {
+                if (!(sum > 1e-13 * a[i][i]) || !std::isfinite(sum)) return false;
+                l[i][i] = std::sqrt(sum);
+            } else {
+                l[i][j] = sum / l[j][j];
+            }
+        }
+        y[i] = b[i];
+        for (int k = 0; k < i; ++k) y[i] -= l[i][k] * y[k];
+        y[i] /= l[i][i];
+    }
+    for (int i = 2; i >= 0; --i) {
+        x[i] = 0.0;
+        if (!free[i]) continue;
+        double sum = y[i];
+        for (int k = i + 1; k < 3; ++k) sum -= l[k][i] * x[k];
+        x[i] = sum / l[i][i];
+    }
+    return true;
+}
+
+// What is known where the likelihood stands, without what the ends of the exposure hide, if that is positive definite.
+inline void known_information(const Likelihood& likelihood, const bool* free, double known[3][3]) {
+    double none[3] = {}, x[3];
+    for (int a = 0; a < 3; ++a)
+        for (int b = 0; b < 3; ++b) known[a][b] = likelihood.information[a][b] - likelihood.hidden[a][b];
+    if (!solve(known, none, free, x))
+        std::copy(&likelihood.information[0][0], &likelihood.information[0][0] + 9, &known[0][0]);
+}
+
+struct Fit {
+    double at[3] = {};
+    Likelihood likelihood;
+    bool free[3] = {};
+    bool converged = false;
+};
+
+// The bounds of a climb, and the height of the best one so far.
+struct Terrain {
+    double least;     // of B
+    double farthest;  // a step of the delay may go
+    double best = -HUGE_VAL;
+    const ExposureEnds* ends = nullptr;
+};
+
+// Fisher scoring with Levenberg's damping: a step is taken if the likelihood does not fall. S >= 0 and B >= least. A
+// climb is given up where several times the gain that its next step promises would not make it the best.
+inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_signal, const Terrain& terrain) {
+    const double least = terrain.least, farthest = terrain.farthest;
+    Fit fit;
+    std::copy(start, start + 3, fit.at);
+    fit.likelihood = pixel(fit.at[0], fit.at[1], fit.at[2], *terrain.ends);
+    double damping = 1e-3;
+    for (int step = 0; step < kMostSteps; ++step) {
+        const Likelihood& now = fit.likelihood;
+        fit.free[0] = with_signal && (fit.at[0] > 0.0 || now.gradient[0] > 0.0) &&
+                      (fit.at[0] < kMostPhotons || now.gradient[0] < 0.0);
+        fit.free[1] =
+            (fit.at[1] > least || now.gradient[1] > 0.0) && (fit.at[1] < kMostPhotons || now.gradient[1] < 0.0);
+        fit.free[2] = with_signal && fit.at[0] > 0.0 && now.information[2][2] > 0.0;
+        double move[3], known[3][3];
+        known_information(now, fit.free, known);
+        if (solve(known, now.gradient, fit.free, move)) {
+            double gain = 0.0;
+            for (int k = 0; k < 3; ++k) gain += 0.5 * move[k] * now.gradient[k];
+            if (gain < kGain) {
+                fit.converged = true;
+                return fit;
+            }
+            if (step >= 3 && now.value + 4.0 * gain + 5.0 < terrain.best) return fit;
+        }
+        bool better = false;
+        for (int trial = 0; trial < 40 && !better; ++trial, damping *= 8.0) {
+            double damped[3][3], next[3];
+            for (int a = 0; a < 3; ++a)
+                for (int b = 0; b < 3; ++b) damped[a][b] = known[a][b] * (a == b ? 1.0 + damping : 1.0);
+            if (!solve(damped, now.gradient, fit.free, move)) continue;
+            next[0] = std::clamp(fit.at[0] + move[0], 0.0, kMostPhotons);
+            next[1] = std::clamp(fit.at[1] + move[1], std::max(least, 0.05 * fit.at[1]), kMostPhotons);
+            next[2] = fit.at[2] + std::clamp(move[2], -farthest, farthest);
+            Likelihood there = pixel(next[0], next[1], next[2], *terrain.ends);
+            if (there.value >= now.value) {
+                double before = 0.0, after = 0.0;  // slopes along the step
+                for (int k = 0; k < 3; ++k) {
+                    before += now.gradient[k] * (next[k] - fit.at[k]);
+                    after += there.gradient[k] * (next[k] - fit.at[k]);
+                }
+                if (after < -0.5 * before) damping = std::max(damping, 8.0);  // far over the top: shorter from here
+                std::copy(next, next + 3, fit.at);
+                fit.likelihood = there;
+                better = true;
+            }
+        }
+        if (!better) {  // no further digit to be had
+            fit.converged = damping > 1e3;
+            return fit;
+        }
+        damping = std::max(damping / 64.0, 1e-9);
+    }
+    return fit;
+}
+
+template <class Count>
+class Maximizer {
+ public:
+    Maximizer(const HistogramRecord& recording, const ReconstructionJob& job)
+        : r_(recording), job_(job), passes_(recording.bins), search_(recording) {}
+
+    // Signal, background, delay, their standard errors, twice the gain of the log likelihood by the signal, and its
+    // value.
+    void operator()(const Count* histogram, double* out, uint8_t* flag) {
+        passes_.set(r_, histogram);
+        PixelLikelihood pixel(r_, passes_);
+        for (int k = 0; k < kMaximumColumns; ++k) out[k] = NAN;
+        *flag = 0;
+        if (!(pixel.count() > 0.0) || !(pixel.time() > 0.0)) {
+            *flag = pixel.count() > 0.0 ? kSaturated : kEmpty;
+            out[0] = out[1] = pixel.count() > 0.0 ? NAN : 0.0;
+            out[6] = 0.0;
+            return;
+        }
+        const double n = static_cast<double>(r_.bins);
+        const double least = 1e-3 * n / pixel.time();  // a thousandth of a registration
+        const double farthest = std::max(r_.width, 0.5 / n);
+        const double flat = std::clamp(n * pixel.count() / pixel.time(), least, kMostPhotons);
+
+        Start starts[DelaySearch::kMost];
+        const int found = search_(passes_, pixel, job_.starts, starts);
+        Fit best;
+        Terrain terrain{least, farthest, -HUGE_VAL, &ends_};
+        double brightest = flat;
+        for (int k = 0; k < found; ++k) brightest = std::max(brightest, starts[k].background);
+        pixel.expect(brightest, series_);
+        for (int k = 0; k < found; ++k) {
+            const double at[3] = {std::min(starts[k].signal, kMostPhotons),
+                                  std::clamp(starts[k].background, least, kMostPhotons), starts[k].delay};
+            ends_.set(r_, passes_, starts[k].delay);
+            const Fit fit = climb(pixel, at, true, terrain);
+            if (k > 0 && !(fit.likelihood.value > terrain.best)) continue;
+            best = fit;
+            terrain.best = fit.likelihood.value;
+        }
+        terrain.best = -HUGE_VAL;
+        const double dark[3] = {0.0, flat, best.at[2]};
+        ends_.set(r_, passes_, best.at[2]);
+        const Fit without = climb(pixel, dark, false, terrain);
+        const double gain = std::max(2.0 * (best.likelihood.value - without.likelihood.value), 0.0);
+        if (!best.converged) *flag |= kUnconverged;
+        if (best.at[0] >= kMostPhotons || best.at[1] >= kMostPhotons) *flag |= kSaturated;
+        if (best.at[0] == 0.0 || gain < job_.least_gain) *flag |= kNoSignal;
+        out[6] = gain;
+        out[7] = best.likelihood.value;
+        if (job_.less_bias && *flag == 0) correct(pixel, least, best);
+        for (int k = 0; k < 3; ++k) out[k] = best.at[k];
+        if (best.at[0] == 0.0) out[2] = NAN;
+        errors(best, out + 3);
+    }
+
+ private:
+    // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.
+    void correct(const PixelLikelihood& pixel, double least, Fit& fit) {
+        double known[3][3], inverse[3][3], bias[3];
+        if (!fit.free[0] || !fit.free[1] || !fit.free[2]) return;
+        known_information(fit.likelihood, fit.free, known);
+        for (int k = 0; k < 3; ++k) {
+            double unit[3] = {};
+            unit[k] = 1.0;
+            if (!solve(known, unit, fit.free, inverse[k])) return;
+        }
+        bias_(r_, passes_, fit.at, inverse, bias);
+        double next[3];
+        for (int k = 0; k < 3; ++k) {
+            if (!std::isfinite(bias[k])) return;
+            const double most = std::sqrt(inverse[k][k]);
+            next[k] = fit.at[k] - std::clamp(bias[k], -most, most);
+        }
+        if (bias[0] > 0.0) next[0] = fit.at[0] / (1.0 + bias[0] / fit.at[0]);
+        next[1] = std::max(next[1], least);
+        const Likelihood there = pixel(next[0], next[1], next[2], ends_);
+        std::copy(next, next + 3, fit.at);
+        fit.likelihood = there;
+    }
+
+    // Standard errors: roots of the diagonal of the inverse information; NaN for what lies on its bound.
+    static void errors(const Fit& fit, double* out) {
+        double known[3][3];
+        known_information(fit.likelihood, fit.free, known);
+        for (int k = 0; k < 3; ++k) {
+            double unit[3] = {}, column[3];
+            unit[k] = 1.0;
+            if (fit.free[k] && solve(known, unit, fit.free, column)) out[k] = std::sqrt(column[k]);
+        }
+    }
+
+    const HistogramRecord& r_;
+    const ReconstructionJob& job_;
+    ArmedPasses passes_;
+    DelaySearch search_;
+    ExposureEnds ends_;
+    BackgroundSeries series_;
+    LikelihoodBias bias_;
+};
+}  // namespace mars

@@ -3,6 +3,9 @@
 Run ``python -m studies --help`` for the list. A study computes what it states: every sentence with
 a figure in it is made from the run. Reports hold the configuration and the seed; only those that time
 something depend on the machine, and they name it.
+
+A study is a folder: `run.py` computes what its report states, `report.md.jinja` is the report, `figures.py` draws. Some
+folders hold several studies of one subject, a module and a template for each. What they share is in `common`.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 Tell = Callable[[str], object]
@@ -40,80 +44,63 @@ class OtherRunsError(ValueError):
 Study = Callable[[Request], list[Path]]
 
 
-def _study(module: str) -> Study:
-    """`run` of a module of this package, which is imported when it is called."""
-
-    def run(request: Request) -> list[Path]:
-        study: Study = importlib.import_module(f"studies.{module}").run
-        return study(request)
-
-    return run
-
-
-STUDIES: dict[str, tuple[str, Study]] = {
-    "covariance": ("covariance of holding times, and the rules that truncate its sum", _study("covariance.run")),
-    "joint": (
-        "can a classifier tell an engine's histograms from exact ones? needs scikit-learn",
-        _study("joint.run"),
-    ),
+# name: (module, what it asks)
+_STUDIES = {
+    "covariance": ("covariance.run", "covariance of holding times, and the rules that truncate its sum"),
+    "joint": ("joint.run", "can a classifier tell an engine's histograms from exact ones? needs scikit-learn"),
     "joint-covariance": (
+        "joint.covariance",
         "the histogram's covariance in closed form against simulation; --data adds reference cases",
-        _study("joint.covariance"),
     ),
     "long-exposures": (
+        "long_exposures.run",
         "the feedback engine at a million cycles and more against the closed form",
-        _study("long_exposures.run"),
     ),
     "domain": (
+        "domain.run",
         "every engine and prediction on random systems over the declared domain; --seed draws others",
-        _study("domain.run"),
     ),
-    "law": (
-        "where each count law holds: total variation to simulation over flux and exposure",
-        _study("count_law.law"),
-    ),
-    "detectors": (
-        "what each mode of a detector does to the same flux, simulated and in closed form",
-        _study("detectors.run"),
-    ),
+    "law": ("count_law.law", "where each count law holds: total variation to simulation over flux and exposure"),
+    "detectors": ("detectors.run", "what each mode of a detector does to the same flux, simulated and in closed form"),
     "effects": (
+        "detectors.effects",
         "what each effect of a detector does to the same flux, simulated and in closed form",
-        _study("detectors.effects"),
     ),
-    "matched": (
-        "a law of the count from four cumulants: total variation to the exact law",
-        _study("count_law.matched"),
-    ),
-    "reference": ("every count law against simulated reference cases; needs --data", _study("count_law.reference")),
-    "count-law": ("T1: every simulator's count law and shape against simulation", _study("count_law.run")),
-    "joint-table": (
-        "variance of signal window and bins, covariance of neighbours: every engine",
-        _study("joint.table"),
-    ),
-    "quantisation": (
-        "what a table's lookup costs, nearest and interpolated, over its size",
-        _study("table.quantisation"),
-    ),
+    "matched": ("count_law.matched", "a law of the count from four cumulants: total variation to the exact law"),
+    "reference": ("count_law.reference", "every count law against simulated reference cases; needs --data"),
+    "count-law": ("count_law.run", "T1: every simulator's count law and shape against simulation"),
+    "joint-table": ("joint.table", "variance of signal window and bins, covariance of neighbours: every engine"),
+    "quantisation": ("table.quantisation", "what a table's lookup costs, nearest and interpolated, over its size"),
     "hardware": (
+        "hardware.run",
         "T6: streams calibrated and validated, faulty detectors; --stream adds a measured one",
-        _study("hardware.run"),
     ),
     "streams": (
+        "streams.run",
         "ideal streams over the whole range of light, jitter and clock: false alarms, and how well errors hold",
-        _study("streams_report"),
     ),
-    "runtime": ("T2, T3: stages of a cube, runtime along four axes, size of the table", _study("runtime.run")),
+    "runtime": ("runtime.run", "T2, T3: stages of a cube, runtime along four axes, size of the table"),
     "reconstruction": (
+        "reconstruction.run",
         "bias and error of depth and signal over flux, every method, beside the bound",
-        _study("reconstruction.run"),
     ),
-    "transients": ("two returns in fog through the dead time of three detectors", _study("transients.run")),
-    "downstream": (
-        "T5: networks trained on every simulator's data, tested on gold; --config",
-        _study("downstream.run"),
-    ),
-    "start-up": ("what the shape of a table leaves out: the start-up at other delays", _study("table.start_up")),
-    "table": ("lookup tables: what they hold, and their errors between entries and at any delay", _study("table.run")),
+    "transients": ("transients.run", "two returns in fog through the dead time of three detectors"),
+    "downstream": ("downstream.run", "T5: networks trained on every simulator's data, tested on gold; --config"),
+    "start-up": ("table.start_up", "what the shape of a table leaves out: the start-up at other delays"),
+    "table": ("table.run", "lookup tables: what they hold, and their errors between entries and at any delay"),
 }
 
-__all__ = ["STUDIES", "OtherRunsError", "Request", "Study", "Tell"]
+
+def module_of(name: str) -> str:
+    """The module of a study, whose `run` is the study."""
+    return f"studies.{_STUDIES[name][0]}"
+
+
+def _run(name: str, request: Request) -> list[Path]:
+    study: Study = importlib.import_module(module_of(name)).run  # imported when it is asked for
+    return study(request)
+
+
+STUDIES: dict[str, tuple[str, Study]] = {name: (words, partial(_run, name)) for name, (_, words) in _STUDIES.items()}
+
+__all__ = ["STUDIES", "OtherRunsError", "Request", "Study", "Tell", "module_of"]

@@ -7,6 +7,7 @@ import datetime
 import os
 import platform
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,15 +29,22 @@ MAX_FIGURE_BYTES = 200_000
 def write(
     request: Request,
     name: str,
-    template: Path,
+    module: str,
+    template: str,
     facts: Mapping[str, Any],
     *,
     rows: Sequence[Row] = (),
     figures: Sequence[Path] = (),
 ) -> list[Path]:
-    """Write NAME.md from a Jinja template and `facts`, and NAME.csv of `rows`; returns these and `figures`."""
+    """Write NAME.md and, of `rows`, NAME.csv; returns these and `figures`.
+
+    The Markdown is made of the Jinja template ``TEMPLATE.md.jinja`` beside the module of that name, which gives the
+    `facts`; the module itself, with its constants, is `study` there.
+    """
+    study = sys.modules[module]
     text = request.out / f"{name}.md"
-    text.write_text(render(request, template, facts), encoding="utf-8")
+    path = Path(str(study.__file__)).with_name(f"{template}.md.jinja")
+    text.write_text(render(request, path, {"study": study, **facts}), encoding="utf-8")
     return [text, *figures, *([save_csv(request.out / f"{name}.csv", rows)] if rows else [])]
 
 
@@ -53,14 +61,7 @@ def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:
         lstrip_blocks=True,
         autoescape=False,
     )
-    environment.filters |= {
-        "f": format,  # x|f(".3g")
-        "n": number,
-        "each": lambda values, spec="g": ", ".join(format(v, spec) for v in values),
-        "mean": lambda values: float(np.mean(list(values))),
-        "median": lambda values: float(np.median(list(values))),
-        "quantile": lambda values, q: float(np.quantile(list(values), q)),
-    }
+    environment.filters |= FILTERS
     environment.globals |= {
         "quick": request.quick,
         "for_looking": "_Quick form: a look, not for citing._" if request.quick else "",
@@ -91,6 +92,16 @@ def table(rows: Iterable[Row]) -> str:
     keys = list(lines[0])
     head = ["| " + " | ".join(keys) + " |", "|" + "---|" * len(keys)]
     return "\n".join(head + ["| " + " | ".join(number(row[key]) for key in keys) + " |" for row in lines])
+
+
+FILTERS = {
+    "f": format,  # x|f(".3g")
+    "n": number,
+    "each": lambda values, spec="g": ", ".join(format(v, spec) for v in values),
+    "mean": lambda values: float(np.mean(list(values))),
+    "median": lambda values: float(np.median(list(values))),
+    "quantile": lambda values, q: float(np.quantile(list(values), q)),
+}
 
 
 def versions() -> str:

@@ -9,11 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar import Detector, Flux, GaussianPulse, System, simulate
 from mars_lidar.engines import Engine
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import Detector, System
-from mars_lidar.light.flux import Flux
-from mars_lidar.simulate import simulate
 
 FloatArray = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar import CountLaw, System, count_law, registration_pdf
 from mars_lidar.engines import ENGINES
-from mars_lidar.instrument.system import System
-from mars_lidar.statistics import CountLaw, count_law, photons_per_bin, registration_pdf
+from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.distance import Pmf
 from mars_lidar.statistics.matched import matched_pmf
 from studies.common.sample import draw

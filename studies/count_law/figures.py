@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.light.flux import Flux
+from mars_lidar import Flux, simulate
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
-from mars_lidar.simulate import simulate
 from mars_lidar.statistics import exposure_moments
 from studies.common.draw import panels
 from studies.common.report import save_figure
 from studies.common.sample import PERIOD_NS
 from studies.common.simulators import arrival_shape
-from studies.count_law.run import FIGURES, SHAPES, Cell, Settings
+from studies.count_law.cells import FIGURES, SHAPES, Cell, Settings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Flux, System, count_law, simulate
-from mars_lidar.statistics import CountLaw, distance
+from mars_lidar import CountLaw, Flux, System, count_law, simulate
+from mars_lidar.statistics import distance
 from mars_lidar.statistics.distance import Pmf, total_variation
 from studies import Request, Tell
 from studies.common.report import Row, write
@@ -246,7 +246,6 @@ def run(request: Request) -> list[Path]:
         "exposure": exposure,
         "cells": cells,
         "again": again,
-        "laws": LAWS,
         "within": {law: sum(c.within(law) for c in cells) for law in LAWS},
         "regimes": _regimes(cells),
         "beyond": sum(not c.within("exact") for c in cells),
@@ -254,16 +253,12 @@ def run(request: Request) -> list[Path]:
         "worst_mean": max(abs(c.mean_score) for c in cells if c.cumulants[1] * settings.realizations > 20),
         "broken": [c for c in cells if c.to_exact["gaussian"] > VISIBLE],
         "ratio": np.array([c.to_exact["gaussian"] for c in plain]) / (_PER_SKEWNESS * skewness),
-        "per_skewness": _PER_SKEWNESS,
         "cost": cost,
         "costliest": cells[int(np.argmax(cost))],
-        "visible": VISIBLE,
-        "few": FEW,
-        "still": STILL,
         "nan": float("nan"),
     }
     rows = [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure]
-    return write(request, "law", Path(__file__).with_name("law.md.jinja"), facts, rows=rows, figures=figures)
+    return write(request, "law", __name__, "law", facts, rows=rows, figures=figures)
 
 
 def _csv_row(name: str, cell: Cell) -> Row:

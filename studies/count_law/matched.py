@@ -191,15 +191,13 @@ def run(request: Request) -> list[Path]:
     within = [(low, high, (variance >= low) & (variance < high)) for low, high in pairwise(_EDGES)]
     facts = {
         "s": settings,
-        "aim": AIM,
-        "listed": _LISTED,
         "kinds": {name: share(cells) for name, cells in kinds.items() if cells},
         "by_variance": [(low, high, matched[here], gaussian[here]) for low, high, here in within],
         "worst": worst(everything, _WORST),
     }
     figure = _draw(request.out / "matched_map.png", settings, armed)
     rows = [_csv_row(part, k) for part in everything for k in np.flatnonzero(_listed(part))]
-    return write(request, "matched", Path(__file__).with_name("matched.md.jinja"), facts, rows=rows, figures=[figure])
+    return write(request, "matched", __name__, "matched", facts, rows=rows, figures=[figure])
 
 
 def _listed(part: Part) -> NDArray[np.bool_]:

@@ -72,10 +72,9 @@ def run(request: Request) -> list[Path]:
         "exact": [c for c in found if c.law == "exact"],
         "laws": LAWS,
         "draws": draws,
-        "seed": SEED,
     }
     rows = [{**vars(c), "good": c.good} for c in found]
-    return write(request, "reference", Path(__file__).with_name("reference.md.jinja"), facts, rows=rows)
+    return write(request, "reference", __name__, "reference", facts, rows=rows)
 
 
 def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Generator) -> list[Comparison]:

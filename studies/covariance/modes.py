@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.statistics import ConvergenceError, HoldingTimeCovariance
-from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics import ConvergenceError, HoldingTimeCovariance, PhaseChain
 from mars_lidar.statistics.renewal import weighted_waits
 
 FloatArray = NDArray[np.float64]

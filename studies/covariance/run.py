@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import System
-from mars_lidar.statistics import holding_time_covariance
+from mars_lidar import System, holding_time_covariance
 from mars_lidar.statistics.chain import Rearm
 from studies import Request, Tell
 from studies.common.report import Row, write
@@ -231,10 +230,6 @@ def run(request: Request) -> list[Path]:
         "wanted": sum(grid.size for grid in settings.grids),
         "grids": grids,
         "against": [_against_paper(settings, name, here) for name, here in against],
-        "paper_cutoff": PAPER_CUTOFF,
-        "paper_spectral": PAPER_SPECTRAL,
-        "paper_beyond": PAPER_BEYOND_FIFTH,
-        "spectral_rule": SPECTRAL,
         "cut20": cut20,
         "spectral": spectral,
         "ratios": {grid.name: _ratio(here) for grid, here in grids},
@@ -254,7 +249,7 @@ def run(request: Request) -> list[Path]:
         "automatic": {t: np.array([c.rules[automatic_name(t)] for c in centre]).T for t in TOLERANCES},
     }
     rows = [_csv_row(c) for c in (*centre, *edge)]
-    return write(request, "covariance", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+    return write(request, "covariance", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _poisson(cells: Sequence[Cell]) -> tuple[Cell | None, float]:

@@ -66,7 +66,7 @@ def run(request: Request) -> list[Path]:
     settings = settings_of(outcomes[0].system, exposures)
     facts = {"settings": settings, "rows": rows, "figures": figures, "rates": rates}
     figures = [*figures, save_csv(request.out / "effects_rate.csv", rates)]
-    return write(request, "effects", Path(__file__).with_name("effects.md.jinja"), facts, rows=rows, figures=figures)
+    return write(request, "effects", __name__, "effects", facts, rows=rows, figures=figures)
 
 
 def constant_light(exposures: int) -> list[dict[str, Any]]:

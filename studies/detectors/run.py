@@ -83,7 +83,7 @@ def run(request: Request) -> list[Path]:
     figures = draw_all(request.out, outcomes)
     rows = [row(each) for each in outcomes]
     facts = {"settings": settings_of(outcomes[0].system, exposures), "rows": rows, "figures": figures}
-    return write(request, "detectors", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+    return write(request, "detectors", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def outcome(shown: Shown, exposures: int) -> Outcome:

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
+from mars_lidar import Flux, GaussianPulse, System
 
 PERIOD_NS = 100.0
 MOVING = "moving gate"

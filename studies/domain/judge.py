@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.simulate import simulate
+from mars_lidar import simulate
 from studies.domain import simulator
 from studies.domain.case import Case
 from studies.domain.checks import (

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.reconstruct import cramer_rao
-from mars_lidar.statistics import CountLaw, JointLaw, count_law, joint_law, mean_histogram, registration_pdf
+from mars_lidar import CountLaw, JointLaw, count_law, cramer_rao, joint_law, registration_pdf
+from mars_lidar.statistics import mean_histogram
 from studies.domain.case import Case
 from studies.domain.checks import Check
 from studies.domain.closed_forms import known

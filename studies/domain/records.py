@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from mars_lidar.simulate import simulate, simulate_timestamps
+from mars_lidar import simulate, simulate_timestamps
 from studies.domain.case import PERIOD_NS, Case
 from studies.domain.checks import Check
 

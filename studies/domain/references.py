@@ -10,11 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from mars_lidar.instrument.detector import Detector
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import System
-from mars_lidar.simulate import simulate
-from mars_lidar.statistics import count_law, joint_law, mean_histogram
+from mars_lidar import Detector, GaussianPulse, System, count_law, joint_law, simulate
+from mars_lidar.statistics import mean_histogram
 from studies.domain.case import PERIOD_NS, Case
 from studies.domain.checks import Check, merge
 

@@ -13,24 +13,12 @@ import numpy as np
 from mars_lidar._base.threads import thread_count
 from studies import Request
 from studies.common.report import number, save_csv, write
-from studies.domain import references
+from studies.domain import judge, references, sweep, verdict, watch
 from studies.domain.checks import Check
 from studies.domain.figures import decades, maps
-from studies.domain.judge import EXPOSURE_SECONDS, LAW_SECONDS, Budget
-from studies.domain.sweep import AGAIN, Judged, Settings, sweep
-from studies.domain.verdict import (
-    ENGINES,
-    FAILED,
-    FAMILY_LEVEL,
-    FIRST_LEVEL,
-    LAWS,
-    SLOW,
-    STATES,
-    SUBJECTS,
-    VERIFIED,
-    second_level,
-)
-from studies.domain.watch import PATIENCE
+from studies.domain.judge import Budget
+from studies.domain.sweep import Judged, Settings
+from studies.domain.verdict import ENGINES, FAILED, LAWS, SLOW, SUBJECTS, VERIFIED
 
 SEED = 20_261_122
 FULL = Settings(2000, SEED, Budget(4e5, 4e6, 800, 6e4), 100_000)
@@ -46,7 +34,7 @@ def run(request: Request) -> list[Path]:
         settings = Settings(settings.systems, request.seed, settings.budget, settings.checks)
     began = time.monotonic()
     judged: list[Judged] = []
-    for case in sweep(settings, request.tell, min(thread_count(None), settings.systems)):
+    for case in sweep.sweep(settings, request.tell, min(thread_count(None), settings.systems)):
         judged.append(case)
         if len(judged) % 50 == 0:
             request.tell(f"{len(judged)} of {settings.systems} systems, {time.monotonic() - began:.0f} s")
@@ -61,19 +49,13 @@ def run(request: Request) -> list[Path]:
     facts = {
         "s": settings,
         "judged": judged,
+        "judge": judge,
+        "watch": watch,
         "data": request.data,
-        "law_seconds": LAW_SECONDS,
-        "exposure_seconds": EXPOSURE_SECONDS,
-        "patience": PATIENCE,
-        "again": AGAIN,
-        "first_level": FIRST_LEVEL,
-        "second_level": second_level(settings.checks),
-        "family_level": FAMILY_LEVEL,
-        "states": STATES,
+        "second_level": verdict.second_level(settings.checks),
         "result": {subject: Counter(state for _, state in _states(judged, subject)) for subject in SUBJECTS},
         "failures": failures,
         "loud": sum("Error" in row["note"].split(":")[0] for row in failures),
-        "listed": _LISTED,
         "ranges": [_range(judged, subject) for subject in SUBJECTS],
         "slow": [_slow(judged, subject) for subject in LAWS],
         "drawn": _drawn(judged),
@@ -81,7 +63,7 @@ def run(request: Request) -> list[Path]:
         "outside": len(outside),
         "seconds": time.monotonic() - began,
     }
-    return write(request, "domain", Path(__file__).with_name("report.md.jinja"), facts, rows=cases, figures=figures)
+    return write(request, "domain", __name__, "report", facts, rows=cases, figures=figures)
 
 
 def case_row(judged: Judged) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.simulate import simulate
+from mars_lidar import simulate
 from studies.domain.case import PERIOD_NS, Case
 
 _PIXELS = 32

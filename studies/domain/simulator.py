@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar import GaussianPulse
 from studies.domain.case import PERIOD_NS, Case
 
 ABLE = {

@@ -8,11 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.instrument.avalanches import Afterpulsing
-from mars_lidar.instrument.detector import Detector
-from mars_lidar.instrument.jitter import Jitter
-from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
-from mars_lidar.instrument.system import System
+from mars_lidar import Afterpulsing, Detector, GaussianPulse, Jitter, Pulse, SampledPulse, System
 from studies.domain.case import MOVING, PERIOD_NS, Case
 
 FluxRange = (1e-6, 1e3)

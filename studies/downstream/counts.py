@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.scene.scene import Scene
+from mars_lidar import Scene
 from studies.downstream.data import Config, Simulators
 
 QUARTERS = ("dimmest", "second", "third", "brightest")

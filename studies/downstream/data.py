@@ -11,12 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar import Detector, GaussianPulse, Scene, System, Table, simulate
 from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import Detector, System
-from mars_lidar.scene.scene import Scene
-from mars_lidar.simulate import simulate
-from mars_lidar.table import Table
 from studies.downstream.fit import Examples, FitPlan
 from studies.neural import NeuralEngine
 

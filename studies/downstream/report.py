@@ -48,8 +48,6 @@ def report(
         "seconds": sum(result["training"]["seconds"] for result in found.values()),
         "result": _rows(found),
         "findings": {sbr: _finding(found, sbr) for sbr in dict.fromkeys(one.sbr for one in found)},
-        "claim_db": _CLAIM_DB,
-        "claim_times": _CLAIM_TIMES,
         "quarters": QUARTERS,
         "counts": counts,
         "words": WORDS,
@@ -58,7 +56,7 @@ def report(
         "pictures": pictures,
     }
     rows = [_csv_row(one, result) for one, result in found.items()]
-    return write(request, "downstream", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=pictures)
+    return write(request, "downstream", __name__, "report", facts, rows=rows, figures=pictures)
 
 
 def _values(results: list[Any], data: str, measure: str) -> list[float]:

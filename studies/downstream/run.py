@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar import Scene
 from mars_lidar._base import checks
-from mars_lidar.scene.scene import Scene
 from studies import OtherRunsError, Request, Tell
 from studies.downstream.counts import count_bias
 from studies.downstream.data import CONFIGS, SYSTEM, WORDS, Config, Simulators, crop, examples, rgbd_scenes

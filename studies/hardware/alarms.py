@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar import Flux, GaussianPulse, Timestamps, calibrate, simulate_timestamps, validate
-from mars_lidar.calibrate import Calibration
+from mars_lidar import Calibration, Flux, GaussianPulse, Timestamps, calibrate, simulate_timestamps, validate
 from studies import Tell
 from studies.hardware.cases import DEAD_NS, DELAY_NS, PIXELS, SIGMA_NS, Settings, recorded, system_of
 

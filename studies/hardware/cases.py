@@ -10,8 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Detector, Flux, GaussianPulse, System, Timestamps, calibrate, simulate_timestamps, validate
-from mars_lidar.calibrate import Calibration, Validation, calibration_bound
+from mars_lidar import (
+    Calibration,
+    Detector,
+    Flux,
+    GaussianPulse,
+    System,
+    Timestamps,
+    Validation,
+    calibrate,
+    simulate_timestamps,
+    validate,
+)
+from mars_lidar.calibrate import calibration_bound
 from studies import Tell
 
 PERIOD_NS, DEAD_NS, SIGMA_NS, DELAY_NS, BINS = 1e3 / 7.5, 85.0, 0.5, 40.0, 1024

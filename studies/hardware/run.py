@@ -9,23 +9,8 @@ import numpy as np
 
 from studies import Request
 from studies.common.report import Row, write
-from studies.hardware.alarms import ALARM_BINS, alarms
-from studies.hardware.cases import (
-    AT_FLOOR,
-    BINS,
-    DEAD_NS,
-    DELAY_NS,
-    FULL,
-    PERIOD_NS,
-    PIXELS,
-    QUICK,
-    SIGMA_NS,
-    Case,
-    example,
-    matched,
-    spreads,
-    sweeps,
-)
+from studies.hardware import alarms, cases
+from studies.hardware.cases import AT_FLOOR, FULL, PIXELS, QUICK, Case
 from studies.hardware.mismatches import mismatches, sensitivities
 
 PAPER = {"bright": 0.0651, "dark": 0.0601}  # T6 of arXiv 2512.04924: total variation of the count law
@@ -37,29 +22,20 @@ def run(request: Request) -> list[Path]:
 
     settings = QUICK if request.quick else FULL
     began = time.process_time()
-    pixels = matched(settings, request.tell)
-    swept = sweeps(settings, request.tell)
+    pixels = cases.matched(settings, request.tell)
+    swept = cases.sweeps(settings, request.tell)
     faults = mismatches(settings, request.tell)
     weak = sensitivities(settings, request.tell)
-    false = alarms(settings, request.tell)
-    many = spreads(settings, request.tell)
-    measured = None if request.stream is None else example(request.stream, settings, request.tell)
+    false = alarms.alarms(settings, request.tell)
+    many = cases.spreads(settings, request.tell)
+    measured = None if request.stream is None else cases.example(request.stream, settings, request.tell)
     figures = draw_all(request.out, pixels, swept, faults, measured)
     scores = [float(value) for case in swept for value in case.scores if not np.isnan(value)]
     ways = [] if measured is None else measured.cases
     free = [case for name, case in ways if name.startswith("free shape, t_e")]
     facts = {
         "s": settings,
-        "period_ns": PERIOD_NS,
-        "bins": BINS,
-        "sigma_ns": SIGMA_NS,
-        "dead_ns": DEAD_NS,
-        "delay_ns": DELAY_NS,
-        "lights": PIXELS,
         "bright": PIXELS["bright"][0],
-        "paper": PAPER,
-        "paper_cycles": FULL.cycles,
-        "at_floor": AT_FLOOR,
         "pixels": pixels,
         "many": many,
         "bias": max(float(np.abs(one.bias).max()) for one in many),
@@ -75,7 +51,6 @@ def run(request: Request) -> list[Path]:
         "refused": [case for one, case in faults if one.fits and not case.found.consistent],
         "below": [case.name for _, case in faults if not case.found.consistent and case.ratio < AT_FLOOR],
         "weak": weak,
-        "alarm_bins": ALARM_BINS,
         "alarms": false,
         "measured": measured,
         "free": free,
@@ -85,7 +60,7 @@ def run(request: Request) -> list[Path]:
         "seconds": time.process_time() - began,
     }
     rows = [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))]
-    return write(request, "hardware", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+    return write(request, "hardware", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _csv_row(case: Case) -> Row:

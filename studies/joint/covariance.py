@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from mars_lidar import Flux, System, joint_law, simulate
-from mars_lidar.statistics import JointLaw
+from mars_lidar import Flux, JointLaw, System, joint_law, simulate
 from mars_lidar.statistics.joint_pixel import Pixel
 from studies import Request, Tell
 from studies.common import sample
@@ -258,8 +257,6 @@ def run(request: Request) -> list[Path]:
     by_z = sorted(systems, key=lambda o: -o.worst()[0])
     facts = {
         "s": settings,
-        "tolerance": TOLERANCE,
-        "often": OFTEN,
         "laws": [
             (name, z, stats.kstest(z, "norm").pvalue, stats.chi2.sf(float(np.sum(z**2)), z.size))
             for name, z in scores.items()
@@ -274,8 +271,8 @@ def run(request: Request) -> list[Path]:
         "worst": [_worst_row(o, second_look(o, settings)) for o in by_z[:_WORST]],
         "cases": cases,
     }
-    template, rows = Path(__file__).with_name("covariance.md.jinja"), [_row(o) for o in [*cases, *systems]]
-    return write(request, "joint_covariance", template, facts, rows=rows, figures=figures)
+    rows = [_row(o) for o in [*cases, *systems]]
+    return write(request, "joint_covariance", __name__, "covariance", facts, rows=rows, figures=figures)
 
 
 def _scores(systems: Sequence[Outcome], settings: Settings) -> dict[str, FloatArray]:

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from mars_lidar import Flux, joint_law, simulate
+from mars_lidar import Flux, JointLaw, joint_law, simulate
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
-from mars_lidar.statistics import JointLaw
 from studies.common.draw import panels
 from studies.common.report import save_figure
 from studies.joint.covariance import PERIOD_NS, FloatArray, system_of

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from mars_lidar.plot.style import COLOURS, DPI, INK, MISSING, style
 from studies.common.draw import WIDTH
 from studies.common.report import save_figure
-from studies.joint.run import ENGINES, TESTS, Outcome, Settings, chance
+from studies.joint.outcomes import ENGINES, TESTS, Outcome, Settings
+from studies.joint.run import chance
 
 _LINEAR = 0.02  # from chance, where the axis turns from linear to logarithmic
 _TICKS = (-0.02, 0.0, 0.02, 0.1, 0.5)

@@ -224,18 +224,14 @@ def run(request: Request) -> list[Path]:
     facts = {
         "s": settings,
         "engines": engines,
-        "coarse": COARSE,
-        "enough": ENOUGH,
         "period_ns": PERIOD_NS,
-        "limit": _SCORES,
-        "again": AGAIN,
         "findings": [_finding(engine, [s for s in scores if s.engine == engine]) for engine in engines],
         "known": [(s, noted[s.case]) for s in scores if s.engine == "mars" and s.case in noted],
         "tables": {key: _rows(scores, key) for key in _COMPARED},
         "spent": time.monotonic() - began,
     }
     rows = [_csv_row(s) for s in scores]
-    return write(request, "joint_table", Path(__file__).with_name("table.md.jinja"), facts, rows=rows)
+    return write(request, "joint_table", __name__, "table", facts, rows=rows)
 
 
 def _pair(score: Score, key: str) -> tuple[float, float]:

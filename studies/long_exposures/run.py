@@ -58,13 +58,12 @@ def run(request: Request) -> list[Path]:
     drawn = [row for row in rows if row["cells"]]
     facts = {
         "s": settings,
-        "goal": GOAL,
         "error": 1.0 / np.sqrt(settings.items),
         "drawn": drawn,
         "rows": [{key: "" if value is None else value for key, value in row.items()} for row in rows],
         "spent": time.monotonic() - began,
     }
-    return write(request, "long_exposures", Path(__file__).with_name("report.md.jinja"), facts, rows=rows)
+    return write(request, "long_exposures", __name__, "report", facts, rows=rows)
 
 
 def _system(random: np.random.Generator) -> tuple[float, float, ml.System, float]:

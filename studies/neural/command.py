@@ -7,8 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import Detector, System
+from mars_lidar import Detector, GaussianPulse, System
 from studies.neural.model import NeuralMap, check_target
 from studies.neural.pairs import FluxRange, Training
 from studies.neural.training import Point, save_curves, train

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar import CountLaw, Flux, System
 from mars_lidar.engines import Engine
 from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.count_shape import normalised
@@ -16,9 +17,7 @@ from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Group, groups, single_return
 from mars_lidar.engines.synthesis import Batch, Run
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.statistics import CountLaw, photons_per_bin
+from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.methods import pixel_of
 from mars_lidar.statistics.pmf import gaussian_window

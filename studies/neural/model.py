@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mars_lidar import System
 from mars_lidar._base.files import TemporarySibling
-from mars_lidar.instrument.system import System
-from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
 from studies.neural.network import PdfAutoencoder, canonical, one_thread, rolled
 from studies.neural.pairs import FluxRange

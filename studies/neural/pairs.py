@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar import System
 from mars_lidar._base import checks
 from mars_lidar.engines.engine import Progress
-from mars_lidar.instrument.system import System
-from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
 
 FloatArray = NDArray[np.float64]

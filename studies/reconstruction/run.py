@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar import Detector, Flux, Scene, System, simulate
-from mars_lidar.reconstruct import METHODS, Flags, Reconstruction, cramer_rao, reconstruct, window_error, window_weights
+from mars_lidar import Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
+from mars_lidar.reconstruct import METHODS, Flags, window_error, window_weights
 from studies import Request
 from studies.common.report import Row, write
 from studies.common.sample import system_of
@@ -72,13 +72,6 @@ def run(request: Request) -> list[Path]:
     words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
     facts = {
         "s": settings,
-        "plain": PLAIN,
-        "synchronous": SYNCHRONOUS,
-        "outlier_sigmas": OUTLIER_SIGMAS,
-        "sbr": SBR,
-        "bright": BRIGHT,
-        "seed": SEED,
-        "known": KNOWN,
         "findings": [one for mode, title in TITLE.items() if (one := _finding(rows, mode, title))],
         "chosen": _chosen(rows, settings),
         "near": near,
@@ -89,8 +82,7 @@ def run(request: Request) -> list[Path]:
         "window": window_lines(settings),
         "times": timings(settings),
     }
-    template = Path(__file__).with_name("report.md.jinja")
-    return write(request, "reconstruction", template, facts, rows=rows, figures=figures)
+    return write(request, "reconstruction", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _chosen(rows: Sequence[Row], settings: Settings) -> list[Row]:

@@ -15,9 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.table import Table
+from mars_lidar import Flux, System, Table
 
 FloatArray = NDArray[np.float64]
 

@@ -293,9 +293,6 @@ def run(request: Request) -> list[Path]:
     facts = {
         "s": settings,
         "period_ns": PERIOD_NS,
-        "dead_ns": DEAD_TIME_NS,
-        "sigma_ns": SIGMA_NS,
-        "flux": FLUX,
         "before": before,
         "cubes": cubes,
         "engines": [cube for cube in cubes if cube.contender != NUMPY],
@@ -305,18 +302,12 @@ def run(request: Request) -> list[Path]:
         "axes": {axis.words: _axis_rows(points, axis.name) for axis in settings.axes},
         "single": single,
         "held": held,
-        "paper_total": PAPER_TOTAL,
-        "paper_stages": PAPER_STAGES,
-        "paper_sequential": PAPER_SEQUENTIAL,
-        "paper_mb": PAPER_TABLE_MB,
-        "paper_delays_gb": PAPER_DELAYS_GB,
-        "grid": PAPER_GRID,
         "size": PAPER_GRID[0] * PAPER_GRID[1] * (PAPER_GRID[2] + 2) * _BYTES,
         "spent": time.monotonic() - began,
     }
     figures = draw_all(request.out, settings, points, single)
     rows = [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]]
-    return write(request, "runtime", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+    return write(request, "runtime", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _axis_rows(points: Sequence[Point], axis: str) -> list[Row]:

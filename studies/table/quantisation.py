@@ -133,17 +133,13 @@ def run(request: Request) -> list[Path]:
             findings.append((dead, interpolation, least, here[-1]))
     facts = {
         "s": settings,
-        "low": LOW,
-        "high": HIGH,
         "period_ns": PERIOD_NS,
-        "visible": VISIBLE,
         "findings": findings,
         "costs": costs,
-        "words": _WORDS,
         "spent": time.monotonic() - began,
     }
-    template, rows = Path(__file__).with_name("quantisation.md.jinja"), [_csv_row(cost) for cost in costs]
-    return write(request, "quantisation", template, facts, rows=rows, figures=[figure])
+    rows = [_csv_row(cost) for cost in costs]
+    return write(request, "quantisation", __name__, "quantisation", facts, rows=rows, figures=[figure])
 
 
 def _figure(path: Path, settings: Settings, costs: Sequence[Cost]) -> Path:

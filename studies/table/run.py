@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mars_lidar import System, Table
-from mars_lidar.table import LawError, QuantisationError
+from mars_lidar import QuantisationError, System, Table
+from mars_lidar.table import LawError
 from mars_lidar.table.axes import PAPER_GRID
 from studies import Request
 from studies.common.report import Row, write
@@ -120,13 +120,12 @@ def run(request: Request) -> list[Path]:
         "grids": grids,
         "samples": samples,
         "laws": laws,
-        "seed": _SEED,
         "content": [case.content() for case in cases],
         "rows": rows,
         "exposures": [case.exposures() for case in cases],
         "count_laws": [case.laws() for case in cases],
     }
-    return write(request, "table", Path(__file__).with_name("report.md.jinja"), facts, rows=rows)
+    return write(request, "table", __name__, "report", facts, rows=rows)
 
 
 def _measure(case: Mapping[str, Any], grids: Mapping[str, tuple[float, float, int]], samples: int, laws: int) -> Case:

@@ -45,13 +45,11 @@ def run(request: Request) -> list[Path]:
         "points": points,
         "delays": delays,
         "levels": list(_LEVELS),
-        "tolerance": _TOLERANCE,
-        "dim": _DIM,
         "lines": [_line(case, [row for row in rows if (row["dead_time_ns"], row["cycles"]) == case]) for case in shown],
         "away": max(row["displaced"] for row in rows if row["dead_time_ns"] < 0.9 * PERIOD_NS),
         "near": max(close, default=None),
     }
-    return write(request, "start_up", Path(__file__).with_name("start_up.md.jinja"), facts, rows=rows)
+    return write(request, "start_up", __name__, "start_up", facts, rows=rows)
 
 
 def _measure(dead_ns: float, cycles: int, points: int, delays: int) -> list[Row]:

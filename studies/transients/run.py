@@ -73,7 +73,7 @@ def run(request: Request) -> list[Path]:
     rows = [row(each) for each in shown]
     figures = [_draw(request.out / "transients.png", shown)]
     facts = {"settings": _settings(exposures), "rows": rows}
-    return write(request, "transients", Path(__file__).with_name("report.md.jinja"), facts, rows=rows, figures=figures)
+    return write(request, "transients", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def row(each: Seen) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import mars_lidar as ml
 from mars_lidar.calibrate import inspect
 from mars_lidar.calibrate.intervals import stream_of
 from mars_lidar.calibrate.same_phase import _passes, same_phase
-from studies import streams
+from studies.streams import cases as streams
 
 
 def recorded(

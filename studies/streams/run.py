@@ -1,4 +1,4 @@
-"""The report on ideal streams: false alarms, what is not known, and how well stated errors hold."""
+"""Study "streams": false alarms, what is not known, and how well stated errors hold."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from studies import Request
 from studies.common.report import Row, configuration, machine, save_csv, save_text, table
-from studies.streams import ESTIMATES, FULL, QUICK, Coverage, Outcome, Settings, outcomes
+from studies.streams.cases import ESTIMATES, FULL, QUICK, Coverage, Outcome, Settings, outcomes
 
 LEVEL = 1e-4  # false-alarm probability of an inspection, as it is stated
 FAMILY = 1e-3  # of all tests of coverage together, by Holm

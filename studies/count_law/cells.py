@@ -1,0 +1,288 @@
+"""Cells of the study "count-law": every simulator's law and shape against simulation, on declared grids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import System, count_law, registration_pdf
+from mars_lidar.statistics.distance import Pmf, kl_divergence, wasserstein
+from studies import Tell
+from studies.common.sample import PERIOD_NS, Sample, draw, log_points, system_of
+from studies.common.simulators import Prediction, arrival_shape, simulators
+from studies.neural.pairs import Training
+
+FloatArray = NDArray[np.float64]
+
+
+FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
+
+
+_NEGLIGIBLE = 1e-10  # probability of a count left out of a resampling, per exposure drawn
+
+
+SHAPES = {
+    "poisson": "Poisson",
+    "renewal": "renewal and MaRS, paper's, centre",
+    "mars_edge": "MaRS, paper's, edge",
+}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells over signal, background (photons per period) and dead time (ns) at one period."""
+
+    name: str
+    words: str
+    period_ns: float
+    flux: tuple[float, ...]  # the points of both S and B
+    dead_ns: tuple[float, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return len(self.flux) ** 2 * len(self.dead_ns)
+
+    @property
+    def cells(self) -> tuple[FloatArray, FloatArray]:
+        """Signal and background (cells of one dead time,)."""
+        signal, background = np.meshgrid(self.flux, self.flux, indexing="ij")
+        return signal.ravel(), background.ravel()
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Configuration of the study; `realizations` of the truth, `sampled` of engines without a law."""
+
+    grids: tuple[Grid, ...]
+    realizations: int
+    resamplings: int
+    sampled: int
+    dead_sweep: tuple[float, ...]  # dead times in periods at which shapes are compared
+    sweep_flux: tuple[float, ...]
+    cycles: int = 1000
+    bins: int = 1024
+    sigma_ns: float = 0.5
+    seed: int = 20266
+    steps: int = 1750  # of the training of the neural stand-in, for each system
+    pairs: int = 6000
+
+    def system(self, period_ns: float, dead_ns: float) -> System:
+        """System of a grid."""
+        return system_of(dead_ns, self.cycles, period_ns=period_ns, bins=self.bins, sigma_ns=self.sigma_ns)
+
+
+def _linear(low: float, high: float, points: int) -> tuple[float, ...]:
+    return tuple(float(v) for v in np.linspace(low, high, points))
+
+
+def _grids(points: int, wide: tuple[float, ...], near: tuple[float, ...]) -> tuple[Grid, ...]:
+    return (
+        Grid("wide", "log-spaced on [0.01, 10]", PERIOD_NS, log_points(points), wide),
+        Grid("near", "linear on [0.01, 10]", 100.0, _linear(0.01, 10.0, points), near),
+    )
+
+
+FULL = Settings(
+    grids=_grids(8, (25.0, 50.0, 75.0, 100.0), (25.0, 50.0, 75.0)),
+    realizations=100_000,
+    resamplings=200,
+    sampled=4_000,
+    dead_sweep=_linear(0.05, 2.0, 40),
+    sweep_flux=log_points(8),
+)
+
+
+QUICK = Settings(
+    grids=_grids(2, (25.0, 75.0), (50.0,)),
+    realizations=400,
+    resamplings=50,
+    sampled=40,
+    dead_sweep=(0.1875, 0.6375, 1.3),
+    sweep_flux=(0.1, 5.0),
+    cycles=100,
+    bins=256,
+    steps=60,
+    pairs=200,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """One simulator in one cell: its distances, what sampling alone makes of them, and how its shape differs.
+
+    `figures` (4,) in the order of `FIGURES`; `floors` (resamplings, 4) the same figures of samples of the exact
+    law; `shape` and `shape_floor` total variations of the mean histogram; `noise` the standard error of a difference
+    in units of the truth's own, above 1 for a simulator that is sampled itself.
+    """
+
+    figures: FloatArray
+    floors: FloatArray
+    shape: float
+    shape_floor: float
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One pixel: the truth and the score of every simulator."""
+
+    grid: str
+    period_ns: float
+    signal: float
+    background: float
+    dead_ns: float
+    mean: float
+    variance: float
+    exact: FloatArray  # (4,) cumulants
+    realizations: int
+    scores: dict[str, Score]
+    truth: Pmf
+    laws: dict[str, Pmf]
+
+    def name(self) -> str:
+        """The cell in words."""
+        flux = f"S = {self.signal:.3g}, B = {self.background:.3g}"
+        return f"{flux}, t_d = {self.dead_ns:g} ns, t_r = {self.period_ns:.4g} ns"
+
+    @property
+    def mean_error(self) -> float:
+        """Standard error of the simulated mean."""
+        return float(np.sqrt(self.exact[1] / self.realizations))
+
+    @property
+    def variance_error(self) -> float:
+        """Standard error of the simulated variance."""
+        return float(np.sqrt(max(self.exact[3] + 2.0 * self.exact[1] ** 2, 0.0) / self.realizations))
+
+
+def compute(settings: Settings, truth: str, tell: Tell) -> list[Cell]:
+    """All cells of all grids against simulation by engine `truth`."""
+    cells: list[Cell] = []
+    number = 0
+    for grid in settings.grids:
+        for dead_ns in grid.dead_ns:
+            cells += _system_cells(settings, grid, dead_ns, truth, number)
+            number += 1
+            tell(f"count-law: {grid.name}, t_d = {dead_ns:g} ns, {len(grid.flux) ** 2} cells")
+    return cells
+
+
+def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, number: int) -> list[Cell]:
+    system = settings.system(grid.period_ns, dead_ns)
+    signal, background = grid.cells
+    seed = (settings.seed << 16) + number
+    sample = draw(truth, signal, background, system, realizations=settings.realizations, seed=seed)
+    # another seed: an engine must not share random numbers with the truth
+    training = Training(steps=settings.steps, pairs=settings.pairs, held_out=min(500, settings.pairs))
+    asked = simulators(settings.sampled, seed + (1 << 40), training)
+    predictions = {one.name: one.predict(signal, background, system) for one in asked}
+    cumulants = count_law(signal, background, system, "exact").cumulants
+    random = np.random.default_rng([settings.seed, number])
+    cells = []
+    for k in range(signal.size):
+        found = Pmf.of_counts(sample.counts[:, k])
+        laws = {name: one.pmfs[k] for name, one in predictions.items()}
+        scores = _scores(settings, sample, found, predictions, k, random)
+        counts = sample.counts[:, k].astype(np.float64)
+        cells.append(
+            Cell(
+                grid.name,
+                grid.period_ns,
+                float(signal[k]),
+                float(background[k]),
+                dead_ns,
+                float(counts.mean()),
+                float(counts.var(ddof=1)),
+                cumulants[k],
+                settings.realizations,
+                scores,
+                found,
+                laws,
+            )
+        )
+    return cells
+
+
+def _scores(
+    settings: Settings,
+    sample: Sample,
+    found: Pmf,
+    predictions: dict[str, Prediction],
+    k: int,
+    random: np.random.Generator,
+) -> dict[str, Score]:
+    """Scores of every simulator in cell `k`."""
+    exact, size = predictions["mars_exact"], settings.realizations
+    noise: dict[int, FloatArray] = {}
+    scores = {}
+    for name, one in predictions.items():
+        if one.sampled not in noise:
+            noise[one.sampled] = resampled_figures(exact.pmfs[k], size, one.sampled, settings.resamplings, random)
+        shape = 0.5 * float(np.abs(sample.shape[k] - one.shape[k]).sum())
+        # a sample has its own noise as well, as much as the truth's for the same number of exposures
+        own = float(np.sqrt(1.0 + size / one.sampled)) if one.sampled else 1.0
+        floor = own * float(sample.shape_floor[k])
+        figures = law_figures(found, one.pmfs[k], float(one.mean[k]), float(one.variance[k]), size)
+        scores[name] = Score(figures, noise[one.sampled], shape, floor, own)
+    return scores
+
+
+def law_figures(sample: Pmf, law: Pmf, mean: float, variance: float, size: int) -> FloatArray:
+    """`FIGURES` (4,) of a law with its own mean and variance, against frequencies of `size` simulated counts."""
+    low, high = min(sample.first, law.first), max(sample.last, law.last)
+    found = _figures(sample.on(low, high)[None], law.on(low, high), low, mean, variance, size)
+    return np.asarray(found[0], dtype=np.float64)
+
+
+def resampled_figures(law: Pmf, size: int, sampled: int, number: int, random: np.random.Generator) -> FloatArray:
+    """`FIGURES` (number, 4) of samples of `size` counts drawn from `law` against the law itself.
+
+    With `sampled` > 0 against other samples of that many counts instead: the floor of a law known by sampling.
+    """
+    kept = np.flatnonzero(law.p > _NEGLIGIBLE / size)
+    first, p = law.first + int(kept[0]), law.p[kept[0] : kept[-1] + 1]
+    p = p / p.sum()
+    counts = first + np.arange(p.size)
+    mean = float((p * counts).sum())
+    variance = float((p * (counts - mean) ** 2).sum())
+    drawn = random.multinomial(size, p, number) / size
+    if not sampled:
+        return _figures(drawn, p, first, mean, variance, size)
+    others = random.multinomial(sampled, p, number) / sampled
+    rows = []
+    for one, other in zip(drawn, others, strict=True):
+        own = float((other * counts).sum())
+        spread = float((other * (counts - own) ** 2).sum()) * sampled / (sampled - 1)
+        rows.append(_figures(one[None], other, first, own, spread, size)[0])
+    return np.array(rows)
+
+
+def _figures(sample: FloatArray, law: FloatArray, first: int, mean: float, variance: float, size: int) -> FloatArray:
+    """`FIGURES` (n, 4) of frequencies `sample` (n, w) of `size` counts against `law` (w,), counts from `first`."""
+    offset = first + np.arange(law.size) - mean
+    shift = sample @ offset
+    spread = (sample @ offset**2 - shift**2) * size / (size - 1)
+    return np.stack(
+        [wasserstein(sample, law), kl_divergence(sample, law), np.abs(shift), np.abs(spread - variance)], axis=-1
+    )
+
+
+def shape_sweep(settings: Settings, tell: Tell) -> dict[str, FloatArray]:
+    """Total variation (dead times, cells) of each of `SHAPES` to the exposure's exact mean histogram."""
+    signal, background = (g.ravel() for g in np.meshgrid(settings.sweep_flux, settings.sweep_flux, indexing="ij"))
+    found: dict[str, list[FloatArray]] = {name: [] for name in SHAPES}
+    for dead in settings.dead_sweep:
+        system = settings.system(PERIOD_NS, dead * PERIOD_NS)
+        truth = registration_pdf(signal, background, system, "exposure")
+        shapes = {
+            "poisson": arrival_shape(signal, background, system),
+            "renewal": registration_pdf(signal, background, system, "chain"),
+            "mars_edge": registration_pdf(signal, background, system, "chain", rearm="edge"),
+        }
+        for name, shape in shapes.items():
+            found[name].append(0.5 * np.abs(shape - truth).sum(-1))
+    tell(f"count-law: shapes at {len(settings.dead_sweep)} dead times, {signal.size} cells each")
+    return {name: np.array(rows) for name, rows in found.items()}

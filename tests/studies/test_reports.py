@@ -1,0 +1,127 @@
+"""What all studies share: the names on the command line, templates, tables, and that the package knows none of them."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+import types
+from importlib import import_module
+from pathlib import Path
+
+import jinja2
+import numpy as np
+import pytest
+
+import studies
+from studies import STUDIES, Request
+from studies.__main__ import main
+from studies.common import report
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "studies"
+TEMPLATES = sorted(FOLDER.rglob("*.md.jinja"))
+NAMES = {  # of every command that a committed report prints
+    "count-law",
+    "covariance",
+    "detectors",
+    "domain",
+    "downstream",
+    "effects",
+    "hardware",
+    "joint",
+    "joint-covariance",
+    "joint-table",
+    "law",
+    "long-exposures",
+    "matched",
+    "quantisation",
+    "reconstruction",
+    "reference",
+    "runtime",
+    "start-up",
+    "streams",
+    "table",
+    "transients",
+}
+
+
+def test_every_name_that_a_report_prints_is_a_study():
+    assert set(STUDIES) == NAMES
+    printed = set()
+    for text in (ROOT / "docs").rglob("*.md"):
+        for command in re.findall(r"python -m studies ([a-z-][a-z -]*)", text.read_text(encoding="utf-8")):
+            printed |= {word for word in command.split(" --")[0].split() if not word.startswith("-")}
+    assert {"covariance", "law", "reference", "joint-table"} <= printed <= NAMES | {"neural", "train", "info"}
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_every_study_has_a_module_that_runs(name: str):
+    pytest.importorskip("torch", reason="extra 'learn'")
+    module = import_module(studies.module_of(name))
+    assert callable(module.run)
+    assert f'"{name}"' in (module.__doc__ or "").splitlines()[0]
+
+
+@pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: str(path.relative_to(FOLDER)))
+def test_templates_parse_and_are_filled_by_a_module_beside_them(path: Path):
+    environment = jinja2.Environment(autoescape=True)
+    environment.filters |= dict.fromkeys(("f", "n", "each", "mean", "median", "quantile"), str)
+    environment.parse(path.read_text(encoding="utf-8"))
+    assert any(
+        f'__name__, "{path.name.split(".")[0]}"' in module.read_text(encoding="utf-8")
+        for module in path.parent.glob("*.py")
+    )
+
+
+def test_the_package_imports_no_study():
+    for path in (ROOT / "src" / "mars_lidar").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not any(name.split(".")[0] == "studies" for name in names), path
+
+
+def test_a_template_is_filled_strictly(tmp_path: Path):
+    template = tmp_path / "x.md.jinja"
+    template.write_text(
+        "# A\n\n{{ for_looking }}\n\n{% for v in values %}\n- {{ v|f('.2f') }}\n{% endfor %}\n\n{{ rest }}\n"
+    )
+    request = Request(tmp_path, quick=True)
+    with pytest.raises(jinja2.UndefinedError, match="rest"):
+        report.render(request, template, {"values": [1.0]})
+    facts = {"values": [1.0, 2.345], "rest": "end"}
+    text = report.render(request, template, facts)
+    assert text == "# A\n\n_Quick form: a look, not for citing._\n\n- 1.00\n- 2.35\n\nend\n"
+    assert "Quick" not in report.render(Request(tmp_path), template, facts)
+
+
+def test_a_report_has_the_template_and_the_constants_of_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    module = types.ModuleType("made_up")
+    module.__file__, module.LIMIT = str(tmp_path / "made_up.py"), 3  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "made_up", module)
+    (tmp_path / "short.md.jinja").write_text("{{ word }} {{ study.LIMIT }}{{ flag }}")
+    request = Request(tmp_path, quick=True)
+    written = report.write(request, "x", "made_up", "short", {"word": "at"}, rows=[{"a": 1, "b": 0.1234567}])
+    assert [path.name for path in written] == ["x.md", "x.csv"]
+    assert written[0].read_text() == "at 3 --quick\n"
+    assert written[1].read_text() == "a,b\n1,0.123457\n"
+
+
+def test_filters_and_tables():
+    assert [report.number(v) for v in (1.23456, 12345.6, 3e7, 7, "x")] == ["1.235", "12346", "3e+07", "7", "x"]
+    assert report.table([]) == ""
+    assert report.table([{"a": 1, "b": 0.5}]) == "| a | b |\n|---|---|\n| 1 | 0.5 |"
+    values = np.array([1.0, 2.0, 4.0])
+    shown = jinja2.Environment(autoescape=False)
+    shown.filters |= report.FILTERS
+    made = shown.from_string("{{ v|each }} {{ v|mean|f('.3f') }} {{ v|median|n }} {{ v|quantile(1.0)|n }}").render(
+        v=values
+    )
+    assert made == "1, 2, 4 2.333 2 4"
+
+
+def test_without_jinja_it_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    assert main(["transients", "--quick", "--out", str(tmp_path)]) == 1
+    assert "pip install 'mars-lidar[studies]'" in capsys.readouterr().err

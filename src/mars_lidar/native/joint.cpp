@@ -110,7 +110,7 @@ std::pair<int64_t, double> forward(Matrix<const double> response, int32_t shift,
     for (size_t j = 0; j < n; ++j) x[j] = Pair{};
     auto nothing = [](int32_t, double, const Pair&) {};
     double window = 0.0, error = INFINITY;
-    Convergence left;
+    Convergence left(grid.bins);
     int64_t done = 0;
     const nb::gil_scoped_release release;
     while (done < sweeps) {

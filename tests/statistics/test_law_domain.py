@@ -360,6 +360,19 @@ def test_corners(signal: float, background: float, dead: float, start: str):
         assert shape.sum() == pytest.approx(1.0, abs=1e-9)
 
 
+# Histograms of many bins
+
+
+@pytest.mark.parametrize("bins", [2**16, 2**18])
+def test_joint_law_of_many_bins(bins: int):
+    """Sweeps over many bins stop at the rounding that these add up: the law of an ordinary pixel has been refused."""
+    system = view(0.33, bins=bins)
+    law, known = ml.joint_law(2.0, 0.1, system), exposure_moments(2.0, 0.1, system.replace(bins=2))
+    assert law.count_mean == pytest.approx(float(known.mean), rel=1e-7)
+    assert law.count_variance == pytest.approx(float(known.variance), rel=1e-5)
+    assert law.mean.reshape(2, -1).sum(-1) == pytest.approx(known.histogram, rel=1e-6)
+
+
 # Paralyzable pixels over 1e8 cycles
 
 

@@ -26,6 +26,7 @@ from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 
 ELECTRONICS_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")
+_A_BLOCK = 2e4  # multiplications that take as long as what comes with a block
 _SETTLED = 1e-11
 
 
@@ -159,9 +160,16 @@ def refined(
     out, electronics = system.bins, electronics_ns / system.period_ns
     bins = coarsest_grid(cell)
     coarse, before = _Run(cell, bins, electronics, effort), None
+    left = effort.moments - coarse.spent
     while True:
         bins *= 2
-        fine = _Run(cell, bins, electronics, effort)
+        if 4.0 * coarse.spent > left:  # as many periods, on twice the bins with kernels twice as long
+            raise ConvergenceError(
+                f"electronics_moments of {cell.name(0)}: {bins} bins per period take too long, and fewer are not "
+                f"enough; {effort.instead}"
+            )
+        fine = _Run(cell, bins, electronics, replace(effort, moments=left))
+        left -= fine.spent
         # the grid errs by the square of its step: what doubling it moved tells the limit
         limit = np.array([fine.mean, fine.variance])
         limit += (limit - [coarse.mean, coarse.variance]) / 3.0
@@ -210,7 +218,7 @@ class _Run:
 
     def __init__(self, cell: Cells, bins: int, electronics: float, effort: Effort) -> None:
         self.cycles = cell.system.cycles
-        self.mean = self.variance = 0.0
+        self.mean = self.variance = self.spent = 0.0  # multiplications
         self.rate = np.zeros(bins)
         if float(cell.total[0]) > 0.0:
             self._run(RecordGrid(cell, bins, electronics, effort))
@@ -218,7 +226,8 @@ class _Run:
     def _run(self, grid: RecordGrid) -> None:
         """Records period by period, and the number of those before each (12), (13)."""
         run = RecordRun(grid, np.array([1.0, 0.0]), lambda now: np.stack([now[0], now[0] + now[1]]))
-        budget = min(self.cycles, max(100, int(grid.effort.moments / (grid.bins * (grid.shift + 64.0)))))
+        a_period = grid.bins * (grid.shift + 64.0) + _A_BLOCK * len(run.blocks)
+        budget = min(self.cycles, max(100, int(grid.effort.moments / a_period)))
         pairs, growth, steady, last = 0.0, 0.0, 0, np.zeros((2, grid.bins))
         for period in range(self.cycles):
             now = run.period()
@@ -227,6 +236,7 @@ class _Run:
             pairs += float(weighted.sum())
             scale, before, growth = float(records.sum()), growth, float((weighted - last[1]).sum())
             moved = max(float(np.abs(records - last[0]).sum()), abs(growth - before))
+            self.spent += a_period
             steady = steady + 1 if moved <= _SETTLED * scale else 0
             last = now
             if steady > 3 * grid.periods:
@@ -235,10 +245,9 @@ class _Run:
                 pairs += left * float(weighted.sum()) + 0.5 * left * (left + 1.0) * growth
                 break
             if period >= budget:
-                more = "" if grid.effort == MOST_EFFORT else "use electronics_moments itself, which goes on, or "
                 raise ConvergenceError(
                     f"electronics_moments of {grid.cell.name(0)}: the state does not repeat within {budget} periods; "
-                    f"{more}simulate it with engine 'exact'"
+                    f"{grid.effort.instead}"
                 )
         self.mean = float(self.rate.sum())
         self.variance = 2.0 * pairs + self.mean - self.mean**2  # E N (N - 1) is twice the pairs

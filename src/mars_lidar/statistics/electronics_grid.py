@@ -32,9 +32,15 @@ class Effort:
     moments: float
     points: float
 
+    @property
+    def instead(self) -> str:
+        """What to use where that is not enough, for errors."""
+        goes_on = self.numbers < MOST_EFFORT.numbers
+        return f"{'use electronics_moments, which goes on for longer, or ' * goes_on}simulate it with engine 'exact'"
 
-MOST_EFFORT = Effort(1 << 27, 3e10, 3e11)  # 1 GiB, and half a minute
-LAW_EFFORT = Effort(1 << 24, 2e9, 2e10)  # of the laws, which are to take 2 s at most
+
+MOST_EFFORT = Effort(1 << 27, 4e10, 3e11)  # 1 GiB, and half a minute
+LAW_EFFORT = Effort(1 << 24, 1.2e9, 2e10)  # of the laws, which are to take 2 s at most
 
 
 class RecordGrid:
@@ -62,10 +68,9 @@ class RecordGrid:
         self.steps = self.off + self.shift + 4
         self.periods = (self.steps + bins) // bins + 2
         if self.steps * bins > effort.numbers:
-            more = "" if effort == MOST_EFFORT else "use electronics_moments, which goes on for longer, or "
             raise ConvergenceError(
                 f"statistics of {cell.name(0)}, t_e = {electronics:g} periods: {bins} bins per period are not enough, "
-                f"and more take too long or do not fit in 1 GiB; {more}simulate it with engine 'exact'"
+                f"and more take too long or do not fit in 1 GiB; {effort.instead}"
             )
         self.kernel, self.late = self._kernel()
         self.first, self.first_armed = self._first()

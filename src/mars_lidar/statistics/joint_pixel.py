@@ -14,6 +14,7 @@ from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 INSTEAD = "use exposure_moments (count and mean histogram), or simulate it with engine 'exact'"
 _SETTLED = 1e-9  # distance from the stationary state (total variation) at which the start is forgotten
 _MAX_STEPS = 40_000_000  # bins x periods after which an exposure counts as not settling: half a second
+_MANY_BINS = 2**16  # with which a grid is judged by few windows
 _MAX_RECURSION = 2**22  # bins x periods of an exposure that is run through for every window
 
 
@@ -25,6 +26,7 @@ class Pixel:
 
         cells.check_history(bins)
         self.cells, self.out = cells, out
+        self._kept: tuple[FloatArray, FloatArray] | None = None
         self.grid = grid = FoldedGrid.of(cells, bins)
         try:
             self.state = np.ascontiguousarray(grid.state.T)
@@ -62,6 +64,12 @@ class Pixel:
             return np.asarray(np.einsum("ki,ki->k", weights, self._columns(weights)))
         windows = self._windows(weights)
         return self.law.covariance(windows, windows)
+
+    def monitored(self, weights: FloatArray) -> FloatArray:
+        """`variances`, which are kept: the next finer grid is compared by the same windows, but for the first time."""
+        if self._kept is None or not np.array_equal(self._kept[0], weights):
+            self._kept = weights, self.variances(weights)
+        return self._kept[1]
 
     def covariances(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Covariances (windows,) of the counts in pairs of windows (windows, bins)."""
@@ -109,9 +117,10 @@ def movement(coarse: Pixel, fine: Pixel) -> float:
     mean = fine.mean.reshape(n, -1).sum(-1)
     total = max(float(mean.sum()), np.finfo(float).tiny)
     shape = 0.5 * float(np.abs(mean - coarse.mean).sum()) / total
-    weights = _monitors(mean, fine.cells.system.dead_time_periods)
+    few = fine.law is None or fine.grid.bins > _MANY_BINS  # a window costs much
+    weights = _monitors(mean, fine.cells.system.dead_time_periods, few)
     means = weights @ mean
-    before, after = coarse.variances(weights), fine.variances(np.repeat(weights, fine.out // n, axis=-1))
+    before, after = coarse.monitored(weights), fine.monitored(np.repeat(weights, fine.out // n, axis=-1))
     floor = 1e-6 * np.abs(means) + 1e-9 * total  # the variance of a locked pixel may be 0
     if (after < -1e-3 * floor).any():
         return math.inf
@@ -121,17 +130,18 @@ def movement(coarse: Pixel, fine: Pixel) -> float:
     return max(shape, float(spread.max()), float(drift.max()))
 
 
-def _monitors(mean: FloatArray, dead: float) -> FloatArray:
-    """(m, n) windows that show an error: all, halves, the brightest bin, its echo, their neighbours."""
+def _monitors(mean: FloatArray, dead: float, few: bool) -> FloatArray:
+    """(m, n) windows that show an error: all, halves, the brightest bin, its echo, their neighbours; or a `few`."""
     n = mean.size
     j = np.arange(n)
     windows = [np.ones(n)]
-    for start in (0, n // 2):
+    for start in (0,) if few else (0, n // 2):
         windows.append(((j - start) % n < (n + 1) // 2).astype(float))
     peak = int(np.argmax(mean))
     echo = int(peak + dead % 1.0 * n) % n
     for centre in (peak, echo):
-        for width in (1, 2, max(1, n // 50)):
-            for side in (0, 1):
+        for width in (1, max(1, n // 50)) if few else (1, 2, max(1, n // 50)):
+            for side in (0,) if few else (0, 1):
                 windows.append(((j - centre + side * (width - 1) + side) % n < width).astype(float))
-    return np.unique(np.array(windows), axis=0)
+    different = {window.tobytes(): window for window in windows}
+    return np.array(list(different.values()))

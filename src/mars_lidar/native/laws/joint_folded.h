@@ -35,7 +35,7 @@ inline FoldedSweeps folded_registrations(const FeedbackGrid& grid, const double*
     for (int32_t j = 0; j < n; ++j) x[j] = Pair{};
     auto nothing = [](int32_t, double, const Pair&) {};
     double window = 0.0, error = INFINITY;
-    Convergence left;
+    Convergence left(grid.bins);
     int64_t done = 0;
     while (done < sweeps) {
         const double change = grid.shift == 0

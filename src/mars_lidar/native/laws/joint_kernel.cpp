@@ -22,7 +22,7 @@ void MARS_JOIN(joint_adjoint_, MARS_LEVEL)(const AdjointBlock& block) {
     }
     const bool self = grid.shift == 0;
     Real window{};
-    Convergence left[kReals];
+    std::vector<Convergence> left(kReals, Convergence(n));
     int64_t sweeps = 0;
     double error[kReals];
     for (double& e : error) e = INFINITY;

@@ -13,9 +13,11 @@ inline namespace MARS_LEVEL {
 // where the slowest mode is a complex pair: rho is the largest ratio of the last four.
 class Convergence {
  public:
+    explicit Convergence(int32_t bins = 1) : rounding_(bins > 8192 ? 2e-17 * bins : 1e-14) {}
+
     // Relative to `size`; infinite while nothing is known.
     double operator()(double change, double size) {
-        if (change <= 1e-14 * size) return size > 0.0 ? change / size : 0.0;  // rounding goes round and round
+        if (change <= rounding_ * size) return size > 0.0 ? change / size : 0.0;
         if (last_ > 0.0) ratio_[sweeps_++ % 4] = change / last_;
         double rho = sweeps_ > 0 ? 0.0 : INFINITY;
         for (int k = 0; k < 4 && k < sweeps_; ++k) rho = std::fmax(rho, ratio_[k]);
@@ -25,6 +27,7 @@ class Convergence {
     }
 
  private:
+    double rounding_;  // goes round and round, and adds up from bin to bin
     double ratio_[4] = {}, last_ = 0.0;
     int64_t sweeps_ = 0;
 };

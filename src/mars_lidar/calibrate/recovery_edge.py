@@ -74,7 +74,6 @@ class Edge:
         matrix = np.array([[left + slope**2 * variance, slope * variance], [slope * variance, variance]])
         return Edge(dead, jitter_ns, matrix, self.fits)
 
-
     def followed(self, follows: tuple[float, float], off_ns: float = 0.0) -> Edge:
         """The edge with the errors that it has with a light which was fitted with the edge's own jitter.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar.calibrate.armed_time import ArmedTime
 from mars_lidar.calibrate.calibration_light import LEAST, Light
@@ -19,7 +20,8 @@ from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 _STEPS = 200
 _CONVERGED = 1e-8  # Newton decrement: twice what log L could still gain
 _DIGITS, _CORNERS = 1e-3, 0.5  # the same where no step gains: half a standard error, with corners
-_SLOW, _GAIN, _SCALE = 5, 1e-5, 0.2  # so many steps in turn, cut to this and gaining less, are a ridge without end
+_LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e8  # of a step, in parts of the information of each parameter
+_SLOW, _GAIN = 5, 1e-5  # so many damped steps in turn that gain less than this are on a ridge without end
 _FEW = 20.0  # photons of the background
 _WIDTHS = 24  # pulse widths tried to begin with, where it is not known
 
@@ -44,10 +46,14 @@ def log_likelihood(seen: ArmedTime, rate: FloatArray) -> float:
 
 
 def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
-    """Fisher scoring with step halving from `theta`; parameters at 0 that want to be negative stay there."""
+    """Fisher scoring from `theta`, damped (Levenberg, Marquardt) where a full step gains nothing.
+
+    Parameters at 0 that want to be negative stay there. Damped steps, unlike shorter ones, still move what is well
+    known where a combination of others is not: a bright pulse behind a wide jitter tells little of signal and width.
+    """
     theta = light.bounded(theta)
     best = log_likelihood(seen, light.rate(theta)) + light.known(theta)[0]
-    converged, slow = False, 0
+    converged, slow, damping = False, 0, 0.0
     information = np.zeros((theta.size, theta.size))
     for _ in range(_STEPS):
         rate, slopes = light.jacobian(theta)
@@ -56,25 +62,26 @@ def fit(seen: ArmedTime, light: Light, theta: FloatArray) -> Fit:
         score = slopes.T @ (seen.registrations / rate - seen.passes) + pull
         information = slopes.T @ ((seen.passes / rate)[:, None] * slopes) + stiff
         free = _free(light, theta, score, information)
-        step = np.zeros(theta.size)
-        step[free] = _solve(information[np.ix_(free, free)], score[free])
-        decrement = float(step @ score)
+        decrement = float(_step(information, score, free, 0.0) @ score)
         if decrement < _CONVERGED:
             converged = True
             break
-        scale = 1.0
-        while scale > 1e-8:
-            trial = light.bounded(theta + scale * step)
+        damping = damping / 100.0 if damping > 100.0 * _LEAST_DAMPING else 0.0
+        while damping < _MOST_DAMPING:
+            trial = light.bounded(theta + _step(information, score, free, damping))
             found = log_likelihood(seen, light.rate(trial)) + light.known(trial)[0]
             if found > best:
                 break
-            scale *= 0.5
+            damping = max(10.0 * damping, _LEAST_DAMPING)
         else:  # log L is at the end of its digits, or has the corners of a sampled pulse
             converged = decrement < (_CORNERS if isinstance(light.pulse, SampledPulse) else _DIGITS)
             break
-        slow = slow + 1 if scale < _SCALE and found - best < _GAIN else 0
+        slow = slow + 1 if damping > 0.0 and found - best < _GAIN else 0
         theta, best = trial, found
+        if light.is_brightest(theta):
+            break
         if slow == _SLOW:
+            converged = decrement < _DIGITS
             break
     return Fit(theta, _not_sure(seen, light, theta, information), best, converged)
 
@@ -90,7 +97,7 @@ def _not_sure(seen: ArmedTime, light: Light, theta: FloatArray, information: Flo
     return np.asarray(slopes.T @ ((seen.passes / np.maximum(rate, 1e-300))[:, None] * slopes) + light.known(more)[2])
 
 
-def _free(light: Light, theta: FloatArray, score: FloatArray, information: FloatArray) -> FloatArray:
+def _free(light: Light, theta: FloatArray, score: FloatArray, information: FloatArray) -> NDArray[np.bool_]:
     """Which parameters may move: none beyond the range of its light, and no delay of a return without light."""
     k = light.returns
     free = np.ones(theta.size, bool)
@@ -105,11 +112,14 @@ def _free(light: Light, theta: FloatArray, score: FloatArray, information: Float
     return free
 
 
-def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Symmetric positive solution, scaled; by least squares where the matrix has lost rank."""
+def _step(information: FloatArray, score: FloatArray, free: NDArray[np.bool_], damping: float) -> FloatArray:
+    """Scoring step (p,) of the free parameters; by least squares where the information has lost rank."""
+    matrix = information[np.ix_(free, free)]
     scale = 1.0 / np.sqrt(np.diag(matrix))
-    scaled = matrix * scale * scale[:, None]
-    return np.asarray(scale * np.linalg.lstsq(scaled, scale * right, rcond=1e-12)[0])
+    scaled = matrix * scale * scale[:, None] + damping * np.eye(scale.size)
+    step = np.zeros(score.size)
+    step[free] = scale * np.linalg.lstsq(scaled, scale * score[free], rcond=1e-12)[0]
+    return step
 
 
 def covariance(light: Light, found: Fit) -> FloatArray:

@@ -138,6 +138,10 @@ class Light:
             out[-1] = np.clip(out[-1], 0.05 * self.jitter_ns, 4.0 * self.jitter_ns)
         return out
 
+    def is_brightest(self, theta: FloatArray) -> bool:
+        """Whether there is as much light as a jittered pixel may have: its likelihood grows, if at all, for ever."""
+        return self.jitter_ns > 0.0 and float(theta[: 1 + self.returns].sum()) > 0.99 * MOST_BLURRED
+
     @property
     def least_sigma_ns(self) -> float:
         """The narrowest pulse that is told from a narrower one: a tenth of the jitter, of 20 bins or so."""

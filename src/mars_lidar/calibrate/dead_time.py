@@ -12,7 +12,7 @@ from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch, fitted
 from mars_lidar.calibrate.calibration_result import Calibration, nearest
 from mars_lidar.calibrate.departure import SIGNIFICANT, departure_of, too_coarse
 from mars_lidar.calibrate.fine_light import fine_light
-from mars_lidar.calibrate.hidden_dead_time import hidden
+from mars_lidar.calibrate.hidden_dead_time import EDGE, excess, hidden
 from mars_lidar.calibrate.intervals import FloatArray, Stream
 from mars_lidar.calibrate.jittered import normal_kernel, unblurred
 from mars_lidar.calibrate.recovery_edge import ORDINARY, REACH, Edge, Law, edge_of
@@ -27,6 +27,7 @@ from mars_lidar.statistics.law import registration_pdf
 SHARP = 0.01  # false-alarm probability of a blurred edge
 HIDDEN = 14.0  # of a jitter this many mean excesses of the smallest interval wide nine in ten are seen
 _ROUNDS = 12
+_NODES = 1.05  # ratio of the widths of an edge for which the light behind it is computed
 _BINS_PER_WIDTH = 3
 _LEAST_BINS, _MOST_BINS = 2**10, 2**15  # of the light behind an edge
 _STARTS = (0.15, 0.06, 0.4, 1.0)  # widths tried, in parts of the reach over which the edge is not sharp
@@ -39,6 +40,16 @@ _HIDES = (
     "signal, delay and width are not known: the pulse is bright, only its first photons are seen, and how much of its "
     "width is jitter is not"
 )
+_LATER = (
+    "all of the light is not known: a jitter may hide after which, to be safe, hardly a registration is left: give the "
+    "dead time and the jitter"
+)
+_STEP = 0.2  # of the light behind an edge that falls before it, where the dead time keeps it away
+_BLURRED = 3.0  # jitters before the first photons of a bright pulse
+_ROUNDED = 0.1  # standard errors of the light that the dead time's rounding may move it by
+_COARSE = 2.0  # units of a clock that runs free, of a pulse below which its shape is not known
+_MOSTLY = 0.7  # of the recorded width of a bright pulse that is jitter: then pulse and signal hide in it
+_FOLLOWED = 0.5  # of a change of a bright pulse's jitter that the edge follows: then it is not the edge that tells it
 _PARTS = (0.6, 1.0)  # of it that are tried
 _ALL = 0.98  # of the pulse that may be jitter
 _WIDEST = 0.1  # periods that a jitter may be wide where no pulse limits it
@@ -93,12 +104,20 @@ class Unknown:
         What a dead time may be below it for want of light, or above it with a jitter that hides, is in the error.
         """
         stream, smallest = self.stream, first.dead_time_ns
-        excess = stream.period_ns / max(stream.registrations * _rate_after(stream, first), 1e-300)
-        told = self.jitter_ns is not None
+        first = self._certain(first)
+        told, law = self.jitter_ns is not None, self._any_width(first)
         sigma = min(_width(first), _WIDEST * stream.period_ns)
-        dead = max(smallest - excess, 0.0)
-        left = hidden(self._ages(), self._any_width(first), stream.registrations, dead, 0.0 if told else _ALL * sigma)
-        error = max(excess, left.below_ns, 0.0 if told else left.above_ns)
+        mean, error = excess(law(0.0), stream.registrations, smallest)
+        dead = max(smallest - mean, 0.0)
+        left = hidden(self._ages(), law, stream.registrations, dead, 0.0 if told else _ALL * sigma)
+        # how the light begins is not known on the scale of a coarse clock, or of a jitter of a bright pulse
+        coarse = stream.units == 0 and not _width(first) > _COARSE * stream.unit_ns
+        guard = 2.0 * stream.unit_ns if coarse else 0.0
+        if not told and first.pulse is not None and first.signal > _SHUT:
+            guard = max(guard, _BLURRED * left.jitter_ns)
+        if guard > 0.0:
+            error = max(error, excess(law(0.0), stream.registrations, smallest, guard)[1])
+        error = max(error, left.below_ns, 0.0 if told else left.above_ns)
         limit = 0.0 if told else math.hypot(max(left.jitter_ns, 0.0), stream.unit_ns)
         found = replace(
             first,
@@ -113,22 +132,49 @@ class Unknown:
                 return replace(found, edge_fits=False, dead_time_error_ns=math.nan)
         return self._with_hidden(found, min(limit, _ALL * sigma))
 
+    def _certain(self, first: Calibration) -> Calibration:
+        """Watched from where the pixel is armed for certain, with two roundings of the clock, where that matters."""
+        unit, rate = self.stream.unit_ns, first.rate
+        peak = float(rate.max(initial=0.0)) * rate.size / self.stream.period_ns
+        if 2.0 * unit * peak < _ROUNDED / math.sqrt(max(self.stream.registrations, 1)):
+            return first
+        # whole units: to where one ends, as a record stands in the middle of its own; others are spread over theirs too
+        hold = max(first.hold_off_ns, first.dead_time_ns + (1.5 if self.stream.units else 3.0) * unit)
+        if not hold > first.hold_off_ns:
+            return first
+        later = self._pass(Watch(first.dead_time_ns, hold, first.jitter_ns, by=first.dead_time_by), first)
+        return later if later.armed.used >= FEW else first
+
     def _with_hidden(self, found: Calibration, jitter: float) -> Calibration:
         """With the light that a jitter that may hide would make, in the covariance: of a bright pulse it moves it."""
+        if found.pulse is None:
+            return self._with_later(found, jitter)
         if not isinstance(found.pulse, GaussianPulse) or jitter < _MATTERS * found.pulse.sigma_ns:
             return found
         if found.signal < _BRIGHT or isinstance(self.shape, Pulse):
             return found
         if found.signal > _SHUT:
-            lost = np.array([name.startswith(("signal", "delay", "sigma")) for name in found.names])
-            covariance = np.where(lost | lost[:, None], math.nan, found.covariance)
-            return replace(found, covariance=covariance, unknown=(*found.unknown, _HIDES))
-        hold, covariance = found.armed.hold_off_ns, found.covariance
+            return _without_pulse(found)
+        covariance = found.covariance
         for part in _PARTS:
-            watch = Watch(hold, hold, part * jitter, by=found.dead_time_by)
-            moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
+            # armed for certain later than without it
+            hold = max(found.armed.hold_off_ns, found.dead_time_ns + CERTAIN * part * jitter)
+            other = self._pass(Watch(found.armed.hold_off_ns, hold, part * jitter, by=found.dead_time_by), found)
+            if other.armed.used < FEW or not other.converged:
+                return _without_pulse(found)
+            moved = nearest(found, other.parameters - found.parameters)
             covariance = covariance + np.outer(moved, moved)
         return replace(found, covariance=covariance)
+
+    def _with_later(self, found: Calibration, jitter: float) -> Calibration:
+        """A free shape whose error has in it what a hold-off makes that is safe with a jitter which may hide."""
+        hold = found.dead_time_ns + CERTAIN * jitter
+        if not hold > found.armed.hold_off_ns:
+            return found
+        other = self._pass(Watch(hold, hold, by=found.dead_time_by))
+        if other.armed.used < FEW:
+            return replace(found, covariance=np.full_like(found.covariance, math.nan), unknown=(*found.unknown, _LATER))
+        return replace(found, covariance=found.covariance + (other.total - found.total) ** 2)
 
     def _ages(self, reach_ns: float = 0.0) -> Ages:
         """The shortest intervals, up to at least `reach_ns` above the smallest."""
@@ -177,7 +223,7 @@ class Unknown:
         period, ages = self.stream.period_ns, self._ages()
         jitter = width / math.sqrt(2.0) if self.jitter_ns is None else self.jitter_ns
         tried: list[tuple[float, float]] = []
-        found = first
+        found, failed = first, 0
         for _ in range(_ROUNDS):
             sigma = _width(found)
             jitter = min(jitter, _ALL * sigma)
@@ -185,10 +231,13 @@ class Unknown:
                 return None
             hold = max(dead + CERTAIN * jitter, self.hold_off_ns or 0.0)
             found = self._pass(Watch(dead, hold, jitter), None if found is first else found)
-            if found.armed.used < FEW:
+            failed += not found.converged
+            if found.armed.used < FEW or failed > 1:
                 return None
             edge = self._edge(ages, found, dead, width)
             if edge is None:
+                return None
+            if not self._is_step(found, edge, self._bins(width)):
                 return None
             if _is_clock(edge, ages):
                 return self._clocked(first, edge, ages)
@@ -223,7 +272,11 @@ class Unknown:
             watch = replace(self._watch(edge), jitter_ns=edge.jitter_ns + edge.jitter_error_ns)
             moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
             found = replace(found, covariance=found.covariance + np.outer(moved, moved))
-        return replace(found, dead_time_ns=edge.dead_time_ns, dead_time_error_ns=edge.dead_time_error_ns)
+        found = replace(found, dead_time_ns=edge.dead_time_ns, dead_time_error_ns=edge.dead_time_error_ns)
+        hides = found.jitter_ns > _MOSTLY * _width(found) or follows[1] > _FOLLOWED
+        if self.jitter_ns is None and found.signal > _SHUT and hides:
+            return _without_pulse(found)
+        return found
 
     def _follows(self, ages: Ages, found: Calibration, edge: Edge, width: float) -> tuple[float, float]:
         """By how much of a change of the jitter that the light is fitted with dead time and jitter of the edge follow.
@@ -269,6 +322,14 @@ class Unknown:
         edge = edge_of(ages, self._law(found, width, ages.clock_ns), dead, width, off)
         return edge if edge is None or self.jitter_ns is None else edge.known(self.jitter_ns, 0.0)
 
+    def _is_step(self, found: Calibration, edge: Edge, bins: int) -> bool:
+        """Whether the dead time makes the edge: not the light, which is no less before it than behind it."""
+        width = math.hypot(math.sqrt(2.0) * edge.jitter_ns, self.stream.unit_ns)
+        ages = np.maximum(edge.dead_time_ns + width * np.array([-3.0, -1.0, 0.0, 2.0]), 0.0)
+        fallen = self._behind(found, bins).fallen(ages)
+        kept, seen = float(fallen[1] - fallen[0]), float(fallen[3] - fallen[2])
+        return self.stream.registrations * kept >= EDGE and kept >= _STEP * seen
+
     def _bins(self, width_ns: float) -> int:
         """Bins that are narrow beside the edge."""
         bins = _MOST_BINS
@@ -283,13 +344,27 @@ class Unknown:
             same = self._behind(found, bins)
             return lambda width_ns: same
 
-        known: dict[float, Underlying] = {}
+        widest = 0.99 * found.pulse.sigma_ns**2  # variance of a jitter
+        known: dict[int, Underlying] = {}
+
+        def variance(width_ns: float) -> float:
+            """Of the jitter that makes an edge of that width."""
+            return min(0.5 * max(width_ns**2 - clock_ns**2, 0.0), widest)
+
+        def at(node: int) -> Underlying:
+            if node not in known:
+                jitter = math.sqrt(variance(_NODES**node))
+                known[node] = self._behind(replace(found, jitter_ns=jitter), bins)
+            return known[node]
 
         def behind(width_ns: float) -> Underlying:
-            if width_ns not in known:
-                jitter = math.sqrt(0.5 * max(width_ns**2 - clock_ns**2, 0.0))
-                known[width_ns] = self._behind(replace(found, jitter_ns=jitter), bins)
-            return known[width_ns]
+            # between two widths by the variance of the jitter, which leaves the variance of the pulse as it is
+            node = math.floor(math.log(width_ns) / math.log(_NODES))
+            low, high = variance(_NODES**node), variance(_NODES ** (node + 1))
+            if high == low:
+                return at(node)
+            part = float(np.clip((variance(width_ns) - low) / (high - low), 0.0, 1.0))
+            return at(node).mixed(at(node + 1), part)
 
         return behind
 
@@ -359,6 +434,12 @@ class Unknown:
         return Watch(edge.dead_time_ns, hold, edge.jitter_ns, edge.jitter_error_ns, edge.dead_time_error_ns, "edge")
 
 
+def _without_pulse(found: Calibration) -> Calibration:
+    lost = np.array([name.startswith(("signal", "delay", "sigma")) for name in found.names])
+    covariance = np.where(lost | lost[:, None], math.nan, found.covariance)
+    return replace(found, covariance=covariance, unknown=(*found.unknown, _HIDES))
+
+
 def _nearer(tried: list[tuple[float, float]]) -> float:
     """Where what comes out is what was put in, by the last two tries."""
     jitter, got = tried[-1]
@@ -383,15 +464,3 @@ def _within_pulse(edge: Edge, found: Calibration) -> bool:
 def _width(found: Calibration) -> float:
     """Sigma of a Gaussian pulse that is seen, else inf."""
     return found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) and is_seen(found) else math.inf
-
-
-def _rate_after(stream: Stream, found: Calibration) -> float:
-    """Mean photons per period that fall on the pixel at the moment it re-arms."""
-    rate, bins = found.rate, found.armed.passes.size
-    shift = found.dead_time_ns / stream.period_ns
-    total = 0.0
-    for phase in stream.phases():
-        again = phase + shift
-        again -= np.floor(again)
-        total += float(rate[np.minimum((again * bins).astype(np.int64), bins - 1)].sum()) * bins
-    return total / max(stream.registrations, 1)

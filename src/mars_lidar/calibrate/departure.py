@@ -10,6 +10,7 @@ from mars_lidar.calibrate.intervals import FloatArray, Stream
 from mars_lidar.calibrate.same_phase import SamePhase, same_phase
 
 SIGNIFICANT = 5.0  # standard deviations
+_NARROW = 0.2  # units, of which a bin is one of a coarse clock
 _BRIGHT = 0.005  # photons of a unit of a clock that runs free: the phase alone does not tell their rate
 
 
@@ -28,5 +29,8 @@ def departure_of(stream: Stream, found: Calibration) -> SamePhase:
 
 def too_coarse(stream: Stream, rate: FloatArray) -> bool:
     """Whether much light (n,) falls within one unit of a clock that does not run with the laser."""
-    bins = max(stream.unit_ns / stream.period_ns * rate.size, 1.0)
-    return stream.unit_ns > 0.0 and stream.units == 0 and bool(rate.max(initial=0.0) * bins > _BRIGHT) and bins > 1.0
+    if stream.unit_ns == 0.0 or stream.units > 0:
+        return False
+    bins = stream.unit_ns / stream.period_ns * rate.size  # of a unit
+    # of a bin that is hardly wider than a unit all light may be that of one unit
+    return bool(rate.max(initial=0.0) * (max(bins, 1.0) if bins > _NARROW else bins) > _BRIGHT)

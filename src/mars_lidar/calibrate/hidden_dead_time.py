@@ -26,10 +26,11 @@ _MOST = 400  # intervals looked at ...
 _SHARE = 0.1  # ... and of all
 _CELLS = 70  # ages on either side of the smallest
 _WIDTHS = 20
+_AGES = 1000  # below the smallest interval
 _REACH = 4.0  # widths from beyond which nothing comes
 _DROPS = (1.0, 3.0, 6.0, 10.0)  # of log likelihood: an error is right at each of them
 _ORDINARY = 3.0  # drop up to which that holds above, where a jitter far from ordinary could hide
-_EDGE = 10.0  # intervals that the dead time has kept away, or there is no edge
+EDGE = 10.0  # intervals that the dead time has kept away, or there is no edge
 _SEEN = 4.0  # drop of log likelihood at which a jitter would have been seen
 
 
@@ -84,9 +85,36 @@ def hidden(ages: Ages, behind: Law, registrations: int, dead_time_ns: float, wid
     jitter = float(widths[np.flatnonzero(by_width > best - _SEEN)[-1]]) / math.sqrt(2.0)
     # where little light would have shown a shorter dead time no edge is seen, but what the light begins with
     shown = behind(0.0).fallen(np.array([max(first - _REACH * math.sqrt(2.0) * widest_ns, 0.0), first]))
-    if widest_ns > 0.0 and registrations * float(shown[1] - shown[0]) < _EDGE:
+    if widest_ns > 0.0 and registrations * float(shown[1] - shown[0]) < EDGE:
         jitter = widest_ns
     return Hidden(max(below, 0.0), max(above, 0.0), jitter)
+
+
+def excess(behind: Underlying, registrations: int, first_ns: float, guard_ns: float = 0.0) -> tuple[float, float]:
+    """By how much the smallest interval exceeds the dead time behind a sharp edge: the mean, and the error, ns.
+
+    A dead time that is less by x has the likelihood e^-H(x), with H(x) the intervals that would have been seen between.
+    Where the light falls evenly, mean and error are both 1 / (sum of the rates at re-arming). `guard_ns`: light that
+    falls within this time before the smallest interval is left out of the error, where it is not known so finely.
+    """
+    if first_ns == 0.0:
+        ages = np.geomspace(1e-9, 1.0, _AGES) * behind.period_ns
+        return 0.0, float(np.interp(1.0, registrations * behind.fallen(ages), ages))
+    below = np.concatenate([[0.0], np.geomspace(1e-12, 1.0, _AGES)]) * first_ns
+    shown = registrations * behind.fallen(np.maximum(first_ns - below, 0.0))
+
+    def moments(hidden: FloatArray) -> tuple[float, float]:
+        weight = np.exp(-np.maximum(hidden, 0.0))
+        total, mean, square = (float(np.trapezoid(weight * below**k, below)) for k in range(3))
+        return mean / total, square / total
+
+    mean, square = moments(shown[0] - shown)
+    error = math.sqrt(max(square - mean**2, 0.0))
+    if guard_ns > 0.0:
+        near = registrations * float(behind.fallen(np.array([max(first_ns - guard_ns, 0.0)]))[0])
+        far, square = moments(near - shown)
+        error = max(error, math.sqrt(max(square - 2.0 * far * mean + mean**2, 0.0)))
+    return mean, error
 
 
 def _mass(behind: Underlying, edges: FloatArray, first_ns: float) -> FloatArray:

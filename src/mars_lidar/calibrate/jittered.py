@@ -16,7 +16,7 @@ lambda * f; of a bright pulse it is later and narrower, because the first photon
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -45,14 +45,17 @@ class Records:
         self._n = rate.size
         self._total = float(rate.sum())
         self._k = np.arange(self._n)
-        place = (self._k + self._n // 2) % self._n - self._n // 2
         # e^-Lambda at the edges of bins is e^(-total k / n) times a factor that repeats; the kernel takes the rest
         before = np.concatenate([[0.0], np.cumsum(rate)[:-1]])
         alive = self._total * self._k / self._n - before
         self._alive = np.exp(alive - alive.max())  # up to a factor, which falls out
-        tilted = np.where(kernel > 0.0, kernel, 0.0) * np.exp(np.clip(self._total * place / self._n, -700.0, 700.0))
-        self._kernel, self._moment = tilted, tilted * place / self._n
-        self._blurred = self._convolved(self._alive, tilted)
+        used = np.flatnonzero(kernel > 0.0)
+        place = (used + self._n // 2) % self._n - self._n // 2
+        self._low, self._high = int(place.min()), int(place.max())
+        self._place = np.arange(self._low, self._high + 1)  # of the kernel's bins
+        tilt = np.exp(np.clip(self._total * self._place / self._n, -700.0, 700.0))
+        self._kernel = np.maximum(kernel[self._place % self._n], 0.0) * tilt
+        self._blurred = self._convolved(self._alive, self._kernel)
         below = -np.log(np.maximum(self._blurred, 1e-300))
         self.rate = np.maximum(np.append(below[1:], below[0]) - below + self._total / self._n, 1e-300)
 
@@ -62,19 +65,24 @@ class Records:
         before = np.concatenate([[0.0], np.cumsum(change)[:-1]]) - grown * self._k / self._n
         blurred = self._convolved(self._alive * before, self._kernel)
         if grown:
-            blurred = blurred - grown * self._convolved(self._alive, self._moment)
+            blurred = blurred - grown * self._moment
         part = blurred / np.maximum(self._blurred, 1e-300)
         return np.asarray(np.append(part[1:], part[0]) - part + grown / self._n)
 
+    @cached_property
+    def _moment(self) -> FloatArray:
+        """What a change of all light alike, from the phase of the bin on, adds."""
+        return self._convolved(self._alive, self._kernel * self._place / self._n)
+
     def _convolved(self, values: FloatArray, kernel: FloatArray) -> FloatArray:
-        if self._total < _BRIGHT:
-            return np.fft.irfft(np.fft.rfft(values) * np.fft.rfft(kernel), self._n)
-        used = np.flatnonzero(kernel)
-        place = (used + self._n // 2) % self._n - self._n // 2
-        low, high = int(place.min()), int(place.max())
-        window = kernel[np.arange(low, high + 1) % self._n]
-        around = values[np.arange(-high, self._n - low) % self._n]
-        return np.convolve(around, window, "valid")
+        """Values (n,) of the period, blurred by a kernel at `_place`."""
+        around = values[np.arange(-self._high, self._n - self._low) % self._n]
+        if self._total >= _BRIGHT:
+            return np.convolve(around, kernel, "valid")
+        from scipy.fft import irfft, next_fast_len, rfft
+
+        size = next_fast_len(around.size, real=True)  # a period is often a prime number of bins
+        return np.asarray(irfft(rfft(around, size) * rfft(kernel, size), size)[kernel.size - 1 : around.size])
 
 
 def split_sigma(recorded_ns: float, jitter_ns: float) -> tuple[float, float]:

@@ -14,7 +14,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar.calibrate.intervals import FloatArray, Stream
 
@@ -88,6 +87,11 @@ class Underlying:
         """Light and the phases of registrations, in any unit."""
         return cls(rate, phases / max(float(phases.sum()), 1e-300), period_ns)
 
+    def mixed(self, other: Underlying, part: float) -> Underlying:
+        """Between this light and another one, of which it has a part of 0 to 1."""
+        rate = (1.0 - part) * self.rate + part * other.rate
+        return Underlying(rate, (1.0 - part) * self.phases + part * other.phases, self.period_ns)
+
     def fallen(self, age_ns: FloatArray) -> FloatArray:
         """Photons (m,) that fall within ages (m,) >= 0 of a registration, in the mean."""
         n = self.rate.size
@@ -105,11 +109,9 @@ class Underlying:
         n = self.rate.size
         cumulative = np.concatenate([[0.0], np.cumsum(np.tile(self.rate, 2))])
         total = float(self.rate.sum())
-        phases = self.phases
-        used: NDArray[np.int64] | None = np.flatnonzero(phases)
-        if used.size > _SPARSE * n:  # slices of neighbours are faster than a choice of a few
-            used = None
-        else:
+        used, phases = np.flatnonzero(self.phases), self.phases
+        sparse = used.size < _SPARSE * n  # else slices of neighbours are faster than a choice of some
+        if sparse:
             phases = phases[used]
 
         def light(age: float) -> FloatArray:
@@ -118,10 +120,10 @@ class Underlying:
             whole = math.floor(x)
             cycle, place = divmod(whole, n)
             part = x - whole
-            if used is None:
-                low, high = cumulative[place : place + n], cumulative[place + 1 : place + 1 + n]
-            else:
+            if sparse:
                 low, high = cumulative[place + used], cumulative[place + 1 + used]
+            else:
+                low, high = cumulative[place : place + n], cumulative[place + 1 : place + 1 + n]
             return np.asarray(low + part * (high - low) + cycle * total)
 
         armed = light(dead_time_ns)

@@ -151,10 +151,15 @@ def estimate(slope: float, registers: int) -> list[str]:
     ]
 
 
+def mars_steps() -> dict[str, Resources]:
+    """The steps of the engine mars, each compiled alone, by their names in C++."""
+    names = ["mars::nothing", "mars::two_poisson", "mars::form"]
+    return compiled_code(source(MARS_LAWS.header) + STEPS, names, "sm_90")
+
+
 def mars_estimate(found: dict[Kernel, Resources]) -> list[str]:
     """The same for mars at 1e5 cycles: rounds of Poisson numbers in all bins."""
-    code = source("mars_device.h") + STEPS
-    steps = compiled_code(code, ["mars::nothing", "mars::two_poisson", "mars::form"], "sm_90")
+    steps = mars_steps()
     nothing = steps["mars::nothing"].instructions
     each = (steps["mars::two_poisson"].instructions - nothing) / 2.0 + steps["mars::form"].instructions - nothing
     issue = ISSUE_PER_S * 32 / (each * BINS * PIXELS)

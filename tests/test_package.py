@@ -131,3 +131,13 @@ def test_packages_of_formats_and_learning_are_there_when_they_are_asked_for():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "False"]
+
+
+def test_nothing_native_is_left_when_the_interpreter_ends():
+    script = (
+        "import mars_lidar as ml; d = ml.Detector(dead_time_ns=1.0, jitter=ml.Jitter(sigma_ns=0.3)); "
+        "s = ml.System(period_ns=100.0, cycles=10, bins=8, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=d); "
+        "ml.simulate(ml.Flux(1.0, 1.0, 5.0), s)"
+    )
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert (ran.stdout, ran.stderr) == ("", "")  # nanobind tells of instances that were never freed

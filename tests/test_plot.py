@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import mars_lidar as ml
 from mars_lidar import io, plot
-from mars_lidar.plot import data
+from mars_lidar.compare import views
 
 SYSTEM = ml.System(
     period_ns=100.0,
@@ -103,7 +103,7 @@ def test_pixels_outside_are_named(pixels, message):
 def test_maps_are_read_in_bands(monkeypatch):
     cube = cube_of(step())
     whole = plot.count_maps(cube)
-    monkeypatch.setattr(data, "_READ_BYTES", 1)
+    monkeypatch.setattr(views, "_READ_BYTES", 1)
     for a, b in zip(whole, plot.count_maps(cube), strict=True):
         assert np.array_equal(a, b, equal_nan=True)
 
@@ -166,7 +166,7 @@ LIT = {
 def test_the_predicted_histogram_is_the_mean_of_many(name, engine):
     cube = cube_of(LIT[name], engine=engine, realizations=4000)
     for x in (0, 1):
-        predicted = data.predicted_counts(cube, 0, x)
+        predicted = views.predicted_counts(cube, 0, x)
         drawn = cube.histogram[:, 0, x].astype(float)
         require({"mean": mean_vector(drawn, predicted)}, f"predicted counts: {engine}, {name}, pixel {x}")
         wrong = drawn @ np.eye(SYSTEM.bins)[:, ::-1]  # the test can tell: bins in the wrong order
@@ -174,7 +174,7 @@ def test_the_predicted_histogram_is_the_mean_of_many(name, engine):
 
 
 def test_no_prediction_where_it_would_take_too_long():
-    assert data.predicted_counts(cube_of(step(2, 2), SYSTEM.replace(cycles=20_001)), 0, 0) is None
+    assert views.predicted_counts(cube_of(step(2, 2), SYSTEM.replace(cycles=20_001)), 0, 0) is None
 
 
 def test_a_headline_names_what_is_not_plain():
@@ -185,13 +185,13 @@ def test_a_headline_names_what_is_not_plain():
         pulse=ml.GaussianPulse(sigma_ns=1.0),
         detector=ml.Detector(dead_time_ns=50.0),
     )
-    assert data.instrument(plain) == "1 bin of 100 ns; 1 laser period of 100 ns; dead time 50 ns"
+    assert views.instrument(plain) == "1 bin of 100 ns; 1 laser period of 100 ns; dead time 50 ns"
     odd = plain.replace(
         bins=1000,
         cycles=2000,
         detector=ml.Detector(dead_time_ns=0.0, mode="synchronous", dark_count_hz=5.0, max_events_per_exposure=4),
     )
-    assert data.instrument(odd) == (
+    assert views.instrument(odd) == (
         "1,000 bins of 100 ps; 2,000 laser periods of 100 ns; dead time 0 ns, synchronous, dark count, "
         "max events per exposure"
     )

@@ -20,7 +20,7 @@ from studies import Request
 from studies.common.report import Row, write
 from studies.common.sample import PERIOD_NS, system_of
 
-GOAL = 0.05  # standard deviations of a bin that its mean may be off (engines/_feedback_grid.py)
+GOAL = 0.05  # standard deviations of a bin that its mean may be off (engines/feedback_grid.py)
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import shutil
 from itertools import product
+from pathlib import Path
 
 import pytest
 
+from benchmarks.gpu_resources import mars_steps
 from benchmarks.nvrtc import NotFound, compiled, library
-from mars_lidar.cuda.kernels import MARS_LAWS, Kernel, Sink, Variant, feedback_histograms, mars_histograms
+from mars_lidar.cuda import kernels
+from mars_lidar.cuda.kernels import (
+    HEADERS,
+    MARS_LAWS,
+    Kernel,
+    Sink,
+    Variant,
+    feedback_histograms,
+    mars_histograms,
+    source,
+)
 
 try:
     library()
@@ -44,6 +57,25 @@ def test_the_other_engines_compile_without_spills(architecture: str, kernels: li
         assert used.spill_stores == used.spill_loads == 0, kernel
         assert used.registers <= 168, kernel
         assert used.instructions > 500, kernel
+
+
+def test_the_steps_of_the_estimate_compile():
+    """What `benchmarks.gpu_resources` counts the instructions of, alone."""
+    found = mars_steps()
+    assert (
+        found["mars::two_poisson"].instructions > found["mars::form"].instructions > found["mars::nothing"].instructions
+    )
+
+
+def test_the_source_names_the_headers_of_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """CuPy finds what it has compiled before by the source: a change in any header must change it."""
+    shutil.copytree(HEADERS, tmp_path / "native", ignore=shutil.ignore_patterns("*.cpp"))
+    monkeypatch.setattr(kernels, "HEADERS", tmp_path / "native")
+    before = source.__wrapped__(MARS_LAWS.header)
+    assert before == source(MARS_LAWS.header)
+    with (tmp_path / "native" / "numbers" / "random.h").open("a") as header:
+        header.write("// changed\n")
+    assert source.__wrapped__(MARS_LAWS.header) != before
 
 
 def test_a_mistake_is_told():

@@ -20,7 +20,8 @@ from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.jitter import Jitter as Jitter
 from mars_lidar.instrument.jitter import SampledJitter as SampledJitter
 from mars_lidar.instrument.jitter import jitter_from_dict
-from mars_lidar.instrument.pulse import GaussianPulse, native_pulse
+from mars_lidar.instrument.native_pulse import native_pulse
+from mars_lidar.instrument.pulse import GaussianPulse
 
 _MAX_RATE_HZ = 1e12
 _MAX_EVENTS = 2**31 - 1

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -124,7 +123,6 @@ class GaussianPulse(Pulse):
         return {"kind": "gaussian", "sigma_ns": self.sigma_ns}
 
     def _native(self, period_ns: float) -> _core.PulseTable:
-
         return _core.PulseTable.gaussian(self.sigma_ns / period_ns)
 
 
@@ -231,7 +229,6 @@ class SampledPulse(Pulse):
         return {"kind": "sampled", "values": self.values.tolist(), "bin_ns": self.bin_ns, "origin": self.origin}
 
     def _native(self, period_ns: float) -> _core.PulseTable:
-
         inside = np.flatnonzero(np.diff(self._cumulative) > 0)
         knots = np.ascontiguousarray(self._cumulative[inside[0] : inside[-1] + 2])
         return _core.PulseTable.sampled(knots, self.bin_ns / period_ns, self.support_ns()[0] / period_ns)
@@ -276,9 +273,3 @@ def pulse_from_dict(data: Any) -> Pulse:
             raise ValueError(f"pulse of kind 'sampled' must give {missing[0]}")
         return SampledPulse(data["values"], data["bin_ns"], data.get("origin", "peak"))
     raise ValueError(f"pulse must be a mapping with kind 'gaussian' or 'sampled', got {data!r}")
-
-
-@lru_cache(maxsize=16)
-def native_pulse(pulse: Pulse, period_ns: float) -> _core.PulseTable:
-    """The native form of a pulse for a laser period, ns."""
-    return pulse._native(period_ns)

@@ -28,22 +28,7 @@ INTERPOLATIONS, OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
 class Nodes:
     """Count law and histogram shape over a grid of (S, B): what a `Table` holds, and how it answers.
 
-    Attributes
-    ----------
-    system
-        Laser, detector and histogram; its `cycles` are those of ``cycles=None``.
-    method
-        ``"exposure"`` or ``"mars"``.
-    signal, background
-        (nS,), (nB,) axes, photons per period, ascending. The first may be 0: pixels without a return.
-    rearm
-        Of the chain, for ``"mars"``.
-    tolerance
-        Of the exposure statistics.
-    provenance
-        How the table came to be: version, request, axes in words, seconds, and the error measured at the end.
-    laws
-        Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.matched.trusted`).
+    The attributes are those of `mars_lidar.Table`.
     """
 
     system: System

@@ -14,6 +14,7 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
+// Which thread of the launch this is.
 struct DevicePlace {
     int64_t thread;  // of the whole launch
     int32_t lane;    // in its block

@@ -42,6 +42,8 @@ MARS_INLINE int64_t warp_sum(int64_t x) { return x; }
 MARS_INLINE float warp_highest(float x) { return x; }
 #endif
 
+// The threads of a block as a team, as `OneThread` of lanes/team.h is one. What they learn from each other goes through
+// `slots`, kBytes of the block's memory.
 class BlockTeam {
  public:
     static constexpr bool kAlone = false;

@@ -2,7 +2,7 @@
 // those of the processor's engine: the same source, no fused multiply-add, IEEE division.
 //
 // Threads of a warp run in step, so each waits for the longest exposure of its 32: the host hands out pixels in the
-// order of their brightness (gpu/exact.py), which makes them alike.
+// order of their brightness (mars_lidar/cuda/exact.py), which makes them alike.
 #pragma once
 #include "cuda/device.h"
 #include "exact/step.h"
@@ -42,6 +42,7 @@ struct BlockCounters {
     MARS_INLINE uint8_t* at(int32_t bin) const { return bytes + (bin >> 2) * (4 * lanes) + (bin & 3); }
 };
 
+// Adds to a bin of a row in the device's memory.
 template <class Count>
 MARS_INLINE void count_in_row(Count* row, int32_t bin, uint32_t number) {
     if constexpr (sizeof(Count) == 4) {
@@ -52,6 +53,7 @@ MARS_INLINE void count_in_row(Count* row, int32_t bin, uint32_t number) {
     }
 }
 
+// The histogram of one item: a row of the output, counted in place or, with `block`, in the block's memory first.
 template <class Count, bool block>
 class DeviceHistogram {
  public:

@@ -30,6 +30,7 @@ struct FeedbackTask {
 };
 
 #if defined(__CUDACC__)
+// The next batch of 32 streams that no other warp has taken: one thread of the warp asks, and tells the others.
 MARS_INLINE uint32_t warp_turn(uint32_t* next, int32_t lane) {
     uint32_t turn = 0;
     if (lane == 0) turn = atomicAdd(next, 1u);
@@ -39,6 +40,9 @@ MARS_INLINE uint32_t warp_turn(uint32_t* next, int32_t lane) {
 MARS_INLINE uint32_t warp_turn(uint32_t* next, int32_t lane) { return take_turns(next + lane, 1u); }
 #endif
 
+// Each thread draws the exposures of one stream after another, into rows of uint32 (`wide`) or uint16. The batch is
+// that of the processor with one lane; its scratch lies in the warp's part of `work`, where the rows of 32 threads are
+// side by side.
 template <bool wide>
 MARS_KERNEL feedback_histograms(const FeedbackTask task) {
     const DevicePlace place = device_place();

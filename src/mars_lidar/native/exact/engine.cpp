@@ -13,6 +13,7 @@
 namespace mars {
 namespace {
 
+// The kernels of one vector level.
 struct Level {
     const char* name;
     ExactKernel kernel, modes, recording, avalanches;  // free running, all other modes, any with more to it
@@ -30,6 +31,7 @@ std::vector<Level> levels() {
     return found;
 }
 
+// The kernel for a job at the level of this name, or the widest; std::invalid_argument where the processor has none.
 ExactKernel kernel_of(const std::string& name, const Job& job) {
     for (const Level& level : levels())
         if (name.empty() || name == level.name)
@@ -55,6 +57,8 @@ void run_exact(const Job& job, const PulseTable& pulse, const Output& output, in
     proto.output = output;
     proto.job = &job;
     proto.pulse = &pulse;
+    // four blocks to a thread, so that the last ones end together; not below 64 items, which keep the lanes of any
+    // level busy
     const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));
     const int64_t items = std::min(kMaxItems, share);
     run_chunks((job.items() + items - 1) / items, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {

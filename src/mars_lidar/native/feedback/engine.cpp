@@ -18,6 +18,7 @@ namespace {
 
 using Kernel = bool (*)(const FeedbackBatch&);
 
+// The kernel at the level of this name, or the widest; std::invalid_argument where the processor has none.
 Kernel kernel_of(const std::string& asked) {
 #define MARS_TRY_LEVEL(level, runs) \
     if ((asked.empty() || asked == #level) && (runs)) return feedback_kernel_##level;

@@ -10,6 +10,7 @@
 
 namespace mars {
 
+// The grid with the arrays into which its plain struct points.
 class CellGrid {
  public:
     FeedbackGrid grid;
@@ -65,6 +66,8 @@ class CellGrid {
     const std::vector<FeedbackEdge>& lap_edge() const { return lap_edge_; }
 
  private:
+    // For every edge of a cell: which cell lies a dead time before it, how many periods ago, and what part of that
+    // cell.
     void set_edges(int32_t base, double rest) {
         grid.watch = grid.cells;
         for (int32_t e = 0; e <= grid.cells; ++e) {

@@ -62,6 +62,7 @@ enum class FeedbackStatus : uint8_t {
     kLaps = 64,      // more laps are needed: kLaps + their number, all of a pixel
 };
 
+// Pixels that need more laps than these are refused: every lap is a period of cells in memory.
 constexpr int32_t kMostLaps = 64;
 
 // One batch: kTeam exposures at a time, each lane its own pixel. A lane counts cells from a first bin of its own, so

@@ -15,6 +15,7 @@ constexpr float kFewestArmed = 32.0f;        // in any cell, for one lap
 constexpr double kGhostsOfDeviation = 0.05;  // expected with one lap, in standard deviations of the count
 constexpr float kForgotten = 3e-3f;          // of the first sweep's change of the mean, with several laps
 constexpr float kModes = 3.0f;  // that a lap remembers, where ghosts are not counted (dead times up to 1/2)
+// Below these many periods, or pieces for each lap, the exact engine draws (docs/feedback.md, "Pieces of several laps").
 constexpr double kFewestLapCycles = 1e4, kFewestPieces = 1000.0;
 constexpr int32_t kFewestLaps = 3;
 

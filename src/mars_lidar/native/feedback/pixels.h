@@ -8,6 +8,7 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
+// Most sweeps of the mean and of the adjoint, and of integers in one lap.
 constexpr int kMeanSweeps = 40, kIntegerSweeps = 40;
 constexpr double kSettled = 0.04;        // a move of the history that ends a lane, in standard deviations of the count
 constexpr double kMeanError = 8e-6;      // of the mean per period: float32 sums, and the last sweep's change

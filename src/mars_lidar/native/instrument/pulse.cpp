@@ -43,6 +43,8 @@ double PulseShape::equivalent_width() const {
 
 namespace {
 
+// Cells of the tables of small energies: the leading bits of a float32, so that each octave has as many cells as any
+// other and small energies are looked up to the same relative precision.
 int32_t octave_cell(float p) {
     uint32_t word;
     std::memcpy(&word, &p, sizeof word);
@@ -72,6 +74,9 @@ void build_forward(PulseTable& table, const std::vector<double>& early, const st
     }
 }
 
+// The tables of a Gaussian pulse. Where it is longer than a period, its neighbours overlap in the frame and are added
+// up; energies of the early half count from the start, those of the late half from the end, so that both tails keep
+// their digits.
 void build_gaussian(PulseTable& table) {
     const PulseShape& shape = table.shape;
     const double half = std::min(0.5, shape.high());
@@ -156,6 +161,7 @@ std::vector<double> halved(const std::vector<double>& knots) {
     return fine;
 }
 
+// The tables of a sampled pulse: exact in each sample, where the density is constant.
 void build_sampled(PulseTable& table) {
     const PulseShape& shape = table.shape;
     std::vector<double> knots = shape.knots;

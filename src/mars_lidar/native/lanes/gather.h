@@ -47,6 +47,7 @@ struct Beyond {
     int n;
     MARS_INLINE int32_t operator()(int lane) const { return find(lane + n); }
 };
+// Places that are known already, for what asks for a function.
 struct Given {
     const int32_t* numbers;
     MARS_INLINE int32_t operator()(int lane) const { return numbers[lane]; }
@@ -63,6 +64,7 @@ MARS_INLINE __m128i load_two(const int32_t* table, int32_t a, int32_t b) {
 // find(0), find(1), ... as a vector, and entries k and k + 1 of a table for each of them. Nothing goes through memory:
 // loads of vectors that were stored number by number wait for the cache.
 #if defined(MARS_LEVEL_avx512)
+// Four quarters of a vector, the lowest first.
 MARS_INLINE __m512i join(__m128i a, __m128i b, __m128i c, __m128i d) {
     const __m256i low = _mm256_inserti128_si256(_mm256_castsi128_si256(a), b, 1);
     const __m256i high = _mm256_inserti128_si256(_mm256_castsi128_si256(c), d, 1);
@@ -85,6 +87,7 @@ MARS_INLINE HardInt gather_found(const int32_t* table, const Find& find, HardInt
     return (HardInt)join(k[0], k[1], k[2], k[3]);
 }
 #elif defined(MARS_LEVEL_avx2)
+// Two halves of a vector, the lower first.
 MARS_INLINE __m256i join(__m128i a, __m128i b) { return _mm256_inserti128_si256(_mm256_castsi128_si256(a), b, 1); }
 template <class Find>
 MARS_INLINE HardInt gather_found(const int32_t* table, const Find& find, HardInt& first, HardInt& second) {

@@ -63,6 +63,7 @@ MARS_AVX512 inline uint32_t mask_of(const uint32_t* at) {
 // change.
 template <class Count>
 MARS_AVX512 size_t find_nonzero_wide(const Count* values, size_t size, uint32_t* where) {
+    // 0, 1, ... 15 from the lowest place on
     const __m512i lanes = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
     size_t found = 0, i = 0;
     for (; i + 16 <= size; i += 16) {

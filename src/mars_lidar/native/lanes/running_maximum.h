@@ -14,6 +14,8 @@ MARS_NOINLINE inline void running_maximum(uint16_t* numbers, int64_t count) {
     alignas(64) static constexpr uint16_t kPlaces[32] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10,
                                                          11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21,
                                                          22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
+    // `back` moves every number up one place (0xfffffffe: the lowest becomes 0), `last` brings the highest to all
+    // places; alignr by 15, 14, 12 and 8 numbers of 32 bits moves by 2, 4, 8 and 16 of 16 bits.
     const __m512i here = _mm512_load_si512(kPlaces), none = _mm512_setzero_si512();
     const __m512i back = _mm512_sub_epi16(here, _mm512_set1_epi16(1)), last = _mm512_set1_epi16(31);
     __m512i before = none;
@@ -28,6 +30,8 @@ MARS_NOINLINE inline void running_maximum(uint16_t* numbers, int64_t count) {
         before = _mm512_max_epu16(before, _mm512_permutexvar_epi16(last, x));
     }
 #elif defined(MARS_LEVEL_avx2)
+    // Bytes 14 and 15 of each half, its highest number, to all places of it; permute2x128 by 0x08 puts the lower half's
+    // above and nothing below, by 0x11 the upper half's into both.
     const __m256i last = _mm256_set1_epi16(0x0f0e);
     __m256i before = _mm256_setzero_si256();
     for (int64_t j = 0; j < count; j += 16) {
@@ -43,6 +47,7 @@ MARS_NOINLINE inline void running_maximum(uint16_t* numbers, int64_t count) {
         before = _mm256_permute2x128_si256(end, end, 0x11);
     }
 #elif MARS_LANES > 1 && defined(MARS_X86)
+    // SSE2 has no maximum of unsigned numbers: what a exceeds b by, or 0, on top of b.
     const auto greater = [](__m128i a, __m128i b) { return _mm_add_epi16(_mm_subs_epu16(a, b), b); };
     __m128i before = _mm_setzero_si128();
     for (int64_t j = 0; j < count; j += 8) {

@@ -8,6 +8,7 @@ namespace mars {
 inline namespace MARS_LEVEL {
 
 #if MARS_LANES > 1
+// 0, 1, 2, ... in memory, for the lanes to load.
 struct LaneNumbers {
     alignas(64) uint32_t value[kLanes];
     constexpr LaneNumbers() : value() {
@@ -23,6 +24,7 @@ MARS_INLINE UInt numbered(uint32_t first) { return load<UInt>(kLaneNumbers.value
 MARS_INLINE UInt numbered(uint32_t first) { return first; }
 #endif
 
+// One thread for all of a pixel; cuda/device_team.h has the same functions for the threads of a block.
 struct OneThread {
     static constexpr bool kAlone = true;
 

@@ -42,6 +42,7 @@ MARS_INLINE Float splat(float x) { return {HardFloat{} + x, HardFloat{} + x}; }
 MARS_INLINE Int splat(int32_t x) { return {HardInt{} + x, HardInt{} + x}; }
 MARS_INLINE UInt splat(uint32_t x) { return {HardUInt{} + x, HardUInt{} + x}; }
 
+// Operators of two vectors, and of a vector and a number for all lanes.
 #define MARS_BINARY(T, S, op)                                                          \
     MARS_INLINE T operator op(T a, T b) { return {a.low op b.low, a.high op b.high}; } \
     MARS_INLINE T operator op(T a, S b) { return a op splat(b); }                      \
@@ -65,6 +66,8 @@ MARS_INLINE UInt operator>>(UInt a, int n) { return {a.low >> n, a.high >> n}; }
 MARS_INLINE Int operator>>(Int a, int n) { return {a.low >> n, a.high >> n}; }
 
 #if defined(MARS_LEVEL_avx512)
+// Comparisons of hardware vectors: AVX-512 has masks of its own, by predicates for floats (f) and integers (i);
+// elsewhere a lane is 0 or -1.
 #define MARS_COMPARE_HARD(name, op, f, i)                                                                        \
     MARS_INLINE HardMask name(HardFloat a, HardFloat b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, f); }  \
     MARS_INLINE HardMask name(HardInt a, HardInt b) { return _mm512_cmp_epi32_mask((__m512i)a, (__m512i)b, i); } \
@@ -140,6 +143,7 @@ MARS_INLINE Float select(Mask m, Float yes, Float no) {
 }
 
 #if defined(MARS_LEVEL_avx512)
+// One more, or one less, in the lanes of a mask: a single masked instruction with AVX-512.
 #define MARS_IF(name, intrinsic_i, intrinsic_f)                                                                 \
     MARS_INLINE Int name(Int x, Mask m) {                                                                       \
         const __m512i one = _mm512_set1_epi32(1), low = (__m512i)x.low, high = (__m512i)x.high;                 \
@@ -198,6 +202,8 @@ MARS_INLINE bool any_below(Float a, float bound) {
 // The 64 bits of x * factor.
 MARS_INLINE void multiply(HardUInt x, uint32_t factor, HardUInt& high, HardUInt& low) {
 #if defined(MARS_LEVEL_avx512)
+    // Products of the numbers at even places, and of those at odd ones moved down; 0xaaaa takes the odd places from the
+    // second.
     const __m512i by = _mm512_set1_epi64(factor), a = (__m512i)x;
     const __m512i even = _mm512_mul_epu32(a, by), odd = _mm512_mul_epu32(_mm512_srli_epi64(a, 32), by);
     high = (HardUInt)_mm512_mask_blend_epi32(0xaaaa, _mm512_srli_epi64(even, 32), odd);

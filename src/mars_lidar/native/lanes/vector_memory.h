@@ -63,6 +63,7 @@ MARS_INLINE void gather_pair(const float* table, const int32_t* k, HardFloat& fi
     const __m512d low = _mm512_insertf64x4(_mm512_castpd256_pd512(four_pairs(table, k)), four_pairs(table, k + 4), 1);
     const __m512d high =
         _mm512_insertf64x4(_mm512_castpd256_pd512(four_pairs(table, k + 8)), four_pairs(table, k + 12), 1);
+    // of the 32 numbers of both vectors, those at even and at odd places: first and second of each pair
     const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
     const __m512i odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
     first = (HardFloat)_mm512_permutex2var_epi32((__m512i)low, even, (__m512i)high);
@@ -74,6 +75,7 @@ MARS_INLINE void gather_pair(const float* table, const int32_t* k, HardFloat& fi
     first = (HardFloat)_mm256_permutevar8x32_ps(_mm256_shuffle_ps(low, high, 0x88), order);
     second = (HardFloat)_mm256_permutevar8x32_ps(_mm256_shuffle_ps(low, high, 0xdd), order);
 #elif defined(MARS_X86)
+    // 0x88 takes places 0 and 2 of either, 0xdd places 1 and 3
     const __m128 low = (__m128)two_pairs(table, k), high = (__m128)two_pairs(table, k + 2);
     first = (HardFloat)_mm_shuffle_ps(low, high, 0x88);
     second = (HardFloat)_mm_shuffle_ps(low, high, 0xdd);

@@ -9,6 +9,7 @@
 
 namespace mars {
 
+// What is drawn: exposures of pixels, and where their counts go.
 struct CountDraws {
     const uint32_t* pixel_index;  // (pixels): names the random streams
     uint32_t first_realization;
@@ -17,6 +18,7 @@ struct CountDraws {
     int64_t* out;  // (realizations, pixels)
 };
 
+// The Poisson law of one pixel, as `draw_counts` calls it; other laws are in laws/count_laws.h.
 struct PoissonLaw {
     PoissonSampler sampler;
     int64_t operator()(const EventStream& stream) { return sampler(stream, 0); }
@@ -25,6 +27,7 @@ struct PoissonLaw {
 // Calls make(pixel) for each pixel and the law's draw(stream) for each of its realizations.
 template <class Make>
 void draw_counts(const CountDraws& draws, int threads, const Watch& watch, const Make& make) {
+    // some milliseconds of work
     constexpr int64_t kChunkPixels = 4096;
     const int64_t pixels = draws.pixels;
     run_chunks((pixels + kChunkPixels - 1) / kChunkPixels, threads, watch,

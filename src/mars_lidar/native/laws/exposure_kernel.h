@@ -117,6 +117,7 @@ struct CharacteristicBlock {
     const ExposureRate* rate = nullptr;  // instead of `flux`: a paralyzable pixel
 };
 
+// Cumulants and mean histogram; what start and end phases change; the stationary state; the generating function.
 #define MARS_DECLARE_EXPOSURE(level)                                \
     void exposure_moments_##level(const MomentsBlock& block);       \
     void exposure_phases_##level(const PhasesBlock& block);         \

@@ -49,6 +49,8 @@ class MomentsRun {
             return responses(*block.flux, block.first, block.count);
     }
 
+    // Period after period until every entry has settled (its increments repeat for `window` periods), has come to the
+    // end of the exposure, or is given up.
     void advance(Pixel<Moments, Real>& recursion, const Stationary& start) {
         std::vector<Real> histogram(grid_.bins), before(grid_.bins);
         std::vector<Moments> repeated = recursion.repeated;
@@ -178,6 +180,8 @@ class MomentsRun {
         history_tail_ = start.tail;
     }
 
+    // Writes entry k after `periods` periods. A settled one goes on to the end of the exposure at its last rates;
+    // others ended there.
     void put(int k, const Moments& step, int64_t periods, bool settled, const Real* histogram, const Real* before) {
         const int64_t entry = block_.first + k;
         const double rest = static_cast<double>(grid_.cycles - periods);

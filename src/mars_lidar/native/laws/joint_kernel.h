@@ -23,6 +23,7 @@ struct AdjointBlock {
     const std::atomic<bool>* stop;
 };
 
+// Solves the windows of a block: `done` and `error` tell how each ended.
 #define MARS_DECLARE_JOINT(level) void joint_adjoint_##level(const AdjointBlock& block);
 
 MARS_DECLARE_JOINT(scalar)

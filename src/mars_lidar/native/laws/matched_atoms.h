@@ -27,6 +27,8 @@ constexpr int kMost = 64;             // integers of a window
 constexpr double kLeastRatio = 0.45;  // a binomial of p > 1/2 is the mirror image of one of p < 1/2
 constexpr double kMostRatio = 1.2;
 
+// How far the law's second to fourth cumulants are from those asked for, in the metric of the polynomials that mend
+// them.
 inline void judge(const Cumulants& k, GainLoss& law) {
     const double r = law.ratio, x = law.gain, y = law.loss, v = k.variance;
     const double second = v - (x * r + y);
@@ -125,6 +127,7 @@ MARS_APART inline void normal_base(const Cumulants& k, double first, int size, d
     }
 }
 
+// Scales weights to a sum of 1; false where there is next to nothing.
 inline bool normalise(int size, double* weight) {
     double sum = 0.0;
     for (int i = 0; i < size; ++i) sum += weight[i];

@@ -65,6 +65,7 @@ inline double adjoint_sweep(const PhaseFeedback& f, double* x) {
     return change;
 }
 
+// How sweeps ended.
 struct SweepsDone {
     int64_t sweeps;
     double error;  // estimated, relative to the largest value

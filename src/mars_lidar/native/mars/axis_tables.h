@@ -36,6 +36,7 @@ class AxisTables {
     const std::vector<int64_t>& start() const { return start_; }
 
  private:
+    // Twice as many cells of equal width in the logarithm as nodes: a lookup then steps over one node or none.
     void set_cells(double range) {
         const int64_t cells = 2 * axis_.size;
         axis_.cells_per_log = static_cast<double>(cells) / range;

@@ -18,6 +18,7 @@ constexpr double kWorkPerBin = 1.5;        // proposals and photons for each bin
 constexpr int kBlock = 64, kBlocks = 8;    // words of 32 events, used together; blocks of proposals
 constexpr int kSlots = 4;                  // counters of what is rejected, so that they do not wait for each other
 constexpr int kGuideBits = 8;              // of a word, that name where the inversion begins
+// entries of the guide that are written at a time, the next ones included: whole vectors, and no loop over each length
 constexpr int kStride = 32;
 
 // How many of the photons lie in the frame, by its share of them. Each of them compares a uniform number with the share

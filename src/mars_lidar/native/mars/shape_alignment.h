@@ -19,6 +19,9 @@ constexpr float kFewPhotons = 0.01f;  // in a bin, below which A is as good as s
 constexpr double kBright = 2.0;       // photons per period from which the slope inside a bin shows
 constexpr int kSweeps = 12;           // of the fixed point where registrations re-arm inside the pulse
 
+// The shape of one pixel after another. Outside of the pulse's frame it is the mixture moved by part of a bin; in the
+// frame, what a bin registers before and after the cut follows from the pixel's flux and the mean armed fraction at the
+// bin's edges.
 template <class Team>
 class Alignment : public Mixture<Team> {
     using Base = Mixture<Team>;

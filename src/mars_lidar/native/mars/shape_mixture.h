@@ -9,6 +9,7 @@ namespace mars {
 inline namespace MARS_LEVEL {
 namespace {
 
+// Memory and sums of one pixel's mixture; `Team` deals the loops over bins out to threads (lanes/team.h).
 template <class Team>
 class Mixture {
  protected:
@@ -39,11 +40,13 @@ class Mixture {
         });
     }
 
+    // `n` bins from `first` on, each with what the bin before it leaves.
     void move(int64_t first, float* to, int64_t n) const {
         const float *mixture = mixture_ + first, *past = past_ + first;
         team_.each(n, [=](int64_t j) { to[j] = (mixture[j] - past[j]) + past[j - 1]; });
     }
 
+    // `count` bins of the mixture from `first` on, round the period.
     void mix_cyclic(int64_t pixel, int64_t first, int64_t count, float* to) const {
         const int64_t here = count < n_ - first ? count : n_ - first;
         mix(pixel, first, here, to);
@@ -56,6 +59,8 @@ class Mixture {
         team_.each(count, [=](int64_t i) { to[i] = mixture[first + i < n ? first + i : first + i - n]; });
     }
 
+    // `count` bins of the mixture from `first` on, not beyond the last bin: one row as it is, or all four places at
+    // once.
     void mix(int64_t pixel, int64_t first, int64_t count, float* to) const {
         const float* row[4];
         float weight[4];

@@ -15,6 +15,8 @@
 
 namespace mars {
 
+// As Alignment, Mixture, Rounds and Photons take it: arrays of the bins, of their classes, of the frame and of its
+// cells.
 int64_t shape_memory(const ShapeJob& job) {
     const double offset = (job.dead_time - std::floor(job.dead_time + 0.5)) * job.bins;
     const int64_t cells = job.frame.cells > 1 ? (job.frame.size + 2 * frame_reach(offset)) * job.frame.cells : 0;
@@ -25,6 +27,7 @@ namespace {
 
 constexpr int64_t kChunkBins = 1 << 19;  // a millisecond of work
 
+// The kernel at the level of this name, or the widest; std::invalid_argument where the processor has none.
 ShapeKernel kernel_of(const std::string& asked) {
 #define MARS_TRY_LEVEL(level, runs) \
     if ((asked.empty() || asked == #level) && (runs)) return shape_kernel_##level;
@@ -33,6 +36,7 @@ ShapeKernel kernel_of(const std::string& asked) {
     throw std::invalid_argument("level must be one that this processor runs, got '" + asked + "'");
 }
 
+// A Poisson number of a mean beyond those that the lanes draw, from a stream of its own.
 int64_t large_poisson(uint64_t key, uint32_t event, uint32_t step, double mean) {
     const EventStream stream(key, 0, step, 0x4c61726765u & 0xffffffffu);
     return PoissonSampler(mean)(stream, event);

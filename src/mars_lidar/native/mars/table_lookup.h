@@ -66,6 +66,8 @@ inline void lagrange(Stencil& out, const double* at, const double* scale, double
     }
 }
 
+// The nodes around `x` and their weights. With `nearest` one node alone, the nearer in the logarithm. Where x lies
+// between 0 and the first node above it the cubic is one in the photons, because 0 has no logarithm.
 MARS_APART inline Stencil stencil(const Axis& axis, const TableFlux& x, bool nearest) {
     Stencil out{};
     out.low = axis.below(x);
@@ -99,6 +101,8 @@ MARS_APART inline Stencil stencil(const Axis& axis, const TableFlux& x, bool nea
     return out;
 }
 
+// A table on the grid of its two axes, with the correction for the phase of the start on a coarser one. Plain pointers:
+// the host's (mars/axis_tables.h) or a GPU's.
 struct TableLookup {
     Axis signal, background, sub_signal, sub_background;
     const double* cumulants;  // (signal * background, 4)
@@ -111,6 +115,8 @@ struct TableLookup {
         for (int k = 0; k < kCumulants; ++k) out[k] += weight * values[k];
     }
 
+    // The four rows around the pixel and their weights (L1): linear in the photons, each by the mean count of its
+    // entry, because expected histograms add up and shapes do not.
     void rows(const Stencil& s, const Stencil& b, int64_t* row, double* weight) const {
         const int64_t i[2] = {s.low, s.high}, j[2] = {b.low, b.high};
         const double v[2] = {1.0 - s.fraction, s.fraction}, w[2] = {1.0 - b.fraction, b.fraction};
@@ -124,12 +130,14 @@ struct TableLookup {
         for (int m = 0; m < 4; ++m) weight[m] = sum > 0.0 ? weight[m] / sum : v[m / 2] * w[m % 2];
     }
 
+    // Cumulants by a cubic through the nodes of either axis (L2); adds them to `out`.
     void bicubic(const Stencil& s, const Stencil& b, double* out) const {
         for (int k = 0; k < s.count; ++k)
             for (int m = 0; m < b.count; ++m)
                 add(cumulants + (s.node[k] * background.size + b.node[m]) * kCumulants, s.weight[k] * b.weight[m], out);
     }
 
+    // Cumulants by the convex combination of the cell's four entries: coarser, and never out of range.
     void bilinear(const Stencil& s, const Stencil& b, double* out) const {
         for (int m = 0; m < 4; ++m) {
             const double w = (m / 2 ? s.fraction : 1.0 - s.fraction) * (m % 2 ? b.fraction : 1.0 - b.fraction);
@@ -138,6 +146,8 @@ struct TableLookup {
         }
     }
 
+    // Adds what the phase `at` at which the pulse comes changes in the cumulants: cubic over a coarser grid of S and B,
+    // linear between the phases that the table holds.
     void correct(const TableFlux& s, const TableFlux& b, double at, double* out) const {
         const Stencil x = stencil(sub_signal, s, false), y = stencil(sub_background, b, false);
         const int64_t next = std::clamp<int64_t>(std::upper_bound(phase, phase + phases, at) - phase, 1, phases - 1);
@@ -151,6 +161,8 @@ struct TableLookup {
             }
     }
 
+    // Rows and weights (4) of the shapes and cumulants (4) of one pixel; a mean or variance below 0 becomes 0, and NaN
+    // stays, which stands for an entry that cannot serve.
     void pixel(double signal_photons, double background_photons, double at, int64_t* row, double* weight,
                double* out) const {
         const TableFlux s(signal_photons), b(background_photons);

@@ -147,6 +147,7 @@ inline bool place(uint32_t word, uint32_t bins, uint32_t uneven, uint32_t& bin) 
     return static_cast<uint32_t>(product) >= uneven;
 }
 
+// Adds to a bin; std::overflow_error where it cannot hold the sum.
 template <class Count>
 void add_counts(Count& bin, int64_t more) {
     if (more > static_cast<int64_t>(std::numeric_limits<Count>::max()) - bin) throw_full<Count>();
@@ -180,6 +181,7 @@ bool use_table(double mean, int32_t bins) {
     return mean >= kPlacedBelow && mean < kTableBelow && PoissonTable::effort(mean) < 8.0 * bins;
 }
 
+// One exposure of one pixel into its row. The table, where there is one, is of the background's mean.
 template <class Count>
 void fill(const EventStream& stream, const Means& means, const PoissonTable* table, int32_t bins, Count* row) {
     std::fill_n(row, bins, Count{0});

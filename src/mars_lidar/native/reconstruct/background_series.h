@@ -10,6 +10,7 @@ namespace mars {
 
 class BackgroundSeries {
  public:
+    // powers of the photons per bin that are kept
     static constexpr int kOrder = 6;
     // Photons per bin up to which the series is used; its radius of convergence is about pi.
     static constexpr double kMost = 0.25;

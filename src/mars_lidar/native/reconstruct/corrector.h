@@ -14,6 +14,7 @@ namespace mars {
 
 enum class Correction : int32_t { kNone, kPasses, kChain };
 
+// How rates are corrected: steps and tolerance are those of the chain's iteration.
 struct CorrectionSettings {
     Correction correction;
     int steps;

@@ -9,10 +9,13 @@
 
 namespace mars {
 
+// A starting value: photons per period, and a delay in periods.
 struct Start {
     double signal, background, delay;
 };
 
+// Starting values of a climb from a histogram: the delay of the best weak pulse gives a first S and B (R11), and with
+// these the local maxima of the gain over all delays (R12), the best first.
 class DelaySearch {
  public:
     explicit DelaySearch(const HistogramRecord& recording) : r_(recording) {
@@ -87,6 +90,7 @@ class DelaySearch {
         return found;
     }
 
+    // delays that a climb may begin at
     static constexpr int kMost = 8;
 
  private:
@@ -107,6 +111,8 @@ class DelaySearch {
         }
     }
 
+    // out[g] = sum over the template's bins i of weights[i] values[g steps + i]: in eight sums side by side, which
+    // compilers make a vector of, always added up in the same order.
     void correlate(const float* values, const float* weights, float* out) const {
         const int64_t taps = static_cast<int64_t>(energy_.size());
         for (int64_t g = 0; g < points_; ++g) {

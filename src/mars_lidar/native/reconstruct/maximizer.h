@@ -61,6 +61,7 @@ inline void known_information(const Likelihood& likelihood, const bool* free, do
         std::copy(&likelihood.information[0][0], &likelihood.information[0][0] + 9, &known[0][0]);
 }
 
+// Where a climb ended: S, B and delay, the likelihood there, which of them were free to move, and whether it settled.
 struct Fit {
     double at[3] = {};
     Likelihood likelihood;
@@ -133,6 +134,7 @@ inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_si
     return fit;
 }
 
+// One histogram after another, with the memory that they share.
 template <class Count>
 class Maximizer {
  public:

@@ -8,6 +8,7 @@
 
 namespace mars {
 
+// The logarithm of the likelihood, its gradient, and Fisher's information at one point.
 struct Likelihood {
     double value = 0.0;
     double gradient[3] = {};        // with respect to S, B (photons per period) and the delay (periods)
@@ -22,6 +23,8 @@ struct Likelihood {
     }
 };
 
+// One pixel's likelihood. Bins that the pulse reaches are added up one by one, each as a binomial law of the passes in
+// which the pixel was armed; those of background alone enter by their sums (R10).
 class PixelLikelihood {
  public:
     // Where a bin of background alone holds more than this many photons, their sum does not suffice (it neglects
@@ -114,6 +117,8 @@ class PixelLikelihood {
     }
 
  private:
+    // One bin: `h` registrations in `armed` passes from its start on and `rearmed` ones from within it, `l` photons per
+    // pass. Where dead time is below a bin, a bin may register again, and counts are Poisson.
     void bin(Likelihood& out, double h, double armed, double rearmed, double l, const double* dl) const {
         if (r_.below_bin()) {
             if (armed <= 0.0) return;

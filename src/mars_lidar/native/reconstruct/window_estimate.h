@@ -9,12 +9,17 @@
 
 namespace mars {
 
+// How the delay is found: at the fullest bin; by correlation with the pulse; by correlation with the logarithm of its
+// height over the background, which weighs bins as the likelihood does (R17).
 enum class Locator : int32_t { kPeak, kLinear, kLog };
 
+// Photons per period, delay in periods, and standard errors of the first two; NaN: not known.
 struct WindowResult {
     double signal = NAN, background = NAN, delay = NAN, signal_error = NAN, background_error = NAN;
 };
 
+// The estimates of one histogram after another, with the pulse's energy in bins worked out once. The grid of delays has
+// three steps to the pulse's width.
 class WindowEstimate {
  public:
     WindowEstimate(const HistogramRecord& recording, Locator locator) : r_(recording), locator_(locator) {
@@ -53,6 +58,7 @@ class WindowEstimate {
     }
 
  private:
+    // The delay on the grid at which the correlation of rates and weights round the period is largest.
     double search(const double* rate, const std::vector<double>& weights) {
         const int64_t n = r_.bins, taps = static_cast<int64_t>(weights.size());
         const int64_t shift = ((first_ % n) + n) % n;

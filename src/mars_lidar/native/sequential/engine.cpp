@@ -125,6 +125,7 @@ void for_pixels(const Job& job, const PulseShape& pulse, int threads, const Watc
     });
 }
 
+// The loop for a job's mode: each has pixels of its own type.
 template <template <class> class Simulation, class Work>
 void for_modes(const Job& job, const PulseShape& pulse, int threads, const Watch& watch, const Work& work) {
     switch (job.mode) {
@@ -139,12 +140,14 @@ void for_modes(const Job& job, const PulseShape& pulse, int threads, const Watch
     }
 }
 
+// Pixels whose avalanches have consequences share one queue of events; others are simulated each alone.
 template <class Work>
 void for_items(const Job& job, const PulseShape& pulse, int threads, const Watch& watch, const Work& work) {
     job.avalanches_matter() ? for_modes<EventSimulator>(job, pulse, threads, watch, work)
                             : for_modes<Simulator>(job, pulse, threads, watch, work);
 }
 
+// The bin of a phase in [0, 1); rounding may not lead beyond the last.
 inline int32_t bin_of(double phase, int32_t bins) { return std::min(static_cast<int32_t>(phase * bins), bins - 1); }
 
 }  // namespace

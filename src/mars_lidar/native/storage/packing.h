@@ -20,6 +20,7 @@ constexpr size_t kKept = 16 << 20;  // bytes that a thread keeps between calls
 // Packs `size` counts into `out`, which is reused from call to call. Returns the bytes used.
 template <class Count>
 size_t pack_counts(const Count* values, size_t size, std::vector<uint8_t>& out) {
+    // elements that are looked through at a time: their positions stay in the first cache
     constexpr size_t kBlock = 4096;
     size_t used = kHeader;
     uint32_t where[kBlock + 16];
@@ -74,6 +75,7 @@ struct Packed {
             throw std::invalid_argument("packed counts have a damaged header");
     }
 
+    // Calls found(k, position, count - 1) for the elements that are not zero, in order.
     template <class Found>
     void for_each(const Found& found) const {
         BitReader bits{data.data() + kHeader, data.data() + data.size() - kPadding};

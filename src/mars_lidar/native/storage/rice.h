@@ -35,6 +35,7 @@ struct Adaptive {
 using Gaps = Adaptive<4>;
 using Counts = Adaptive<1>;
 
+// The bits of one code, the lowest first.
 struct Code {
     uint64_t bits;
     int width;  // at most 56
@@ -48,6 +49,7 @@ inline Code rice(uint32_t value, int k) {
     return {(rest << 1 | 1) << quotient, static_cast<int>(quotient) + 1 + k};
 }
 
+// Appends codes to memory that has room; `at` moves on by whole bytes.
 struct BitWriter {
     uint8_t* at;
     uint64_t bits = 0;
@@ -63,6 +65,7 @@ struct BitWriter {
     }
 };
 
+// Reads codes one after the other; std::invalid_argument where they go on beyond the end.
 struct BitReader {
     const uint8_t *at, *end;  // readable to end + kPadding
     int used = 0;             // bits of *at

@@ -12,6 +12,7 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
+// the last place in a part: below 1, which is the first of the next one
 constexpr float kLastInside = 1.0f - 0x1p-24f;
 
 // A time: the period, the part of the waveform in it, and the place in the part, in [0, 1): 2^-24 of a part fine.

@@ -16,6 +16,7 @@
 namespace mars {
 namespace {
 
+// The kernel for a job at the level of this name, or the widest; std::invalid_argument where the processor has none.
 WaveformKernel kernel_of(const std::string& asked, const Job& job) {
 #define MARS_TRY_LEVEL(level, runs)                                        \
     if ((asked.empty() || asked == #level) && (runs))                      \
@@ -45,6 +46,7 @@ void draw_starts(const Job& job, const WaveformBlock& block, std::vector<int32_t
 
 // Cuts a job into blocks, realizations of one pixel together because they share its table.
 void run_waveform(const Job& job, const Output& output, int threads, const std::string& level, const Watch& watch) {
+    // memory of one thread's tables: fewer lanes have one of their own where waveforms are long
     constexpr int64_t kTableBytes = int64_t{64} << 20;
     const WaveformKernel kernel = kernel_of(level, job);
     const TableLayout layout(job.samples);

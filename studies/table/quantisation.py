@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Table
+from mars_lidar import System, Table
 from mars_lidar.plot.style import COLOURS, style
 from mars_lidar.statistics import Exposure, exposure_moments
 from mars_lidar.statistics.distance import Pmf, total_variation
@@ -30,7 +30,7 @@ Interpolation = Literal["nearest", "bilinear"]
 INTERPOLATIONS: tuple[Interpolation, ...] = ("nearest", "bilinear")
 LOW, HIGH = 0.01, 10.0  # photons per period, of both axes
 VISIBLE = 0.002  # total variation of the count law, or standard deviations of the mean, that a lookup may cost
-_WORDS = {
+ERRORS = {  # in words
     "mean": "mean, standard deviations",
     "variance": "variance, relative",
     "shape": "shape, total variation",
@@ -49,6 +49,10 @@ class Settings:
     bins: int = 1024
     sigma_ns: float = 0.5
     seed: int = 20269
+
+    def system(self, dead_ns: float) -> System:
+        """Armed start."""
+        return system_of(dead_ns, self.cycles, bins=self.bins, sigma_ns=self.sigma_ns)
 
 
 FULL = Settings(
@@ -80,7 +84,7 @@ def compute(settings: Settings, tell: Tell) -> list[Cost]:
     signal, background = np.exp(random.uniform(np.log(LOW), np.log(HIGH), (2, settings.pixels)))
     costs = []
     for dead_ns in settings.dead_ns:
-        system = system_of(dead_ns, settings.cycles, bins=settings.bins, sigma_ns=settings.sigma_ns)
+        system = settings.system(dead_ns)
         truth = exposure_moments(signal, background, system)
         for size in settings.sizes:
             began = time.perf_counter()
@@ -143,8 +147,8 @@ def run(request: Request) -> list[Path]:
 
 
 def _figure(path: Path, settings: Settings, costs: Sequence[Cost]) -> Path:
-    figure, axes = panels(2.5, 1, len(_WORDS), sharex=True)
-    for ax, key in zip(axes[0], _WORDS, strict=True):
+    figure, axes = panels(2.5, 1, len(ERRORS), sharex=True)
+    for ax, key in zip(axes[0], ERRORS, strict=True):
         _panel(ax, settings, costs, key)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=4)
     return save_figure(path, figure)
@@ -160,7 +164,7 @@ def _panel(ax: Axes, settings: Settings, costs: Sequence[Cost], key: str) -> Non
             ax.plot(entries, [np.quantile(c.errors[key], 0.95) for c in here], dash, color=COLOURS[k], lw=0.5)
     ax.set(xscale="log", yscale="log", xlabel="entries")
     ax.tick_params(axis="x", which="minor", labelbottom=False)
-    ax.set_title(_WORDS[key], loc="left", fontsize=7.0)
+    ax.set_title(ERRORS[key], loc="left", fontsize=7.0)
 
 
 def _csv_row(cost: Cost) -> Row:
@@ -172,7 +176,7 @@ def _csv_row(cost: Cost) -> Row:
         "megabytes": cost.megabytes,
         "build_seconds": cost.seconds,
     }
-    for key in _WORDS:
+    for key in ERRORS:
         values = cost.errors[key]
         row |= {f"{key}_mean": float(values.mean()), f"{key}_95": float(np.quantile(values, 0.95))}
         row[f"{key}_largest"] = float(values.max())

@@ -15,6 +15,7 @@ from studies.__main__ import main
 from studies.common import simulators
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.common.sample import draw
+from studies.count_law import cells as cells_of
 from studies.count_law import run as count_law
 from studies.count_law.run import shape_sweep
 
@@ -83,14 +84,14 @@ def test_floors_are_those_of_samples():
     law = Pmf(0, stats.poisson.pmf(np.arange(80), 20.0))
     size = 10_000
     random = np.random.default_rng(3)
-    found = count_law.resampled_figures(law, size, 0, 2000, random)
+    found = cells_of.resampled_figures(law, size, 0, 2000, random)
     assert found[:, 2].mean() == pytest.approx(np.sqrt(2 / np.pi * 20.0 / size), rel=0.06)
     assert found[:, 3].mean() == pytest.approx(np.sqrt(2 / np.pi * (20.0 + 2 * 20.0**2) / size), rel=0.06)
     times = np.arange(1, size + 1)
     rates = np.log(times[:, None] / (size * law.p)) * times[:, None] / size
     expected = (stats.binom.pmf(times[:, None], size, law.p) * rates).sum()
     assert found[:, 1].mean() == pytest.approx(expected, rel=0.05)
-    twice = count_law.resampled_figures(law, size, size, 500, random)
+    twice = cells_of.resampled_figures(law, size, size, 500, random)
     assert twice[:, 2].mean() == pytest.approx(np.sqrt(2) * found[:, 2].mean(), rel=0.12)
 
 

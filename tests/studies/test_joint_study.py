@@ -12,8 +12,9 @@ from scipy import stats
 
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
-from studies.joint import classifiers
-from studies.joint import run as joint
+from studies.joint import classifiers, run
+from studies.joint import outcomes as joint
+from studies.joint import table as bins
 
 
 def test_auc_and_its_error():
@@ -63,28 +64,28 @@ def test_qda_sees_covariance():
 
 
 def test_features():
-    case = joint.REFERENCE[0]
+    case = bins.REFERENCE[0]
     x, handed = joint.sample(case, 256, "feedback", 50, 1)
     assert not handed
-    assert x.coarse.shape == (50, joint.COARSE)
+    assert x.coarse.shape == (50, bins.COARSE)
     fine = joint.near(case, 256)
     assert {128 - 16, 128, 128 + 16} <= set(fine.tolist())
     echo = int(256 * (0.5 + 0.6375 - 1.0))
     assert {echo - 16, echo + 16} <= set(fine.tolist())
     assert x.fine.shape == (50, fine.size) == (50, 66)
-    short = joint.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
+    short = bins.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
     assert joint.sample(short, 256, "feedback", 5, 1)[1], "given to exact"
 
 
 def test_pixels_given_to_exact_are_not_judged():
     pytest.importorskip("sklearn", reason="extra 'studies'")
     settings = joint.Settings((), 60, 0, 60, bins=256)
-    case = joint.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
+    case = bins.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
     found = {o.engine: o for o in joint.examine(case, settings, 0, 300, joint.TESTS[:1])}
     assert found["feedback"].handed
     assert not found["feedback"].aucs
     assert found["mars"].aucs
-    assert joint.given_to_exact(list(found.values())) == ["too short"]
+    assert run.given_to_exact(list(found.values())) == ["too short"]
 
 
 def test_files(tmp_path):
@@ -100,13 +101,13 @@ def test_files(tmp_path):
     chance = classifiers.chance_error(quick.exposures // 2, quick.exposures // 2)
     outcomes = {}
     for row in rows:
-        if row["random"] == "0" and row["engine"] in (joint.AGAIN, "feedback"):
+        if row["random"] == "0" and row["engine"] in (bins.AGAIN, "feedback"):
             for key in ("qda", "fine_qda", "gradient_boosting", "random_forest"):
                 z = (float(row[f"auc_{key}"]) - 0.5) / chance
                 outcomes[f"{row['case']}, {row['engine']}, {key}"] = 2 * stats.norm.sf(abs(z))
     assert len(outcomes) == 16
     require(outcomes, "joint study")
-    bright = [row for row in rows if row["case"] == joint.SEVEN[6].name]
+    bright = [row for row in rows if row["case"] == bins.SEVEN[6].name]
     seen = {row["engine"]: float(row["auc_qda"]) for row in bright if row["auc_qda"]}
     assert seen["mars"] > 0.7, "its window variance is more than twice the exact one"
     assert seen["renewal"] > 0.7

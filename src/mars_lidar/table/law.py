@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar.statistics.pmf import Window
+from mars_lidar.statistics.count_window import Window
 from mars_lidar.table.error import random_pixels
 
 if TYPE_CHECKING:

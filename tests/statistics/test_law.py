@@ -217,7 +217,7 @@ def test_bad_input(call, error, message):
 
 
 def test_a_pmf_that_contradicts_its_cumulants_is_refused(monkeypatch):
-    monkeypatch.setattr(pmf_module, "_TAIL", 0.2)  # too small a window: the pmf is aliased
+    monkeypatch.setattr(pmf_module, "TAIL", 0.2)  # too small a window: the pmf is aliased
     with pytest.raises(ConvergenceError, match=r"S = 1, B = 1 .* disagrees with the cumulants"):
         _ = count_law(1.0, 1.0, make_system(0.6375)).pmf
 

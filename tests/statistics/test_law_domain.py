@@ -197,7 +197,7 @@ def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, latt
         value = np.exp(0.3 * cells.system.cycles * ((re + 1j * im) ** lattice - 1.0))
         return value.real, value.imag
 
-    monkeypatch.setattr(pmf_module, "_characteristic", transform)
+    monkeypatch.setattr(pmf_module, "characteristic", transform)
     variance = 0.3 * 10_000 * lattice**2
     size = 2 * math.ceil(8 * math.sqrt(variance))
     found = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.Purse())

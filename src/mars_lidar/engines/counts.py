@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.statistics.pmf import Window
+from mars_lidar.statistics.count_window import Window
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]

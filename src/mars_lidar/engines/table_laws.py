@@ -10,7 +10,8 @@ from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import Entries, TableReader
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.pmf import Window, guessed_windows
+from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.pmf import guessed_windows
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]

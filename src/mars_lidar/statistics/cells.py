@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cell_input import broadcast, flat, photons, reals
 from mars_lidar.statistics.gate import PLAIN, require_mode
 from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.narrow_pulse import followed_bins, followed_edges, needed_bins
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
-_MAX_PHOTONS = 1e6
 _MIN_BINS = 128
 _MAX_FIRST_BINS = 2**14  # finer first grids only where the tolerance asks for them
 _BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # of 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
@@ -75,40 +75,40 @@ class Cells:
             raise TypeError(f"system must be a System, got {type(system).__name__}")
         require_mode(what, system, modes, effects)
         share, dark = system.detector.detection_efficiency, system.detector.dark_count_hz * system.period_ns * 1e-9
-        back = _photons("background", background)
+        back = photons("background", background)
         if share != 1.0 or dark > 0.0:
-            system, back = system.detected(), _photons("background with dark counts", back * share + dark)
+            system, back = system.detected(), photons("background with dark counts", back * share + dark)
         if waveform is not None:
             if signal is not None or delay_ns is not None:
                 raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
-            wave = _photons("waveform", waveform) * share
+            wave = photons("waveform", waveform) * share
             if wave.ndim == 0 or wave.shape[-1] == 0:
                 raise ValueError(f"waveform must be (..., T) with T >= 1, got shape {wave.shape}")
-            total = _photons("waveform summed over a period", wave.sum(-1))
+            total = photons("waveform summed over a period", wave.sum(-1))
             rows = np.arange(total.size).reshape(total.shape)
-            total, back, rows = _broadcast(("waveform", "background", "waveform"), total, back, rows)
+            total, back, rows = broadcast(("waveform", "background", "waveform"), total, back, rows)
             unit = wave.reshape(-1, wave.shape[-1])
             unit = unit / np.maximum(unit.sum(-1, keepdims=True), np.finfo(float).tiny)
             return cls(
                 system,
                 total.shape,
-                _flat(total),
-                _flat(back),
+                flat(total),
+                flat(back),
                 np.zeros(total.size),
                 unit,
                 np.ascontiguousarray(rows.reshape(-1), dtype=np.int64),
             )
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-        total = _photons("signal", signal) * share
-        given = _reals("delay_ns", 0.5 * system.period_ns if delay_ns is None else delay_ns)
-        total, back, delay = _broadcast(("signal", "background", "delay_ns"), total, back, given)
+        total = photons("signal", signal) * share
+        given = reals("delay_ns", 0.5 * system.period_ns if delay_ns is None else delay_ns)
+        total, back, delay = broadcast(("signal", "background", "delay_ns"), total, back, given)
         bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (total == 0))
         if bad.any():
             raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}")
-        phase = np.nan_to_num(_flat(delay) / system.period_ns)
+        phase = np.nan_to_num(flat(delay) / system.period_ns)
         phase -= np.floor(phase)
-        return cls(system, total.shape, _flat(total), _flat(back), phase, None, np.zeros(total.size, np.int64))
+        return cls(system, total.shape, flat(total), flat(back), phase, None, np.zeros(total.size, np.int64))
 
     @property
     def size(self) -> int:
@@ -296,32 +296,3 @@ def _unit_energies(before: FloatArray) -> FloatArray:
     """Shares (cells, parts) of a period's photons, from those before each edge (cells, parts + 1)."""
     unit = np.diff(before) / np.maximum(before[:, -1:], np.finfo(float).tiny)
     return np.ascontiguousarray(np.maximum(unit, 0.0))
-
-
-def _reals(name: str, value: ArrayLike) -> FloatArray:
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
-    if array.size == 0:
-        raise ValueError(f"{name} must not be empty, got shape {array.shape}")
-    return array.astype(np.float64)
-
-
-def _photons(name: str, value: ArrayLike) -> FloatArray:
-    array = _reals(name, value)
-    bad = ~((array >= 0) & (array <= _MAX_PHOTONS))
-    if bad.any():
-        raise ValueError(f"{name} must lie in [0, {_MAX_PHOTONS:g}] photons per period, got {array[bad].flat[0]}")
-    return array
-
-
-def _broadcast(names: tuple[str, ...], *arrays: NDArray[Any]) -> list[NDArray[Any]]:
-    try:
-        return list(np.broadcast_arrays(*arrays))
-    except ValueError:
-        told = ", ".join(f"{n} {a.shape}" for n, a in zip(names, arrays, strict=False))
-        raise ValueError(f"shapes must broadcast, got {told}") from None
-
-
-def _flat(array: NDArray[Any]) -> FloatArray:
-    return np.ascontiguousarray(array.reshape(-1), dtype=np.float64)

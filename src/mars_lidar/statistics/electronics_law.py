@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.count_window import Window
 from mars_lidar.statistics.electronics import refined, without_effect
 from mars_lidar.statistics.electronics_grid import LAW_EFFORT, RecordGrid, RecordRun, Rows
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
-from mars_lidar.statistics.pmf import Window, exact_windows
+from mars_lidar.statistics.pmf import exact_windows
 
 ComplexArray = NDArray[np.complex128]
 

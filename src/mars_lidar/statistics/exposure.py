@@ -8,19 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.brief import brief
 from mars_lidar._base.threads import thread_count
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics.exposure_result import Exposure as Exposure
+from mars_lidar.statistics.exposure_result import blank, darkness, movement, put, shaped, take
+from mars_lidar.statistics.no_dead_time import without_dead_time
 from mars_lidar.statistics.paralyzable_rate import RATES_STEPS, registration_rates
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
@@ -32,57 +34,9 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], object]
 
 _MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
-_ORDERS = 4
 MOST_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
 _NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settled")  # what the native core fills
 UNSETTLED = -2  # the native core's code: gave up
-
-
-@dataclass(frozen=True, eq=False)
-class Exposure:
-    """Statistics of the count N and of the histogram of one exposure, for cells of shape (...).
-
-    Attributes
-    ----------
-    cumulants
-        (..., 4) mean, variance, third and fourth cumulant of N.
-    histogram
-        (..., bins) mean registrations per bin; sums to the mean of N.
-    cumulant_rates, histogram_rate
-        (..., 4) and (..., bins): what one more cycle adds, once the state repeats from period to period, so
-        that an exposure of n cycles has ``cumulants + (n - cycles) * cumulant_rates``. NaN where the exposure
-        ended before that.
-    settled
-        (...) periods after which the state repeated and the rest was extrapolated; -1 where the exposure was
-        run to its end.
-    bins
-        (...) bins per period of the statistics grid that was needed, which is not the histogram's.
-    movement
-        (...) how far the result moved when that grid was last halved: the largest of the changes of the mean
-        in standard deviations (or relative, if that is larger), of the other cumulants relative to
-        themselves or to the power of the standard deviation, and of the shape in total variation. The error
-        of the result is smaller: the method is of fourth order for smooth pulses.
-    """
-
-    cumulants: FloatArray
-    histogram: FloatArray
-    cumulant_rates: FloatArray
-    histogram_rate: FloatArray
-    settled: IndexArray
-    bins: IndexArray
-    movement: FloatArray
-
-    __repr__ = brief
-
-    @property
-    def mean(self) -> FloatArray:
-        """Mean of N (...)."""
-        return self.cumulants[..., 0]
-
-    @property
-    def variance(self) -> FloatArray:
-        """Variance of N (...), never negative."""
-        return self.cumulants[..., 1]
 
 
 def exposure_moments(
@@ -170,16 +124,16 @@ def refined_moments(
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:
-        return _poisson(cells, out_bins)
+        return without_dead_time(cells, out_bins)
     cells = cells.resolved(out_bins)
-    result = _blank(cells, out_bins)
+    result = blank(cells, out_bins)
     pending = np.flatnonzero(cells.total > 0.0)
     bins = cells.first_bins(out_bins)
     most = max(MOST_BINS, 4 * out_bins, 2 * bins)
     if pending.size < cells.size:
-        _darkness(result, cells.total == 0.0, bins)
+        darkness(result, cells.total == 0.0, bins)
         if not pending.size:
-            return _shaped(result, cells.shape)
+            return shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _run(cells.part(pending), bins // 2, shared, team, progress, steps)
     last = spent = _spent(coarse, cells.system)
@@ -188,12 +142,12 @@ def refined_moments(
         fine = _run(cells.part(pending), bins, out_bins, team, progress, steps)
         last = _spent(fine, cells.system)
         spent = spent + last
-        moved = _movement(coarse, fine)
+        moved = movement(coarse, fine)
         good = moved <= tolerance
-        _put(result, pending[good], fine, good, bins, moved)
+        put(result, pending[good], fine, good, bins, moved)
         if good.all():
             break
-        pending, coarse = pending[~good], _take(fine, ~good)
+        pending, coarse = pending[~good], take(fine, ~good)
         last, spent = last[~good], spent[~good]
         bins *= 2
         if bins > most:
@@ -209,7 +163,7 @@ def refined_moments(
             f"exposure statistics of {cells.name(k)}: variance {result.cumulants[k, 1]:.3g} < 0; {cells.instead}"
         )
     np.maximum(result.cumulants[:, 1], 0.0, out=result.cumulants[:, 1])  # rounding of a locked pixel
-    return _shaped(result, cells.shape)
+    return shaped(result, cells.shape)
 
 
 def _spent(done: Exposure, system: System) -> FloatArray:
@@ -238,26 +192,6 @@ def _too_long(cells: Cells, steps: int | None) -> str:
     )
 
 
-def _darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
-    """Nothing is registered where nothing arrives."""
-    for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
-        array[which] = 0
-    result.bins[which] = bins
-
-
-def _blank(cells: Cells, out_bins: int) -> Exposure:
-    n = cells.size
-    return Exposure(
-        cumulants=np.empty((n, _ORDERS)),
-        histogram=np.empty((n, out_bins)),
-        cumulant_rates=np.empty((n, _ORDERS)),
-        histogram_rate=np.empty((n, out_bins)),
-        settled=np.empty(n, np.int64),
-        bins=np.empty(n, np.int64),
-        movement=np.zeros(n),
-    )
-
-
 def _run(
     cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, steps: int | None = None
 ) -> Exposure:
@@ -268,7 +202,7 @@ def _run(
     periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _before(cells.system)
     if steps is not None and periods * bins > steps:
         raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, steps)}")
-    result = _blank(cells, out_bins)
+    result = blank(cells, out_bins)
     paralyzable = cells.system.detector.mode == "paralyzable"
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
@@ -322,66 +256,3 @@ def _moments(
         progress=progress,
         history=history,
     )
-
-
-def _movement(coarse: Exposure, fine: Exposure) -> FloatArray:
-    """`Exposure.movement` (21); infinite where the fine grid is still so coarse that a bin is negative."""
-    mean, spread = np.abs(fine.cumulants[:, 0]), np.sqrt(np.maximum(fine.cumulants[:, 1], 0.0))
-    floor = 1e-10 * mean + np.finfo(float).tiny  # rounding: the variance of a locked pixel may be 0
-    change = np.abs(fine.cumulants - coarse.cumulants)
-    worst = change[:, 0] / np.maximum(np.minimum(mean, spread), floor)
-    for k in range(1, _ORDERS):
-        scale = np.maximum(np.abs(fine.cumulants[:, k]), spread ** (k + 1))
-        worst = np.maximum(worst, change[:, k] / np.maximum(scale, floor))
-    joined = fine.histogram.reshape(*coarse.histogram.shape, -1).sum(-1)
-    shape = 0.5 * np.abs(joined - coarse.histogram).sum(-1) / np.maximum(mean, np.finfo(float).tiny)
-    below = fine.histogram.min(-1) < -1e-12 * mean
-    return np.asarray(np.where(below, np.inf, np.maximum(worst, shape)), dtype=np.float64)
-
-
-def _take(some: Exposure, which: NDArray[np.bool_]) -> Exposure:
-    return Exposure(**{name: array[which] for name, array in vars(some).items()})
-
-
-def _put(
-    result: Exposure, at: IndexArray, fine: Exposure, good: NDArray[np.bool_], bins: int, moved: FloatArray
-) -> None:
-    for name, array in vars(fine).items():
-        vars(result)[name][at] = array[good]
-    result.histogram[at] = np.maximum(result.histogram[at], 0.0)
-    result.bins[at] = bins
-    result.movement[at] = moved[good]
-
-
-def _shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
-    return Exposure(**{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(flat).items()})
-
-
-def recorded_light(cells: Cells, out_bins: int) -> FloatArray:
-    """Photons (cells, out_bins) of a period: all of them are registered where there is no dead time."""
-    from mars_lidar._base.native import _core
-
-    parts, step = int(_core.EXPOSURE_PARTS), _poisson_bins(out_bins)
-    rate = np.empty((cells.size, out_bins))
-    for part in cells.chunks(step, out_bins):
-        some = cells.part(part)
-        energy, row = some.energies(step)
-        energy = energy.reshape(energy.shape[0], out_bins, step // out_bins * parts).sum(-1)
-        photons, flat = some.native_flux
-        rate[part] = photons[:, None] * energy[row] + flat[:, None] / out_bins
-    return rate
-
-
-def _poisson_bins(out_bins: int) -> int:
-    return out_bins * math.ceil(512 / out_bins)
-
-
-def _poisson(cells: Cells, out_bins: int) -> Exposure:
-    """No dead time: Poisson exactly, in every bin and in all."""
-    result = _blank(cells, out_bins)
-    result.histogram_rate[:] = recorded_light(cells, out_bins)
-    result.cumulant_rates[:] = cells.total[:, None]
-    result.cumulants[:] = cells.system.cycles * result.cumulant_rates
-    result.histogram[:] = cells.system.cycles * result.histogram_rate
-    result.settled[:], result.bins[:] = 0, _poisson_bins(out_bins)
-    return _shaped(result, cells.shape)

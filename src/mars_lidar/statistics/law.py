@@ -15,12 +15,13 @@ from mars_lidar.instrument.detector import MODES, Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import LAW_STEPS, Cells, FloatArray, IndexArray
+from mars_lidar.statistics.count_window import Window, gaussian_window, poisson_window
 from mars_lidar.statistics.electronics_law import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects
 from mars_lidar.statistics.methods import pixel_of, rearm_of
-from mars_lidar.statistics.pmf import Window, exact_windows, gaussian_window, poisson_window
+from mars_lidar.statistics.pmf import exact_windows
 from mars_lidar.statistics.shape import registration_pdf as registration_pdf
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar.statistics.cells import FloatArray, IndexArray
-from mars_lidar.statistics.pmf import Window
+from mars_lidar.statistics.count_window import Window
 
 _MAX_COUNTS = 2**24
 _MAX_MEAN = 1e15

@@ -8,26 +8,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
-from mars_lidar.statistics.paralyzable_rate import registration_rates
+from mars_lidar.statistics.characteristic import Purse, TooLongError, characteristic
+from mars_lidar.statistics.count_window import TAIL
+from mars_lidar.statistics.count_window import Window as Window
+from mars_lidar.statistics.count_window import gaussian_window as gaussian_window
+from mars_lidar.statistics.count_window import poisson_window as poisson_window
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
-from mars_lidar.statistics.warm import NOT_WARM, warm_history
 
-_TAIL = 1e-12  # probability that may lie outside the support, at either end
 _TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # standard deviations of reach
 _MAX_TILT = 25.0
 _MAX_LOG_GROWTH = 600.0  # of one period, below the largest double
 _CONSISTENT = 1e-5  # agreement demanded of the pmf with the cumulants, in standard deviations
 _CONSISTENT_PER_CYCLE = 1e-13  # and what extrapolation over so many cycles may add by rounding
-_UNSETTLED = -2
-_MAX_STEPS, _LANES = 80_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
-_NEAR_BYTES, _FAR = 1 << 21, 4  # a history beyond that, or a dead time below a bin, makes a step cost as many
 _MAX_COUNTS = 2**24
 _FOR_SUPPORT = 0.25  # of the steps of a law, to bound its support; a guess must do beyond
 _WIDE_REACH = 12.0  # standard deviations, and counts beside them, of that guess
@@ -39,59 +37,6 @@ _BLOCK = 64  # cells at a time
 _ALL_POINTS = 256  # of the circle: narrower laws take all points
 _QUIET = 1e-15  # of the transform of a wide law, that counts as 0
 _SHORT_VARIANCE, _SHORTER = 4.0, 6  # the exposure in which other peaks are looked for: variance, and how much shorter
-
-
-class TooLongError(ConvergenceError):
-    """A transform whose state does not repeat for longer than a law is to take."""
-
-
-class Purse:
-    """Steps (bins x periods, `_LANES` points at once) that are left for the law of one cell."""
-
-    def __init__(self, share: float = 1.0) -> None:
-        self.left = share * _MAX_STEPS
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """Probabilities `pmf` of the counts `first`, `first` + 1, ...; at most `outside` lies elsewhere."""
-
-    first: int
-    pmf: FloatArray
-    outside: float
-
-
-def poisson_window(mean: float) -> Window:
-    """Poisson law: exact without dead time. The support comes from Bernstein's bounds of the two tails."""
-    from scipy.special import gammaln, xlogy
-
-    reach = -math.log(_TAIL)
-    low = max(0, math.ceil(mean - math.sqrt(2.0 * reach * mean)))
-    high = math.floor(mean + reach / 3.0 + math.sqrt(reach**2 / 9.0 + 2.0 * reach * mean))
-    counts = np.arange(low, high + 1)
-    return Window(low, np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), _TAIL * (1 + (low > 0)))
-
-
-def gaussian_window(mean: float, variance: float) -> Window:
-    """Normal law on the integers: P(n) = Phi((n + 1/2 - mean) / sd) - Phi((n - 1/2 - mean) / sd).
-
-    What lies below 0 is in P(0).
-    """
-    from scipy.special import ndtr
-
-    spread = math.sqrt(variance)
-    low = max(0, math.floor(mean - 8.5 * spread))
-    high = max(low, math.ceil(mean + 8.5 * spread))
-    counts = np.arange(low, high + 1)
-    if spread == 0.0:
-        return Window(low, (counts == round(mean)).astype(np.float64), 0.0)
-    edges = np.arange(low, high + 2) - 0.5 - mean
-    if low == 0:
-        edges[0] = -np.inf
-    # differences of the smaller of the two tails keep their digits at both ends
-    below, above = ndtr(edges / spread), ndtr(-edges / spread)
-    pmf = np.where(edges[:-1] > 0, above[:-1] - above[1:], below[1:] - below[:-1])
-    return Window(low, np.maximum(pmf, 0.0), float(below[0] + above[-1]))
 
 
 def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Window]:
@@ -152,7 +97,7 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
     """Probabilities (cells, size) of the counts from `first` (cells,) on, as (23) has them."""
     angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
     shape = (cells.size, 1)
-    re, im = _characteristic(cells, np.tile(np.cos(angle), shape), np.tile(np.sin(angle), shape), bins, threads)
+    re, im = characteristic(cells, np.tile(np.cos(angle), shape), np.tile(np.sin(angle), shape), bins, threads)
     folded = np.fft.irfft(re - 1j * im, size, axis=-1)
     return np.take_along_axis(folded, (first[:, None] + np.arange(size)) % size, axis=-1)
 
@@ -190,10 +135,10 @@ def _supports(
     unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, _MAX_TILT) / _TILTS[-1])
     tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
-    log_value = _characteristic(cells, np.exp(tilt), None, bins, threads, Purse(_FOR_SUPPORT))[0]
+    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, Purse(_FOR_SUPPORT))[0]
     with np.errstate(invalid="ignore"):
         # P(N >= edge) <= tail for a positive tilt, P(N <= edge) <= tail for a negative one
-        edge = (log_value - math.log(_TAIL)) / tilt
+        edge = (log_value - math.log(TAIL)) / tilt
     up, down = np.split(np.where(np.isfinite(edge), edge, np.nan), 2, axis=1)
     exposure = float(cells.system.cycles)
     most = min(math.floor(exposure / dead) + 1.0, 9e15)
@@ -209,7 +154,7 @@ def _supports(
             f"{_MAX_COUNTS}; mean, variance and cumulants are known; use method 'mars' or 'renewal' for a Gaussian"
         )
     # where the support ends at the least or the largest possible count nothing lies beyond
-    outside = _TAIL * ((first > 0).astype(np.float64) + (last < most))
+    outside = TAIL * ((first > 0).astype(np.float64) + (last < most))
     return first.astype(np.int64), last.astype(np.int64), outside
 
 
@@ -228,7 +173,7 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
     value = _narrow(cell, size, bins, threads, variance, purse) if size > _ALL_POINTS else None
     if value is None:
         angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
-        re, im = _characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, purse)
+        re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, purse)
         value = re[0] - 1j * im[0]
     # numpy's transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
     folded = np.fft.irfft(value, size)
@@ -255,7 +200,7 @@ def _narrow(
     end = 0
     while end < angle.size:
         some = slice(end, min(end + step, angle.size))
-        re, im = _characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, purse)
+        re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, purse)
         value[some] = re[0] - 1j * im[0]
         end = some.stop
         if np.abs(value[some]).max() <= _QUIET:
@@ -263,71 +208,13 @@ def _narrow(
     spread = math.sqrt(variance * shorter / cycles)
     begin = min(4.0 / spread, np.pi)
     between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
-    re, im = _characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, purse)
+    re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, purse)
     beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
     brief = replace(cell, system=cell.system.replace(cycles=shorter))
-    short_re, short_im = _characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, purse)
+    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, purse)
     highest = float(np.hypot(short_re, short_im).max())
     faint = float(np.hypot(re, im).max()) <= 10.0 * _QUIET
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None
-
-
-def _characteristic(
-    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, purse: Purse | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
-    from mars_lidar._base.native import _core
-
-    purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
-    dead = cells.system.dead_time_periods
-    reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
-    dear = float(_FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1)
-    # at real points the blind of every period of a dead time are summed
-    dear *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
-    steps = max(int(purse.left / dear) // batches, bins)
-    grid = cells.grid(bins, 1, steps)
-    re, im = np.empty(z_re.shape), np.empty(z_re.shape)
-    settled = np.empty(z_re.shape, np.int64)
-    points: dict[str, Any] = {
-        "tilted": z_im is None,
-        "z_re": np.ascontiguousarray(z_re),
-        "z_im": np.zeros(z_re.shape) if z_im is None else np.ascontiguousarray(z_im),
-        "re": re,
-        "im": im,
-        "settled": settled,
-        "threads": threads,
-        "level": "",
-        "progress": None,
-    }
-    if cells.system.detector.mode == "paralyzable":
-        for part in cells.chunks(bins, 1):
-            some = cells.part(part)
-            mine: dict[str, Any] = {name: x[part] if isinstance(x, np.ndarray) else x for name, x in points.items()}
-            rates = registration_rates(some, bins)
-            _core.paralyzable_characteristic(grid=grid, photons=some.total, rates=rates, **mine)
-    else:
-        energy, row = cells.energies(bins)
-        photons, flat = cells.native_flux
-        arrays: dict[str, Any] = {"signal": photons, "background": flat, "shape": row}
-        _core.exposure_characteristic(grid=grid, shapes=energy, **arrays, **points)
-        cold = np.flatnonzero((settled == NOT_WARM).any(-1))
-        if cold.size:
-            every: dict[str, Any] = points | arrays
-            again = every | {name: np.ascontiguousarray(x[cold]) for name, x in every.items() if np.ndim(x)}
-            history = warm_history(cells, cold, bins)
-            _core.exposure_characteristic(grid=grid, shapes=energy, history=history, **again)
-            for name, array in (("re", re), ("im", im), ("settled", settled)):
-                array[cold] = again[name]
-    lost = (settled == _UNSETTLED).any(-1)
-    if lost.any():
-        raise TooLongError(
-            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
-            f"{steps:.1g} bins x periods, too many to run the exposure to its end at {z_re.shape[1]} points; mean, "
-            f"variance and two more cumulants are known; for the law {cells.instead}"
-        )
-    taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
-    purse.left = max(purse.left - float(taken) * bins * batches * dear, 1.0)
-    return re, im
 
 
 def _check(cells: Cells, cell: int, window: Window, cumulants: FloatArray) -> None:
@@ -335,7 +222,7 @@ def _check(cells: Cells, cell: int, window: Window, cumulants: FloatArray) -> No
     pmf: NDArray[np.float64] = window.pmf
     offset = window.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
-    if window.outside > _TAIL * 4.0:  # a guessed support
+    if window.outside > TAIL * 4.0:  # a guessed support
         ends = max(abs(float(pmf[-1])), abs(float(pmf[0])) if window.first > 0 else 0.0)
         if ends > _EDGE + _CONSISTENT_PER_CYCLE * cells.system.cycles:
             raise ConvergenceError(

@@ -9,7 +9,8 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
 from mars_lidar.statistics.cells import Cells, FloatArray
-from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED, recorded_light
+from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED
+from mars_lidar.statistics.no_dead_time import recorded_light
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.warm import warm_history
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.count_window import Window
 from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
-from mars_lidar.statistics.pmf import Window
 
 _TAIL = 1e-13  # probability left out at either end of the support
 _SPREAD = 9.0  # standard deviations of the number of late registrations that are summed over

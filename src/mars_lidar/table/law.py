@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar.statistics.pmf import Window
+from mars_lidar.statistics.count_window import Window
 from mars_lidar.table.error import random_pixels
 from mars_lidar.table.nodes import Nodes
 

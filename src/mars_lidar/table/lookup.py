@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar.statistics.cells import FloatArray, IndexArray, _broadcast, _reals
+from mars_lidar.statistics.cell_input import broadcast, reals
+from mars_lidar.statistics.cells import FloatArray, IndexArray
 from mars_lidar.table.start_phase import StartPhases
 
 
@@ -61,9 +62,9 @@ def read_pixels(
     there is no return.
     """
     canonical = 0.5 * period_ns
-    given = _reals("delay_ns", canonical if delay_ns is None else delay_ns)
-    parts = _broadcast(
-        ("signal", "background", "delay_ns"), _reals("signal", signal), _reals("background", background), given
+    given = reals("delay_ns", canonical if delay_ns is None else delay_ns)
+    parts = broadcast(
+        ("signal", "background", "delay_ns"), reals("signal", signal), reals("background", background), given
     )
     s, b, delay = (np.ascontiguousarray(part.reshape(-1), dtype=np.float64) for part in parts)
     bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (s == 0))

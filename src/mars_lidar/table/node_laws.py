@@ -9,7 +9,8 @@ import numpy as np
 
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
-from mars_lidar.statistics.pmf import Window, guessed_windows
+from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.pmf import guessed_windows
 from mars_lidar.table.entries import Entries, Progress
 
 

@@ -1,0 +1,89 @@
+"""The generating function E z^N of a count, at points of the unit circle or of the real line, and what it may cost.
+
+Equation numbers: docs/theory_exposure.md, section 8.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.paralyzable_rate import registration_rates
+from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.warm import NOT_WARM, warm_history
+
+_UNSETTLED = -2
+_MAX_STEPS, _LANES = 80_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
+_NEAR_BYTES, _FAR = 1 << 21, 4  # a history beyond that, or a dead time below a bin, makes a step cost as many
+
+
+class TooLongError(ConvergenceError):
+    """A transform whose state does not repeat for longer than a law is to take."""
+
+
+class Purse:
+    """Steps (bins x periods, `_LANES` points at once) that are left for the law of one cell."""
+
+    def __init__(self, share: float = 1.0) -> None:
+        self.left = share * _MAX_STEPS
+
+
+def characteristic(
+    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, purse: Purse | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
+    from mars_lidar._base.native import _core
+
+    purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
+    dead = cells.system.dead_time_periods
+    reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
+    dear = float(_FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1)
+    # at real points the blind of every period of a dead time are summed
+    dear *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
+    steps = max(int(purse.left / dear) // batches, bins)
+    grid = cells.grid(bins, 1, steps)
+    re, im = np.empty(z_re.shape), np.empty(z_re.shape)
+    settled = np.empty(z_re.shape, np.int64)
+    points: dict[str, Any] = {
+        "tilted": z_im is None,
+        "z_re": np.ascontiguousarray(z_re),
+        "z_im": np.zeros(z_re.shape) if z_im is None else np.ascontiguousarray(z_im),
+        "re": re,
+        "im": im,
+        "settled": settled,
+        "threads": threads,
+        "level": "",
+        "progress": None,
+    }
+    if cells.system.detector.mode == "paralyzable":
+        for part in cells.chunks(bins, 1):
+            some = cells.part(part)
+            mine: dict[str, Any] = {name: x[part] if isinstance(x, np.ndarray) else x for name, x in points.items()}
+            rates = registration_rates(some, bins)
+            _core.paralyzable_characteristic(grid=grid, photons=some.total, rates=rates, **mine)
+    else:
+        energy, row = cells.energies(bins)
+        photons, flat = cells.native_flux
+        arrays: dict[str, Any] = {"signal": photons, "background": flat, "shape": row}
+        _core.exposure_characteristic(grid=grid, shapes=energy, **arrays, **points)
+        cold = np.flatnonzero((settled == NOT_WARM).any(-1))
+        if cold.size:
+            every: dict[str, Any] = points | arrays
+            again = every | {name: np.ascontiguousarray(x[cold]) for name, x in every.items() if np.ndim(x)}
+            history = warm_history(cells, cold, bins)
+            _core.exposure_characteristic(grid=grid, shapes=energy, history=history, **again)
+            for name, array in (("re", re), ("im", im), ("settled", settled)):
+                array[cold] = again[name]
+    lost = (settled == _UNSETTLED).any(-1)
+    if lost.any():
+        raise TooLongError(
+            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
+            f"{steps:.1g} bins x periods, too many to run the exposure to its end at {z_re.shape[1]} points; mean, "
+            f"variance and two more cumulants are known; for the law {cells.instead}"
+        )
+    taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
+    purse.left = max(purse.left - float(taken) * bins * batches * dear, 1.0)
+    return re, im

@@ -33,8 +33,8 @@ _LATER = (
 def with_hidden(found: Calibration, jitter: float, again: Again, *, known: bool) -> Calibration:
     """`found` with what jitters of sigma up to `jitter`, ns, would change of its light added to the covariance.
 
-    `again` fits the light for another detector; `known`: the shape of the pulse was given. No error is stated of signal,
-    delay and width of a pulse so bright that only its first photons are seen.
+    `again` fits the light for another detector; `known`: the shape of the pulse was given. No error is stated of
+    signal, delay and width of a pulse so bright that only its first photons are seen.
     """
     if found.pulse is None:
         return _with_later(found, jitter, again)

@@ -11,50 +11,31 @@ import numpy as np
 from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch, fitted
 from mars_lidar.calibrate.calibration_result import Calibration, nearest
 from mars_lidar.calibrate.departure import SIGNIFICANT, departure_of, too_coarse
-from mars_lidar.calibrate.fine_light import fine_light
 from mars_lidar.calibrate.hidden_dead_time import EDGE, excess, hidden
-from mars_lidar.calibrate.intervals import FloatArray, Stream
-from mars_lidar.calibrate.jittered import normal_kernel, unblurred
+from mars_lidar.calibrate.hidden_light import SHUT, with_hidden, without_pulse
+from mars_lidar.calibrate.intervals import Stream
+from mars_lidar.calibrate.light_behind import LightBehind
 from mars_lidar.calibrate.recovery_edge import ORDINARY, REACH, Edge, Law, edge_of
 from mars_lidar.calibrate.shortest_intervals import FEW, LEAST_REACH, Ages, Underlying, extrapolated, is_sharp, shortest
 from mars_lidar.calibrate.stream_summary import Summary
 from mars_lidar.calibrate.unknowns import is_seen
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
-from mars_lidar.instrument.system import Detector, System
-from mars_lidar.statistics import ConvergenceError
-from mars_lidar.statistics.law import registration_pdf
 
 SHARP = 0.01  # false-alarm probability of a blurred edge
 HIDDEN = 14.0  # of a jitter this many mean excesses of the smallest interval wide nine in ten are seen
 _ROUNDS = 12
-_NODES = 1.05  # ratio of the widths of an edge for which the light behind it is computed
-_BINS_PER_WIDTH = 3
-_LEAST_BINS, _MOST_BINS = 2**10, 2**15  # of the light behind an edge
 _STARTS = (0.15, 0.06, 0.4, 1.0)  # widths tried, in parts of the reach over which the edge is not sharp
 _SAME = 0.05  # standard errors by which a last round may move the edge
 _AGREE = 4.0  # standard errors between the jitter by the edge and that by the shape of the pulse
-_MATTERS = 0.15  # of the pulse: a jitter that may hide and is wider moves the light of more than ...
-_BRIGHT = 0.02  # ... so many photons of signal
-_SHUT = 4.0  # photons of signal of which the pixel sees the first alone
-_HIDES = (
-    "signal, delay and width are not known: the pulse is bright, only its first photons are seen, and how much of its "
-    "width is jitter is not"
-)
-_LATER = (
-    "all of the light is not known: a jitter may hide after which, to be safe, hardly a registration is left: give the "
-    "dead time and the jitter"
-)
 _STEP = 0.2  # of the light behind an edge that falls before it, where the dead time keeps it away
 _BLURRED = 3.0  # jitters before the first photons of a bright pulse
 _ROUNDED = 0.1  # standard errors of the light that the dead time's rounding may move it by
 _COARSE = 2.0  # units of a clock that runs free, of a pulse below which its shape is not known
 _MOSTLY = 0.7  # of the recorded width of a bright pulse that is jitter: then pulse and signal hide in it
 _FOLLOWED = 0.5  # of a change of a bright pulse's jitter that the edge follows: then it is not the edge that tells it
-_PARTS = (0.6, 1.0)  # of it that are tried
 _ALL = 0.98  # of the pulse that may be jitter
 _WIDEST = 0.1  # periods that a jitter may be wide where no pulse limits it
 _OUT_OF_ORDER = 0.3  # of the intervals within the reach of a jitter that may hide
-_STEPS = 30  # of Richardson and Lucy
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +49,10 @@ class Unknown:
     returns: int
     jitter_ns: float | None
     _seen: dict[float, Ages] = field(default_factory=dict)
+
+    @property
+    def _light(self) -> LightBehind:
+        return LightBehind(self.stream)
 
     def calibrated(self) -> Calibration:
         """By the smallest interval where the edge is sharp, else with edge and light fitted in turn."""
@@ -105,7 +90,7 @@ class Unknown:
         """
         stream, smallest = self.stream, first.dead_time_ns
         first = self._certain(first)
-        told, law = self.jitter_ns is not None, self._any_width(first)
+        told, law = self.jitter_ns is not None, self._light.any_width(first)
         sigma = min(_width(first), _WIDEST * stream.period_ns)
         mean, error = excess(law(0.0), stream.registrations, smallest)
         dead = max(smallest - mean, 0.0)
@@ -113,7 +98,7 @@ class Unknown:
         # how the light begins is not known on the scale of a coarse clock, or of a jitter of a bright pulse
         coarse = stream.units == 0 and not _width(first) > _COARSE * stream.unit_ns
         guard = 2.0 * stream.unit_ns if coarse else 0.0
-        if not told and first.pulse is not None and first.signal > _SHUT:
+        if not told and first.pulse is not None and first.signal > SHUT:
             guard = max(guard, _BLURRED * left.jitter_ns)
         if guard > 0.0:
             error = max(error, excess(law(0.0), stream.registrations, smallest, guard)[1])
@@ -130,7 +115,7 @@ class Unknown:
             near = sum(int((dt < CERTAIN * left.jitter_ns).sum()) for dt in stream.intervals())
             if near > _OUT_OF_ORDER * stream.registrations:
                 return replace(found, edge_fits=False, dead_time_error_ns=math.nan)
-        return self._with_hidden(found, min(limit, _ALL * sigma))
+        return with_hidden(found, min(limit, _ALL * sigma), self._pass, known=isinstance(self.shape, Pulse))
 
     def _certain(self, first: Calibration) -> Calibration:
         """Watched from where the pixel is armed for certain, with two roundings of the clock, where that matters."""
@@ -145,37 +130,6 @@ class Unknown:
         later = self._pass(Watch(first.dead_time_ns, hold, first.jitter_ns, by=first.dead_time_by), first)
         return later if later.armed.used >= FEW else first
 
-    def _with_hidden(self, found: Calibration, jitter: float) -> Calibration:
-        """With the light that a jitter that may hide would make, in the covariance: of a bright pulse it moves it."""
-        if found.pulse is None:
-            return self._with_later(found, jitter)
-        if not isinstance(found.pulse, GaussianPulse) or jitter < _MATTERS * found.pulse.sigma_ns:
-            return found
-        if found.signal < _BRIGHT or isinstance(self.shape, Pulse):
-            return found
-        if found.signal > _SHUT:
-            return _without_pulse(found)
-        covariance = found.covariance
-        for part in _PARTS:
-            # armed for certain later than without it
-            hold = max(found.armed.hold_off_ns, found.dead_time_ns + CERTAIN * part * jitter)
-            other = self._pass(Watch(found.armed.hold_off_ns, hold, part * jitter, by=found.dead_time_by), found)
-            if other.armed.used < FEW or not other.converged:
-                return _without_pulse(found)
-            moved = nearest(found, other.parameters - found.parameters)
-            covariance = covariance + np.outer(moved, moved)
-        return replace(found, covariance=covariance)
-
-    def _with_later(self, found: Calibration, jitter: float) -> Calibration:
-        """A free shape whose error has in it what a hold-off makes that is safe with a jitter which may hide."""
-        hold = found.dead_time_ns + CERTAIN * jitter
-        if not hold > found.armed.hold_off_ns:
-            return found
-        other = self._pass(Watch(hold, hold, by=found.dead_time_by))
-        if other.armed.used < FEW:
-            return replace(found, covariance=np.full_like(found.covariance, math.nan), unknown=(*found.unknown, _LATER))
-        return replace(found, covariance=found.covariance + (other.total - found.total) ** 2)
-
     def _ages(self, reach_ns: float = 0.0) -> Ages:
         """The shortest intervals, up to at least `reach_ns` above the smallest."""
         smallest = float(self.counted.smallest_ns[0])
@@ -189,7 +143,7 @@ class Unknown:
         ages = self._ages()
         if ages.interval_ns.size < FEW:
             return True, None
-        sharp = self._any_width(first)(0.0)
+        sharp = self._light.any_width(first)(0.0)
         if self.jitter_ns is None:
             chance, reach = is_sharp(ages, sharp, self.stream.registrations)
             if chance > SHARP:
@@ -237,7 +191,7 @@ class Unknown:
             edge = self._edge(ages, found, dead, width)
             if edge is None:
                 return None
-            if not self._is_step(found, edge, self._bins(width)):
+            if not self._is_step(found, edge, self._light.bins(width)):
                 return None
             if _is_clock(edge, ages):
                 return self._clocked(first, edge, ages)
@@ -259,7 +213,7 @@ class Unknown:
             found = self._pass(self._watch(edge), found)
         if found.too_short:
             return None
-        edge = self._edge(ages, found, dead, width, self._uncertain(found, width, ages.clock_ns))
+        edge = self._edge(ages, found, dead, width, self._light.uncertain(found, width, ages.clock_ns))
         if edge is None or not edge.fits > ORDINARY:
             return None
         edge = edge.followed(follows, off)
@@ -274,8 +228,8 @@ class Unknown:
             found = replace(found, covariance=found.covariance + np.outer(moved, moved))
         found = replace(found, dead_time_ns=edge.dead_time_ns, dead_time_error_ns=edge.dead_time_error_ns)
         hides = found.jitter_ns > _MOSTLY * _width(found) or follows[1] > _FOLLOWED
-        if self.jitter_ns is None and found.signal > _SHUT and hides:
-            return _without_pulse(found)
+        if self.jitter_ns is None and found.signal > SHUT and hides:
+            return without_pulse(found)
         return found
 
     def _follows(self, ages: Ages, found: Calibration, edge: Edge, width: float) -> tuple[float, float]:
@@ -313,131 +267,28 @@ class Unknown:
             jitter_limit_ns=max(edge.jitter_ns + 2.0 * edge.jitter_error_ns, ages.clock_ns),
         )
         sigma = found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) else 0.0
-        return self._with_hidden(found, min(found.jitter_limit_ns, _ALL * sigma))
+        return with_hidden(
+            found, min(found.jitter_limit_ns, _ALL * sigma), self._pass, known=isinstance(self.shape, Pulse)
+        )
 
     def _edge(
         self, ages: Ages, found: Calibration, dead: float, width: float, off: tuple[Law, ...] = ()
     ) -> Edge | None:
         ages = self._ages(dead + REACH * width - ages.smallest_ns)
-        edge = edge_of(ages, self._law(found, width, ages.clock_ns), dead, width, off)
+        edge = edge_of(ages, self._light.law(found, width, ages.clock_ns), dead, width, off)
         return edge if edge is None or self.jitter_ns is None else edge.known(self.jitter_ns, 0.0)
 
     def _is_step(self, found: Calibration, edge: Edge, bins: int) -> bool:
         """Whether the dead time makes the edge: not the light, which is no less before it than behind it."""
         width = math.hypot(math.sqrt(2.0) * edge.jitter_ns, self.stream.unit_ns)
         ages = np.maximum(edge.dead_time_ns + width * np.array([-3.0, -1.0, 0.0, 2.0]), 0.0)
-        fallen = self._behind(found, bins).fallen(ages)
+        fallen = self._light.of(found, bins).fallen(ages)
         kept, seen = float(fallen[1] - fallen[0]), float(fallen[3] - fallen[2])
         return self.stream.registrations * kept >= EDGE and kept >= _STEP * seen
-
-    def _bins(self, width_ns: float) -> int:
-        """Bins that are narrow beside the edge."""
-        bins = _MOST_BINS
-        while bins > _LEAST_BINS and bins * width_ns > 2.0 * _BINS_PER_WIDTH * self.stream.period_ns:
-            bins //= 2
-        return bins
-
-    def _law(self, found: Calibration, about_ns: float, clock_ns: float) -> Law:
-        """What lies behind edges of about that width, as a function of it."""
-        bins = self._bins(about_ns)
-        if not isinstance(found.pulse, GaussianPulse):
-            same = self._behind(found, bins)
-            return lambda width_ns: same
-
-        widest = 0.99 * found.pulse.sigma_ns**2  # variance of a jitter
-        known: dict[int, Underlying] = {}
-
-        def variance(width_ns: float) -> float:
-            """Of the jitter that makes an edge of that width."""
-            return min(0.5 * max(width_ns**2 - clock_ns**2, 0.0), widest)
-
-        def at(node: int) -> Underlying:
-            if node not in known:
-                jitter = math.sqrt(variance(_NODES**node))
-                known[node] = self._behind(replace(found, jitter_ns=jitter), bins)
-            return known[node]
-
-        def behind(width_ns: float) -> Underlying:
-            # between two widths by the variance of the jitter, which leaves the variance of the pulse as it is
-            node = math.floor(math.log(width_ns) / math.log(_NODES))
-            low, high = variance(_NODES**node), variance(_NODES ** (node + 1))
-            if high == low:
-                return at(node)
-            part = float(np.clip((variance(width_ns) - low) / (high - low), 0.0, 1.0))
-            return at(node).mixed(at(node + 1), part)
-
-        return behind
-
-    def _any_width(self, found: Calibration) -> Law:
-        """What lies behind edges of any width; jitters that are small beside the pulse are none."""
-        known: dict[float, Underlying] = {}
-        sigma = found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) else math.inf
-        bins = self._bins(sigma) if math.isfinite(sigma) else _MOST_BINS // 4
-
-        def behind(width_ns: float) -> Underlying:
-            jitter = width_ns / math.sqrt(2.0)
-            jitter = jitter if jitter > _MATTERS * sigma else 0.0
-            if jitter not in known:
-                known[jitter] = self._behind(replace(found, jitter_ns=jitter), bins)
-            return known[jitter]
-
-        return behind
-
-    def _behind(self, found: Calibration, bins: int) -> Underlying:
-        """Light and phases of avalanches."""
-        period, jitter = self.stream.period_ns, found.jitter_ns
-        if found.pulse is None:
-            rate = fine_light(self.stream, found.hold_off_ns, bins)
-        else:
-            rate = found.arriving_in(bins)
-        if jitter == 0.0:
-            phases = self.stream.histogram(bins).astype(np.float64)
-        elif found.pulse is not None:
-            phases = self._in_the_long_run(rate, found)
-        else:
-            kernel = normal_kernel(jitter, period, bins)
-            rate = unblurred(rate, kernel, _STEPS)
-            phases = unblurred(self.stream.histogram(bins).astype(np.float64), kernel, _STEPS)
-        return Underlying.of(rate, phases, period)
-
-    def _in_the_long_run(self, rate: FloatArray, found: Calibration) -> FloatArray:
-        """Phases (n,) of avalanches in light (n,), which the jitter of the records hides."""
-        system = System(
-            period_ns=self.stream.period_ns,
-            cycles=1,
-            bins=rate.size,
-            start="stationary",
-            pulse=GaussianPulse(sigma_ns=0.01 * self.stream.period_ns),
-            detector=Detector(dead_time_ns=found.dead_time_ns),
-        )
-        try:
-            return registration_pdf(None, 0.0, system, "stationary", waveform=rate, threads=1)
-        except (ConvergenceError, ValueError):  # locked to the laser, or far more light than the laws do
-            kernel = normal_kernel(found.jitter_ns, self.stream.period_ns, rate.size)
-            return unblurred(self.stream.histogram(rate.size).astype(np.float64), kernel, _STEPS)
-
-    def _uncertain(self, found: Calibration, width_ns: float, clock_ns: float) -> tuple[Law, ...]:
-        """The light, a standard error away in each independent direction of its parameters but the jitter."""
-        if found.pulse is None:
-            return ()
-        told = np.isfinite(np.diag(found.covariance)) & np.array([name != "jitter_ns" for name in found.names])
-        values, vectors = np.linalg.eigh(found.covariance[np.ix_(told, told)])
-        lights = []
-        for value, vector in zip(values, vectors.T, strict=True):
-            step: FloatArray = np.zeros(told.size)
-            step[told] = math.sqrt(max(value, 0.0)) * vector
-            lights.append(self._law(found.moved(step), width_ns, clock_ns))
-        return tuple(lights)
 
     def _watch(self, edge: Edge) -> Watch:
         hold = max(edge.dead_time_ns + CERTAIN * edge.jitter_ns, self.hold_off_ns or 0.0)
         return Watch(edge.dead_time_ns, hold, edge.jitter_ns, edge.jitter_error_ns, edge.dead_time_error_ns, "edge")
-
-
-def _without_pulse(found: Calibration) -> Calibration:
-    lost = np.array([name.startswith(("signal", "delay", "sigma")) for name in found.names])
-    covariance = np.where(lost | lost[:, None], math.nan, found.covariance)
-    return replace(found, covariance=covariance, unknown=(*found.unknown, _HIDES))
 
 
 def _nearer(tried: list[tuple[float, float]]) -> float:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +17,38 @@ from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-    from mars_lidar.statistics.joint_grid import FoldedGrid
-
 FloatArray = NDArray[np.float64]
 
 MOST_FACTORED = 2**14  # bins of an equation that is factorised: a second
 GOOD = 1e-9  # relative residual with which a solution is accepted
 
 
-def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
+class FeedbackEquation(Protocol):
+    """The equation of one pixel on one grid, as `statistics.joint_grid.FoldedGrid` has it."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def bins(self) -> int:
+        """Number n of bins."""
+
+    @property
+    def shift(self) -> int:
+        """Whole bins d of the dead time without whole periods."""
+
+    @property
+    def response(self) -> FloatArray:
+        """(6, n): (4.1)."""
+
+    @property
+    def maps(self) -> tuple[FloatArray, FloatArray]:
+        """The 2 x 2 maps `near` and `far` of a shift by a fraction of a bin."""
+
+    def apply(self, x: FloatArray) -> FloatArray:
+        """The left side of (4.4) for `x` (2, n)."""
+
+
+def factorised(grid: FeedbackEquation) -> Callable[..., FloatArray]:
     """Sparse factors of (5.4) with the windows of worths as further unknowns: few entries in every row.
 
     The window that the others follow from sums many bins: that one full row would fill the factors. So it is held
@@ -46,9 +69,9 @@ def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
         source = grid.response[[0, 3]]
         x = np.zeros_like(source)
         for _ in range(2):
-            rest = np.concatenate([(source - grid._apply(x)).reshape(-1), np.zeros(grid.bins)])
+            rest = np.concatenate([(source - grid.apply(x)).reshape(-1), np.zeros(grid.bins)])
             x = x + solve(rest, trans="T")[: 2 * grid.bins].reshape(2, -1)
-        left = left_over(source - grid._apply(x), x)
+        left = left_over(source - grid.apply(x), x)
         if best is None or left < least:
             best, least = solve, left
         if least <= 0.1 * GOOD:
@@ -57,7 +80,7 @@ def factorised(grid: FoldedGrid) -> Callable[..., FloatArray]:
     return best
 
 
-def _factors_at(grid: FoldedGrid, place: int) -> Callable[..., FloatArray]:
+def _factors_at(grid: FeedbackEquation, place: int) -> Callable[..., FloatArray]:
     """Factors with the window before bin `place` held, and put back."""
     from scipy.sparse.linalg import splu
 
@@ -91,13 +114,13 @@ def _factors_at(grid: FoldedGrid, place: int) -> Callable[..., FloatArray]:
     return whole
 
 
-def _matrix(grid: FoldedGrid) -> csc_matrix:
+def _matrix(grid: FeedbackEquation) -> csc_matrix:
     """The equations without the sum over a window in row 2 n, the window before the first bin."""
     from scipy.sparse import csc_matrix
 
     pa, p0, p1, qa, q0, q1 = grid.response
     n, d = grid.bins, grid.shift
-    near, far = grid._maps
+    near, far = grid.maps
     i = np.arange(n)
     rows: list[NDArray[np.int64]] = []
     columns: list[NDArray[np.int64]] = []

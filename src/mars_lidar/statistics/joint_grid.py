@@ -77,7 +77,7 @@ class FoldedGrid:
     # What re-arms (4.2), and who is blind
 
     @cached_property
-    def _maps(self) -> tuple[FloatArray, FloatArray]:
+    def maps(self) -> tuple[FloatArray, FloatArray]:
         """The 2 x 2 maps `near` and `far` of a shift by f bins."""
         f = self.fraction
         g, c = f * (1.0 - f), 1.0 - 2.0 * f
@@ -87,7 +87,7 @@ class FoldedGrid:
 
     def rearmed(self, x: FloatArray, near: ArrayLike = 1.0, far: ArrayLike = 1.0) -> FloatArray:
         """(2, n) of what registrations `x` (2, n) re-arm in each bin, its two parts weighted."""
-        a, b = self._maps
+        a, b = self.maps
         stays, goes_on = a @ np.roll(x, self.shift, -1), b @ np.roll(x, self.shift + 1, -1)
         return np.asarray(np.asarray(near) * stays + np.asarray(far) * goes_on, dtype=np.float64)
 
@@ -96,7 +96,7 @@ class FoldedGrid:
         mass, n, d = x[0], self.bins, self.shift
         below = np.concatenate([[0.0], np.cumsum(np.concatenate([mass, mass]))])
         j = np.arange(n)
-        last = (self._maps[1] @ np.roll(x, d + 1, -1))[0]
+        last = (self.maps[1] @ np.roll(x, d + 1, -1))[0]
         return np.asarray(below[j + n] - below[j + n - d] + last + self.whole * mass.sum())
 
     def noise(self, x: FloatArray, armed: FloatArray, again: FloatArray) -> FloatArray:
@@ -166,14 +166,14 @@ class FoldedGrid:
                 tolerance=_TOLERANCE,
             )
             x = np.ascontiguousarray(out.T)
-            self.direct = not (error <= _TOLERANCE and left_over(source - self._apply(x), x) <= GOOD)
+            self.direct = not (error <= _TOLERANCE and left_over(source - self.apply(x), x) <= GOOD)
             self.sweeps = max(self.sweeps, int(done))
         if self.direct:
             x = np.zeros((2, self.bins))
             for _ in range(2):  # the second round takes away the rounding of the first
-                rest = np.concatenate([(source - self._apply(x)).reshape(-1), np.zeros(self.bins)])
+                rest = np.concatenate([(source - self.apply(x)).reshape(-1), np.zeros(self.bins)])
                 x = x + self._factors(rest, trans="T")[: 2 * self.bins].reshape(2, -1)
-        self._judge(source - self._apply(x), x)
+        self._judge(source - self.apply(x), x)
         return x
 
     def _adjoint(self, mass: FloatArray, moment: FloatArray | None, tolerance: float) -> FloatArray:
@@ -229,7 +229,7 @@ class FoldedGrid:
         if not left <= GOOD:
             raise ConvergenceError(f"the feedback equation is left with a relative residual of {left:.1e}")
 
-    def _apply(self, x: FloatArray) -> FloatArray:
+    def apply(self, x: FloatArray) -> FloatArray:
         """The left side of (4.4), without whole periods of dead time, by prefix sums: no code of the sweeps."""
         pa, p0, p1, qa, q0, q1 = self.response
         total, slope = self.rearmed(x)
@@ -240,7 +240,7 @@ class FoldedGrid:
         """The left side of (5.4) for `y` (m, 2, n), without whole periods of dead time."""
         _, p0, p1, _, q0, q1 = self.response
         d, n = self.shift, self.bins
-        near, far = self._maps
+        near, far = self.maps
         armed = self.worth(y)
         again = np.stack([p0 * y[:, 0] + q0 * y[:, 1], p1 * y[:, 0] + q1 * y[:, 1]], 1)
         below = np.concatenate([np.zeros((len(y), 1)), np.cumsum(np.concatenate([armed, armed], -1), -1)], -1)

@@ -121,7 +121,7 @@ class SettledLaw:
     def _edge(self, y: FloatArray, armed: FloatArray) -> FloatArray:
         """(m, 2): the oldest bin reaches beyond the end only with the part that re-arms in the next bin."""
         _, p0, p1, _, q0, q1 = self.grid.response
-        far = self.grid._maps[1]
+        far = self.grid.maps[1]
         again = np.stack([p0[0] * y[:, 0, 0] + q0[0] * y[:, 1, 0], p1[0] * y[:, 0, 0] + q1[0] * y[:, 1, 0]], 1)
         return np.asarray(armed[:, :1] * far[0] - again @ far)
 

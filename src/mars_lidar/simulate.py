@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
-from mars_lidar.engines.engine import Progress, Records, Task
+from mars_lidar.engines.engine import Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux

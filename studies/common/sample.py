@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, simulate
+from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import Engine
-
-FloatArray = NDArray[np.float64]
 
 PERIOD_NS = 1e3 / 7.5
 

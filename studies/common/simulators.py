@@ -13,9 +13,9 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import CountLaw, System, count_law, registration_pdf
+from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ENGINES
 from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.distance import Pmf
@@ -26,7 +26,6 @@ from studies.neural.pairs import Training
 if TYPE_CHECKING:
     from studies.neural import NeuralEngine
 
-FloatArray = NDArray[np.float64]
 
 # engines whose count law is evaluated instead of sampled, and those that are the truth
 _IN_CLOSED_FORM = ("poisson", "renewal", "mars", "exact", "sequential")

@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import System, count_law, registration_pdf
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.distance import Pmf, kl_divergence, wasserstein
 from studies import Tell
 from studies.common.sample import PERIOD_NS, Sample, draw, log_points, system_of
 from studies.common.simulators import Prediction, arrival_shape, simulators
 from studies.neural.pairs import Training
-
-FloatArray = NDArray[np.float64]
-
 
 FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
 

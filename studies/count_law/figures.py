@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import Flux, simulate
+from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
 from mars_lidar.statistics import exposure_moments
 from studies.common.draw import panels
@@ -21,7 +21,6 @@ from studies.count_law.cells import FIGURES, SHAPES, Cell, Settings
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = NDArray[np.float64]
 
 PANELS = ((0.07, 0.07, 25.0), (0.5, 0.5, 50.0), (4.0, 0.5, 75.0), (10.0, 10.0, 100.0))  # nearest cells are drawn
 HISTOGRAM = (2.0, 1.0, 0.6375)  # S, B in photons per period, dead time in periods

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import CountLaw, Flux, System, count_law, simulate
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import distance
 from mars_lidar.statistics.distance import Pmf, total_variation
 from studies import Request, Tell
 from studies.common.report import Row, write
 from studies.common.sample import PERIOD_NS, log_points, system_of
-
-FloatArray = NDArray[np.float64]
 
 LAWS = {
     "exact": "exact",

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import GaussianPulse, System, count_law
+from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, style
 from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
@@ -19,8 +20,6 @@ from studies.common.draw import heat, panels
 from studies.common.report import Row, save_figure, write
 from studies.common.sample import PERIOD_NS, log_points, system_of
 from studies.count_law.law import pmf_of
-
-FloatArray = NDArray[np.float64]
 
 AIM = 0.002  # total variation
 _EDGES = (0.0, 0.2, 0.7, 2.3, 9.0, 100.0, np.inf)  # of the variance

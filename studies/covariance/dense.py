@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import HoldingTimeCovariance, moment_matrices
 from studies import Tell
 from studies.covariance.run import SPECTRAL, Cell, Settings, spectral_name
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

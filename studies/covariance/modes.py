@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import ConvergenceError, HoldingTimeCovariance, PhaseChain
 from mars_lidar.statistics.renewal import weighted_waits
 
-FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MODES = 14  # two more than the automatic rule looks at, so that its last pair is whole

@@ -11,16 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import System, holding_time_covariance
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from studies import Request, Tell
 from studies.common.report import Row, write
 from studies.common.sample import PERIOD_NS, log_points, system_of
 from studies.covariance.modes import LeadingTerms
-
-FloatArray = NDArray[np.float64]
 
 CUTOFFS = (*range(21), 25, 30, 40, 50, 75, 100, 150, 200, 300, 500)
 SPECTRAL = (6, 5)  # the paper's L and p

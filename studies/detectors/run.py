@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, count_law, simulate_timestamps
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
 from mars_lidar.statistics import mean_histogram
 from studies import Request
 from studies.common.report import write
-
-FloatArray = NDArray[np.float64]
 
 SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
 SEED = 20

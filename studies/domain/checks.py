@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from mars_lidar._base.types import FloatArray
 from studies.domain.samples import Sample
 
-FloatArray = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 LEAST = 40.0  # expected events of a cell of a chi-square test
 EVENTS = 400  # events from which a variance is compared

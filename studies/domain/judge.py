@@ -7,9 +7,9 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import simulate
+from mars_lidar._base.types import FloatArray
 from studies.domain import simulator
 from studies.domain.case import Case
 from studies.domain.checks import (
@@ -26,7 +26,6 @@ from studies.domain.records import recorded
 from studies.domain.samples import Sample, Windows, handed, own, simulated
 from studies.domain.verdict import FAILED, HANDED, LAWS, REFUSED, SLOW, UNJUDGED, VERIFIED, Outcome, refusal
 
-FloatArray = NDArray[np.float64]
 LAW_SECONDS = 2.0  # a prediction that takes longer is slower than real use
 EXPOSURE_SECONDS = 2.0  # likewise one exposure of one pixel
 _NS = {"exact": 5e-9, "sequential": 16e-9}  # rough seconds of a registration, of an arrival

@@ -6,16 +6,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import CountLaw, JointLaw, count_law, cramer_rao, joint_law, registration_pdf
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import mean_histogram
 from studies.domain.case import Case
 from studies.domain.checks import Check
 from studies.domain.closed_forms import known
 from studies.domain.samples import Windows
 
-FloatArray = NDArray[np.float64]
 TOLERANCE = 1e-4  # of `count_law` and `mean_histogram`: their default
 AGREE = 2e-3  # standard deviations, relative variance, total variation that two predictions may differ by
 _QUICK_JOINT = 8.0  # photons in a dead time up to which `joint_law` takes milliseconds

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import simulate
+from mars_lidar._base.types import FloatArray
 from studies.domain.case import PERIOD_NS, Case
 
 _PIXELS = 32
 _BLOCK_BYTES = 2**24
 MOST_CELLS = 40
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import GaussianPulse
+from mars_lidar._base.types import FloatArray
 from studies.domain.case import PERIOD_NS, Case
 
 ABLE = {
@@ -20,7 +21,6 @@ ABLE = {
     "max_events_per_exposure",
     "twilight_ns",
 }
-FloatArray = NDArray[np.float64]
 
 
 def warm_up(case: Case) -> float:

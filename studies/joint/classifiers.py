@@ -8,10 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-FloatArray = NDArray[np.float64]
+from mars_lidar._base.types import FloatArray
 
 QDA, BOOSTING, FOREST = "QDA", "gradient boosting", "random forest"
 CLASSIFIERS = (QDA, BOOSTING, FOREST)

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mars_lidar import Flux, JointLaw, System, joint_law, simulate
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.joint_pixel import Pixel
 from studies import Request, Tell
 from studies.common import sample
 from studies.common.report import Row, write
-
-FloatArray = NDArray[np.float64]
 
 PERIOD_NS = 100.0
 OFTEN = 500  # exposures that must differ from the rest before a z-score is as good as Gaussian

@@ -9,10 +9,11 @@ import numpy as np
 from scipy import stats
 
 from mars_lidar import Flux, JointLaw, joint_law, simulate
+from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
 from studies.common.draw import panels
 from studies.common.report import save_figure
-from studies.joint.covariance import PERIOD_NS, FloatArray, system_of
+from studies.joint.covariance import PERIOD_NS, system_of
 
 
 def figure(path: Path, scores: dict[str, FloatArray], exposures: int) -> Path:

@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import Flux, joint_law, simulate
+from mars_lidar._base.types import FloatArray
 from studies import Tell
 from studies.common.sample import PERIOD_NS
 from studies.joint.classifiers import CLASSIFIERS, QDA, require_sklearn, separate
 from studies.joint.table import AGAIN, COARSE, REFERENCE, SEVEN, Case, window
-
-FloatArray = NDArray[np.float64]
-
 
 ENGINES = (AGAIN, "feedback", "mars", "renewal")
 

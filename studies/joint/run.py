@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from mars_lidar._base.types import FloatArray
 from studies import Request
 from studies.common.report import Row, write
 from studies.common.sample import PERIOD_NS
 from studies.joint import classifiers, outcomes
-from studies.joint.outcomes import ENGINES, FULL, QUICK, RATIOS, TESTS, FloatArray, Outcome, Settings
+from studies.joint.outcomes import ENGINES, FULL, QUICK, RATIOS, TESTS, Outcome, Settings
 from studies.joint.table import AGAIN
 
 _SEEN = 4.0  # standard errors beyond which a figure is marked

@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import Flux, System
+from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ANY_SYSTEM
 from studies import Request, Tell
 from studies.common.report import Row, write
 from studies.common.sample import PERIOD_NS, histograms, system_of
-
-FloatArray = NDArray[np.float64]
 
 ENOUGH = 0.5  # mean counts of a coarse bin that takes part
 COARSE = 64  # bins in which single bins and neighbours are compared

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar import CountLaw, Flux, System
+from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import Engine
 from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.count_shape import normalised
@@ -22,8 +23,6 @@ from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.methods import pixel_of
 from mars_lidar.statistics.pmf import gaussian_window
 from studies.neural.model import NeuralMap
-
-FloatArray = NDArray[np.float64]
 
 
 class NeuralEngine(Engine):

@@ -12,16 +12,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from mars_lidar import System
 from mars_lidar._base.files import TemporarySibling
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
 from studies.neural.network import PdfAutoencoder, canonical, one_thread, rolled
 from studies.neural.pairs import FluxRange
-
-FloatArray = NDArray[np.float64]
 
 _FORMAT = 1
 _BATCH = 32  # always filled up to: the answer to a flux must not depend on what else is asked

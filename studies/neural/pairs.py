@@ -6,15 +6,12 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import System
 from mars_lidar._base import checks
-from mars_lidar.engines.engine import Progress
+from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.statistics import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
-
-FloatArray = NDArray[np.float64]
 
 _SMALLEST = 1e-6
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mars_lidar import System
 from mars_lidar._base import checks
-from mars_lidar.engines.engine import Progress
+from mars_lidar._base.types import Progress
 from mars_lidar.statistics.gate import require_mode
 from studies.neural.model import NeuralMap
 from studies.neural.network import PdfAutoencoder, canonical, one_thread, rolled

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import Flux, System, Table
-
-FloatArray = NDArray[np.float64]
+from mars_lidar._base.types import FloatArray
 
 STAGES = ("lookup", "alignment", "sampling")
 _BLOCK = 1024  # pixels at a time

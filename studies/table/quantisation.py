@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import System, Table
+from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, style
 from mars_lidar.statistics import Exposure, exposure_moments
 from mars_lidar.statistics.distance import Pmf, total_variation
@@ -24,7 +25,6 @@ from studies.common.sample import PERIOD_NS, system_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = NDArray[np.float64]
 Interpolation = Literal["nearest", "bilinear"]
 
 INTERPOLATIONS: tuple[Interpolation, ...] = ("nearest", "bilinear")

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, simulate
+from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
 from mars_lidar.statistics import mean_histogram
 from studies import Request
@@ -19,7 +19,6 @@ from studies.common.report import save_figure, write
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = NDArray[np.float64]
 
 GLASS, WALL = (0.15, 40.0), (3.0, 73.0)  # photons per period without fog, delay in ns
 FOG = {"extinction_per_m": 0.08, "backscatter": 1.2, "nearest_m": 0.6}

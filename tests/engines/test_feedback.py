@@ -21,15 +21,14 @@ from harness import (
     require,
     waveform_flux,
 )
-from numpy.typing import NDArray
 from scipy import stats
 
 from mars_lidar import joint_law
+from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.feedback_grid import cell_cuts
 
 CLAIMS = {COUNTS, SHAPE, JOINT}
-FloatArray = NDArray[np.float64]
 
 
 # The covariance in closed form, on dense matrices

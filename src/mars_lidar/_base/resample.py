@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-
-FloatArray = NDArray[np.float64]
+from mars_lidar._base.types import FloatArray
 
 MAX_SIDE = 1 << 13
 

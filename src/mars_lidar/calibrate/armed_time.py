@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.brief import brief
-from mars_lidar.calibrate.intervals import CHUNK, FloatArray, Stream
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibrate.intervals import CHUNK, Stream
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration_light import Light
-from mars_lidar.calibrate.intervals import FloatArray
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.grid import default_bins

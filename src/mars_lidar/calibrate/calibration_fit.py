@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import ArmedTime
 from mars_lidar.calibrate.calibration_light import LEAST, Light
-from mars_lidar.calibrate.intervals import FloatArray
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 
 _STEPS = 200

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar.calibrate.intervals import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.jittered import Records, before_blur, normal_kernel, split_sigma
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 

@@ -8,13 +8,14 @@ from typing import Literal
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import armed_time
 from mars_lidar.calibrate.calibration_fit import covariance, fit, initial
 from mars_lidar.calibrate.calibration_light import Light
 from mars_lidar.calibrate.calibration_rapp import split, total_of
 from mars_lidar.calibrate.calibration_result import Calibration
 from mars_lidar.calibrate.fine_light import fine_light
-from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar.calibrate.intervals import Stream
 from mars_lidar.calibrate.phase_bins import SHAPE_BINS, fine_bins, free_bins
 from mars_lidar.calibrate.stream_summary import Summary
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import ArmedTime
 from mars_lidar.calibrate.calibration_light import Light
 from mars_lidar.calibrate.calibration_rapp import RappEstimate
-from mars_lidar.calibrate.intervals import FloatArray
 from mars_lidar.calibrate.jittered import normal_kernel, unblurred
 from mars_lidar.calibrate.stream_summary import Summary
 from mars_lidar.instrument.effects import Jitter

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration_pass import CERTAIN
 from mars_lidar.calibrate.calibration_result import Calibration
-from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar.calibrate.intervals import Stream
 from mars_lidar.calibrate.same_phase import SamePhase, same_phase
 
 SIGNIFICANT = 5.0  # standard deviations

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import armed_time
-from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar.calibrate.intervals import Stream
 
 _COARSE = 1024
 _ENOUGH = 32  # registrations of a bin that is halved

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.calibrate.intervals import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.light_error import LEAST_LEFT, Fitted, tested
 from mars_lidar.calibrate.prediction import Prediction
 from mars_lidar.calibrate.response import fit_covariance

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.calibrate.intervals import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.recovery_edge import Law
 from mars_lidar.calibrate.shortest_intervals import Ages, Underlying
 

@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration_result import Calibration, nearest
-from mars_lidar.calibrate.intervals import FloatArray, Stream, stream_of
+from mars_lidar.calibrate.intervals import Stream, stream_of
 from mars_lidar.instrument.system import System
 
 TIMES = 4.0  # the simulated stream is so much longer than the measured one

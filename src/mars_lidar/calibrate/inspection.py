@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import armed_time
 from mars_lidar.calibrate.calibration import Calibration, calibrate
 from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch, fitted
 from mars_lidar.calibrate.departure import departure_of, too_coarse
-from mars_lidar.calibrate.intervals import FloatArray, Stream, stream_of
+from mars_lidar.calibrate.intervals import Stream, stream_of
 from mars_lidar.calibrate.periodicity import other_period
 from mars_lidar.calibrate.recovery import Recovery, recovery_of
 from mars_lidar.light.timestamps import Timestamps

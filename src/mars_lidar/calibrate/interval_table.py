@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import begun, places
-from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar.calibrate.intervals import Stream
 from mars_lidar.calibrate.light_error import Fitted, tested
 
 _MOST = 4_000_000  # intervals looked at

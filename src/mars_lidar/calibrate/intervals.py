@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.light.timestamps import Timestamps
-
-FloatArray = NDArray[np.float64]
 
 CHUNK = 2**19  # registrations at a time: some ten temporaries stay in the cache of a processor
 _DITHER_SEED = 1

@@ -20,7 +20,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from mars_lidar.calibrate.intervals import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import SampledPulse
 
 REACH = 8.5  # widths of a Gaussian that are taken along: less than 1e-16 lie outside

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import armed_time
 from mars_lidar.calibrate.calibration_result import Calibration
-from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar.calibrate.intervals import Stream
 
 LEAST_LEFT = 0.05  # share of a variance that the fit must leave to a statistic, or it is taken for fitted
 _MOST_BINS, _PHOTONS = 2048, 20

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibrate.intervals import Stream
 
 _CELLS = 2**20  # of the time axis: all of it where the stream is shorter
 _PER_PERIOD = 32  # cells of the given period: lines up to 16 times its frequency

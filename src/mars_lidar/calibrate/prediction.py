@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration import Calibration
 from mars_lidar.calibrate.detector_model import is_plain, pulse_of_the_light
 from mars_lidar.calibrate.interval_table import AgeTable, age_table
-from mars_lidar.calibrate.intervals import FloatArray, Piece, Stream, stream_of
+from mars_lidar.calibrate.intervals import Piece, Stream, stream_of
 from mars_lidar.calibrate.light_error import Fitted
 from mars_lidar.calibrate.recovery import Recovery, recovery_of
 from mars_lidar.instrument.detector import Detector

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.interval_table import intervals_of, light_before
-from mars_lidar.calibrate.intervals import FloatArray, Stream, stream_of
+from mars_lidar.calibrate.intervals import Stream, stream_of
 from mars_lidar.calibrate.same_phase import SamePhase
 from mars_lidar.light.timestamps import Timestamps
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mars_lidar.calibrate.intervals import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.shortest_intervals import FEW, WIDEST, Ages, Underlying
 
 Law = Callable[[float], Underlying]

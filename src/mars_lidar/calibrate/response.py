@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mars_lidar.calibrate.intervals import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.light_error import Fitted
 
 _BINS = 1024  # about: a dense solution of so many

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.interval_table import intervals_of
-from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar.calibrate.intervals import Stream
 
 _MOST = 250_000  # intervals looked at
 _CLASSES = 32

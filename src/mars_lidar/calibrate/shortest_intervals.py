@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar.calibrate.intervals import FloatArray, Stream
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibrate.intervals import Stream
 
 FEW = 20  # intervals about an edge that tell something of it
 WIDEST = 0.2  # periods: a wider edge is a slow recovery

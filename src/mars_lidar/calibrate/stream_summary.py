@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mars_lidar._base.brief import brief
-from mars_lidar.calibrate.intervals import FloatArray, Stream, stream_of
+from mars_lidar._base.types import FloatArray
+from mars_lidar.calibrate.intervals import Stream, stream_of
 from mars_lidar.light.timestamps import Timestamps
 
 

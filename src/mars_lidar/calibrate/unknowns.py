@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration_fit import log_likelihood
 from mars_lidar.calibrate.calibration_result import Calibration
-from mars_lidar.calibrate.intervals import FloatArray
 from mars_lidar.instrument.pulse import GaussianPulse
 
 _MISFIT = 1e-5  # false-alarm probability of light that is told not to be that of the pulse

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration import Calibration, _system_of, calibrate
 from mars_lidar.calibrate.detector_model import is_plain, moves_records, stream_detector
 from mars_lidar.calibrate.fit_tests import Check, Compared
 from mars_lidar.calibrate.interval_table import age_table
-from mars_lidar.calibrate.intervals import FloatArray, stream_of
+from mars_lidar.calibrate.intervals import stream_of
 from mars_lidar.calibrate.light_error import Fitted
 from mars_lidar.calibrate.phase_bins import free_bins
 from mars_lidar.calibrate.prediction import Prediction, cut, predict, system_of

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import Progress
 from mars_lidar.compare.expected import Expected, PixelLaw, expected_counts, pixel_law
 from mars_lidar.compare.pixel import (
     PixelStatistics,
@@ -28,7 +29,6 @@ from mars_lidar.compare.pixel import (
 from mars_lidar.compare.sample import Sample
 from mars_lidar.compare.scene import SceneStatistics, scene_statistics
 from mars_lidar.engines import ENGINES, Engine, find_engine
-from mars_lidar.engines.engine import Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics import ConvergenceError

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.compare.sample import FloatArray, Moments
+from mars_lidar._base.types import FloatArray
+from mars_lidar.compare.sample import Moments
 from mars_lidar.compare.views import law_arguments
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux

@@ -10,18 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.compare.expected import PixelLaw
-from mars_lidar.compare.sample import (
-    Distance,
-    Estimate,
-    FloatArray,
-    Moments,
-    Sample,
-    law_distance,
-    ratio,
-    score,
-    shape_distance,
-)
+from mars_lidar.compare.sample import Distance, Estimate, Moments, Sample, law_distance, ratio, score, shape_distance
 from mars_lidar.compare.views import example_pixels, incident_rate
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.distance import Pmf, sampling_floor, total_variation
-
-FloatArray = NDArray[np.float64]
 
 SIGNIFICANT = 5.0  # standard scores from which a deviation is called wrong: 6e-7 by chance
 _LARGEST_SCORE = 37.0  # of a p-value that a double still holds

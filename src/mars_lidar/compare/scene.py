@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.compare.expected import Expected
-from mars_lidar.compare.sample import Estimate, FloatArray, score
+from mars_lidar.compare.sample import Estimate, score
 from mars_lidar.compare.views import bin_depth_m
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
+from mars_lidar._base.types import IndexArray, Progress
 from mars_lidar.cuda.kernels import feedback_histograms, overflow
 from mars_lidar.cuda.machine import Machine
-from mars_lidar.engines.engine import Progress, Task
+from mars_lidar.engines.engine import Task
 from mars_lidar.engines.feedback_grid import near_pulse
 from mars_lidar.engines.feedback_rule import Grid, Plan, sweep_pixels
 from mars_lidar.engines.parts import part_of
-
-IndexArray = NDArray[np.int64]
 
 _LANES = 32  # a warp: its threads' rows lie side by side
 _WORK_BYTES = 4 << 30  # of all warps that run at the same time, at most

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.cuda.kernels import MARS_LAWS, mars_histograms, overflow
 from mars_lidar.cuda.machine import Machine
 from mars_lidar.engines.alignment import Frame, pulse_frame
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from mars_lidar.engines.mars import MarsEngine
     from mars_lidar.table import Table
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 _LAW_LANES = 64
 LANES = 128  # threads that share a pixel

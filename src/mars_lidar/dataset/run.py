@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import Progress
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.recipe import DatasetRecipe
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from mars_lidar.dataset.write import Made
     from mars_lidar.io.scan import Problem
 
-Progress = Callable[[int, int], object]
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
 
 

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.resample import area_mean, nearest, new_size, window
+from mars_lidar._base.types import FloatArray
 from mars_lidar.dataset.light import Light
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import FloatArray, Flux
+from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import PARTS_PER_BIN, Fog
 from mars_lidar.light.transient import Transient, parts_of
 from mars_lidar.scene.layers import LayeredScene

@@ -9,10 +9,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
-
-FloatArray = NDArray[np.float64]
 
 _OUTSIDE = 1e-6  # energy of the pulse before the frame, and behind it
 _STEPS_PER_WIDTH = 64  # energies per standard deviation of the pulse, linear between

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.counts import CountLaws
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.synthesis import Run
@@ -17,9 +18,6 @@ from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 
 class CountTimesShape(Engine):

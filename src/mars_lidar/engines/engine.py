@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import Progress
 from mars_lidar.instrument.detector import MODES, Detector, Mode
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS, LIGHT_EFFECTS, RECORDING_EFFECTS, native_fields
 from mars_lidar.instrument.native_pulse import native_pulse
@@ -19,8 +19,6 @@ from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
-
-Progress = Callable[[int, int], object]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar.engines.engine import Engine, Progress, Task
+from mars_lidar._base.types import Progress
+from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback_grid import near_pulse
 from mars_lidar.engines.feedback_rule import Grid, Plan, Reason, Rest, draw_rest, sweep_pixels

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines.engine import Engine, Progress, Task
+from mars_lidar._base.types import IndexArray, Progress
+from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.feedback_grid import MOST_CELLS, cell_cuts, internal_cells, meets_echo
 from mars_lidar.engines.parts import draw_pixels, stage
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
-IndexArray = NDArray[np.int64]
 StatusArray = NDArray[np.uint8]
 
 FEWEST_PERIODS = 100  # per dead time, rounded up to periods: shorter exposures are drawn exactly ...

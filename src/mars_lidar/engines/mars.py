@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.count_shape import CountTimesShape, normalised
 from mars_lidar.engines.counts import CountLaws, Matched, Mended, Poisson, RoundedGaussian, Tabulated
 from mars_lidar.engines.options import Count, Interpolation, Outside
@@ -21,8 +19,6 @@ from mars_lidar.instrument.system import System
 if TYPE_CHECKING:
     from mars_lidar.table import Table
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 _COUNTS = ("exact", "matched", "gaussian")
 

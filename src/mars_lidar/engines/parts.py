@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.engines.engine import Engine, Progress, Task
+from mars_lidar._base.types import Progress
+from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.light.flux import Flux
 
 _TICKS = 1000

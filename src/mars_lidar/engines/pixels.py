@@ -9,13 +9,11 @@ from hashlib import blake2b
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics.cells import Cells
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 _PARTS = 8192  # of the period, at least, in which several returns are written as a waveform
 _BATCH_BYTES = 64 * 2**20  # work area of the statistics of distinct pixels

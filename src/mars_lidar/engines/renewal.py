@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.count_shape import CountTimesShape, normalised
 from mars_lidar.engines.counts import CountLaws, RoundedGaussian
@@ -18,9 +19,6 @@ from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 
 class RenewalEngine(CountTimesShape):

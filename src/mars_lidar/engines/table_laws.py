@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.counts import Tabulated
 from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import Entries, TableReader
@@ -12,9 +12,6 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_window import Window
 from mars_lidar.statistics.pmf import guessed_windows
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 
 def untrusted(run: Run, reader: TableReader, entries: Entries) -> IndexArray:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.counts import CountLaws
 from mars_lidar.engines.engine import Task
@@ -22,8 +23,6 @@ from mars_lidar.light.flux import Flux
 if TYPE_CHECKING:
     from mars_lidar.table import Table
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 PIXELS = 2**17  # looked up at a time: 14 MiB
 _INTERPOLATIONS = ("bilinear", "nearest")

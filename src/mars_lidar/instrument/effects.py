@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.jitter import Jitter as Jitter
 from mars_lidar.instrument.jitter import SampledJitter as SampledJitter
@@ -26,7 +26,6 @@ from mars_lidar.instrument.pulse import GaussianPulse
 _MAX_RATE_HZ = 1e12
 _MAX_EVENTS = 2**31 - 1
 _MAX_CODES = 2**16
-FloatArray = NDArray[np.float64]
 
 
 Kind = Literal["light", "avalanche", "recording", "timing"]

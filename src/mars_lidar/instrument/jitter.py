@@ -8,12 +8,11 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.files import WriteError as WriteError
 from mars_lidar._base.files import reason
+from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
 from mars_lidar.engines.options import given
 from mars_lidar.instrument.system import System
@@ -23,8 +23,6 @@ from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)

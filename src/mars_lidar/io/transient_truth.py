@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from mars_lidar._base.types import FloatArray
+
 NAMES = ("depth", "reflectivity")
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base.late import late
+from mars_lidar._base.types import FloatArray
 from mars_lidar.light.photon_maps import MAX_PHOTONS as MAX_PHOTONS
-from mars_lidar.light.photon_maps import FloatArray as FloatArray
 from mars_lidar.light.photon_maps import broadcast, check_photons, common_shape, frozen, light_map, waveform_maps
 
 if TYPE_CHECKING:

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.types import FloatArray
 
 if TYPE_CHECKING:
     from mars_lidar.instrument.system import System
-    from mars_lidar.light.flux import FloatArray, Flux
+    from mars_lidar.light.flux import Flux
     from mars_lidar.light.stored_flux import StoredFlux
 
 PARTS_PER_BIN = 4  # of the waveform, by default

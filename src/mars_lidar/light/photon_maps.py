@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from mars_lidar._base.types import FloatArray
 
 MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
-FloatArray = NDArray[np.float64]
 
 
 def light_map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:

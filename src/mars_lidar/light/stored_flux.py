@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.memory import check_memory
-from mars_lidar.light.flux import FloatArray, Flux
+from mars_lidar._base.types import FloatArray
+from mars_lidar.light.flux import Flux
 from mars_lidar.light.photon_maps import check_photons
 
 BAND_BYTES = 64 * 2**20  # of waveforms that are made together

@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.resample import new_size, window
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.rate_parts import CroppedRates, RateArray, ResizedRates
 from mars_lidar.light.stored_flux import StoredFlux
 
-FloatArray = NDArray[np.float64]
 _BAND_BYTES = 64 * 2**20
 _WORK_BYTES = 8 * 2**20  # of rows that are folded and convolved together, some six times over
 _MAX_PARTS = 2**20

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import core_ns
 from mars_lidar.reconstruct.histograms import Histograms
-from mars_lidar.reconstruct.method import Estimates, FloatArray, Method, window_estimates
+from mars_lidar.reconstruct.method import Estimates, Method, window_estimates
 
 _BLOCK = 2**22  # counts gathered at a time
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruct.method import FloatArray, RateMethod
+from mars_lidar.reconstruct.method import RateMethod
 
 
 @dataclass(frozen=True)

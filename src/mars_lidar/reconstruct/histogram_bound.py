@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import core_ns, open_bins, relative_width
-from mars_lidar.reconstruct.method import FloatArray
 
 _SINGULAR = 1e-11  # of the largest eigenvalue, all of size 1 to 3: rounding of the sums over the bins is 1e-15 of it
 

@@ -7,15 +7,14 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
 
-FloatArray = NDArray[np.float64]
 
 _CELLS_PER_SIGMA = 32  # Hermite interpolation: energies to 3e-9
 _CELLS_PER_PERIOD = 4096  # of a Gaussian that is wider than the period

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,13 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import recording_of
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
-
-Progress = Callable[[int, int], object]
 
 
 @dataclass(frozen=True, eq=False)

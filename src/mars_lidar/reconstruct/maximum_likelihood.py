@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import recording_of, relative_width
 from mars_lidar.reconstruct.histograms import Histograms, checked
-from mars_lidar.reconstruct.method import Estimates, FloatArray, Method
+from mars_lidar.reconstruct.method import Estimates, Method
 
 
 @dataclass(frozen=True)

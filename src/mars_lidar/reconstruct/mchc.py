@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histograms import Histograms, checked
-from mars_lidar.reconstruct.method import _CHAIN, Estimates, FloatArray, RateMethod, corrected_rates, window_estimates
+from mars_lidar.reconstruct.method import _CHAIN, Estimates, RateMethod, corrected_rates, window_estimates
 
 
 @dataclass(frozen=True)

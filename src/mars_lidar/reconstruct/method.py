@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import check_window, recording_of
 from mars_lidar.reconstruct.histograms import Histograms, checked
 
-FloatArray = NDArray[np.float64]
 Filter = Literal["log", "linear"]
 FILTERS = ("log", "linear")
 

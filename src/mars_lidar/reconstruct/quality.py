@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar.reconstruct.method import FloatArray
+from mars_lidar._base.types import FloatArray
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruct.histograms import Progress, checked
-from mars_lidar.reconstruct.method import Estimates, Flags, FloatArray, Method, tell_effects
+from mars_lidar.reconstruct.histograms import checked
+from mars_lidar.reconstruct.method import Estimates, Flags, Method, tell_effects
 from mars_lidar.reconstruct.methods import METHODS
 
 ATTENUATIONS = ("none", "inverse_square")

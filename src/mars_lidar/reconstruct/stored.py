@@ -11,7 +11,8 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
-from mars_lidar.reconstruct.histograms import Progress, checked
+from mars_lidar._base.types import Progress
+from mars_lidar.reconstruct.histograms import checked
 from mars_lidar.reconstruct.method import Estimates, Method, tell_effects
 from mars_lidar.reconstruct.reconstruction import Reconstruction, assembled, find_method
 

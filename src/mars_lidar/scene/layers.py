@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.scene.radiometry import scene_flux
-from mars_lidar.scene.scene import FloatArray, Scene
+from mars_lidar.scene.scene import Scene
 
 MOST = 16  # returns of a pixel
 

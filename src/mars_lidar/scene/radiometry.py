@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-
-FloatArray = NDArray[np.float64]
 
 _ATTENUATIONS = ("none", "inverse_square")
 _AMBIENTS = ("uniform", "reflectivity", "map")

@@ -8,11 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.scene.raycast import Box, Camera, Sphere, Texture, cast
-
-FloatArray = NDArray[np.float64]
 
 
 def random_scene(size: tuple[int, int], seed: int) -> tuple[FloatArray, FloatArray]:

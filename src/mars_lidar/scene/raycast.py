@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from mars_lidar._base.types import FloatArray
+
 Texture = Callable[[FloatArray, FloatArray], FloatArray]
 
 _RAYS = 1 << 14  # cast together: their arrays stay in the second-level cache

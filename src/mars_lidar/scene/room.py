@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.scene.raycast import Box, Camera, Sphere, Texture, cast
-
-FloatArray = NDArray[np.float64]
 
 _TABLE = 128  # texels per side of the noise table, a power of two
 _WIDTH, _HEIGHT, _LENGTH = 5.2, 2.8, 6.9  # the room: x in +-_WIDTH / 2, y from 0, z from 0

@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.late import late
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.scene.radiometry import scene_flux
-
-FloatArray = NDArray[np.float64]
 
 _EXAMPLES = ("room", "random")
 _MAX_DEPTH_M = 1e9  # beyond the Moon; keeps delays far inside what a double resolves to a picosecond

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.gate import require_mode
-
-FloatArray = NDArray[np.float64]
 
 _WITHOUT_GATE = MODES[:3]  # what is inside of a gate depends on the delay, which these do not know
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from mars_lidar._base.types import FloatArray
 
 MAX_PHOTONS = 1e6
 

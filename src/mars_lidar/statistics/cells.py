@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
@@ -21,8 +22,6 @@ from mars_lidar.statistics.narrow_pulse import followed_bins, followed_edges, ne
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 _MIN_BINS = 128
 _MAX_FIRST_BINS = 2**14  # finer first grids only where the tolerance asks for them

@@ -14,16 +14,16 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.grid import cell_name, photons_per_bin
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError, Feedback, Solution, cyclic_recursion
 
-FloatArray = NDArray[np.float64]
 Rearm = Literal["centre", "edge"]
 
 _REARMS = ("centre", "edge")

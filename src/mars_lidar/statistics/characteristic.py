@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.paralyzable_rate import registration_rates
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.warm import NOT_WARM, warm_history

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar.statistics.cells import FloatArray
+from mars_lidar._base.types import FloatArray
 
 TAIL = 1e-12  # probability that may lie outside the support, at either end
 

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.pmf import gaussian_window
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 _POOLED = 5.0  # expected counts below which cells of a G-test are pooled
 KL_FLOOR = 1e-12  # of a law's probabilities in a Kullback-Leibler divergence, which is infinite without

@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.electronics_grid import MOST_EFFORT, Effort, RecordGrid, RecordRun
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.gated_light import photons_before

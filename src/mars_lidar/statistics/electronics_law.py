@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_window import Window
 from mars_lidar.statistics.electronics import refined, without_effect
 from mars_lidar.statistics.electronics_grid import LAW_EFFORT, RecordGrid, RecordRun, Rows

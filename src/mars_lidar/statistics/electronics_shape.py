@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.electronics import coarsest_grid, rebinned, without_effect
 from mars_lidar.statistics.electronics_grid import LAW_EFFORT, RecordGrid
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError

@@ -7,7 +7,6 @@ Derivation and equation numbers: docs/theory_exposure.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure_result import Exposure as Exposure
 from mars_lidar.statistics.exposure_result import blank, darkness, movement, put, shaped, take
 from mars_lidar.statistics.no_dead_time import without_dead_time
@@ -31,7 +31,6 @@ from mars_lidar.statistics.warm import NOT_WARM, warm_history
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
 
-Progress = Callable[[int, int], object]
 
 _MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
 MOST_BINS = 2**20  # of the statistics grid, unless the histogram itself has more

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.brief import brief
-from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar.statistics.cells import Cells
 
 _ORDERS = 4
 

@@ -11,10 +11,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.gate import open_parts
-
-FloatArray = NDArray[np.float64]
 
 
 class CellLight(Protocol):

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-
-FloatArray = NDArray[np.float64]
 
 _MAX_BINS = 2**20
 _MAX_PHOTONS = 1e6

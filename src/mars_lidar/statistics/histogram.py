@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import LAW_STEPS, Cells, FloatArray
+from mars_lidar.statistics.cells import LAW_STEPS, Cells
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments
 from mars_lidar.statistics.electronics_grid import LAW_EFFORT
 from mars_lidar.statistics.exposure import refined_moments

@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_pixel import INSTEAD, Pixel, movement
 from mars_lidar.statistics.joint_timed import TimedPixel
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError

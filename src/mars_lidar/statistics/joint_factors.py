@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-FloatArray = NDArray[np.float64]
 
 MOST_FACTORED = 2**14  # bins of an equation that is factorised: a second
 GOOD = 1e-9  # relative residual with which a solution is accepted

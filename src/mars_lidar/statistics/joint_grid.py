@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_factors import GOOD, factorised, left_over
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
-
-FloatArray = NDArray[np.float64]
-
 
 _CHECKED = 3  # windows of those that are solved together, by a residual: first, last and between
 _SWEEPS = 200  # beyond, a factorisation is cheaper

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.joint_window import SettledLaw, Windows
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from mars_lidar._base.memory import check_memory
-from mars_lidar.statistics.cells import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.joint_pixel import Pixel
 from mars_lidar.statistics.timing import Timing

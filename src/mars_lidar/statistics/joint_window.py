@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mars_lidar.statistics.joint_grid import FloatArray, FoldedGrid
+from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.joint_grid import FoldedGrid
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import MODES, Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import LAW_STEPS, Cells, FloatArray, IndexArray
+from mars_lidar.statistics.cells import LAW_STEPS, Cells
 from mars_lidar.statistics.count_window import Window, gaussian_window, poisson_window
 from mars_lidar.statistics.electronics_law import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar.statistics.cells import FloatArray, IndexArray
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.count_window import Window
 
 _MAX_COUNTS = 2**24

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 from mars_lidar._base import checks
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.cells import Cells
 
 
 def rearm_of(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"]:

@@ -10,12 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.statistics.gated_light import CellLight
-
-FloatArray = NDArray[np.float64]
 
 _PROBE = 2**12  # parts of a pulse's record
 _SEEN = 8.0  # standard deviations of bins that see a pulse: the refinement of the grid finds the rest

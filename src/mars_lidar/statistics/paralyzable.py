@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.narrow_pulse import knots
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from mars_lidar._base.types import FloatArray
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-FloatArray = NDArray[np.float64]
 
 _SWEEPS = 24
 _KRYLOV = 48

@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.characteristic import Purse, TooLongError, characteristic
 from mars_lidar.statistics.count_window import TAIL
 from mars_lidar.statistics.count_window import Window as Window

@@ -11,17 +11,16 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.grid import cell_name, default_bins, photons_per_bin
 from mars_lidar.statistics.phase_chain_operator import cyclic_recursion
-
-FloatArray = NDArray[np.float64]
 
 _AGREEMENT = 1e-7  # two independent routes to a moment may differ by this much, relative to its largest term
 _MAX_DENSE = 8192

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.electronics_shape import stationary_records
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects, mean_histograms

@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.statistics.renewal import HoldingTimes, holding_times, lag_covariances, weighted_waits
 
-FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _MAX_LAGS = 100_000

@@ -8,7 +8,8 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED
 from mars_lidar.statistics.no_dead_time import recorded_light
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError

@@ -12,7 +12,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.statistics.cells import Cells, FloatArray
+from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_window import Window
 from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError

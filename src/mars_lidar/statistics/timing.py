@@ -15,11 +15,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import TIMING_EFFECTS, code_edges
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
-
-FloatArray = NDArray[np.float64]
 
 _PARTS_PER_SIGMA = 24.0  # a part adds 1/6 of its square to the variance: 3e-4 of it
 _MOST_PARTS = 2**16

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 if TYPE_CHECKING:
-    from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+    from mars_lidar.statistics.cells import Cells
 
 NOT_WARM = -3  # the native core's code: the warm state was not found
 

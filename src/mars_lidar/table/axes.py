@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Grid = tuple[float, float, int] | ArrayLike
 
 _MAX_PHOTONS = 1e6

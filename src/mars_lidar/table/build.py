@@ -9,13 +9,12 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.table.axes import Grid, axis_values, describe
-from mars_lidar.table.entries import Progress
 from mars_lidar.table.error import QuantisationError, long_error, quantisation_error
 from mars_lidar.table.law import law_error
 from mars_lidar.table.node_laws import NodeLaws, node_laws

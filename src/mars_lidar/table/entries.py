@@ -6,17 +6,16 @@ made for N periods serves any n: cumulants by their rates, histograms as start-u
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
 
-Progress = Callable[[int, int], object]
 Shapes = NDArray[np.float32]
 
 _BLOCK_BYTES = 32 << 20  # of float64 histograms at a time: the work beside the table stays far below its size

@@ -11,7 +11,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
-from mars_lidar.statistics.cells import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.exposure import exposure_moments
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.table.nodes import Interpolation, Nodes

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.cell_input import broadcast, reals
-from mars_lidar.statistics.cells import FloatArray, IndexArray
 from mars_lidar.table.start_phase import StartPhases
 
 

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_window import Window
 from mars_lidar.statistics.pmf import guessed_windows
-from mars_lidar.table.entries import Entries, Progress
+from mars_lidar.table.entries import Entries
 
 
 @dataclass(frozen=True, eq=False)

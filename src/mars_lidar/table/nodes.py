@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.table.entries import Entries
 from mars_lidar.table.lookup import Lookup, evaluate, read_pixels

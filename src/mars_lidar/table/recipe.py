@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.chain import Rearm
-from mars_lidar.table.entries import Entries, Progress, exposure_entries
+from mars_lidar.table.entries import Entries, exposure_entries
 from mars_lidar.table.nodes import Method
 from mars_lidar.table.renewal_entries import renewal_entries
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mars_lidar.statistics.cells import FloatArray
+from mars_lidar._base.types import FloatArray
 from mars_lidar.table.axes import MAX_POINTS, inserted, midpoints, thinned
 from mars_lidar.table.entries import Entries
 from mars_lidar.table.error import _LEAST_SPREAD, _TV_MEAN, _TV_VARIANCE

@@ -6,12 +6,12 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import FloatArray
 from mars_lidar.statistics.chain import PhaseChain, Rearm
 from mars_lidar.statistics.grid import cell_name, default_bins
 from mars_lidar.statistics.renewal import holding_times
-from mars_lidar.table.entries import Entries, Progress
+from mars_lidar.table.entries import Entries
 
 _BLOCK = 32
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import FloatArray
 
 FORMAT = 2
 KEY_LENGTH = 24

@@ -7,20 +7,18 @@ is smooth, and on the phases that its interpolation needs. Derivation and equati
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells, FloatArray, IndexArray
+from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import _run
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.table.axes import thinned
-
-Progress = Callable[[int, int], object]
 
 _STEP = 0.2  # of log S and log B; bicubic between: errors below 1e-4 standard deviations (docs/table.md, 4)
 _PHASE_ERROR = 1e-3  # of linear interpolation between phases, in standard deviations

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.table.axes import PAPER_GRID, Grid
 from mars_lidar.table.build import build
 from mars_lidar.table.cache import cached
-from mars_lidar.table.entries import Progress
 from mars_lidar.table.error import QuantisationError, quantisation_error
 from mars_lidar.table.law import LawError, law_error
 from mars_lidar.table.nodes import INTERPOLATIONS, Interpolation, Method, Nodes

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.io.rgbd import pixels
-from mars_lidar.io.rgbd.pixels import FloatArray
 
 _DEPTH_IMAGES = (".png", ".tif", ".tiff")
 _DEPTH_FLOATS = (".pfm", ".exr")

@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
 from mars_lidar.io.rgbd import pixels
 from mars_lidar.io.rgbd.pfm import read_pfm
-from mars_lidar.io.rgbd.pixels import FloatArray
 
 _FILES_2005 = ("disp1.png", "view1.png", "dmin.txt")
 _FILES_2014 = ("disp0.pfm", "im0.png", "calib.txt")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mars_lidar._base.types import FloatArray
 from mars_lidar.io.rgbd import _depth, _npz_arrays, _obliquity, pixels
-from mars_lidar.io.rgbd.pixels import FloatArray
 
 
 def is_stack(path: Path) -> bool:

@@ -1,0 +1,13 @@
+"""Types that the whole package uses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+Progress = Callable[[int, int], object]
+"""Called as ``progress(done, total)``; an exception from it stops the work."""

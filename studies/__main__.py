@@ -11,7 +11,6 @@ from pathlib import Path
 
 from mars_lidar._base.optional import MissingLibraryError
 from studies import STUDIES, OtherRunsError, Request
-from studies.joint.classifiers import MissingExtra
 
 
 def _parser(command: str) -> argparse.ArgumentParser:
@@ -92,7 +91,7 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
             for path in STUDIES[name][1](request):
                 print(path)
             tell(f"{name}: done in {time.monotonic() - began:.0f} s")
-    except (MissingExtra, MissingLibraryError, OtherRunsError) as error:
+    except (MissingLibraryError, OtherRunsError) as error:
         tell(str(error))
         return 1
     except KeyboardInterrupt:

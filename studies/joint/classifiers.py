@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
+from mars_lidar._base.optional import MissingLibraryError
 from mars_lidar._base.types import FloatArray
 
 QDA, BOOSTING, FOREST = "QDA", "gradient boosting", "random forest"
@@ -19,16 +20,14 @@ TREES, LEAF = 100, 5
 _JOBS = 2  # of the random forest
 
 
-class MissingExtra(ImportError):
-    """A study needs a package that is not installed; the message names the extra."""
-
-
 def require_sklearn() -> str:
-    """Version of scikit-learn; raises MissingExtra where it cannot be imported."""
+    """Version of scikit-learn; raises MissingLibraryError where it cannot be imported."""
     try:
         import sklearn
     except ImportError as error:
-        raise MissingExtra("study 'joint' needs scikit-learn >= 1.5: pip install 'mars-lidar[studies]'") from error
+        raise MissingLibraryError(
+            "study 'joint' needs scikit-learn >= 1.5: pip install 'mars-lidar[studies]'"
+        ) from error
     return str(sklearn.__version__)
 
 

@@ -73,7 +73,7 @@ class Outcome:
 
 
 def compute(settings: Settings, tell: Tell) -> list[Outcome]:
-    """All engines in all cases, then in the random systems; raises MissingExtra without scikit-learn."""
+    """All engines in all cases, then in the random systems; raises MissingLibraryError without scikit-learn."""
     require_sklearn()
     found = []
     for number, case in enumerate(settings.cases):

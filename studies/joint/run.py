@@ -40,7 +40,7 @@ def auc_score(outcome: Outcome, test: str, settings: Settings) -> float:
 
 
 def run(request: Request) -> list[Path]:
-    """Compute, draw and write; returns the paths written. Raises MissingExtra without scikit-learn."""
+    """Compute, draw and write; returns the paths written. Raises MissingLibraryError without scikit-learn."""
     from studies.joint.figures import figure
 
     settings = QUICK if request.quick else FULL

@@ -1,4 +1,4 @@
-"""Libraries of the extra `io`: imported when their format is first used."""
+"""Libraries of extras: imported when they are first used."""
 
 from __future__ import annotations
 

@@ -120,8 +120,9 @@ def _methods(text: str, cube: Cube) -> list[str]:
 
 def _show(cube: Cube, found: dict[str, Timed]) -> None:
     """One line a method on standard output."""
+    from mars_lidar._base.optional import MissingLibraryError
     from mars_lidar.reconstruct import Flags
-    from mars_lidar.reconstruct.quality import MissingExtraError, errors_against
+    from mars_lidar.reconstruct.quality import errors_against
 
     realizations, height, width, _ = cube.shape
     head = ["method", "seconds", "seen %", "saturated %"]
@@ -129,7 +130,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     errors = {}
     try:
         errors = {name: errors_against(cube, each.found) for name, each in found.items()}
-    except MissingExtraError as error:
+    except MissingLibraryError as error:
         say(f"no errors against the truth: {error}")
     kinds = list(next(iter(errors.values()), {}))
     for kind in kinds:

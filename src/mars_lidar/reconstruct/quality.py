@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar._base.optional import MissingLibraryError
 from mars_lidar._base.types import FloatArray
 
 if TYPE_CHECKING:
@@ -35,10 +36,6 @@ class MapError:
     psnr: float
     ssim: float
     missing: float
-
-
-class MissingExtraError(ImportError, ValueError):
-    """scikit-image is not installed."""
 
 
 def map_error(truth: FloatArray, estimate: FloatArray) -> MapError:
@@ -95,7 +92,7 @@ def _skimage_metrics() -> Any:
     try:
         from skimage import metrics
     except ImportError as error:
-        raise MissingExtraError(
+        raise MissingLibraryError(
             f"PSNR and SSIM need scikit-image: pip install 'mars-lidar[estimate]' ({error})"
         ) from error
     return metrics

@@ -83,8 +83,8 @@ def _findings(found: list[Outcome], covered: list[Coverage]) -> list[str]:
         if far:
             ideal = one.ideal
             lines.append(
-                f"Stream {number} (S {ideal.signal:.3g}, B {ideal.background:.2g}, jitter {ideal.jitter_ns:.2g} and pulse "
-                f"{ideal.sigma_ns:.2g} of {ideal.period_ns:.4g} ns): off by " + ", ".join(far) + " stated errors."
+                f"Stream {number} (S {ideal.signal:.3g}, B {ideal.background:.2g}, jitter {ideal.jitter_ns:.2g} and "
+                f"pulse {ideal.sigma_ns:.2g} of {ideal.period_ns:.4g} ns): off by " + ", ".join(far) + " stated errors."
             )
     refused = Counter(one.refused.split(",")[0] for one in found if one.refused)
     if refused:

@@ -77,6 +77,14 @@ def _findings(found: list[Outcome], covered: list[Coverage]) -> list[str]:
     lines.append(
         f"Of {total:,} stated errors {beyond} are exceeded by more than 5 times, where {wanted:.2g} are expected."
     )
+    for number, one in enumerate(found):
+        far = [f"{name} {pull:.3g}" for name, pull in one.pulls.items() if abs(pull) > 5.0]
+        if far:
+            ideal = one.ideal
+            lines.append(
+                f"Stream {number} (S {ideal.signal:.3g}, B {ideal.background:.2g}, jitter {ideal.jitter_ns:.2g} and "
+                f"pulse {ideal.sigma_ns:.2g} of {ideal.period_ns:.4g} ns): off by " + ", ".join(far) + " stated errors."
+            )
     refused = Counter(one.refused.split(",")[0] for one in found if one.refused)
     if refused:
         lines.append("Refused: " + "; ".join(f"{text} ({number})" for text, number in refused.items()) + ".")
@@ -143,7 +151,7 @@ def figure(found: list[Outcome], covered: list[Coverage]) -> Any:
     for law, style in laws:
         right.plot(at, [tail(value, law) for value in at], style, lw=1, label=law)
     right.set(yscale="log", ylim=(1e-3, 1.0), xlabel="stated errors", ylabel="share of streams beyond")
-    right.legend(fontsize=6, frameon=False)
+    right.legend(fontsize=6, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return drawing
 
 

@@ -4,7 +4,7 @@ __version__ = "0.2.0"
 
 
 def other_version(made_by: object) -> str:
-    """Of counts that differ: empty, or that another version made them, in brackets and with a space before them."""
+    """What is added where counts differ: empty, or, in brackets after a space, that another version made them."""
     if made_by in (None, "", __version__):
         return ""
     told = f"made by mars-lidar {made_by}, this is {__version__}"

@@ -15,7 +15,7 @@ def loader() -> Any:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Its resolvers are its own: adding one leaves those of `yaml.SafeLoader` alone."""
+        """A loader with resolvers of its own: adding one leaves those of `yaml.SafeLoader` alone."""
 
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+0123456789"))
     return Loader

@@ -36,7 +36,7 @@ class Light:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the parameters; those of several returns are numbered from 1."""
+        """Names of the parameters; those of several returns are numbered from 1."""
         tails = [""] if self.returns == 1 else [f"_{k}" for k in range(1, self.returns + 1)]
         width = ("sigma_ns",) if self.fit_width else ()
         jitter = ("jitter_ns",) if self.fit_jitter else ()

@@ -177,7 +177,7 @@ class Calibration:
         return np.concatenate([self._parameters, width, jitter])
 
     def moved(self, step: FloatArray) -> Calibration:
-        """The same with other `parameters`; no light is negative, and no width changes by more than half."""
+        """This calibration with other `parameters`; no light is negative, and no width changes by more than half."""
         if self.waveform is not None:
             return replace(self, waveform=np.maximum(self.waveform + step, 0.0))
         k, period = self.returns_signal.size, self.summary.period_ns

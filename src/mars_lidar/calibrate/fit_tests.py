@@ -110,7 +110,7 @@ class Compared:
         return [*found, self._shape_check()] if shape else found
 
     def _count_test(self) -> float:
-        """Of the counts against their law, or against simulated ones, but for their mean, which has its own test."""
+        """Test of the counts against their law, or simulated ones, but for their mean, which has its own test."""
         measured, law = Pmf.of_counts(self.counts), self.law
         if "count" in law.exact:
             return g_test(law.count, measured, self.size, any_mean=True)

@@ -57,7 +57,7 @@ def with_hidden(found: Calibration, jitter: float, again: Again, *, known: bool)
 
 
 def _with_later(found: Calibration, jitter: float, again: Again) -> Calibration:
-    """The same for a free shape: watched only from where the pixel is armed for certain with such a jitter."""
+    """`with_hidden` for a free shape: watched only from where the pixel is armed for certain with such a jitter."""
     hold = found.dead_time_ns + CERTAIN * jitter
     if not hold > found.armed.hold_off_ns:
         return found

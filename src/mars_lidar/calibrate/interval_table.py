@@ -65,7 +65,7 @@ class AgeTable:
 
     @property
     def recovery(self) -> AgeTable:
-        """The same by age alone, (1, m, 1)."""
+        """This table summed to ages alone, (1, m, 1)."""
         kept = [one[:, :, self.judged] for one in (self.observed, self.expected, self.slopes)]
         observed, expected, slopes = (one.sum((0, 2), keepdims=True) for one in kept)
         judged = np.array([self.judged.any()])

@@ -50,7 +50,7 @@ class LightBehind:
         known: dict[int, Underlying] = {}
 
         def variance(width_ns: float) -> float:
-            """Of the jitter that makes an edge of that width."""
+            """Variance, ns^2, of the jitter that makes an edge of that width."""
             return min(0.5 * max(width_ns**2 - clock_ns**2, 0.0), widest)
 
         def at(node: int) -> Underlying:

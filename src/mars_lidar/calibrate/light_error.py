@@ -54,7 +54,7 @@ class Fitted:
 
     @classmethod
     def of(cls, calibration: Calibration, stream: Stream) -> Fitted:
-        """Of a calibration, to be compared with `stream`."""
+        """The light of a calibration, to be compared with `stream`."""
         seen, period = calibration.armed, calibration.summary.period_ns
         more = 0.0 if calibration.simulated == 0.0 else 1.0 / calibration.simulated
         own = _same(calibration, stream)

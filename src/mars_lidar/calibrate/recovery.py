@@ -81,7 +81,7 @@ class Recovery:
 
     @property
     def p_value(self) -> float:
-        """Of all ages beyond the dead time, by chi-square."""
+        """Probability of such deviations over all ages beyond the dead time, by chi-square."""
         from scipy.stats import chi2
 
         judged = self.after & (self.expected >= _LEAST)

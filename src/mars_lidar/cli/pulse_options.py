@@ -70,7 +70,7 @@ class PulseOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class FittedPulseOptions(PulseOptions):
-    """The same where a Gaussian is fitted if none is given."""
+    """Options of the pulse of a stream: a Gaussian is fitted if none is given."""
 
     pulse_sigma_ns: FittedSigma = None
 

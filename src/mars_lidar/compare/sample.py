@@ -132,7 +132,7 @@ class Moments:
     def of(
         cls, counts: NDArray[np.int64], *, cumulants: FloatArray | None = None, other: Moments | None = None
     ) -> Moments:
-        """Of a sample (n,), scored against the `cumulants` (4,) of a law, or against an `other` sample.
+        """Statistics of a sample (n,), scored against the `cumulants` (4,) of a law, or against an `other` sample.
 
         The error of the variance comes from the fourth moment. A law adds what it knows to the errors: a
         count that hardly ever changes looks certain in a sample.
@@ -164,7 +164,7 @@ class Moments:
 
     @classmethod
     def certain(cls, cumulants: FloatArray) -> Moments:
-        """Of a law with these cumulants (4,): no errors."""
+        """Statistics of a law with these cumulants (4,): no errors."""
         mean, variance = float(cumulants[0]), float(cumulants[1])
         fano = variance / mean if mean > 0 else math.nan
         return cls(Estimate(mean), Estimate(variance), Estimate(fano))

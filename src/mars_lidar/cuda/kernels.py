@@ -95,7 +95,7 @@ class Variant:
 
     @property
     def expression(self) -> str:
-        """Its name in C++."""
+        """Name of the kernel in C++."""
         flags = ", ".join(str(flag).lower() for flag in (self.gaussian, self.whole, self.single))
         return f"mars::exact_items<{self.mode}, {flags}, {int(self.sink)}, {self.ahead}>"
 

@@ -48,13 +48,13 @@ class Machine(Protocol):
         """An array there."""
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """The same, of anything."""
+        """Room for an array of anything."""
 
     def host(self, array: Any) -> NDArray[Any]:
         """A copy here, when everything queued before is done."""
 
     def address(self, array: Any) -> int:
-        """Of its memory."""
+        """Address of an array's memory."""
 
     def resident(self, kernel: Kernel, lanes: int, shared: int) -> int:
         """Blocks that the machine runs at the same time."""
@@ -81,7 +81,7 @@ class Cuda:
         return self._cupy.zeros(shape, dtype)
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """The same, of anything."""
+        """Room for an array of anything."""
         return self._cupy.empty(shape, dtype)
 
     def host(self, array: Any) -> NDArray[Any]:
@@ -90,7 +90,7 @@ class Cuda:
         return copy
 
     def address(self, array: Any) -> int:
-        """Of its memory."""
+        """Address of an array's memory."""
         return int(array.data.ptr)
 
     def resident(self, kernel: Kernel, lanes: int, shared: int) -> int:

@@ -127,7 +127,7 @@ def _looked_at(found: list[Candidate], plan: DatasetRecipe, problems: list[Probl
 
 
 def _scene_bytes(shown: Shown) -> int:
-    """Of one scene in the store, not packed."""
+    """Bytes of one scene in the store, not packed."""
     maps = 3 + shown.transient.values.shape[2] if isinstance(shown, Rendered) else 2 * len(shown.layers)
     return 8 * maps * math.prod(shown.shape)
 

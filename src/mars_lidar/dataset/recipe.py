@@ -133,7 +133,7 @@ class DatasetRecipe:
 
 
 def _merged(old: Any, new: Any) -> Any:
-    """Of light and store the entries that are given replace those of the file, the others stay."""
+    """Replace the entries of light and store that are given; the others stay."""
     return old | new if isinstance(old, dict) and isinstance(new, dict) else new
 
 

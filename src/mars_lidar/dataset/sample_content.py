@@ -39,12 +39,12 @@ class Surfaces:
 
     @property
     def depth_m(self) -> FloatArray:
-        """Of the first layer, NaN where it has no surface."""
+        """Depth of the first layer, m, NaN where it has no surface."""
         return self.scene.depth_m
 
     @property
     def reflectivity(self) -> FloatArray:
-        """Of the first layer."""
+        """Reflectivity of the first layer."""
         return self.scene.reflectivity
 
     @property

@@ -25,7 +25,7 @@ other work on the machine): feedback 10-11 ns per internal cell at fluxes up to 
 """
 
 BREAK_EVEN_LAPS = 6.0
-"""The same for every cell of all laps, of a pixel that is drawn in pieces of several laps.
+"""Registrations per cell of all laps above which feedback is faster, for a pixel drawn in pieces of several laps.
 
 Measured like that (S = 20, B = 0.01 to 3, dead times of 0.64 and 0.97 periods, 1e5 and 1e6 cycles, 1024 bins): 20 to 25
 ns for a cell.

@@ -75,9 +75,9 @@ class Delay:
         return window + self.whole * h.sum(-1, keepdim=True)
 
     def left(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of settled registrations h a period: e and its falls (4.6 of docs/joint_law.md), the dead time at the end.
+        """What dead time at the end of the exposure leaves of settled registrations h a period: e and its falls.
 
-        e: expected periods, of those that follow the exposure, in which the pixel is still blind at the start of a
+        With (4.6) of docs/joint_law.md, e: expected periods, of those that follow the exposure, in which the pixel is still blind at the start of a
         bin; its falls: re-armings that come after the end.
         """
         k, j = self.whole, torch.arange(self.bins, device=h.device)

@@ -114,7 +114,7 @@ class Given(SceneSource):
         return len(self._scenes)
 
     def number(self, seed: int, epoch: int, sample: int) -> int:
-        """Its place in the list."""
+        """Place of the scene in the list."""
         turn, place = divmod(sample, len(self))
         if self._order is None or self._order[0] != (seed, epoch, turn):
             self._order = (seed, epoch, turn), generator(3, seed, epoch, turn).permutation(len(self))

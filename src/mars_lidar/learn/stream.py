@@ -187,7 +187,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
 
     @property
     def epoch(self) -> int:
-        """Of the next pass, or of the one that is going on."""
+        """Number of the next pass, or of the one that is going on."""
         return int(self._state[0])
 
     def state_dict(self, batches: int | None = None) -> dict[str, int]:

@@ -135,7 +135,7 @@ class HistogramTable(torch.nn.Module):
         return before
 
     def _energy(self, part: torch.Tensor) -> torch.Tensor:
-        """Of the canonical pulse in the first `part` (pixels, 1) of each bin (pixels, bins)."""
+        """Energy of the canonical pulse in the first `part` (pixels, 1) of each bin (pixels, bins)."""
         system, n = self.system, self.system.bins
         low, high = (math.floor((0.5 + one / system.period_ns) * n) for one in system.pulse.support_ns())
         low, high = (0, n) if low < 0 or high >= n else (low, high + 1)  # the bins that it reaches

@@ -174,7 +174,7 @@ class Flux:
         nearest_m: float = 1.0,
         parts: int | None = None,
     ) -> Flux:
-        """The same returns through homogeneous fog, as a waveform: attenuated, and behind the fog's own light.
+        """These returns through homogeneous fog, as a waveform: attenuated, and behind the fog's own light.
 
         With alpha the extinction and z = c tau / 2, by the lidar equation for single scattering (U. Wandinger,
         "Introduction to lidar", in C. Weitkamp, ed., Lidar, Springer 2005), through the pulse of the system::

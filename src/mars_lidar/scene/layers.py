@@ -73,17 +73,17 @@ class LayeredScene:
 
     @property
     def depth_m(self) -> FloatArray:
-        """Of the first layer (H, W)."""
+        """Depth of the first layer (H, W), m."""
         return self.layers[0].depth_m
 
     @property
     def reflectivity(self) -> FloatArray:
-        """Of the first layer (H, W)."""
+        """Reflectivity of the first layer (H, W)."""
         return self.layers[0].reflectivity
 
     @property
     def background(self) -> FloatArray | None:
-        """Of the first layer (H, W), or None."""
+        """Background of the first layer (H, W), or None."""
         return self.layers[0].background
 
     @property

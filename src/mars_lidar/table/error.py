@@ -103,7 +103,7 @@ def long_error(table: Nodes, samples: int, threads: int | None) -> QuantisationE
 def quantisation_error(
     table: Nodes, interpolation: Interpolation, samples: int, seed: int, cycles: int | None, threads: int | None
 ) -> QuantisationError:
-    """See `Table.quantisation_error`."""
+    """Errors on random pixels between the nodes of a table: `Table.quantisation_error`."""
     samples = checks.integer("samples", samples, low=1, high=1_000_000)
     rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     periods = table.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)

@@ -53,7 +53,7 @@ class LawError:
 
 
 def law_error(table: Nodes, samples: int, seed: int, cycles: int | None, threads: int | None) -> LawError:
-    """See `Table.law_error`."""
+    """Total variation on random pixels between a table's count law and the exact one: `Table.law_error`."""
     from mars_lidar.statistics.law import count_law
     from mars_lidar.statistics.matched import matched_pmf
 

@@ -49,7 +49,7 @@ class NodeLaws:
 
     @classmethod
     def none(cls) -> NodeLaws:
-        """Of no entry."""
+        """Laws of no entry."""
         return cls.of(np.empty(0, np.int64), [])
 
     @property

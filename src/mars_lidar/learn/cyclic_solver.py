@@ -77,8 +77,8 @@ class Delay:
     def left(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """What dead time at the end of the exposure leaves of settled registrations h a period: e and its falls.
 
-        With (4.6) of docs/joint_law.md, e: expected periods, of those that follow the exposure, in which the pixel is still blind at the start of a
-        bin; its falls: re-armings that come after the end.
+        With (4.6) of docs/joint_law.md, e: expected periods, of those that follow the exposure, in which the pixel is
+        still blind at the start of a bin; its falls: re-armings that come after the end.
         """
         k, j = self.whole, torch.arange(self.bins, device=h.device)
         falls = self.rearmed(h, k + (j < self.shift).to(h.dtype), k + (j <= self.shift).to(h.dtype))

@@ -7,7 +7,9 @@ from mars_lidar._base.files import IncompleteFileError
 from mars_lidar._base.optional import MissingLibraryError
 from mars_lidar.io.convert import Converted, convert, photons
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save
-from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.foreign import foreign_cube
+from mars_lidar.io.measured import from_histograms, from_photon_times
+from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.scan import Problem, SceneFile, scan
 from mars_lidar.io.simulate_to import Interrupted, WriteError, Written, regenerate, simulate_to, verify
 from mars_lidar.io.spad_mat import SpadMat, read_mat, save_mat
@@ -23,12 +25,16 @@ __all__ = [
     "MissingLibraryError",
     "Problem",
     "Recipe",
+    "Recording",
     "SceneFile",
     "SpadMat",
     "Transient",
     "WriteError",
     "Written",
     "convert",
+    "foreign_cube",
+    "from_histograms",
+    "from_photon_times",
     "load",
     "photons",
     "read_mat",

@@ -117,7 +117,7 @@ def photons(
     from mars_lidar.simulate import simulate_timestamps
 
     k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
-    arguments = cube.recipe.part(slice(k, k + 1), slice(0, cube.shape[1]))
+    arguments = cube.simulation("the time of each photon").part(slice(k, k + 1), slice(0, cube.shape[1]))
     del arguments["realizations"]
     arguments["realization"] = arguments.pop("first_realization")
     times = simulate_timestamps(**arguments, threads=threads, progress=progress)

@@ -16,7 +16,7 @@ from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, Write
 from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
-from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import CountArray, Writer
 from mars_lidar.light.flux import Flux
 
@@ -29,7 +29,7 @@ def _nothing() -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Cube:
-    """A histogram cube and the recipe that makes it again.
+    """A histogram cube and what is behind it: the recipe that makes it again, or how it was measured.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Cube:
         (realizations, H, W, bins) uint16 or uint32. From a ``.zarr`` or ``.h5`` it is read from disk when
         indexed: ``cube.histogram[0, y, x]`` reads one chunk. ``np.asarray(cube.histogram)`` reads it all.
     recipe
-        Arguments of the simulation.
+        Arguments of the simulation, or the `Recording` of measured counts, which have no flux, engine and seed.
     complete
         False for what an unfinished run left (see `load`).
     registrations
@@ -49,7 +49,7 @@ class Cube:
     """
 
     histogram: CountArray
-    recipe: Recipe
+    recipe: Recipe | Recording
     complete: bool = True
     registrations: int | None = None
     version: str = ""
@@ -72,34 +72,47 @@ class Cube:
         return self.recipe.system
 
     @property
+    def measured(self) -> bool:
+        """Whether the counts were measured, so that flux, engine and seed are not known."""
+        return isinstance(self.recipe, Recording)
+
+    def simulation(self, what: str = "this") -> Recipe:
+        """The recipe of a simulated cube; ValueError for a measured one, which `what` needs it for."""
+        if isinstance(self.recipe, Recording):
+            raise ValueError(
+                f"{self.path or 'the cube'} was measured, not simulated, and {what} needs the light behind it"
+            )
+        return self.recipe
+
+    @property
     def flux(self) -> Flux:
         """Photons per period at each pixel."""
-        return self.recipe.flux
+        return self.simulation("flux").flux
 
     @property
     def engine(self) -> str:
-        """Name of the engine."""
-        return self.recipe.engine
+        """Name of the engine; "measured" where there is none."""
+        return layout.MEASURED if isinstance(self.recipe, Recording) else self.recipe.engine
 
     @property
     def settings(self) -> dict[str, Any]:
         """Settings of the engine that the counts depend on; empty for most engines."""
-        return self.recipe.settings
+        return {} if isinstance(self.recipe, Recording) else self.recipe.settings
 
     @property
     def seed(self) -> int:
         """Seed of the random streams."""
-        return self.recipe.seed
+        return self.simulation("seed").seed
 
     @property
     def depth_m(self) -> NDArray[np.float64]:
-        """Depth (H, W), m; NaN where there is no return."""
-        return self.recipe.depth_m
+        """True depth (H, W), m; NaN where there is no return, or where it is not known."""
+        return np.full(self.recipe.pixels, np.nan) if isinstance(self.recipe, Recording) else self.recipe.depth_m
 
     @property
     def reflectivity(self) -> NDArray[np.float64] | None:
         """Reflectivity (H, W), or None where no scene is behind the flux."""
-        return self.recipe.reflectivity
+        return None if isinstance(self.recipe, Recording) else self.recipe.reflectivity
 
     @property
     def time_ns(self) -> NDArray[np.float64]:
@@ -212,7 +225,7 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
         raise
 
 
-def check_output(path: str | Path, recipe: Recipe, *, overwrite: bool = False) -> None:
+def check_output(path: str | Path, recipe: Recipe | Recording, *, overwrite: bool = False) -> None:
     """Raise what `create` would raise, without touching anything."""
     target = Path(path)
     form = _format(target, "out")
@@ -221,10 +234,12 @@ def check_output(path: str | Path, recipe: Recipe, *, overwrite: bool = False) -
         what = f"the counts of {target}, which NumPy reads whole,"
         check_memory(recipe.nbytes, what, "a .zarr or .h5 is read in parts")
     if target.suffix in (".mat", ".ptu"):  # formats with limits of their own
+        if isinstance(recipe, Recording):
+            raise ValueError(f"a {target.suffix} keeps the light behind a cube, unknown of measured counts; use .h5")
         form.check(recipe)
 
 
-def create(path: str | Path, recipe: Recipe, *, overwrite: bool = False) -> Writer:
+def create(path: str | Path, recipe: Recipe | Recording, *, overwrite: bool = False) -> Writer:
     """A writer for the format that the suffix names."""
     check_output(path, recipe, overwrite=overwrite)
     writer: Writer = _format(Path(path), "out").open_writer(Path(path), recipe)

@@ -21,7 +21,7 @@ pixel_index         y, x                         where the cube is a part of a l
 Attributes: ``format``, ``format_version``, ``complete``, ``system`` (JSON), ``engine``, ``engine_settings``
 (JSON: what the counts depend on beside, such as the hash and grid of a table), ``seed``,
 ``first_realization``, ``flux`` (JSON: what made the flux), ``source``, ``version`` (of this package) and,
-once complete, ``registrations``.
+once complete, ``registrations``. Measured counts have ``engine`` "measured", and nothing that belongs to a flux.
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.instrument.system import System
-from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import BAND_BYTES, StoredFlux, Waveforms
 
 FORMAT = "mars-lidar cube"
+MEASURED = "measured"  # attribute `engine` of counts that no engine drew
 _OTHERS = {  # attribute `format` of what is no cube, `kind` of a table: what it is, what reads it
     "mars-lidar maps": "reconstructed maps, not a cube: mars_lidar.io.maps.load_maps reads them",
     "mars-lidar dataset": "a dataset, not a cube: mars_lidar.dataset.open_dataset reads it",
@@ -78,18 +79,21 @@ class Variable:
             yield slice(0, self.data.shape[0])
 
 
-def variables(recipe: Recipe) -> list[Variable]:
+def variables(recipe: Recipe | Recording) -> list[Variable]:
     """All variables but the histogram; coordinates first."""
-    flux, system = recipe.flux, recipe.system
-    height, width = flux.shape
+    system = recipe.system
+    height, width = recipe.image
     numbers = recipe.first_realization + np.arange(recipe.realizations, dtype=np.int64)
     out = [
         Variable("realization", ("realization",), numbers, "1", "realization number"),
         Variable("y", ("y",), np.arange(height), "pixel", "image row"),
         Variable("x", ("x",), np.arange(width), "pixel", "image column"),
         Variable("time", ("time",), system.time_ns, "ns", "time in the period, bin centre"),
-        Variable("depth", _IMAGE, recipe.depth_m, "m", "depth"),
     ]
+    if isinstance(recipe, Recording):
+        return out
+    flux = recipe.flux
+    out.append(Variable("depth", _IMAGE, recipe.depth_m, "m", "depth"))
     if recipe.reflectivity is not None:
         out.append(Variable("reflectivity", _IMAGE, recipe.reflectivity, "1", "reflectivity"))
     out += [
@@ -117,21 +121,26 @@ def variables(recipe: Recipe) -> list[Variable]:
     return out
 
 
-def attributes(recipe: Recipe) -> dict[str, str | int]:
+def attributes(recipe: Recipe | Recording) -> dict[str, str | int]:
     """Attributes of the file as plain strings and integers; ``complete`` is the writer's own."""
     from mars_lidar._version import __version__
 
-    return {
+    both: dict[str, str | int] = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "system": recipe.system.to_json(),
+        "source": recipe.source,
+        "version": __version__,
+    }
+    if isinstance(recipe, Recording):
+        return {**both, "engine": MEASURED}
+    return {
+        **both,
         "engine": recipe.engine,
         "engine_settings": json.dumps(recipe.settings),
         "seed": recipe.seed,
         "first_realization": recipe.first_realization,
         "flux": json.dumps(recipe.flux.info, default=_plain),
-        "source": recipe.source,
-        "version": __version__,
     }
 
 
@@ -141,12 +150,19 @@ def recipe_from(
     read: Callable[[str], NDArray[Any]],
     realizations: int,
     rows_of: Callable[[str], Any] | None = None,
-) -> Recipe:
-    """The recipe that `variables` and `attributes` wrote.
+) -> Recipe | Recording:
+    """The recipe or the recording that `variables` and `attributes` wrote.
 
     `read` returns a variable by name; `rows_of` one that is read from disk when it is sliced, for waveforms larger
     than `BAND_BYTES`.
     """
+    if attrs["engine"] == MEASURED:
+        return Recording(
+            system=System.from_json(attrs["system"]),
+            pixels=(len(read("y")), len(read("x"))),
+            realizations=realizations,
+            source=str(attrs["source"]),
+        )
     flux: Flux
     background, info = read("background"), json.loads(attrs["flux"])
     if "waveform" in names:

@@ -189,11 +189,11 @@ def _rate_bands(flux: Flux, system: System) -> Iterator[NDArray[np.float64]]:
 class _MatCounts:
     """The counts of a file, sparse in memory; dense when they are indexed."""
 
-    def __init__(self, path: Path, spad: Any, recipe: Recipe) -> None:
+    def __init__(self, path: Path, spad: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         self._path = path
         self._spad = spad
-        self.shape: tuple[int, ...] = recipe.shape
-        self.dtype = recipe.dtype
+        self.shape = shape
+        self.dtype = dtype
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         _, height, width, bins = self.shape
@@ -234,7 +234,7 @@ def open_store(path: Path) -> OpenedStore:
         return np.ascontiguousarray(np.asarray(ours[name]).reshape(shapes[name]))  # sums keep their bits
 
     recipe = layout.recipe_from(attrs, frozenset(shapes), read, 1)
-    counts = _MatCounts(path, found["spad"], recipe)
+    counts = _MatCounts(path, found["spad"], recipe.shape, recipe.dtype)
     if found["spad"].shape != (counts.shape[1] * counts.shape[2], counts.shape[3]):
         raise ValueError(f"{path}: spad must be (H W, bins) of {counts.shape[1:]}, got {found['spad'].shape}")
     return OpenedStore(attrs, frozenset(shapes), read, counts, True, "", lambda: None)

@@ -1,4 +1,4 @@
-"""What a cube is made of: everything that is needed to make it again, bit for bit."""
+"""What is behind a cube: all that makes a simulated one again, bit for bit, or how a measured one was recorded."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +20,112 @@ from mars_lidar.light.stored_flux import StoredFlux
 BLOCK_BYTES = 64 * 2**20  # one call of the simulator: enough work for every core, little beside the output
 
 
+class _Blocks:
+    """Shape and type of a cube, and the parts in which it is simulated, written and read."""
+
+    system: System
+    realizations: int
+
+    @property
+    def image(self) -> tuple[int, int]:
+        """(H, W)."""
+        raise NotImplementedError
+
+    @property
+    def light_bytes(self) -> int:
+        """Size of incident light that stays on disk until a part of it is simulated."""
+        return 0
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """(realizations, H, W, bins) of the cube."""
+        return (self.realizations, *self.image, self.system.bins)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the counts, a function of the system."""
+        return self.system.histogram_dtype
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the whole cube in memory."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    def chunks(self, target_bytes: int) -> tuple[int, int, int, int]:
+        """Shape of a storage chunk of at most about `target_bytes`: image rows x all columns x all bins.
+
+        Realizations share a chunk only where whole images are small, and columns are split only where a
+        single row is larger than the target.
+        """
+        realizations, height, width, bins = self.shape
+        pixel = bins * self.dtype.itemsize
+        columns = min(width, max(1, target_bytes // pixel))
+        rows = min(height, max(1, target_bytes // (columns * pixel)))
+        if self.light_bytes:  # blocks are made of whole chunks, and must hold the waveforms
+            rows = min(rows, max(1, BLOCK_BYTES // max(1, self.light_bytes // height)))
+        together = min(realizations, max(1, target_bytes // (height * width * pixel)))
+        return together, rows, columns, bins
+
+    def blocks(self, chunks: tuple[int, int, int, int]) -> Iterator[tuple[slice, slice]]:
+        """Parts (realizations, rows) that cover the cube in C order, each one made of whole chunks.
+
+        A part is several whole images or a band of rows of one image, of at most about `BLOCK_BYTES`.
+        """
+        realizations, height, width, bins = self.shape
+        # waveforms on disk are in memory while a part is simulated
+        row_bytes = max(width * bins * self.dtype.itemsize, self.light_bytes // height)
+        images = BLOCK_BYTES // (height * row_bytes)
+        if images >= 1:
+            step = max(chunks[0], images // chunks[0] * chunks[0])
+            for first in range(0, realizations, step):
+                yield slice(first, min(first + step, realizations)), slice(0, height)
+            return
+        band = max(chunks[1], BLOCK_BYTES // row_bytes // chunks[1] * chunks[1])
+        if self.system.detector.crosstalk is not None:  # no part of an image can be made alone
+            band = height
+        for k in range(realizations):
+            for row in range(0, height, band):
+                yield slice(k, k + 1), slice(row, min(row + band, height))
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Recipe:
+class Recording(_Blocks):
+    """How a measured cube was recorded; the light that fell on the detector is not known.
+
+    Parameters
+    ----------
+    system
+        Laser, detector and histogram: `cycles` laser periods in each exposure.
+    pixels
+        (H, W) of the image.
+    realizations
+        Exposures of it.
+    source
+        Free text: where the counts came from.
+    """
+
+    system: System
+    pixels: tuple[int, int]
+    realizations: int = 1
+    source: str = ""
+
+    __repr__ = brief
+
+    first_realization: ClassVar[int] = 0
+
+    @property
+    def image(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.pixels
+
+    def replace(self, **changes: Any) -> Recording:
+        """A copy with some fields changed."""
+        changes.pop("first_realization", None)  # its exposures have no numbers
+        return dataclasses.replace(self, **changes)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recipe(_Blocks):
     """All arguments of one `mars_lidar.simulate`, and the maps that explain its cube.
 
     Parameters
@@ -93,56 +197,14 @@ class Recipe:
         return array
 
     @property
-    def shape(self) -> tuple[int, int, int, int]:
-        """(realizations, H, W, bins) of the cube."""
-        return (self.realizations, *self.flux.shape, self.system.bins)
+    def image(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.flux.shape
 
     @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the counts, a function of the system."""
-        return self.system.histogram_dtype
-
-    @property
-    def nbytes(self) -> int:
-        """Size of the whole cube in memory."""
-        return math.prod(self.shape) * self.dtype.itemsize
-
-    def chunks(self, target_bytes: int) -> tuple[int, int, int, int]:
-        """Shape of a storage chunk of at most about `target_bytes`: image rows x all columns x all bins.
-
-        Realizations share a chunk only where whole images are small, and columns are split only where a
-        single row is larger than the target.
-        """
-        realizations, height, width, bins = self.shape
-        pixel = bins * self.dtype.itemsize
-        columns = min(width, max(1, target_bytes // pixel))
-        rows = min(height, max(1, target_bytes // (columns * pixel)))
-        if isinstance(self.flux, StoredFlux):  # blocks are made of whole chunks, and must hold the waveforms
-            rows = min(rows, max(1, BLOCK_BYTES // max(1, self.flux.waveform_bytes // height)))
-        together = min(realizations, max(1, target_bytes // (height * width * pixel)))
-        return together, rows, columns, bins
-
-    def blocks(self, chunks: tuple[int, int, int, int]) -> Iterator[tuple[slice, slice]]:
-        """Parts (realizations, rows) that cover the cube in C order, each one made of whole chunks.
-
-        A part is several whole images or a band of rows of one image, of at most about `BLOCK_BYTES`.
-        """
-        realizations, height, width, bins = self.shape
-        row_bytes = width * bins * self.dtype.itemsize
-        if isinstance(self.flux, StoredFlux):  # whose waveforms are in memory while a part is simulated
-            row_bytes = max(row_bytes, self.flux.waveform_bytes // height)
-        images = BLOCK_BYTES // (height * row_bytes)
-        if images >= 1:
-            step = max(chunks[0], images // chunks[0] * chunks[0])
-            for first in range(0, realizations, step):
-                yield slice(first, min(first + step, realizations)), slice(0, height)
-            return
-        band = max(chunks[1], BLOCK_BYTES // row_bytes // chunks[1] * chunks[1])
-        if self.system.detector.crosstalk is not None:  # no part of an image can be made alone
-            band = height
-        for k in range(realizations):
-            for row in range(0, height, band):
-                yield slice(k, k + 1), slice(row, min(row + band, height))
+    def light_bytes(self) -> int:
+        """Size of incident light that stays on disk until a part of it is simulated."""
+        return self.flux.waveform_bytes if isinstance(self.flux, StoredFlux) else 0
 
     def part(self, realizations: slice, rows: slice) -> dict[str, Any]:
         """Arguments with which `mars_lidar.simulate` makes this part alone, the same bits as in the whole.

@@ -186,7 +186,7 @@ def regenerate(
     NDArray
         (realizations, rows, W, bins): the bits of the cube, with the same engine on the same version.
     """
-    recipe = _repeatable(cube.recipe if isinstance(cube, Cube) else cube, table)
+    recipe = _repeatable(cube.simulation("simulating again") if isinstance(cube, Cube) else cube, table)
     parts = []
     count, height = recipe.shape[:2]
     for name, part, size in (("realizations", realizations, count), ("rows", rows, height)):
@@ -204,7 +204,7 @@ def verify(
 
     A cube that was made with a table needs that `table`; another one is refused.
     """
-    recipe = _repeatable(cube.recipe, table)
+    recipe = _repeatable(cube.simulation("simulating again"), table)
     for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
         again = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))
         if not np.array_equal(again, np.asarray(cube.histogram[images, rows])):

@@ -116,7 +116,8 @@ def save_mat(
     if target.suffix != ".mat":
         raise ValueError(f"path must end in .mat, got {str(path)!r}")
     k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
-    recipe = cube.recipe.replace(realizations=1, first_realization=cube.recipe.first_realization + k)
+    whole = cube.simulation("a .mat")
+    recipe = whole.replace(realizations=1, first_realization=whole.first_realization + k)
     fine = None
     if depth_hr_m is not None:
         depth = np.asarray(depth_hr_m)

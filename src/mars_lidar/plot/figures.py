@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.compare.fitted import fitted
 from mars_lidar.compare.views import count_maps, depth_error_m, example_pixels, incident_rate, instrument
+from mars_lidar.io.layout import MEASURED
 from mars_lidar.plot.pixel import draw_pixel, quiet_corner
 from mars_lidar.plot.style import COLOURS, DPI, MISSING, style
 
@@ -31,6 +33,8 @@ def overview(
 ) -> Figure:
     """Depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
 
+    A measured cube is shown with the light that maximum likelihood finds in it, in place of the true one.
+
     Parameters
     ----------
     cube
@@ -47,7 +51,10 @@ def overview(
     ValueError
         `realization` or a pixel outside of the cube.
     """
-    chosen = _checked(cube, realization, pixels)
+    _check_realization(cube, realization)
+    if cube.measured:
+        cube, realization = fitted(cube, realization), 0
+    chosen = _checked(cube, pixels)
     totals, peaks_m = count_maps(cube, realization)
     with style():
         from matplotlib.figure import Figure
@@ -70,7 +77,10 @@ def overview(
 
 def pixel_histogram(cube: Cube, y: int, x: int, *, realization: int = 0) -> Figure:
     """Histogram of one pixel over the period and around its return, beside the incident rate's shape."""
-    chosen = _checked(cube, realization, [(y, x)])
+    _check_realization(cube, realization)
+    if cube.measured:
+        cube, realization = fitted(cube, realization), 0
+    chosen = _checked(cube, [(y, x)])
     with style():
         from matplotlib.figure import Figure
 
@@ -100,21 +110,22 @@ def _hspace(inches: float) -> float:
 
 def _draw_maps(axes: Any, cube: Cube, totals: NDArray[np.int64], peaks_m: NDArray[np.float64], pixels: _Pixels) -> None:
     depth = cube.depth_m
-    known = bool(np.isfinite(depth).any())
+    known, fit = bool(np.isfinite(depth).any()), ", fitted" if cube.engine == MEASURED else ""
     limits = _limits(depth if known else peaks_m)
     if known:
-        _draw_map(axes[0, 0], depth, "depth (m)", "viridis", limits, "Depth")
+        _draw_map(axes[0, 0], depth, "depth (m)", "viridis", limits, f"Depth{fit}")
     else:  # a waveform has no depth: its background stands here
         _draw_map(axes[0, 0], cube.flux.background, "photons per period", "viridis", None, "Background")
     if cube.reflectivity is not None:
         _draw_map(axes[0, 1], cube.reflectivity, "reflectivity", "gray", None, "Reflectivity")
     else:
-        _draw_map(axes[0, 1], cube.flux.signal, "photons per period", "gray", None, "Signal")
+        shown = cube.flux.signal
+        _draw_map(axes[0, 1], shown, "photons per period", "gray", _limits(shown) if fit else None, f"Signal{fit}")
     _draw_map(axes[1, 0], totals, "registrations", "magma", _limits(totals), "Total counts")
     note = "Peak-bin depth"
     error = np.abs(depth_error_m(cube, peaks_m))
     if np.isfinite(error).any():
-        note += f" (median error {_metres(float(np.nanmedian(error)))})"
+        note += f" (median {'distance' if fit else 'error'} {_metres(float(np.nanmedian(error)))})"
     _draw_map(axes[1, 1], peaks_m, "depth (m)", "viridis", limits, note)
     for ax in axes.flat:
         for (y, x), colour in zip(pixels.values(), COLOURS, strict=False):
@@ -185,17 +196,21 @@ def _headline(cube: Cube, realization: int) -> str:
     system, flux = cube.system, cube.flux
     _, height, width, _ = cube.shape
     which = f", realization {cube.recipe.first_realization + realization}" if cube.shape[0] > 1 else ""
+    made = "measured" if cube.engine == MEASURED else f"{cube.engine} engine{which}"
     return (
         f"{height} × {width} pixels, {instrument(system)}; mean S = {flux.signal.mean():.3g}, "
-        f"B = {flux.background.mean():.3g} photons per period; {cube.engine} engine{which}"
+        f"B = {flux.background.mean():.3g} photons per period; {made}"
     )
 
 
-def _checked(cube: Cube, realization: int, pixels: Sequence[tuple[int, int]] | None) -> _Pixels:
-    """The pixels to draw by name, all arguments checked."""
-    count, height, width, _ = cube.shape
-    if not 0 <= realization < count:
-        raise ValueError(f"realization must be an integer in [0, {count - 1}], got {realization}")
+def _check_realization(cube: Cube, realization: int) -> None:
+    if not 0 <= realization < cube.shape[0]:
+        raise ValueError(f"realization must be an integer in [0, {cube.shape[0] - 1}], got {realization}")
+
+
+def _checked(cube: Cube, pixels: Sequence[tuple[int, int]] | None) -> _Pixels:
+    """The pixels to draw by name, checked."""
+    _, height, width, _ = cube.shape
     if pixels is None:
         return example_pixels(cube.flux, cube.depth_m)
     if not 1 <= len(pixels) <= len(COLOURS):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.compare.views import incident_rate, predicted_counts
 from mars_lidar.instrument.system import System
+from mars_lidar.io.layout import MEASURED
 from mars_lidar.plot.style import INK, MUTED
 
 if TYPE_CHECKING:
@@ -38,11 +39,12 @@ def draw_pixel(
     delays = [float(tau % system.period_ns) for s, tau in returns if s > 0]
 
     predicted = predicted_counts(cube, y, x)
-    _draw_whole(whole, system, counts, expected, predicted, delays, colour)
+    told = "fitted" if cube.engine == MEASURED else "true"
+    _draw_whole(whole, system, counts, expected, predicted, delays, colour, told)
     if delays:
         centre, (low, high) = float(flux.delay_ns[y, x] % system.period_ns), _zoom_ns(system)
     else:
-        centre = float(system.time_ns[rate.argmax()])
+        centre = float(system.time_ns[int((rate if np.ptp(rate) > 0 else counts).argmax())])
         low, high = -0.1 * system.period_ns, 0.1 * system.period_ns
     _draw_zoom(zoom, system, counts, expected, predicted, delays, centre, (low, high), colour)
     whole.set_title(
@@ -70,6 +72,7 @@ def _draw_whole(
     predicted: _Array | None,
     delays: list[float],
     colour: str,
+    told: str,
 ) -> None:
     edges = np.linspace(0.0, system.period_ns, system.bins + 1)
     ax.fill_between(*_steps(edges, counts), color=colour, alpha=0.4, lw=0, label="counts")
@@ -87,7 +90,7 @@ def _draw_whole(
     if predicted is not None:
         ax.plot(*_steps(edges, predicted), color=INK, lw=0.9, label="predicted mean")
     for k, tau in enumerate(delays):
-        ax.axvline(tau, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0, label="true delay" if k == 0 else None)
+        ax.axvline(tau, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0, label=f"{told} delay" if k == 0 else None)
     ax.set_xlim(0.0, system.period_ns)
     top = max(float(counts.max()), float(expected.max()), 1.0)
     if top > _LOG_FROM:

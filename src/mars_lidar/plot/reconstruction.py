@@ -34,8 +34,9 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
     """
     depth = cube.depth_m
     known = bool(np.isfinite(depth).any())
-    truth = cube.reflectivity if cube.reflectivity is not None else cube.flux.signal
-    what = "reflectivity" if cube.reflectivity is not None else "signal"
+    what = "signal" if cube.reflectivity is None else "reflectivity"
+    reflectivity = cube.reflectivity
+    truth = depth if cube.measured else cube.flux.signal if reflectivity is None else reflectivity
     unit = "reflectivity" if what == "reflectivity" else "photons per period"
     pick = {name: _maps(each, what, realization) for name, each in results.items()}
     first = next(iter(pick.values()))

@@ -61,7 +61,7 @@ def reconstruct_stored(
         method.check(system)
     tell_effects(system)
     if attenuation is None:
-        attenuation = str(cube.flux.info.get("attenuation", "none"))
+        attenuation = "none" if cube.measured else str(cube.flux.info.get("attenuation", "none"))
     scale = true_level(cube, attenuation) if level is None else checks.real("level", level, low=0.0, strict_low=True)
     team = thread_count(threads)
     shape = cube.shape[:3]

@@ -27,7 +27,7 @@ def read(
 ) -> Timestamps:
     """Read a stream; see `Timestamps.load`."""
     try:
-        found = _mat(path) if path.suffix == ".mat" else _npz(path)
+        found = mat_cells(path) if path.suffix == ".mat" else _npz(path)
     except Exception as error:  # whatever the readers make of a damaged file: they know a dozen errors
         raise ValueError(f"{path} cannot be read ({error})") from error
     name, cells = _chosen(path, found, variable)
@@ -129,7 +129,8 @@ def _npz(path: Path) -> dict[str, _Cells]:
     return {name: _one(values) for name, values in arrays.items() if _is_times(np.atleast_1d(values))}
 
 
-def _mat(path: Path) -> dict[str, _Cells]:
+def mat_cells(path: Path) -> dict[str, _Cells]:
+    """The vectors and cell arrays of a .mat (v5, v7.3), by name: (H, W) of vectors, (1, 1) for a plain one."""
     import h5py
 
     return _mat_73(path) if h5py.is_hdf5(path) else _mat_5(path)

@@ -19,7 +19,7 @@ from mars_lidar._base.files import TemporarySibling
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.optional import needed
 from mars_lidar.io import layout
-from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import LazyCounts, OpenedStore, Writer
 from mars_lidar.io.streams import ptu_header
 
@@ -106,7 +106,7 @@ class PtuWriter(Writer):
 class _PtuCounts(LazyCounts):
     """The counts of a file."""
 
-    def __init__(self, path: Path, recipe: Recipe) -> None:
+    def __init__(self, path: Path, recipe: Recipe | Recording) -> None:
         self._path, self._recipe = path, recipe
         self.shape = recipe.shape
         self.dtype = recipe.dtype

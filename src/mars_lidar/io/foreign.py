@@ -1,0 +1,237 @@
+"""Histograms and photon times in the files of others: arrays of NumPy, MATLAB and HDF5, TIFF stacks, tables of text."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar.instrument.system import System
+from mars_lidar.io.cube import Cube
+from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
+from mars_lidar.io.streams.bare_stream import mat_cells
+
+FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".csv", ".txt")
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignCounts:
+    """What `read_counts` found.
+
+    Attributes
+    ----------
+    path, name
+        The file, and the array in it; "" where the format has no names.
+    counts
+        (exposures, H, W, T), or None where the file holds photon times.
+    cells
+        (H, W) of arrays of photon times, or None.
+    axes
+        What the array's dimensions were taken for.
+    """
+
+    path: Path
+    name: str
+    counts: NDArray[Any] | None
+    cells: NDArray[Any] | None
+    axes: str
+
+    def cube(self, system: System, *, start_ns: float = 0.0, unit_ns: float | None = None) -> Cube:
+        """The cube, see `foreign_cube`."""
+        source = f"{self.path}" + (f", {self.name}" if self.name else "") + (f", axes {self.axes}" if self.axes else "")
+        try:
+            if self.counts is not None:
+                if unit_ns is not None:
+                    raise ValueError("unit_ns is for photon times, and this array holds histograms")
+                return from_histograms(self.counts, system, start_ns=start_ns, source=source)
+            if unit_ns is None:
+                raise ValueError(f"{self.name} holds photon times of an unknown unit: give unit_ns (1 for ns)")
+            return from_photon_times(self.cells, system, unit_ns=unit_ns, start_ns=start_ns, source=source)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from error
+
+
+def foreign_cube(
+    path: str | Path,
+    system: System,
+    *,
+    variable: str | None = None,
+    axes: str | None = None,
+    image: tuple[int, int] | None = None,
+    start_ns: float = 0.0,
+    unit_ns: float | None = None,
+) -> Cube:
+    """A cube from a file that another program wrote.
+
+    Parameters
+    ----------
+    path
+        ``.npy``, ``.npz`` (SciPy's sparse matrices as well), ``.mat`` (v5, v7.3; dense, sparse, or cells of photon
+        times), ``.h5``, ``.hdf5``, ``.tif`` (a page for each time bin), ``.csv`` or ``.txt`` (one histogram: a column
+        of counts, or times and counts).
+    system, axes, image, start_ns
+        As for `mars_lidar.io.from_histograms`. Default of `axes`: time is the dimension that is as long as the system
+        has bins where there is one such, else the last; of a TIFF the pages. A dimension of pixels goes through columns
+        in MATLAB's files, else through rows.
+    variable
+        Name of the array, of a file that has several.
+    unit_ns
+        Unit of photon times, ns.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        No such file, not readable, or not what the arguments say; the message names the file.
+    """
+    found = read_counts(path, variable=variable, axes=axes, image=image, bins=system.bins)
+    return found.cube(system, start_ns=start_ns, unit_ns=unit_ns)
+
+
+def read_counts(
+    path: str | Path,
+    *,
+    variable: str | None = None,
+    axes: str | None = None,
+    image: tuple[int, int] | None = None,
+    bins: int | None = None,
+) -> ForeignCounts:
+    """The array of a file, in order; `bins` is the length by which time is told from the image, if that is known."""
+    source = Path(path)
+    if source.suffix.lower() not in FOREIGN_SUFFIXES:
+        raise ValueError(f"{source}: histograms of others are read from {', '.join(FOREIGN_SUFFIXES)}")
+    if not source.is_file():
+        raise FileNotFoundError(f"{source} does not exist")
+    try:
+        found = _READERS[source.suffix.lower()](source)
+    except (MemoryError, FileNotFoundError):
+        raise
+    except Exception as error:  # readers know a dozen errors of damaged files
+        raise ValueError(f"{source} cannot be read ({error})") from error
+    name, array = _chosen(source, found, variable)
+    if isinstance(array, np.ndarray) and array.dtype == object:
+        return ForeignCounts(source, name, None, array, "")
+    told = axes or _guessed(source, array.shape, bins)
+    try:
+        return ForeignCounts(source, name, in_order(array, told, image), None, told)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{source}: {name or 'the array'}: {error}") from error
+
+
+def _chosen(path: Path, found: dict[str, Any], variable: str | None) -> tuple[str, Any]:
+    told = ", ".join(f"{name} {tuple(array.shape)}" for name, array in found.items())
+    if variable is not None:
+        if variable not in found:
+            raise ValueError(f"{path}: variable must be one of {told or 'none'}, got {variable!r}")
+        return variable, found[variable]
+    for least in (3, 2, 1):  # an image before a list of pixels before a vector
+        deep = [name for name, array in found.items() if len(array.shape) >= least and np.prod(array.shape) > 1]
+        if len(deep) == 1:
+            return deep[0], found[deep[0]]
+        if deep:
+            raise ValueError(f"{path} holds several arrays, give variable: {told}")
+    raise ValueError(f"{path} holds no array of counts" + (f", only {told}" if told else ""))
+
+
+def _guessed(path: Path, shape: tuple[int, ...], bins: int | None) -> str:
+    kind = path.suffix.lower()
+    if kind in (".tif", ".tiff"):
+        return "tyx"
+    pixels = "(xy)" if kind == ".mat" else "(yx)"
+    image = {1: [], 2: [pixels], 3: ["y", "x"], 4: ["n", "y", "x"]}.get(len(shape))
+    if image is None:
+        raise ValueError(f"{path}: an array of shape {shape} is no cube of histograms")
+    fitting = [k for k, size in enumerate(shape) if size == bins]
+    place = fitting[0] if len(fitting) == 1 else len(shape) - 1
+    return "".join([*image[:place], "t", *image[place:]])
+
+
+def _npz(path: Path) -> dict[str, Any]:
+    with np.load(path, allow_pickle=False) as archive:
+        if {"format", "shape", "data"} <= set(archive.files):
+            from scipy import sparse
+
+            return {"": sparse.load_npz(path)}
+        return {name: archive[name] for name in archive.files if archive[name].dtype.kind in "iuf"}
+
+
+def _mat(path: Path) -> dict[str, Any]:
+    import h5py
+
+    if h5py.is_hdf5(path):
+        arrays = {name: array if _is_sparse(array) else array.T for name, array in _hdf5(path).items()}
+    else:
+        from scipy.io import loadmat
+
+        every = loadmat(str(path))
+        arrays = {
+            name: array
+            for name, array in every.items()
+            if not name.startswith("__")
+            and (_is_sparse(array) or getattr(array, "dtype", np.dtype(object)).kind in "iuf")
+        }
+    images = {name: np.squeeze(array) if not _is_sparse(array) else array for name, array in arrays.items()}
+    return images | {name: cells for name, cells in mat_cells(path).items() if cells.size > 1}
+
+
+def _is_sparse(array: Any) -> bool:
+    return hasattr(array, "toarray")
+
+
+def _hdf5(path: Path) -> dict[str, Any]:
+    """The arrays of numbers of a file, of all its groups; a sparse one of MATLAB is a group of three."""
+    import h5py
+
+    out: dict[str, Any] = {}
+    parts: list[str] = []
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
+            from scipy import sparse
+
+            data = np.asarray(item["data"][()]) if "data" in item else np.zeros(0)
+            inner = np.asarray(item["ir"][()]) if "ir" in item else np.zeros(0, int)
+            shape = (int(item.attrs["MATLAB_sparse"]), len(item["jc"]) - 1)
+            out[name] = sparse.csc_array((data, inner.astype(np.int64), item["jc"][()].astype(np.int64)), shape=shape)
+            parts.extend(f"{name}/{part}" for part in item)
+        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and item.ndim and name not in parts:
+            out[name] = item[()]
+
+    with h5py.File(path, "r") as file:
+        file.visititems(visit)
+    return out
+
+
+def _tiff(path: Path) -> dict[str, Any]:
+    import imageio.v3 as iio
+
+    return {"": np.asarray(iio.imread(path, index=..., plugin="pillow"))}
+
+
+def _table(path: Path) -> dict[str, Any]:
+    rows = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            rows.append([float(part) for part in line.replace(",", " ").replace(";", " ").split()])
+        except ValueError:
+            if len(rows) > 0:
+                raise ValueError(f"line {line[:40]!r} holds no numbers") from None
+    rows = [row for row in rows if row]
+    if not rows or {len(row) for row in rows} - {1, 2} or len({len(row) for row in rows}) != 1:
+        raise ValueError("a histogram as text is a column of counts, or times and counts")
+    return {"": np.asarray(rows)[:, -1]}
+
+
+_READERS = {
+    ".npy": lambda path: {"": np.load(path, mmap_mode="r", allow_pickle=False)},
+    ".npz": _npz,
+    ".mat": _mat,
+    ".h5": _hdf5,
+    ".hdf5": _hdf5,
+    ".tif": _tiff,
+    ".tiff": _tiff,
+    ".csv": _table,
+    ".txt": _table,
+}

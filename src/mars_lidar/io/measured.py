@@ -1,0 +1,226 @@
+"""Histograms and photon times of other programs as cubes: the arrays are in memory, `foreign_cube` reads files."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.memory import check_memory
+from mars_lidar.instrument.system import System
+from mars_lidar.io.cube import Cube
+from mars_lidar.io.recipe import Recording
+
+_AXES = {1: "t", 2: "(yx)t", 3: "yxt", 4: "nyxt"}  # by the number of dimensions
+_WHOLE = 1e-3  # share of a bin by which a start may miss a whole number of bins
+
+
+def from_histograms(
+    counts: ArrayLike,
+    system: System,
+    *,
+    axes: str | None = None,
+    image: tuple[int, int] | None = None,
+    start_ns: float = 0.0,
+    source: str = "",
+) -> Cube:
+    """A cube of measured histograms, for `mars_lidar.reconstruct`, `io.save` and all that takes cubes.
+
+    Parameters
+    ----------
+    counts
+        Counts (H, W, T), or as `axes` says; a SciPy sparse matrix of (pixels, T) as well. Whole numbers >= 0, also as
+        floats.
+    system
+        How they were recorded; `cycles` is the number of laser periods that a histogram was accumulated over, `bins`
+        the number of bins of a whole period. Where T is smaller, the histograms are a window of the period: the
+        detector becomes one that is gated to it, and bins outside are empty.
+    axes
+        What the dimensions are, in order: n exposures, y rows, x columns, t time, and in brackets a dimension of pixels
+        that goes through rows, ``(yx)``, or columns, ``(xy)``, as MATLAB's does. Default by the number of dimensions:
+        ``t``, ``(yx)t``, ``yxt``, ``nyxt``.
+    image
+        (H, W) of the pixels in brackets. Default: (1, pixels).
+    start_ns
+        Time from the laser pulse to the start of the first bin, ns: a whole number of bins.
+    source
+        Free text: where the counts came from.
+
+    Returns
+    -------
+    Cube
+        In memory; its `recipe` is a `Recording`, and it has no flux.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Shapes that do not fit, counts that are no counts or more than the system can register; nothing was done.
+    """
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    ordered = in_order(counts, axes, image)
+    first = _first_bin(start_ns, system)
+    recorded = windowed(system, ordered.shape[-1], first)
+    kind = recorded.histogram_dtype
+    most = min(recorded.max_bin_count, np.iinfo(kind).max)
+    _check_counts(ordered, most, recorded)
+    if ordered.shape[-1] == system.bins and first == 0:
+        whole = np.ascontiguousarray(ordered, kind)
+    else:
+        shape = (*ordered.shape[:-1], system.bins)
+        check_memory(int(np.prod(shape)) * kind.itemsize, "the cube of whole periods", "take a part of the image")
+        whole = np.zeros(shape, kind)
+        whole[..., (first + np.arange(ordered.shape[-1])) % system.bins] = ordered
+    realizations, height, width, _ = whole.shape
+    recording = Recording(system=recorded, pixels=(height, width), realizations=realizations, source=source)
+    return Cube(histogram=whole, recipe=recording, registrations=int(whole.sum(dtype=np.uint64)))
+
+
+def from_photon_times(
+    cells: Any, system: System, *, unit_ns: float = 1.0, start_ns: float = 0.0, source: str = ""
+) -> Cube:
+    """A cube of the photon times of each pixel, as MATLAB's cell arrays hold them.
+
+    Parameters
+    ----------
+    cells
+        (H, W) of arrays of times since the laser pulse, or one array for one pixel. Absolute times, which go on over
+        laser periods, are folded.
+    system
+        How they were recorded, see `from_histograms`.
+    unit_ns
+        Unit of the times, ns. Times that are all whole numbers are units of a clock and become the middle of theirs.
+    start_ns
+        Time from the laser pulse to time 0, ns: of a gate that the times count from.
+    source
+        Free text: where the times came from.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Times that are no numbers >= 0, or shapes that do not fit.
+    """
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    unit = checks.real("unit_ns", unit_ns, low=0.0, strict_low=True)
+    start = checks.real("start_ns", start_ns)
+    image = _cells(cells)
+    times = [np.asarray(cell, np.float64).ravel() for cell in image.ravel()]
+    raw = np.concatenate([np.empty(0), *times])
+    bad = ~(np.isfinite(raw) & (raw >= 0))
+    if bad.any():
+        raise ValueError(f"cells must hold finite times >= 0, got {raw[int(np.argmax(bad))]}")
+    middle = 0.5 if raw.size and bool((raw == np.floor(raw)).all()) else 0.0
+    phase = np.mod(((raw + middle) * unit + start) / system.period_ns, 1.0)
+    place = np.minimum((phase * system.bins).astype(np.int64), system.bins - 1)
+    check_memory(
+        8 * image.size * system.bins, "the histograms of the photons", "take fewer bins or a part of the image"
+    )
+    pixel = np.repeat(np.arange(image.size), [cell.size for cell in times])
+    flat = np.bincount(pixel * system.bins + place, minlength=image.size * system.bins)
+    return from_histograms(flat.reshape(*image.shape, system.bins), system, source=source)
+
+
+def in_order(counts: Any, axes: str | None, image: tuple[int, int] | None) -> NDArray[Any]:
+    """`counts` as (exposures, H, W, T)."""
+    if hasattr(counts, "toarray"):  # a sparse matrix or array of SciPy
+        check_memory(8 * counts.shape[0] * counts.shape[1], "the counts of the sparse matrix", "take a part of it")
+        counts = counts.toarray()
+    if isinstance(counts, np.ma.MaskedArray):
+        raise TypeError("counts must not be a masked array: fill it, or leave those pixels out")
+    array = np.asarray(counts)
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"counts must be an array of numbers, got {array.dtype}")
+    told = _AXES.get(array.ndim, "") if axes is None else axes
+    names = re.findall(r"\((?:yx|xy)\)|[nyxt]", told)
+    letters = "".join(names).translate({40: None, 41: None})
+    if "".join(names) != told or len(set(letters)) != len(letters) or "t" not in letters:
+        raise ValueError(f"axes must be made of n, y, x, t and (yx) or (xy), each once and t among them, got {axes!r}")
+    if array.ndim != len(names) or array.size == 0:
+        raise ValueError(f"counts must have the axes {told} and not be empty, got shape {array.shape}")
+    shape = list(array.shape)
+    flat = next((k for k, name in enumerate(names) if name.startswith("(")), None)
+    if flat is None:
+        if image is not None:
+            raise ValueError(f"image belongs to axes with pixels in brackets, (yx) or (xy), got axes {told}")
+    else:
+        height, width = (1, shape[flat]) if image is None else image
+        if height * width != shape[flat]:
+            raise ValueError(f"image must have {shape[flat]} pixels, got {height} x {width}")
+        shape[flat : flat + 1] = [height, width] if names[flat] == "(yx)" else [width, height]
+    array = array.reshape(shape)
+    array = array.transpose([letters.index(name) for name in "nyxt" if name in letters])
+    for place, name in enumerate("nyx"):
+        if name not in letters:
+            array = np.expand_dims(array, place)
+    return array
+
+
+def windowed(system: System, bins: int, first: int) -> System:
+    """The system of histograms of `bins` bins from bin `first` on: gated to them where they are not the period."""
+    if bins > system.bins:
+        raise ValueError(f"the system has {system.bins} bins in a period, and the histograms have {bins}")
+    if bins == system.bins or system.detector.mode == "gated":
+        return system
+    if system.detector.mode != "nonparalyzable":
+        raise ValueError(
+            f"histograms of {bins} of {system.bins} bins are a window, which mode {system.detector.mode!r} has not: "
+            "the detector must be nonparalyzable or gated"
+        )
+    start, width = first * system.bin_ns, bins * system.bin_ns
+    gated = dataclasses.replace(system.detector, mode="gated", gate_start_ns=start, gate_width_ns=width)
+    return system.replace(detector=gated)
+
+
+def _first_bin(start_ns: float, system: System) -> int:
+    start = checks.real("start_ns", start_ns)
+    bins = start / system.bin_ns
+    if abs(bins - round(bins)) > _WHOLE:
+        below, above = np.floor(bins) * system.bin_ns, np.ceil(bins) * system.bin_ns
+        raise ValueError(
+            f"start_ns must be a whole number of bins of {system.bin_ns:.6g} ns, got {start:g}; "
+            f"{below:.6g} or {above:.6g} would be one, and depths move with it"
+        )
+    return round(bins) % system.bins
+
+
+def _check_counts(counts: NDArray[Any], most: float, system: System) -> None:
+    for image in counts:  # one exposure at a time: what is compared is a copy
+        if image.dtype.kind == "f" and not (np.isfinite(image) & (image == np.floor(image))).all():
+            raise ValueError("counts must be whole numbers; means of several exposures are for mars_lidar.reconstruct")
+        if image.min() < 0:
+            raise ValueError(f"counts must be at least 0, got {image.min():g}")
+        if image.max() > most:
+            raise ValueError(
+                f"a bin holds {image.max():g} counts, and the system registers at most {most:g} there: cycles must be "
+                f"the laser periods that each histogram was accumulated over, got {system.cycles:,}"
+            )
+
+
+def _cells(cells: Any) -> NDArray[Any]:
+    """(H, W) of arrays of times."""
+    array = cells if isinstance(cells, np.ndarray) else np.empty(0)
+    if not isinstance(cells, np.ndarray):
+        rows = list(cells)
+        if all(isinstance(cell, Real) for cell in rows):
+            return _cells(np.asarray(rows, np.float64))
+        array = np.empty((len(rows), len(rows[0]) if rows else 0), object)
+        for y, row in enumerate(rows):
+            if len(row) != array.shape[1]:
+                raise ValueError("cells must be rows of equally many pixels, each an array of times")
+            for x, cell in enumerate(row):
+                array[y, x] = np.asarray(cell)
+    if array.dtype != object:
+        if array.ndim != 1:
+            raise ValueError(f"cells must be (H, W) of arrays of times, or one array of times, got {array.shape}")
+        one = np.empty((1, 1), object)
+        one[0, 0] = array
+        return one
+    if array.ndim != 2 or array.size == 0:
+        raise ValueError(f"cells must be (H, W) of arrays of times, got shape {array.shape}")
+    return array

@@ -1,0 +1,239 @@
+"""Cubes of other programs: every layout and format gives the counts back, and what does not fit is refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import sparse
+from scipy.io import savemat
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.compare.fitted import fitted
+
+SYSTEM = ml.System(
+    period_ns=50.0,
+    cycles=2000,
+    bins=250,
+    pulse=ml.GaussianPulse(sigma_ns=0.4),
+    detector=ml.Detector(dead_time_ns=30.0),
+)
+DELAY = np.linspace(8.0, 40.0, 12).reshape(3, 4)
+FLUX = ml.Flux(np.linspace(0.2, 2.0, 12).reshape(3, 4), 0.3, DELAY)
+
+
+@pytest.fixture(scope="module")
+def counts() -> np.ndarray:
+    return ml.simulate(FLUX, SYSTEM, seed=3)[0]
+
+
+def written(path: Path, counts: np.ndarray, kind: str) -> dict[str, object]:
+    """Writes the counts as another program would; the arguments that reading them takes."""
+    times = np.empty(counts.shape[:2], object)
+    for place in np.ndindex(times.shape):
+        times[place] = np.repeat(np.arange(SYSTEM.bins), counts[place]).astype(np.uint16)[:, None]
+    by_column = sparse.csc_matrix(counts.transpose(1, 0, 2).reshape(12, -1).astype(float))
+    if kind == "yxt.npy":
+        np.save(path, counts)
+    elif kind == "tyx.npy":
+        np.save(path, counts.transpose(2, 0, 1))
+    elif kind == "named.npz":
+        np.savez(path, spad=counts, mask=np.ones((3, 4)))
+    elif kind == "sparse.npz":
+        sparse.save_npz(path, sparse.csr_matrix(counts.reshape(12, -1)))
+        return {"image": (3, 4)}
+    elif kind == "dense.mat":
+        savemat(path, {"cube": counts.astype(float), "rate": 7.5})
+    elif kind == "sparse.mat":
+        savemat(path, {"spad": by_column})
+        return {"image": (3, 4)}
+    elif kind == "cells.mat":
+        savemat(path, {"times": times, "bin_ns": 0.2})
+        return {"unit_ns": 0.2}
+    elif kind == "dense73.mat":
+        with h5py.File(path, "w") as file:
+            file["cube"] = counts.transpose(2, 1, 0)  # as MATLAB writes: its first dimension is HDF5's last
+    elif kind == "sparse73.mat":
+        with h5py.File(path, "w") as file:
+            group = file.create_group("spad")
+            group.attrs["MATLAB_sparse"] = np.uint64(12)
+            group["data"], group["ir"], group["jc"] = by_column.data, by_column.indices, by_column.indptr
+        return {"image": (3, 4)}
+    elif kind == "deep.h5":
+        with h5py.File(path, "w") as file:
+            file["run/1/histograms"] = counts
+            file["run/1/gain"] = 2.0
+    elif kind == "stack.tif":
+        first, *others = (Image.fromarray(page.astype(np.uint16)) for page in counts.transpose(2, 0, 1))
+        first.save(path, save_all=True, append_images=others)
+    return {}
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "yxt.npy",
+        "tyx.npy",
+        "named.npz",
+        "sparse.npz",
+        "dense.mat",
+        "sparse.mat",
+        "cells.mat",
+        "dense73.mat",
+        "sparse73.mat",
+        "deep.h5",
+        "stack.tif",
+    ],
+)
+def test_every_format_gives_every_count(tmp_path: Path, counts: np.ndarray, kind: str) -> None:
+    path = tmp_path / kind
+    arguments = written(path, counts, kind)
+    cube = io.foreign_cube(path, SYSTEM, **arguments)
+    assert cube.measured
+    assert cube.engine == "measured"
+    np.testing.assert_array_equal(np.asarray(cube.histogram)[0], counts)
+    assert str(path) in cube.recipe.source
+
+
+def test_one_histogram_as_text(tmp_path: Path, counts: np.ndarray) -> None:
+    path = tmp_path / "pixel.csv"
+    rows = [f"{t:.3f}, {n}" for t, n in zip(SYSTEM.time_ns, counts[1, 2], strict=True)]
+    path.write_text("time (ns), counts\n" + "\n".join(rows) + "\n")
+    cube = io.foreign_cube(path, SYSTEM)
+    assert cube.shape == (1, 1, 1, 250)
+    np.testing.assert_array_equal(np.asarray(cube.histogram)[0, 0, 0], counts[1, 2])
+
+
+@pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
+def test_saved_and_loaded_it_stays_a_measured_cube(tmp_path: Path, counts: np.ndarray, suffix: str) -> None:
+    cube = io.from_histograms(counts, SYSTEM, source="bench")
+    io.save(tmp_path / f"lab{suffix}", cube)
+    with io.load(tmp_path / f"lab{suffix}") as again:
+        assert again.measured
+        assert again.recipe.source == "bench"
+        assert again.system.to_json() == SYSTEM.to_json()
+        np.testing.assert_array_equal(np.asarray(again.histogram)[0], counts)
+        with pytest.raises(ValueError, match="measured, not simulated"):
+            io.verify(again)
+        with pytest.raises(ValueError, match="measured, not simulated"):
+            io.photons(again)
+
+
+def test_formats_that_keep_the_light_refuse_measured_counts(tmp_path: Path, counts: np.ndarray) -> None:
+    cube = io.from_histograms(counts, SYSTEM)
+    with pytest.raises(ValueError, match=r"a \.mat keeps the light"):
+        io.save(tmp_path / "lab.mat", cube)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_window_of_the_period_is_a_gate(counts: np.ndarray) -> None:
+    """Histograms of a gated camera that begin 4 ns after the pulse: the truth lies within five standard errors."""
+    start, bins = 20, 200
+    gated = SYSTEM.replace(
+        detector=ml.Detector(
+            dead_time_ns=30.0, mode="gated", gate_start_ns=start * SYSTEM.bin_ns, gate_width_ns=bins * SYSTEM.bin_ns
+        )
+    )
+    seen = ml.simulate(FLUX, gated, seed=4)[0, ..., start : start + bins]
+    cube = io.from_histograms(seen, SYSTEM, start_ns=start * SYSTEM.bin_ns)
+    assert cube.system.to_json() == gated.to_json()
+    found = ml.reconstruct(cube.histogram[0], cube.system)
+    assert found.delay_error_ns is not None
+    assert found.signal_error is not None
+    assert (np.abs(found.delay_ns - DELAY) < 5 * found.delay_error_ns).all()
+    assert (np.abs(found.signal - FLUX.signal) < 5 * found.signal_error).all()
+
+
+def test_photon_times_of_a_clock_and_of_a_gate(counts: np.ndarray) -> None:
+    cells = [[np.repeat(SYSTEM.time_ns, row) + 50.0 * np.arange(row.sum()) for row in line] for line in counts]
+    cube = io.from_photon_times(cells, SYSTEM)  # absolute times
+    np.testing.assert_array_equal(np.asarray(cube.histogram)[0], counts)
+    later = [[np.repeat(SYSTEM.time_ns, row) - 0.1 for row in line] for line in counts]
+    cube = io.from_photon_times(later, SYSTEM, start_ns=2.1)
+    np.testing.assert_array_equal(np.asarray(cube.histogram)[0], np.roll(counts, 10, axis=-1))
+    one = io.from_photon_times(np.repeat(SYSTEM.time_ns, counts[0, 0]), SYSTEM)
+    np.testing.assert_array_equal(np.asarray(one.histogram)[0, 0, 0], counts[0, 0])
+
+
+def test_exposures_and_brackets(counts: np.ndarray) -> None:
+    two = np.stack([counts, counts[::-1]])
+    cube = io.from_histograms(two.transpose(3, 0, 2, 1), SYSTEM, axes="tnxy")
+    np.testing.assert_array_equal(np.asarray(cube.histogram), two)
+    by_column = two.transpose(0, 2, 1, 3).reshape(2, 12, 250)
+    cube = io.from_histograms(by_column, SYSTEM, axes="n(xy)t", image=(3, 4))
+    np.testing.assert_array_equal(np.asarray(cube.histogram), two)
+
+
+def test_the_law_is_drawn_on_measured_counts(counts: np.ndarray) -> None:
+    """What `view` draws: the fitted light stands in for the true one, which it meets within its errors."""
+    cube = io.from_histograms(counts, SYSTEM)
+    with pytest.raises(ValueError, match="measured, not simulated"):
+        _ = cube.flux
+    shown = fitted(cube, 0)
+    assert np.abs(shown.flux.delay_ns - DELAY).max() < 0.2
+    figure = ml.plot.overview(cube, pixels=[(1, 1)])
+    assert "measured" in figure.texts[0].get_text()
+    legends = [axes.get_legend() for axes in figure.axes if axes.get_legend() is not None]
+    assert "fitted delay" in [text.get_text() for text in legends[0].get_texts()]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"counts": np.full((2, 2, 250), 0.5)}, "whole numbers"),
+        ({"counts": np.full((2, 2, 250), -1)}, "at least 0"),
+        ({"counts": np.full((2, 2, 250), np.nan)}, "whole numbers"),
+        ({"counts": np.full((2, 2, 250), 3000)}, "cycles must be"),
+        ({"counts": np.zeros((2, 2, 251), int)}, "has 250 bins"),
+        ({"counts": np.zeros((2, 0, 250), int)}, "not be empty"),
+        ({"counts": np.zeros((2, 2, 250), bool)}, "array of numbers"),
+        ({"counts": np.ma.zeros((2, 2, 250))}, "masked"),
+        ({"axes": "yxz"}, "axes must be made of"),
+        ({"axes": "yxx"}, "axes must be made of"),
+        ({"axes": "yt"}, "must have the axes yt"),
+        ({"image": (1, 4)}, "in brackets"),
+        ({"counts": np.zeros((5, 250), int), "image": (2, 2)}, "must have 5 pixels"),
+        ({"counts": np.zeros((2, 2, 100), int), "start_ns": 0.3}, "0.2 or 0.4"),
+        ({"start_ns": np.inf}, "start_ns"),
+    ],
+)
+def test_what_is_no_cube_is_refused(change: dict[str, object], told: str) -> None:
+    arguments: dict[str, object] = {"counts": np.zeros((2, 2, 250), int), "system": SYSTEM} | change
+    with pytest.raises((ValueError, TypeError), match=told):
+        io.from_histograms(**arguments)  # type: ignore[arg-type]
+
+
+def test_a_window_needs_a_detector_with_a_gate() -> None:
+    paralyzable = SYSTEM.replace(detector=ml.Detector(dead_time_ns=30.0, mode="paralyzable"))
+    with pytest.raises(ValueError, match="paralyzable"):
+        io.from_histograms(np.zeros((2, 2, 100), int), paralyzable)
+
+
+def test_files_that_cannot_be_read_name_themselves(tmp_path: Path) -> None:
+    for name, content in (
+        ("a.npy", b"no"),
+        ("a.npz", b"PK"),
+        ("a.mat", b"x" * 200),
+        ("a.h5", b"\x89HDF"),
+        ("a.tif", b""),
+    ):
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=name):
+            io.foreign_cube(path, SYSTEM)
+    (tmp_path / "b.csv").write_text("1\n2\nthree\n")
+    with pytest.raises(ValueError, match=r"b\.csv.*three"):
+        io.foreign_cube(tmp_path / "b.csv", SYSTEM)
+    np.savez(tmp_path / "two.npz", a=np.zeros((2, 2, 250)), b=np.zeros((2, 2, 250)))
+    with pytest.raises(ValueError, match="give variable: a"):
+        io.foreign_cube(tmp_path / "two.npz", SYSTEM)
+    with pytest.raises(ValueError, match="variable must be one of a"):
+        io.foreign_cube(tmp_path / "two.npz", SYSTEM, variable="c")
+    with pytest.raises(FileNotFoundError):
+        io.foreign_cube(tmp_path / "none.npy", SYSTEM)
+    with pytest.raises(ValueError, match="are read from"):
+        io.foreign_cube(tmp_path / "none.doc", SYSTEM)

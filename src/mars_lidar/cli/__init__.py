@@ -14,6 +14,7 @@ import typer
 
 from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
+from mars_lidar.cli.export import EXPORT_EPILOG, export
 from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
 from mars_lidar.cli.info import info, view
 from mars_lidar.cli.init import init
@@ -43,6 +44,7 @@ for _command, _epilog in (
     (compare, COMPARE_EPILOG),
     (generate, GENERATE_EPILOG),
     (verify, None),
+    (export, EXPORT_EPILOG),
     (info, None),
     (view, None),
     (convert, CONVERT_EPILOG),

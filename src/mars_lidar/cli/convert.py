@@ -52,8 +52,11 @@ def convert(
 ) -> None:
     """Write a cube or a photon stream in another format, and tell what the other format cannot hold."""
     with reported():
+        from mars_lidar.dataset.store import is_dataset
         from mars_lidar.io.convert import convert as converted
 
+        if is_dataset(source):
+            raise ValueError(f"{source} is a dataset: mars-lidar export writes it as the files that networks load")
         done = converted(source, target, realization=realization, period_ns=period_ns, bins=bins, overwrite=overwrite)
         rows = [("wrote", str(done.path)), ("content", done.content)]
         table(rows + [("lost", text) for text in done.lost or ("nothing",)])

@@ -8,6 +8,7 @@ from mars_lidar.dataset.run import Generated, generate
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.estimate import Estimate, estimate
+    from mars_lidar.dataset.export import Exported, export
     from mars_lidar.dataset.light import Light
     from mars_lidar.dataset.read import read_sparse
     from mars_lidar.dataset.recipe import DatasetRecipe
@@ -18,9 +19,11 @@ _MODULES = {
     "Dataset": "store",
     "DatasetRecipe": "recipe",
     "Estimate": "estimate",
+    "Exported": "export",
     "Light": "light",
     "Verified": "verify",
     "estimate": "estimate",
+    "export": "export",
     "open_dataset": "store",
     "read_sparse": "read",
     "verify": "verify",
@@ -41,10 +44,12 @@ __all__ = [
     "Dataset",
     "DatasetRecipe",
     "Estimate",
+    "Exported",
     "Generated",
     "Light",
     "Verified",
     "estimate",
+    "export",
     "generate",
     "open_dataset",
     "read_sparse",

@@ -207,7 +207,7 @@ def _hdf5(path: Path) -> dict[str, Any]:
 def _tiff(path: Path) -> dict[str, Any]:
     import imageio.v3 as iio
 
-    return {"": np.asarray(iio.imread(path, index=..., plugin="pillow"))}
+    return {"": np.stack(list(iio.imiter(path, plugin="pillow")))}
 
 
 def _table(path: Path) -> dict[str, Any]:

@@ -26,7 +26,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -97,8 +97,6 @@ class MatWriter(Writer):
         attrs: dict[str, Any] = {**layout.attributes(recipe), "complete": True, "registrations": registrations}
         ours: dict[str, Any] = {v.name: v.data for v in layout.variables(recipe)}
         attrs["shapes"] = {name: list(array.shape) for name, array in ours.items()}
-        header, _ = _element("", 0.0)
-        self._file.write(header)
         variables = {
             "spad": spad,
             "SBR": sbr,
@@ -108,8 +106,7 @@ class MatWriter(Writer):
             "rates": rates(flux, recipe.system),
             "mars_lidar": {"attributes": json.dumps(attrs), **ours},
         }
-        for name, value in variables.items():
-            self._file.write(_element(name, value)[1])
+        write_variables(self._file, variables)
         self._file.close()
         self._sibling.publish()
 
@@ -118,6 +115,13 @@ class MatWriter(Writer):
         with contextlib.suppress(Exception):
             self._file.close()
         return self._sibling.discard()
+
+
+def write_variables(file: BinaryIO, variables: Mapping[str, Any]) -> None:
+    """A v5 file of variables, compressed one by one at the fastest level; small integers are of class double."""
+    file.write(_element("", 0.0)[0])
+    for name, value in variables.items():
+        file.write(_element(name, value)[1])
 
 
 def _element(name: str, value: Any) -> tuple[bytes, bytes]:

@@ -1,0 +1,198 @@
+"""Datasets as the files that networks of the field load: a layout is a row of keys, and one file is one exposure.
+
+The keys, units and names are those that the loaders of these networks read:
+
+- Lindell, O'Toole, Wetzstein (ACM TOG 37, 113, 2018) and Peng et al. (ECCV 2020): ``lindell``,
+- the variant of the former's that draws its photons anew while it trains: ``deepsensorfusion``,
+- Sun, Lindell, Solgaard, Wetzstein (Optics Express 28, 14948, 2020), SPADnet: ``sun``,
+- Gutierrez-Barragan et al. (NeurIPS 2023), learned compressive histograms: ``gutierrez``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.files import TemporarySibling
+from mars_lidar._base.memory import check_memory
+from mars_lidar._base.types import Progress
+from mars_lidar.dataset.network_keys import Exposure, check_size, psf, pulse_in_bins
+from mars_lidar.dataset.samples import sample_parts
+from mars_lidar.dataset.store import Dataset, open_dataset
+from mars_lidar.dataset.write import Maker
+from mars_lidar.instrument.system import System
+from mars_lidar.io.mat import write_variables
+
+_NAMES = {"intensity_hr": "intensity"}  # what another name is stored under
+_MONOCULAR_M = 10.0  # depth of grey value 255 in SPADnet's images
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A layout: names of the files with ``{scene}``, ``{number}`` and ``{level}``, and the variables in each.
+
+    `lists` is the file that the loader's list names, relative to the folder `inside`; `root` are files for the whole
+    dataset, `pictures` the images beside an exposure, `size` what the loader has written into it, if anything.
+    """
+
+    files: dict[str, tuple[str, ...]]
+    lists: str
+    inside: str = ""
+    root: dict[str, Callable[[System], dict[str, Any]]] | None = None
+    pictures: dict[str, str] | None = None
+    size: tuple[int, ...] = ()
+
+
+_SPAD, _INTENSITY = "{scene}/spad_{number:04d}_p{level}.mat", "{scene}/intensity_{number:04d}.mat"
+_LINDELL = ("spad", "rates", "bin", "bin_hr", "SBR", "photons")
+_MEANS = ("SBR", "mean_signal_photons", "mean_background_photons", "bin_size")
+LAYOUTS = {
+    "lindell": Layout({_SPAD: _LINDELL, _INTENSITY: ("intensity_hr",)}, _INTENSITY, size=(64, 64, 1024)),
+    "deepsensorfusion": Layout(
+        {_SPAD: (*_LINDELL, "signal_ppp", "ambient_ppp", "pulse"), _INTENSITY: ("intensity_hr",)},
+        _INTENSITY,
+        root={"simulated_data/dark_img.mat": lambda system: {"dark_img": np.zeros((50, 64))}},
+        size=(64, 64, 1024),
+    ),
+    "sun": Layout(
+        {"spad_nyuv2/{scene}/spad_{number:04d}_nl{level}.mat": ("spad", "intensity", "depth", *_MEANS)},
+        "{scene}/spad_{number:04d}_nl{level}.mat",
+        pictures={
+            "mono_nyuv2/{scene}/{number:04d}_truth.png": "depth",
+            "mono_nyuv2/{scene}/{number:04d}_pred.png": "level_depth",
+        },
+        size=(512, 512),
+    ),
+    "gutierrez": Layout(
+        {_SPAD: ("spad", "rates", "bin", "range_bins", "est_range_bins_argmax", "intensity", "photons", *_MEANS)},
+        _SPAD,
+        root={"PSF_used_for_simulation.mat": lambda system: {"psf": psf(system)}},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What `export` did: how many files of exposures it wrote, the list of them, and what to know of them."""
+
+    files: int
+    listed: Path
+    notes: tuple[str, ...]
+
+
+def export(
+    dataset: Dataset | str | Path,
+    out: str | Path,
+    *,
+    layout: str,
+    fill: bool = False,
+    progress: Progress | None = None,
+) -> Exported:
+    """Write every exposure of a dataset as a file that a network's loader reads.
+
+    Parameters
+    ----------
+    dataset
+        What `mars_lidar.generate` wrote, or its path.
+    out
+        A folder that is not there yet, or is empty. The loader's list in it, ``list.txt``, holds a file a line.
+    layout
+        One of `LAYOUTS`.
+    fill
+        Give pixels without a return the depth, bin and rates of the nearest pixel with one. Otherwise their bin is 0,
+        and loaders that divide rates by their sum make NaN of them.
+    progress
+        Called as ``progress(done, total)`` after each exposure.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An unknown layout, or what it cannot hold; nothing was written.
+    OSError
+        `out` has something in it, or cannot be written.
+    """
+    source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
+    chosen = LAYOUTS[checks.choice("layout", layout, tuple(LAYOUTS))]
+    folder = Path(out)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} exists already and is not an empty folder")
+    replaced = ("intensity", ".mat") if chosen.lists == _INTENSITY else ()  # by loaders, in the whole path
+    if any(word in str(folder) for word in replaced) or len(str(folder).split()) != 1:
+        raise ValueError(f"out must not have {' or '.join((*replaced, 'a blank'))} in its path, got {str(folder)!r}")
+    samples, realizations, height, width, bins = source.histogram.shape
+    names = {name for keys in chosen.files.values() for name in keys}
+    if "rates" in names:
+        check_size("rates", 4 * height * width * bins)
+        check_memory(24 * height * width * bins, "the rates of an exposure", "generate smaller crops")
+    if "pulse" in names:
+        for system in source.recipe.systems:
+            pulse_in_bins(system, np.zeros((1, 1)), np.ones((1, 1)))
+    folder.mkdir(parents=True, exist_ok=True)
+    maker, written = Maker(source), 0
+    listed: list[str] = []
+    for path, content in (chosen.root or {}).items():
+        _save(folder / path, content(source.recipe.systems[0]))
+    for sample in range(samples):
+        scene, which, signal, sbr = sample_parts(source.recipe, sample)
+        level = source.recipe.light.levels.index((signal, sbr))
+        for realization in range(realizations):
+            place = {
+                "scene": f"{scene:05d}_{_plain(source.scene_names()[scene])}",
+                "number": which * realizations + realization + 1,
+                "level": level + 1,
+            }
+            exposure = Exposure(maker, sample, realization, fill)
+            for pattern, keys in chosen.files.items():
+                file = folder / pattern.format(**place)
+                if not file.exists():  # the intensity of all levels of light is one file
+                    _save(file, {_NAMES.get(key, key): getattr(exposure, key) for key in keys})
+            for pattern, key in (chosen.pictures or {}).items():
+                _save_depth(folder / pattern.format(**place), getattr(exposure, key))
+            line = chosen.lists.format(**place)
+            entry = line if chosen.pictures else str(folder / line)
+            if entry not in listed:
+                listed.append(entry)
+            written += 1
+            if progress is not None:
+                progress(written, samples * realizations)
+    (folder / "list.txt").write_text("".join(f"{entry}\n" for entry in listed))
+    if chosen.pictures:
+        (folder / "blacklist.txt").write_text("")
+    return Exported(written, folder / "list.txt", tuple(_notes(layout, chosen, (height, width, bins))))
+
+
+def _notes(name: str, layout: Layout, shape: tuple[int, ...]) -> list[str]:
+    out = []
+    if layout.size and shape[: len(layout.size)] != layout.size:
+        sizes = [" x ".join(map(str, one)) for one in (layout.size, shape[: len(layout.size)])]
+        out.append(f"the loader of {name} has {sizes[0]} written into it, and these files hold {sizes[1]}")
+    if layout.pictures:
+        out.append("*_pred.png hold one depth each, the median of the scene: put a monocular network's in their place")
+    return out
+
+
+def _plain(name: str) -> str:
+    """A scene's name without what loaders' lists cannot have."""
+    return re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-").replace("intensity", "i").replace("spad", "s")[-60:]
+
+
+def _save(path: Path, variables: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporarySibling(path).writing() as unfinished, open(unfinished, "wb") as file:
+        write_variables(file, variables)
+
+
+def _save_depth(path: Path, depth_m: NDArray[np.float64]) -> None:
+    import imageio.v3 as iio
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    grey = np.clip(np.round(255.0 / _MONOCULAR_M * depth_m), 0, 255).astype(np.uint8)
+    with TemporarySibling(path).writing() as unfinished:
+        iio.imwrite(unfinished, grey, extension=".png", plugin="pillow")

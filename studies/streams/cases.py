@@ -258,53 +258,64 @@ def tail(pull: float, law: Law) -> float:
     return math.exp(-pull) if law == "exponential" else math.erfc(pull / math.sqrt(2.0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Coverage:
-    """Pulls of an estimate: `stated` finite errors, shares within 1 and 2 of them, the largest, how many beyond 5.
+    """Pulls of an estimate in `streams` streams: `sizes` (stated,) of those whose error is finite.
 
-    `law`: of the pulls, normal, or exponential for a dead time that no interval has shown to be less; `p`: of as few
-    within 1 and 2, and of one as large, if errors are at least what they are stated to be; `values`: the pulls' sizes.
+    `law` of the pulls: normal, or exponential for a dead time that no interval has shown to be less.
     """
 
     name: str
     law: Law
-    stated: int
-    within_1: float
-    within_2: float
-    largest: float
-    beyond_5: int
-    p: dict[str, float]
-    values: NDArray[np.float64]
+    streams: int
+    sizes: NDArray[np.float64]
 
     @classmethod
-    def of(cls, name: str, values: list[float], law: Law = "normal") -> Coverage:
-        """Of the pulls of many streams, NaN where no error is stated."""
+    def of(cls, name: str, pulls: list[float], law: Law = "normal") -> Coverage:
+        """From the pulls of many streams, NaN where no error is stated."""
+        sizes = np.abs(pulls)
+        return cls(name, law, len(pulls), sizes[np.isfinite(sizes)])
+
+    @property
+    def stated(self) -> int:
+        """Number of finite errors."""
+        return int(self.sizes.size)
+
+    @property
+    def largest(self) -> float:
+        """The largest pull, 0 where there is none."""
+        return float(self.sizes.max(initial=0.0))
+
+    def within(self, limit: float) -> int:
+        """How many are off by less than `limit` stated errors."""
+        return int((self.sizes < limit).sum())
+
+    def share(self, limit: float) -> float:
+        """Their share of those stated, 0 where none is."""
+        return self.within(limit) / max(self.stated, 1)
+
+    def beyond(self, limit: float) -> int:
+        """How many are off by more than `limit` stated errors."""
+        return int((self.sizes > limit).sum())
+
+    @property
+    def p(self) -> dict[str, float]:
+        """p-values of as few within 1 and 2, and of one as large, if errors are at least what they are stated to be."""
         from scipy.stats import binom
 
-        pulls = np.abs(values)
-        pulls = pulls[np.isfinite(pulls)]
-        number = int(pulls.size)
-
-        inside = [int((pulls < limit).sum()) for limit in (1.0, 2.0)]
-        p = {
-            f"{name}, within {limit:g}": float(binom.cdf(count, number, 1.0 - tail(limit, law)))
-            for limit, count in zip((1.0, 2.0), inside, strict=True)
+        few = {
+            f"{self.name}, within {limit:g}": float(
+                binom.cdf(self.within(limit), self.stated, 1.0 - tail(limit, self.law))
+            )
+            for limit in (1.0, 2.0)
         }
-        largest = float(pulls.max(initial=0.0))
-        p[f"{name}, largest"] = min(1.0, number * tail(largest, law))
-        shares = [count / max(number, 1) for count in inside]
-        return cls(name, law, number, shares[0], shares[1], largest, int((pulls > 5.0).sum()), p, pulls)
+        return few | {f"{self.name}, largest": min(1.0, self.stated * tail(self.largest, self.law))}
 
 
 def coverage(found: list[Outcome]) -> list[Coverage]:
     """Of all estimates; of dead times by the way they were found, which have errors of another law."""
-    by = {"edge": "dead time, by the edge", "smallest interval": "dead time, by the smallest interval"}
-    covered = []
-    for name in ESTIMATES:
-        if name != "dead time":
-            covered.append(Coverage.of(name, [one.pulls[name] for one in found]))
-            continue
-        for way, text in by.items():
-            law: Law = "normal" if way == "edge" else "exponential"
-            covered.append(Coverage.of(text, [one.pulls[name] for one in found if one.by == way], law))
-    return covered
+    ways: dict[str, Law] = {"edge": "normal", "smallest interval": "exponential"}
+    return [
+        Coverage.of(f"dead time, by the {way}", [one.pulls["dead time"] for one in found if one.by == way], law)
+        for way, law in ways.items()
+    ] + [Coverage.of(name, [one.pulls[name] for one in found]) for name in ESTIMATES if name != "dead time"]

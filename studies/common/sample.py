@@ -39,6 +39,43 @@ def log_points(points: int, low: float = 0.01, high: float = 10.0) -> tuple[floa
     return tuple(float(v) for v in np.geomspace(low, high, points))
 
 
+def linear_points(points: int, low: float = 0.01, high: float = 10.0) -> tuple[float, ...]:
+    """Points from `low` to `high`, equidistant."""
+    return tuple(float(v) for v in np.linspace(low, high, points))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells: each of the points `flux` as S with each as B, photons per period, and every dead time."""
+
+    name: str
+    period_ns: float
+    flux: tuple[float, ...]
+    dead_ns: tuple[float, ...]
+    spacing: str = "log-spaced"
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return len(self.flux) ** 2 * len(self.dead_ns)
+
+    @property
+    def cells(self) -> tuple[FloatArray, FloatArray]:
+        """Signal and background (cells of one dead time,), the background fastest."""
+        return np.repeat(self.flux, len(self.flux)), np.tile(self.flux, len(self.flux))
+
+
+def paper_grids(points: int, wide_ns: tuple[float, ...], near_ns: tuple[float, ...]) -> tuple[Grid, Grid]:
+    """The grids declared for the paper's tables T1 and T4, which state none: *wide* and *near*, by their dead times."""
+    return (
+        Grid("wide", PERIOD_NS, log_points(points), wide_ns),
+        Grid("near", 100.0, linear_points(points), near_ns, "linear"),
+    )
+
+
+WIDE_NS, NEAR_NS = (25.0, 50.0, 75.0, 100.0), (25.0, 50.0, 75.0)  # dead times
+
+
 @dataclass(frozen=True, eq=False)
 class Sample:
     """Exposures of `cells` pixels by one engine.

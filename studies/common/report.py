@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar._base.files import TemporarySibling
 from mars_lidar._base.optional import MissingLibraryError
 
 if TYPE_CHECKING:
@@ -118,6 +119,12 @@ def versions() -> str:
 def picked(source: object, names: str) -> dict[str, Any]:
     """Attributes of `source` by name, `names` separated by blanks: columns that are called as what they hold."""
     return {name: getattr(source, name) for name in names.split()}
+
+
+def save_whole(path: Path, text: str) -> None:
+    """Write a text that is whole or not there, whatever stops the process."""
+    with TemporarySibling(path).writing() as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
 
 
 def save_csv(path: Path, rows: Sequence[Row]) -> Path:

@@ -135,10 +135,7 @@ def _map(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     for row, rule in zip(axes, rules, strict=True):
         for ax, dead_ns in zip(row, dead, strict=True):
             error = np.array(
-                [
-                    [_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.flux]
-                    for b in grid.flux
-                ]
+                [[_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.flux] for b in grid.flux]
             )
             mesh = heat(ax, grid.flux, grid.flux, np.abs(error), norm)
     for ax, dead_ns in zip(axes[0], dead, strict=True):

@@ -113,8 +113,9 @@ def fit(
 ) -> Fitted:
     """Fit `network` to L1 loss, or go on from the folder's checkpoint; leaves the best weights in the network.
 
-    The folder takes ``run.yaml`` (the plan and `about`), ``log.csv``, ``last.pt`` and ``best.pt``. A run that was stopped, at any time, goes on from its last validation, with the same
-    steps as if it had not been; one of another plan in the same folder is an error. A complete one returns at once.
+    The folder takes ``run.yaml`` (the plan and `about`), ``log.csv``, ``last.pt`` and ``best.pt``. A run that was
+    stopped, at any time, goes on from its last validation, with the same steps as if it had not been; one of another
+    plan in the same folder is an error. A complete one returns at once.
     """
     place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     folder = Path(folder)

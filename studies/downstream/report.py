@@ -13,7 +13,7 @@ from studies.common.report import Row, save_figure, write
 from studies.downstream.counts import QUARTERS
 from studies.downstream.data import SYSTEM, WORDS, Config
 from studies.downstream.figures import picture
-from studies.downstream.run import TARGETS, Run, by_arm
+from studies.downstream.run import Run, by_arm
 
 PAPER = {  # T5 of arXiv 2512.04924: by ratio and arm, own then gold; reflectivity PSNR in dB, depth RMSE in m
     (0.6, "poisson"): ((36.49, 0.072), (7.02, 1.654)),

@@ -16,7 +16,7 @@ from mars_lidar import System, holding_time_covariance
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from studies import Request, Tell
-from studies.common.report import Row, write
+from studies.common.report import Row, picked, write
 from studies.common.sample import NEAR_NS, PERIOD_NS, WIDE_NS, Grid, log_points, paper_grids, system_of
 from studies.covariance.modes import LeadingTerms
 
@@ -268,9 +268,7 @@ def _csv_row(cell: Cell) -> Row:
     terms = cell.terms
     return {
         "grid": cell.grid.name,
-        "rearm": cell.rearm,
-        "signal": cell.signal,
-        "background": cell.background,
+        **picked(cell, "rearm signal background"),
         "dead_time_ns": cell.dead_ns,
         "period_ns": cell.grid.period_ns,
         "mu_ns": terms.mu,

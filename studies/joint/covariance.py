@@ -22,7 +22,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.joint_pixel import Pixel
 from studies import Request, Tell
 from studies.common import sample
-from studies.common.report import Row, write
+from studies.common.report import Row, picked, write
 
 PERIOD_NS = 100.0
 OFTEN = 500  # exposures that must differ from the rest before a z-score is as good as Gaussian
@@ -309,17 +309,13 @@ def _row(o: Outcome) -> Row:
     return {
         "name": o.name,
         **given,
-        "count_mean": o.law.count_mean,
-        "count_variance": o.law.count_variance,
+        **picked(o.law, "count_mean count_variance"),
         **{"z_" + name.replace(", ", "_").replace(" ", "_"): o.single.get(name, "") for name in _SINGLE},
         "bins": o.bins.size,
-        "rms_z_bins": float(np.sqrt(np.mean(o.bins**2))) if o.bins.size else "",
+        "rms_z_bins": _rms(o.bins) if o.bins.size else "",
         "lags": o.lags.size,
-        "rms_z_lags": float(np.sqrt(np.mean(o.lags**2))) if o.lags.size else "",
+        "rms_z_lags": _rms(o.lags) if o.lags.size else "",
         "worst_z": worst,
         "worst_of": what,
-        "grid_bins": o.law.grid_bins,
-        "movement": o.law.movement,
-        "sweeps": o.law.sweeps,
-        "settled": o.law.settled,
+        **picked(o.law, "grid_bins movement sweeps settled"),
     }

@@ -14,7 +14,8 @@ from scipy.stats import binom
 from studies import Request
 from studies.common.draw import panels
 from studies.common.report import Row, picked, save_figure, write
-from studies.streams.cases import FULL, QUICK, Coverage, Law, Outcome, Settings, coverage, outcomes, tail
+from studies.streams.cases import FULL, QUICK, Outcome, Settings, outcomes
+from studies.streams.coverage import Coverage, Law, coverage, tail
 
 LEVEL = 1e-4  # false-alarm probability of an inspection, as it is stated
 FAMILY = 1e-3  # of all tests of coverage together, by Holm

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mars_lidar import CountLaw, Flux, System, count_law, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import distance
+from mars_lidar.statistics.count_window import gaussian_window
 from mars_lidar.statistics.distance import Pmf, total_variation
 from studies import Request, Tell
 from studies.common.report import Row, picked, write
@@ -198,7 +199,7 @@ def pmf_of(law: CountLaw, k: int) -> Pmf:
 
 def gaussian_of(exact: CountLaw, k: int) -> Pmf:
     """The Gaussian with mean and variance of one cell of the exact law."""
-    return Pmf.gaussian(float(exact.mean[k]), float(exact.variance[k]))
+    return gaussian_window(float(exact.mean[k]), float(exact.variance[k]))
 
 
 def _simulate(

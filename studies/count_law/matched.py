@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mars_lidar import GaussianPulse, System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, style
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
 from studies import Request, Tell
 from studies.common.draw import heat, panels
@@ -131,7 +131,7 @@ def measure(kind: str, system: System, signal: FloatArray, background: FloatArra
     matched, gaussian = np.empty(signal.size), np.empty(signal.size)
     for k, window in enumerate(windows):
         law = pmf_of(exact, k)
-        matched[k] = total_variation(Pmf(window.first, window.pmf), law)
+        matched[k] = total_variation(window, law)
         gaussian[k] = total_variation(gaussian_of(exact, k), law)
     return Part(kind, system, signal, background, exact.cumulants, matched, gaussian, trusted(exact.cumulants))
 

@@ -12,6 +12,7 @@ from scipy import stats
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, count_law
 from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics.count_window import gaussian_window
 from mars_lidar.statistics.distance import Pmf, g_test, sampling_floor, total_variation, variance_score
 from studies import STUDIES, Request
 from studies.__main__ import main
@@ -142,7 +143,7 @@ def test_total_variation():
     assert total_variation(a, Pmf(100, np.array([1.0]))) == pytest.approx(1.0)
     assert Pmf.of_counts(np.array([5, 7, 7, 7], np.uint16)).p.tolist() == [0.25, 0.0, 0.75]
     assert a.on(4, 6).tolist() == [0.5, 0.0, 0.0]
-    assert Pmf.gaussian(10.3, 4.0).p.sum() == pytest.approx(1.0)
+    assert gaussian_window(10.3, 4.0).p.sum() == pytest.approx(1.0)
 
 
 def test_sampling_floor_and_g_test():

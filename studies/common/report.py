@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar._base.files import TemporarySibling
 from mars_lidar._base.optional import MissingLibraryError
 
 if TYPE_CHECKING:
@@ -115,6 +116,17 @@ def versions() -> str:
     return "- versions: " + ", ".join(f"{name} {version}" for name, version in used.items()) + f"\n- date: {today}"
 
 
+def picked(source: object, names: str) -> dict[str, Any]:
+    """Attributes of `source` by name, `names` separated by blanks: columns that are called as what they hold."""
+    return {name: getattr(source, name) for name in names.split()}
+
+
+def save_whole(path: Path, text: str) -> None:
+    """Write a text that is whole or not there, whatever stops the process."""
+    with TemporarySibling(path).writing() as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
 def save_csv(path: Path, rows: Sequence[Row]) -> Path:
     """Write rows that share their keys; floats with six significant figures. Returns `path`."""
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -161,14 +173,3 @@ def _processor() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
-
-
-def configuration(settings: Mapping[str, Any]) -> str:
-    """What was run: settings, versions and the date, one line each."""
-    return "\n".join([*(f"- {name}: {value}" for name, value in settings.items()), versions()])
-
-
-def save_text(path: Path, parts: Sequence[str]) -> Path:
-    """Write paragraphs as one Markdown file; returns `path`."""
-    path.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
-    return path

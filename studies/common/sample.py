@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -34,9 +34,53 @@ def system_of(
     return System(period_ns=period_ns, cycles=cycles, bins=bins, pulse=pulse, detector=detector, start=start)
 
 
+def settings_of(system: System, light: Mapping[str, Any], exposures: int, seed: int) -> dict[str, Any]:
+    """A configuration by name: the system but for its detector, the light, and what is simulated."""
+    told = {field.name: getattr(system, field.name) for field in fields(system) if field.name != "detector"}
+    simulated = {"exposures": exposures, "engine": "exact", "seed": seed}
+    return told | dict(light) | simulated
+
+
 def log_points(points: int, low: float = 0.01, high: float = 10.0) -> tuple[float, ...]:
     """Points from `low` to `high`, log-spaced."""
     return tuple(float(v) for v in np.geomspace(low, high, points))
+
+
+def linear_points(points: int, low: float = 0.01, high: float = 10.0) -> tuple[float, ...]:
+    """Points from `low` to `high`, equidistant."""
+    return tuple(float(v) for v in np.linspace(low, high, points))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells: each of the points `flux` as S with each as B, photons per period, and every dead time."""
+
+    name: str
+    period_ns: float
+    flux: tuple[float, ...]
+    dead_ns: tuple[float, ...]
+    spacing: str = "log-spaced"
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return len(self.flux) ** 2 * len(self.dead_ns)
+
+    @property
+    def cells(self) -> tuple[FloatArray, FloatArray]:
+        """Signal and background (cells of one dead time,), the background fastest."""
+        return np.repeat(self.flux, len(self.flux)), np.tile(self.flux, len(self.flux))
+
+
+def paper_grids(points: int, wide_ns: tuple[float, ...], near_ns: tuple[float, ...]) -> tuple[Grid, Grid]:
+    """The grids declared for the paper's tables T1 and T4, which state none: *wide* and *near*, by their dead times."""
+    return (
+        Grid("wide", PERIOD_NS, log_points(points), wide_ns),
+        Grid("near", 100.0, linear_points(points), near_ns, "linear"),
+    )
+
+
+WIDE_NS, NEAR_NS = (25.0, 50.0, 75.0, 100.0), (25.0, 50.0, 75.0)  # dead times
 
 
 @dataclass(frozen=True, eq=False)

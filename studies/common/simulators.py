@@ -127,7 +127,7 @@ def _matched(signal: FloatArray, background: FloatArray, system: System) -> Pred
     """What a table holds of the exact law, and an engine with a table draws: four cumulants."""
     shape = registration_pdf(signal, background, system, "exposure")
     cumulants = count_law(signal, background, system, "exact").cumulants
-    pmfs = [Pmf(window.first, window.pmf) for window in matched_pmf(cumulants)]
+    pmfs = matched_pmf(cumulants)
     return Prediction(cumulants[:, 0], cumulants[:, 1], pmfs, shape)
 
 

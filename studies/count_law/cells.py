@@ -10,43 +10,28 @@ from mars_lidar import System, count_law, registration_pdf
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.distance import Pmf, kl_divergence, wasserstein
 from studies import Tell
-from studies.common.sample import PERIOD_NS, Sample, draw, log_points, system_of
+from studies.common.sample import (
+    NEAR_NS,
+    PERIOD_NS,
+    WIDE_NS,
+    Grid,
+    Sample,
+    draw,
+    linear_points,
+    log_points,
+    paper_grids,
+    system_of,
+)
 from studies.common.simulators import Prediction, arrival_shape, simulators
 from studies.neural.pairs import Training
 
 FIGURES = ("wasserstein", "kl", "mean", "variance")  # distances of a law to the truth, in this order
-
-
 _NEGLIGIBLE = 1e-10  # probability of a count left out of a resampling, per exposure drawn
-
-
 SHAPES = {
     "poisson": "Poisson",
     "renewal": "renewal and MaRS, paper's, centre",
     "mars_edge": "MaRS, paper's, edge",
 }
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Cells over signal, background (photons per period) and dead time (ns) at one period."""
-
-    name: str
-    words: str
-    period_ns: float
-    flux: tuple[float, ...]  # the points of both S and B
-    dead_ns: tuple[float, ...]
-
-    @property
-    def size(self) -> int:
-        """Number of cells."""
-        return len(self.flux) ** 2 * len(self.dead_ns)
-
-    @property
-    def cells(self) -> tuple[FloatArray, FloatArray]:
-        """Signal and background (cells of one dead time,)."""
-        signal, background = np.meshgrid(self.flux, self.flux, indexing="ij")
-        return signal.ravel(), background.ravel()
 
 
 @dataclass(frozen=True)
@@ -71,29 +56,18 @@ class Settings:
         return system_of(dead_ns, self.cycles, period_ns=period_ns, bins=self.bins, sigma_ns=self.sigma_ns)
 
 
-def _linear(low: float, high: float, points: int) -> tuple[float, ...]:
-    return tuple(float(v) for v in np.linspace(low, high, points))
-
-
-def _grids(points: int, wide: tuple[float, ...], near: tuple[float, ...]) -> tuple[Grid, ...]:
-    return (
-        Grid("wide", "log-spaced on [0.01, 10]", PERIOD_NS, log_points(points), wide),
-        Grid("near", "linear on [0.01, 10]", 100.0, _linear(0.01, 10.0, points), near),
-    )
-
-
 FULL = Settings(
-    grids=_grids(8, (25.0, 50.0, 75.0, 100.0), (25.0, 50.0, 75.0)),
+    grids=paper_grids(8, WIDE_NS, NEAR_NS),
     realizations=100_000,
     resamplings=200,
     sampled=4_000,
-    dead_sweep=_linear(0.05, 2.0, 40),
+    dead_sweep=linear_points(40, 0.05, 2.0),
     sweep_flux=log_points(8),
 )
 
 
 QUICK = Settings(
-    grids=_grids(2, (25.0, 75.0), (50.0,)),
+    grids=paper_grids(2, (25.0, 75.0), (50.0,)),
     realizations=400,
     resamplings=50,
     sampled=40,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 from mars_lidar import CountLaw, Flux, System, count_law, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import distance
+from mars_lidar.statistics.count_window import gaussian_window
 from mars_lidar.statistics.distance import Pmf, total_variation
 from studies import Request, Tell
-from studies.common.report import Row, write
+from studies.common.report import Row, picked, write
 from studies.common.sample import PERIOD_NS, log_points, system_of
 
 LAWS = {
@@ -135,18 +137,11 @@ def _cells(
     system = settings.system(dead, cycles)
     counts = _simulate(settings, signal, background, system, number)
     random = np.random.default_rng([settings.seed, number])
-    exact = count_law(signal, background, system)
-    others = {
-        "mars": count_law(signal, background, system, "mars"),
-        "mars_edge": count_law(signal, background, system, "mars", rearm="edge"),
-        "renewal": count_law(signal, background, system, "renewal"),
-        "poisson": count_law(signal, background, system, "poisson"),
-    }
+    batch = laws_of(signal, background, system)
+    exact = batch["exact"]
     cells = []
     for k in range(signal.size):
-        laws = {"exact": pmf_of(exact, k)}
-        laws["gaussian"] = Pmf.gaussian(float(exact.mean[k]), float(exact.variance[k]))
-        laws |= {name: pmf_of(law, k) for name, law in others.items()}
+        laws = pmfs_of(batch, k)
         sample, size = Pmf.of_counts(counts[:, k]), settings.realizations
         noise = distance.sampling_floor(laws["exact"], size, settings.draws, random)
         mean, variance = float(exact.mean[k]), float(exact.variance[k])
@@ -183,9 +178,28 @@ def second_look(settings: Settings, cells: list[Cell], tell: Tell) -> list[tuple
     return found
 
 
+def laws_of(
+    signal: FloatArray, background: FloatArray, system: System, delay_ns: float | None = None
+) -> dict[str, CountLaw]:
+    """Every law in closed form, of cells (cells,)."""
+    law = partial(count_law, signal, background, system, delay_ns=delay_ns)
+    marked = {"mars": law("mars"), "mars_edge": law("mars", rearm="edge")}
+    return {"exact": law("exact")} | marked | {name: law(name) for name in ("renewal", "poisson")}
+
+
+def pmfs_of(laws: dict[str, CountLaw], k: int) -> dict[str, Pmf]:
+    """One cell of `laws_of`, in the order of `LAWS`, the best Gaussian among them."""
+    return {name: gaussian_of(laws["exact"], k) if name == "gaussian" else pmf_of(laws[name], k) for name in LAWS}
+
+
 def pmf_of(law: CountLaw, k: int) -> Pmf:
     """One cell of a batched count law."""
     return Pmf(int(law.support[k, 0]), law.pmf[k])
+
+
+def gaussian_of(exact: CountLaw, k: int) -> Pmf:
+    """The Gaussian with mean and variance of one cell of the exact law."""
+    return gaussian_window(float(exact.mean[k]), float(exact.variance[k]))
 
 
 def _simulate(
@@ -263,13 +277,11 @@ def run(request: Request) -> list[Path]:
 def _csv_row(name: str, cell: Cell) -> Row:
     return {
         "map": name,
-        "signal": cell.signal,
-        "background": cell.background,
+        **picked(cell, "signal background"),
         "dead_time_periods": cell.dead,
         "cycles": cell.cycles,
         **{f"cumulant_{k + 1}": float(cell.cumulants[k]) for k in range(4)},
-        "floor": cell.floor,
-        "limit": cell.limit,
+        **picked(cell, "floor limit"),
         "g_test_p": cell.p_value,
         "z_mean": cell.mean_score,
         "z_variance": cell.variance_score,

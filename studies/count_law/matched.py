@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from mars_lidar import GaussianPulse, System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, style
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
 from studies import Request, Tell
 from studies.common.draw import heat, panels
 from studies.common.report import Row, save_figure, write
 from studies.common.sample import PERIOD_NS, log_points, system_of
-from studies.count_law.law import pmf_of
+from studies.count_law.law import gaussian_of, pmf_of
 
 AIM = 0.002  # total variation
 _EDGES = (0.0, 0.2, 0.7, 2.3, 9.0, 100.0, np.inf)  # of the variance
@@ -131,9 +131,8 @@ def measure(kind: str, system: System, signal: FloatArray, background: FloatArra
     matched, gaussian = np.empty(signal.size), np.empty(signal.size)
     for k, window in enumerate(windows):
         law = pmf_of(exact, k)
-        matched[k] = total_variation(Pmf(window.first, window.pmf), law)
-        mean, variance = float(exact.mean[k]), float(exact.variance[k])
-        gaussian[k] = total_variation(Pmf.gaussian(mean, variance), law)
+        matched[k] = total_variation(window, law)
+        gaussian[k] = total_variation(gaussian_of(exact, k), law)
     return Part(kind, system, signal, background, exact.cumulants, matched, gaussian, trusted(exact.cumulants))
 
 

@@ -13,15 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar import count_law
 from mars_lidar.statistics import distance
-from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.distance import Pmf
-from mars_lidar.statistics.law import Method
 from studies import Request
 from studies.common.report import write
 from studies.common.sample import system_of
-from studies.count_law.law import LAWS
+from studies.count_law.law import LAWS, laws_of, pmfs_of
 
 DRAWS, QUICK_DRAWS = 20_000, 500
 SEED = 20262
@@ -89,37 +86,30 @@ def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Gener
     sample = Pmf(int(counts.min()), frequency)
     mean = float((counts * (times / size)).sum())
 
-    exact = count_law(signal, background, system, delay_ns=delay)
-    laws = {"exact": (exact.cumulants, Pmf(int(exact.support[0]), exact.pmf))}
-    moments = np.array([exact.mean, exact.variance, 0.0, 0.0])
-    laws["gaussian"] = (moments, Pmf.gaussian(float(exact.mean), float(exact.variance)))
-    others: tuple[tuple[str, Method, Rearm | None], ...] = (
-        ("mars", "mars", "centre"),
-        ("mars_edge", "mars", "edge"),
-        ("renewal", "renewal", None),
-        ("poisson", "poisson", None),
-    )
-    for key, method, rearm in others:
-        law = count_law(signal, background, system, method, delay_ns=delay, rearm=rearm)
-        laws[key] = (law.cumulants, Pmf(int(law.support[0]), law.pmf))
-    noise = distance.sampling_floor(laws["exact"][1], size, draws, random)
-    return [
-        Comparison(
-            name,
-            key,
-            size,
-            float(cumulants[0]),
-            float(cumulants[1]),
-            # what the sample's mean and variance scatter by is known from the exact law
-            z_mean=distance.mean_score(float(cumulants[0]), float(exact.variance), mean, size),
-            z_variance=distance.variance_score(exact.cumulants, sample, size, float(cumulants[1])),
-            distance=distance.total_variation(pmf, sample),
-            floor=float(noise.mean()),
-            limit=float(np.quantile(noise, 0.999)),
-            p_value=distance.g_test(pmf, sample, size),
+    laws = laws_of(np.array([signal]), np.array([background]), system, delay)
+    pmfs, exact = pmfs_of(laws, 0), laws["exact"].cumulants[0]
+    noise = distance.sampling_floor(pmfs["exact"], size, draws, random)
+    found = []
+    for key, pmf in pmfs.items():
+        # the Gaussian has mean and variance of the exact law
+        expected, variance = (float(v) for v in laws.get(key, laws["exact"]).cumulants[0, :2])
+        found.append(
+            Comparison(
+                name,
+                key,
+                size,
+                expected,
+                variance,
+                # what the sample's mean and variance scatter by is known from the exact law
+                z_mean=distance.mean_score(expected, float(exact[1]), mean, size),
+                z_variance=distance.variance_score(exact, sample, size, variance),
+                distance=distance.total_variation(pmf, sample),
+                floor=float(noise.mean()),
+                limit=float(np.quantile(noise, 0.999)),
+                p_value=distance.g_test(pmf, sample, size),
+            )
         )
-        for key, (cumulants, pmf) in laws.items()
-    ]
+    return found
 
 
 def _read(path: Path) -> dict[str, Any]:

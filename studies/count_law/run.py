@@ -11,7 +11,7 @@ import numpy as np
 
 from mars_lidar.statistics.distance import KL_FLOOR
 from studies import Request
-from studies.common.report import Row, write
+from studies.common.report import Row, picked, write
 from studies.common.simulators import simulators
 from studies.count_law.cells import FIGURES, FULL, QUICK, Cell, compute, shape_sweep
 
@@ -104,10 +104,7 @@ def run(request: Request) -> list[Path]:
 
 def _csv_row(cell: Cell) -> Row:
     row: dict[str, object] = {
-        "grid": cell.grid,
-        "period_ns": cell.period_ns,
-        "signal": cell.signal,
-        "background": cell.background,
+        **picked(cell, "grid period_ns signal background"),
         "dead_time_ns": cell.dead_ns,
         "simulated_mean": cell.mean,
         "simulated_variance": cell.variance,

@@ -135,12 +135,9 @@ def _map(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     for row, rule in zip(axes, rules, strict=True):
         for ax, dead_ns in zip(row, dead, strict=True):
             error = np.array(
-                [
-                    [_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.signal]
-                    for b in grid.background
-                ]
+                [[_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.flux] for b in grid.flux]
             )
-            mesh = heat(ax, grid.signal, grid.background, np.abs(error), norm)
+            mesh = heat(ax, grid.flux, grid.flux, np.abs(error), norm)
     for ax, dead_ns in zip(axes[0], dead, strict=True):
         ax.set_title(f"$t_d$ = {dead_ns / grid.period_ns:g} $t_r$", fontsize=7)
     for row, rule in zip(axes, rules, strict=True):

@@ -16,8 +16,8 @@ from mars_lidar import System, holding_time_covariance
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.chain import Rearm
 from studies import Request, Tell
-from studies.common.report import Row, write
-from studies.common.sample import PERIOD_NS, log_points, system_of
+from studies.common.report import Row, picked, write
+from studies.common.sample import NEAR_NS, PERIOD_NS, WIDE_NS, Grid, log_points, paper_grids, system_of
 from studies.covariance.modes import LeadingTerms
 
 CUTOFFS = (*range(21), 25, 30, 40, 50, 75, 100, 150, 200, 300, 500)
@@ -27,34 +27,6 @@ PAPER_CUTOFF, PAPER_SPECTRAL = 125.91, 10.00  # mean absolute errors, in a unit 
 PAPER_BEYOND_FIFTH = 0.7
 _USUAL_CUTOFFS = range(21)  # among these the best fixed one is looked for
 _HARD = (10.0, 1.0, 1.0)  # S, B, t_d / t_r
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A grid of cells: every S with every B and every dead time."""
-
-    name: str
-    period_ns: float
-    signal: tuple[float, ...]
-    background: tuple[float, ...]
-    dead_ns: tuple[float, ...]
-
-    @property
-    def size(self) -> int:
-        """Number of cells."""
-        return len(self.signal) * len(self.background) * len(self.dead_ns)
-
-    @property
-    def dead_periods(self) -> list[float]:
-        """Dead times in periods."""
-        return [dead / self.period_ns for dead in self.dead_ns]
-
-    @property
-    def spacing(self) -> str:
-        """How S and B are spaced."""
-        steps = np.diff(self.signal)
-        log = len(self.signal) < 3 or float(np.ptp(steps)) > 1e-6 * float(steps.max())
-        return "log-spaced" if log else "linear"
 
 
 @dataclass(frozen=True)
@@ -73,27 +45,22 @@ class Settings:
         return system_of(dead_ns, 1000, period_ns=period_ns, bins=self.bins, sigma_ns=self.sigma_ns)
 
 
-def _linear(points: int) -> tuple[float, ...]:
-    return tuple(float(v) for v in np.linspace(0.01, 10.0, points))
-
-
 def _periods(*dead: float) -> tuple[float, ...]:
     return tuple(d * PERIOD_NS for d in dead)
 
 
 FULL = Settings(
     grids=(
-        Grid("wide", PERIOD_NS, log_points(8), log_points(8), (25.0, 50.0, 75.0, 100.0)),
-        Grid("near", 100.0, _linear(8), _linear(8), (25.0, 50.0, 75.0)),
-        Grid("locked", PERIOD_NS, log_points(8), log_points(8), _periods(0.0, 0.5, 0.9, 0.95, 0.98, 0.99, 0.999)),
+        *paper_grids(8, WIDE_NS, NEAR_NS),
+        Grid("locked", PERIOD_NS, log_points(8), _periods(0.0, 0.5, 0.9, 0.95, 0.98, 0.99, 0.999)),
     ),
     decay_dead=(0.0, 0.1875, 0.5, 0.6375, 0.95, 0.99),
     dense_random=2,
 )
 QUICK = Settings(
     grids=(
-        Grid("wide", PERIOD_NS, log_points(2), log_points(2), (50.0,)),
-        Grid("locked", PERIOD_NS, log_points(2), log_points(2), _periods(0.0, 0.95)),
+        Grid("wide", PERIOD_NS, log_points(2), (50.0,)),
+        Grid("locked", PERIOD_NS, log_points(2), _periods(0.0, 0.95)),
     ),
     decay_dead=(0.0, 0.6375, 0.95),
     dense_random=0,
@@ -156,16 +123,15 @@ def compute(settings: Settings, rearm: Rearm, tell: Tell) -> list[Cell]:
     for grid in settings.grids:
         for dead_ns in grid.dead_ns:
             system = settings.system(grid.period_ns, dead_ns)
-            for signal in grid.signal:
-                for background in grid.background:
-                    cells.append(_cell(settings, grid, system, signal, background, rearm))
+            for signal, background in zip(*grid.cells, strict=True):
+                cells.append(_cell(settings, grid, system, float(signal), float(background), rearm))
         tell(f"covariance: grid {grid.name}, re-arming at the {rearm}: {grid.size} cells")
     return cells
 
 
 def one_cell(settings: Settings, signal: float, background: float, dead_periods: float, rearm: Rearm) -> Cell:
     """A cell outside of the grids, at the period of the canonical system."""
-    grid = Grid("single", PERIOD_NS, (signal,), (background,), _periods(dead_periods))
+    grid = Grid("single", PERIOD_NS, (), _periods(dead_periods))
     system = settings.system(PERIOD_NS, grid.dead_ns[0])
     return _cell(settings, grid, system, signal, background, rearm)
 
@@ -302,9 +268,7 @@ def _csv_row(cell: Cell) -> Row:
     terms = cell.terms
     return {
         "grid": cell.grid.name,
-        "rearm": cell.rearm,
-        "signal": cell.signal,
-        "background": cell.background,
+        **picked(cell, "rearm signal background"),
         "dead_time_ns": cell.dead_ns,
         "period_ns": cell.grid.period_ns,
         "mu_ns": terms.mu,

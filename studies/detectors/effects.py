@@ -11,27 +11,17 @@ from mars_lidar import Afterpulsing, Crosstalk, Detector, Flux, GaussianPulse, J
 from mars_lidar.statistics import constant_light_rate
 from studies import Request
 from studies.common.report import save_csv, write
-from studies.detectors.run import SEED, outcome, row, settings_of, shown_as
+from studies.common.sample import settings_of
+from studies.detectors.run import LIGHT, SEED, outcome, row, shown_as
 
 CODES = tuple(1.0 + 0.25 * np.sin(2.0 * np.pi * k / 8.0) for k in range(8))
 SHOWN = (
     shown_as("free running", ""),
     shown_as("efficiency 0.3", "light", detection_efficiency=0.3),
     shown_as("dark counts 5 MHz", "light", dark_count_hz=5e6),
-    shown_as(
-        "p 0.1, 30 ns",
-        "afterpulsing",
-        afterpulsing=Afterpulsing(probability=0.1, delay_ns=30.0),
-    ),
-    shown_as(
-        "p 0.4, 30 ns",
-        "afterpulsing",
-        afterpulsing=Afterpulsing(probability=0.4, delay_ns=30.0),
-    ),
-    shown_as(
-        "p 0.4, 200 ns",
-        "afterpulsing",
-        afterpulsing=Afterpulsing(probability=0.4, delay_ns=200.0),
+    *(
+        shown_as(f"p {p:g}, {delay:g} ns", "afterpulsing", afterpulsing=Afterpulsing(probability=p, delay_ns=delay))
+        for p, delay in ((0.1, 30.0), (0.4, 30.0), (0.4, 200.0))
     ),
     shown_as("alpha 3 ns", "twilight", twilight_ns=3.0),
     shown_as("alpha 15 ns", "twilight", twilight_ns=15.0),
@@ -63,7 +53,7 @@ def run(request: Request) -> list[Path]:
     figures = draw_all(request.out, outcomes, "effects")
     rows = [{"effect": each.shown.figure or "none", **row(each)} for each in outcomes]
     rates = constant_light(40 if request.quick else 4000)
-    settings = settings_of(outcomes[0].system, exposures)
+    settings = settings_of(outcomes[0].system, LIGHT, exposures, SEED)
     facts = {"settings": settings, "rows": rows, "figures": figures, "rates": rates}
     figures = [*figures, save_csv(request.out / "effects_rate.csv", rates)]
     return write(request, "effects", __name__, "effects", facts, rows=rows, figures=figures)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,8 +17,10 @@ from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
 from mars_lidar.statistics import mean_histogram
 from studies import Request
 from studies.common.report import write
+from studies.common.sample import settings_of
 
 SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
+LIGHT = {"signal S": SIGNAL, "background B": BACKGROUND, "delay_ns": DELAY_NS, "dead_time_ns": DEAD_NS}
 SEED = 20
 REACH = 3.0  # periods of inter-registration times that are shown
 _BINS_OF_INTERVALS = 150
@@ -81,7 +82,7 @@ def run(request: Request) -> list[Path]:
         outcomes.append(outcome(shown, exposures))
     figures = draw_all(request.out, outcomes)
     rows = [row(each) for each in outcomes]
-    facts = {"settings": settings_of(outcomes[0].system, exposures), "rows": rows, "figures": figures}
+    facts = {"settings": settings_of(outcomes[0].system, LIGHT, exposures, SEED), "rows": rows, "figures": figures}
     return write(request, "detectors", __name__, "report", facts, rows=rows, figures=figures)
 
 
@@ -167,10 +168,3 @@ def _fit(counts: NDArray[np.int64], law: FloatArray) -> float:
 def of_figure(outcomes: Sequence[Outcome], figure: str) -> list[Outcome]:
     """The outcomes that a figure shows: the free-running pixel first."""
     return [each for each in outcomes if each.shown.figure in ("", figure)]
-
-
-def settings_of(system: System, exposures: int) -> dict[str, Any]:
-    """The configuration, by name."""
-    told = {field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"}
-    flux = {"signal S": SIGNAL, "background B": BACKGROUND, "delay_ns": DELAY_NS}
-    return told | flux | {"dead_time_ns": DEAD_NS, "exposures": exposures, "engine": "exact", "seed": SEED}

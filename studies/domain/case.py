@@ -58,6 +58,19 @@ class Case:
         """Mode of the detector; a moving gate is a mode of its own here."""
         return MOVING if self.system.detector.gate_moves else self.system.detector.mode
 
+    def since_gate(self, time: NDArray[np.float64], early: float = 0.0) -> NDArray[np.float64]:
+        """Time since the gate of its period opened, modulo the period, of times (periods) that may be `early`."""
+        detector = self.system.detector
+        period = np.floor(time)
+        moves = np.floor(period / (detector.gate_cycles or 1)) if detector.gate_moves else 0.0
+        start = ((detector.gate_start_ns or 0.0) + moves * (detector.gate_step_ns or 0.0)) / PERIOD_NS
+        return np.asarray((time - period - start + early) % 1.0)
+
+    @property
+    def gate_width(self) -> float:
+        """How long the gate is open in a period."""
+        return (self.system.detector.gate_width_ns or 0.0) / PERIOD_NS
+
     def registrations(self) -> float:
         """Registrations of an exposure, roughly."""
         n, rate, dead = self.system.cycles, self.photons, self.system.dead_time_periods

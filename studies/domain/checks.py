@@ -84,14 +84,13 @@ def variances_of(sample: Sample, oracle: str, names: list[str], x: Numbers, vari
     found = []
     n = len(x)
     for name, y, known in zip(names, np.asarray(x, float).T, variance, strict=True):
-        square = (y - y.mean()) ** 2
-        second = square.mean()
+        second = y.var()
         if n < 60 or second == 0.0 or known <= 0.0 or known * n < 60.0:
             continue
-        kurtosis = max((square**2).mean() / second**2 - 1.0, 2.0)
-        if kurtosis > n / 100.0:
+        error = _log_variance_error(y)
+        if error is None:
             continue
-        z = np.log(second * n / (n - 1) / known) / np.sqrt(kurtosis / n)
+        z = np.log(second * n / (n - 1) / known) / np.sqrt(error)
         found.append(
             Check(sample.engine, oracle, name, float(2.0 * stats.norm.sf(abs(z))), float(second / known - 1.0))
         )
@@ -125,7 +124,7 @@ def two_samples(a: Sample, b: Sample) -> list[Check]:
     if high > low and min(a.items, b.items) >= 100:
         edges = np.unique(np.quantile(np.concatenate([a.counts, b.counts]), np.linspace(0, 1, 25)).astype(np.int64))
         table = np.array([np.bincount(np.searchsorted(edges, s.counts), minlength=edges.size + 1) for s in (a, b)])
-        checks.append(_homogeneous(a, b, "law of the count", table))
+        checks.append(homogeneous(a.engine, b.engine, "law of the count", table))
     x, y = a.cells, b.cells
     n, m = a.items, b.items
     often = (x.sum(0) + y.sum(0)) >= 60
@@ -141,7 +140,7 @@ def two_samples(a: Sample, b: Sample) -> list[Check]:
         u, v = a.windows[:, k].astype(float), b.windows[:, k].astype(float)
         checks += _two_variances(a, b, name, u, v)
     if _sparse(a, b):
-        checks.append(_homogeneous(a, b, "sum histogram", np.array([a.cells.sum(0), b.cells.sum(0)])))
+        checks.append(homogeneous(a.engine, b.engine, "sum histogram", np.array([a.cells.sum(0), b.cells.sum(0)])))
     return checks
 
 
@@ -153,28 +152,31 @@ def _sparse(a: Sample, b: Sample) -> bool:
 def _two_variances(a: Sample, b: Sample, name: str, u: FloatArray, v: FloatArray) -> list[Check]:
     if min(len(u), len(v)) < 200 or min(u.var() * len(u), v.var() * len(v)) < 200.0:
         return []
-    error = 0.0
-    for w in (u, v):
-        square = (w - w.mean()) ** 2
-        kurtosis = max((square**2).mean() / square.mean() ** 2 - 1.0, 2.0)
-        if kurtosis > len(w) / 100.0:
-            return []
-        error += kurtosis / len(w)
+    errors = _log_variance_error(u), _log_variance_error(v)
+    if errors[0] is None or errors[1] is None:
+        return []
     ratio = float(u.var() / v.var())
-    p = float(2.0 * stats.norm.sf(abs(np.log(ratio)) / np.sqrt(error)))
+    p = float(2.0 * stats.norm.sf(abs(np.log(ratio)) / np.sqrt(errors[0] + errors[1])))
     return [Check(a.engine, b.engine, name, p, ratio - 1.0)]
 
 
-def _homogeneous(a: Sample, b: Sample, what: str, table: NDArray[np.int64]) -> Check:
+def _log_variance_error(x: FloatArray) -> float | None:
+    """Variance of the logarithm of the sample variance, from the fourth moment; None where a few numbers make it."""
+    square = (x - x.mean()) ** 2
+    kurtosis = max((square**2).mean() / square.mean() ** 2 - 1.0, 2.0)
+    return None if kurtosis > len(x) / 100.0 else float(kurtosis / len(x))
+
+
+def homogeneous(a: str, b: str, what: str, table: NDArray[np.int64]) -> Check:
     """Chi-square of two rows of numbers of events, cells merged until each expects enough in either row."""
     share = min(table.sum(1)) / max(table.sum(), 1)
     cell = merge(table.sum(0) * share)
     merged = np.array([np.bincount(cell, row) for row in table])
     if merged.shape[1] < 2:
-        return Check(a.engine, b.engine, what, 1.0, 0.0)
+        return Check(a, b, what, 1.0, 0.0)
     p = float(stats.chi2_contingency(merged, correction=False).pvalue)
     rows = merged / merged.sum(1, keepdims=True)
-    return Check(a.engine, b.engine, what, p, 0.5 * float(np.abs(rows[0] - rows[1]).sum()))
+    return Check(a, b, what, p, 0.5 * float(np.abs(rows[0] - rows[1]).sum()))
 
 
 def merge(weight: FloatArray, least: float = LEAST) -> NDArray[np.intp]:

@@ -53,11 +53,7 @@ def _in_gate(case: Case, t: NDArray[np.float64]) -> bool:
     detector = case.system.detector
     if detector.mode != "gated" or {"jitter", "code_density"} & set(detector.effects):
         return True
-    period = np.floor(t)
-    moves = np.floor(period / (detector.gate_cycles or 1)) if detector.gate_moves else 0.0
-    start = ((detector.gate_start_ns or 0.0) + moves * (detector.gate_step_ns or 0.0)) / PERIOD_NS
-    after = (t - period - start + 2.5e-7) % 1.0
-    return bool((after <= (detector.gate_width_ns or 0.0) / PERIOD_NS + 5e-7).all())
+    return bool((case.since_gate(t, early=2.5e-7) <= case.gate_width + 5e-7).all())
 
 
 def _lattice(case: Case, t: NDArray[np.float64], owner: NDArray[np.int64]) -> list[Check]:

@@ -51,7 +51,7 @@ def counts(case: Case, exposures: int, seed: int) -> NDArray[np.int64]:
     time -= early
     keep = time >= -np.broadcast_to(offset, exposures)[owner]
     if detector.mode == "gated":
-        keep &= _open(case, time)
+        keep &= case.since_gate(time) < case.gate_width
     owner, time = owner[keep], time[keep]
     order = np.lexsort((time, owner))
     owner, time = owner[order], time[order]
@@ -96,16 +96,6 @@ def _pulse(case: Case, number: int, random: np.random.Generator) -> FloatArray:
     edges = np.linspace(low, high, 1 + round((high - low) / pulse.to_dict()["bin_ns"]))
     below = pulse.cumulative(edges)
     return np.asarray(np.interp(random.random(number) * below[-1], below, edges) / PERIOD_NS)
-
-
-def _open(case: Case, time: FloatArray) -> NDArray[np.bool_]:
-    """Whether the gate of its period is open at `time`."""
-    detector = case.system.detector
-    period = np.floor(time)
-    moves = np.floor(period / (detector.gate_cycles or 1)) if detector.gate_moves else 0.0
-    start = (detector.gate_start_ns or 0.0) + moves * (detector.gate_step_ns or 0.0)
-    after = (time - period - start / PERIOD_NS) % 1.0
-    return np.asarray(after < (detector.gate_width_ns or 0.0) / PERIOD_NS)
 
 
 def _registered(case: Case, first: NDArray[np.int64], time: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:

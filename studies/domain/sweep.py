@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
-from queue import Empty, Queue
-from threading import Thread
+from queue import SimpleQueue
 
 from studies import Tell
 from studies.domain.case import Case
@@ -55,39 +56,22 @@ class Judged:
 
 def sweep(settings: Settings, tell: Tell, workers: int = 1) -> Iterator[Judged]:
     """Judge system after system, in order, `workers` at a time, each in a process of its own."""
-    numbers: Queue[int] = Queue()
-    for number in range(settings.systems):
-        numbers.put(number)
-    done: Queue[tuple[int, Judged | BaseException]] = Queue()
-    for _ in range(workers):
-        Thread(target=_workers, args=(settings, numbers, done), daemon=True).start()
-    held: dict[int, Judged] = {}
-    for number in range(settings.systems):
-        while number not in held:
-            at, judged = done.get()
-            if isinstance(judged, BaseException):
-                raise judged
-            held[at] = judged
-        judged = held.pop(number)
-        for subject in sorted({o.subject for o in judged.outcomes if o.state == FAILED}):
-            tell(f"{judged.case.name} ({judged.case.family}): {subject} failed")
-        yield judged
+    idle: SimpleQueue[Watched] = SimpleQueue()
 
+    def judged(number: int) -> Judged:
+        watched = idle.get()
+        try:
+            return judge_case(draw(settings.seed, number), settings, watched, settings.seed * 1_000_003 + number)
+        finally:
+            idle.put(watched)
 
-def _workers(settings: Settings, numbers: Queue[int], done: Queue[tuple[int, Judged | BaseException]]) -> None:
-    """One thread: takes numbers until there are none."""
-    with Watched() as watched:
-        while True:
-            try:
-                number = numbers.get_nowait()
-            except Empty:
-                return
-            try:
-                case = draw(settings.seed, number)
-                done.put((number, judge_case(case, settings, watched, settings.seed * 1_000_003 + number)))
-            except BaseException as error:
-                done.put((number, error))
-                return
+    with ExitStack() as stack, ThreadPoolExecutor(workers) as pool:
+        for _ in range(workers):
+            idle.put(stack.enter_context(Watched()))
+        for one in pool.map(judged, range(settings.systems)):
+            for subject in sorted({o.subject for o in one.outcomes if o.state == FAILED}):
+                tell(f"{one.case.name} ({one.case.family}): {subject} failed")
+            yield one
 
 
 def judge_case(case: Case, settings: Settings, watched: Watched, seed: int) -> Judged:
@@ -118,7 +102,7 @@ def _blame(outcomes: list[Outcome], case: Case, party: str, checks: list[Check])
     words = "; ".join(f"{c.what} ({c.a} against {c.b}): p {c.p:.1g}, effect {c.effect:.3g}" for c in checks[:4])
     for outcome in outcomes:
         if outcome.subject == party:
-            if outcome.state in (VERIFIED, UNJUDGED) or outcome.state != FAILED:
+            if outcome.state != FAILED:
                 outcome.note = words + (f" [{outcome.state}]" if outcome.state not in (VERIFIED, UNJUDGED) else "")
             outcome.state = FAILED
             return

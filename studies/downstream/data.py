@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import Detector, GaussianPulse, Scene, System, Table, simulate
 from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
-from studies.downstream.fit import Examples, FitPlan
+from studies.downstream.fit import FitPlan
 from studies.neural import NeuralEngine
 
 SYSTEM = System(  # that of the network beside studies/neural
@@ -67,68 +66,58 @@ class Config:
 
 
 _ONE, _THREE = (0,), (0, 1, 2)
-_ARMS: dict[str, tuple[int, ...]] = {
-    "poisson": _ONE,
-    "renewal": _ONE,
-    "neural": _ONE,
-    "nearest": _ONE,
-    "mars": _THREE,
-    "exact": _THREE,
-}
-CONFIGS = {
-    "small": Config(
-        name="small",
-        sbr=(1.0,),
-        arms=_ARMS,
-        train=(1000, 40),
-        validation=(2000, 6),
-        test=(3000, 8),
-        size=64,
-        render=160,
-        steps=1000,
-        batch=4,
-        every=100,
-        patience=4,
-        stem=64,
-        widths=(32, 64, 96),
-        blocks=1,
-    ),
-    "full": Config(
-        name="full",
-        sbr=(0.6, 1.0),
-        arms=dict.fromkeys(_ARMS, _THREE),
-        train=(1000, 400),
-        validation=(2000, 40),
-        test=(3000, 40),
-        size=64,
-        render=160,
-        steps=40_000,
-        batch=16,
-        every=500,
-        patience=10,
-        stem=128,
-        widths=(64, 128, 256, 256),
-        blocks=2,
-    ),
-    "tiny": Config(
-        name="tiny",
-        sbr=(1.0,),
-        arms={"poisson": _ONE, "neural": _ONE, "nearest": _ONE, "mars": (0, 1)},
-        train=(1000, 3),
-        validation=(2000, 1),
-        test=(3000, 2),
-        size=16,
-        render=32,
-        steps=6,
-        batch=2,
-        every=3,
-        patience=5,
-        stem=8,
-        widths=(8, 16),
-        blocks=1,
-        table=(10, 8),
-    ),
-}
+_ARMS: dict[str, tuple[int, ...]] = dict.fromkeys(WORDS, _ONE) | {"mars": _THREE, "exact": _THREE}
+_SMALL = Config(
+    name="small",
+    sbr=(1.0,),
+    arms=_ARMS,
+    train=(1000, 40),
+    validation=(2000, 6),
+    test=(3000, 8),
+    size=64,
+    render=160,
+    steps=1000,
+    batch=4,
+    every=100,
+    patience=4,
+    stem=64,
+    widths=(32, 64, 96),
+    blocks=1,
+)
+_FULL = replace(
+    _SMALL,
+    name="full",
+    sbr=(0.6, 1.0),
+    arms=dict.fromkeys(_ARMS, _THREE),
+    train=(1000, 400),
+    validation=(2000, 40),
+    test=(3000, 40),
+    steps=40_000,
+    batch=16,
+    every=500,
+    patience=10,
+    stem=128,
+    widths=(64, 128, 256, 256),
+    blocks=2,
+)
+_TINY = replace(
+    _SMALL,
+    name="tiny",
+    arms={"poisson": _ONE, "neural": _ONE, "nearest": _ONE, "mars": (0, 1)},
+    train=(1000, 3),
+    validation=(2000, 1),
+    test=(3000, 2),
+    size=16,
+    render=32,
+    steps=6,
+    batch=2,
+    every=3,
+    patience=5,
+    stem=8,
+    widths=(8, 16),
+    table=(10, 8),
+)
+CONFIGS = {config.name: config for config in (_SMALL, _FULL, _TINY)}
 
 
 def crop(number: int, config: Config) -> Scene:
@@ -145,16 +134,15 @@ def crop(number: int, config: Config) -> Scene:
 
 def rgbd_scenes(folder: Path, config: Config) -> dict[str, Scene]:
     """Measured scenes that are there, at the size of the crops: their middle."""
-    found: dict[str, Callable[[], Scene]] = {
-        "Art (Middlebury 2005)": partial(Scene.from_rgbd, folder / "middlebury_art"),
-        "NYUv2 frame 1": partial(Scene.from_rgbd, folder / "nyuv2_00001_depth.png", folder / "nyuv2_00001_colors.png"),
+    files = {
+        "Art (Middlebury 2005)": ("middlebury_art",),
+        "NYUv2 frame 1": ("nyuv2_00001_depth.png", "nyuv2_00001_colors.png"),
     }
-    present = {"Art (Middlebury 2005)": "middlebury_art", "NYUv2 frame 1": "nyuv2_00001_depth.png"}
     scenes = {}
-    for name, make in found.items():
-        if not (folder / present[name]).exists():
+    for name, parts in files.items():
+        if not (folder / parts[0]).exists():
             continue
-        scene = make()
+        scene = Scene.from_rgbd(*(folder / part for part in parts))
         side = min(scene.shape)
         top, left = ((n - side) // 2 for n in scene.shape)
         scenes[name] = scene[top : top + side, left : left + side].resize((config.size, config.size))
@@ -206,8 +194,3 @@ def truths(scenes: Sequence[Scene], target: str, config: Config) -> NDArray[np.f
     else:
         maps = [np.where(scene.valid, np.nan_to_num(scene.depth_m), 0.0) / config.depth_range_m for scene in scenes]
     return np.stack(maps).astype(np.float32)
-
-
-def examples(cubes: NDArray[Any], scenes: Sequence[Scene], target: str, config: Config) -> Examples:
-    """Cubes with the maps of their scenes."""
-    return Examples(cubes, truths(scenes, target, config))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mars_lidar._base import checks
+from mars_lidar._base.files import TemporarySibling
+from studies.common.report import save_csv, save_whole
 
 RECORD, LOG, LAST, BEST = "run.yaml", "log.csv", "last.pt", "best.pt"
 _COLUMNS = ("step", "seconds", "rate", "loss", "validation")
@@ -60,11 +60,6 @@ class FitPlan:
         for name in ("rate", "scale"):
             object.__setattr__(self, name, checks.real(name, getattr(self, name), low=0.0, strict_low=True))
         checks.integer("seed", self.seed, low=0, high=2**63 - 1)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> FitPlan:
-        """From plain data; an unknown key is an error."""
-        return cls(**checks.known_keys("fit", data, tuple(field.name for field in fields(cls))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +113,9 @@ def fit(
 ) -> Fitted:
     """Fit `network` to L1 loss, or go on from the folder's checkpoint; leaves the best weights in the network.
 
-    The folder takes ``run.yaml`` (the plan and `about`), ``log.csv``, ``last.pt`` and ``best.pt``, and TensorBoard's
-    events where it is installed. A run that was stopped, at any time, goes on from its last validation, with the same
-    steps as if it had not been; one of another plan in the same folder is an error. A complete one returns at once.
+    The folder takes ``run.yaml`` (the plan and `about`), ``log.csv``, ``last.pt`` and ``best.pt``. A run that was
+    stopped, at any time, goes on from its last validation, with the same steps as if it had not been; one of another
+    plan in the same folder is an error. A complete one returns at once.
     """
     place = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     folder = Path(folder)
@@ -138,7 +133,6 @@ def fit(
         optimizer.load_state_dict(loaded["optimizer"])
         scaler.load_state_dict(loaded["scaler"])
         state = {name: loaded[name] for name in state}
-    board = _board(folder)
     began, before = time.monotonic(), float(state["seconds"])
     losses: list[float] = []
     while state["step"] < plan.steps and not _stale(state, plan):
@@ -174,14 +168,10 @@ def fit(
         losses.clear()
         parts: dict[str, Any] = {"network": network, "optimizer": optimizer, "scaler": scaler}
         _write(folder / LAST, {name: part.state_dict() for name, part in parts.items()} | state)
-        _write_log(folder / LOG, state["log"])
-        if board is not None:
-            for name, value in zip(_COLUMNS[2:], state["log"][-1][2:], strict=True):
-                board.add_scalar(name, value, step + 1)
+        with TemporarySibling(folder / LOG).writing() as log:
+            save_csv(log, [dict(zip(_COLUMNS, row, strict=True)) for row in state["log"]])
         if tell is not None:
             tell(f"step {step + 1}: validation {found:.4f}{' *' if better else ''}, {state['seconds']:.0f} s")
-    if board is not None:
-        board.close()
     network.load_state_dict(torch.load(folder / BEST, map_location=place, weights_only=True)["network"])
     return Fitted(
         int(state["step"]), float(state["best"]), int(state["best_step"]), float(state["seconds"]), _stale(state, plan)
@@ -216,34 +206,11 @@ def _stale(state: Mapping[str, Any], plan: FitPlan) -> bool:
 
 def _check_record(path: Path, record: dict[str, Any]) -> None:
     if not path.exists():
-        unfinished = path.with_name(path.name + ".incomplete")
-        unfinished.write_text(yaml.safe_dump(record, sort_keys=False))
-        os.replace(unfinished, path)
-        return
-    there = yaml.safe_load(path.read_text())
-    if there != record:
+        save_whole(path, yaml.safe_dump(record, sort_keys=False))
+    elif yaml.safe_load(path.read_text()) != record:
         raise ValueError(f"{path.parent} holds a run of another configuration ({path.name}); give another folder")
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    unfinished = path.with_name(path.name + ".incomplete")
-    torch.save(content, unfinished)
-    os.replace(unfinished, path)
-
-
-def _write_log(path: Path, rows: list[list[float]]) -> None:
-    unfinished = path.with_name(path.name + ".incomplete")
-    with unfinished.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows([f"{v:.6g}" for v in row] for row in rows)
-    os.replace(unfinished, path)
-
-
-def _board(folder: Path) -> Any:
-    """TensorBoard's writer, or None where it is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder))
+    with TemporarySibling(path).writing() as unfinished:
+        torch.save(content, unfinished)

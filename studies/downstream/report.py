@@ -13,7 +13,7 @@ from studies.common.report import Row, save_figure, write
 from studies.downstream.counts import QUARTERS
 from studies.downstream.data import SYSTEM, WORDS, Config
 from studies.downstream.figures import picture
-from studies.downstream.run import TARGETS, Run, by_arm
+from studies.downstream.run import Run, by_arm
 
 PAPER = {  # T5 of arXiv 2512.04924: by ratio and arm, own then gold; reflectivity PSNR in dB, depth RMSE in m
     (0.6, "poisson"): ((36.49, 0.072), (7.02, 1.654)),
@@ -46,13 +46,13 @@ def report(
         "stopped": sum(bool(result["training"]["stopped"]) for result in found.values()),
         "networks": len(found),
         "seconds": sum(result["training"]["seconds"] for result in found.values()),
-        "result": _rows(found),
+        "arms": list(by_arm(found)),
+        "spread": spread,
         "findings": {sbr: _finding(found, sbr) for sbr in dict.fromkeys(one.sbr for one in found)},
         "quarters": QUARTERS,
         "counts": counts,
         "words": WORDS,
-        "measures": _all(found),
-        "measured": _measured(found),
+        "measured": list(next(iter(found.values())).get("measured", ())),
         "pictures": pictures,
     }
     rows = [_csv_row(one, result) for one, result in found.items()]
@@ -67,21 +67,6 @@ def spread(values: list[float], digits: int) -> str:
     """Mean, and the standard deviation between seeds where there are several."""
     mean = f"{np.mean(values):.{digits}f}"
     return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
-
-
-def _rows(found: Mapping[Run, Any]) -> list[Row]:
-    rows: list[Row] = []
-    for arm, sbr, results in by_arm(found):
-        row: dict[str, Any] = {"SBR": f"{sbr:g}", "trained on": WORDS[arm], "seeds": len(results["depth"])}
-        for k, data in enumerate(("own", "gold")):
-            row[data] = " / ".join(
-                spread(_values(results[target], data, measure), digits)
-                for target, measure, digits in (("reflectivity", "psnr", 2), ("depth", "rmse", 3))
-            )
-            paper = PAPER.get((sbr, arm))
-            row[f"{data}, paper"] = "-" if paper is None else f"{paper[k][0]:.2f} / {paper[k][1]:.3f}"
-        rows.append(row)
-    return rows
 
 
 def _finding(found: Mapping[Run, Any], ratio: float) -> dict[str, Any]:
@@ -106,32 +91,6 @@ def _finding(found: Mapping[Run, Any], ratio: float) -> dict[str, Any]:
     if {"mars", "nearest"} <= set(arms):
         one["nearest"] = better("mars", "nearest", "reflectivity"), better("nearest", "mars", "depth")
     return one
-
-
-def _all(found: Mapping[Run, Any]) -> list[Row]:
-    rows: list[Row] = []
-    for arm, sbr, results in by_arm(found):
-        for target in TARGETS:
-            row: dict[str, Any] = {"SBR": f"{sbr:g}", "trained on": WORDS[arm], "target": target}
-            for data in ("own", "gold"):
-                for measure, digits in (("psnr", 2), ("ssim", 3), ("rmse", 4)):
-                    row[f"{measure.upper()}, {data}"] = spread(_values(results[target], data, measure), digits)
-            rows.append(row)
-    return rows
-
-
-def _measured(found: Mapping[Run, Any]) -> list[Row]:
-    rows: list[Row] = []
-    for arm, sbr, results in by_arm(found):
-        for name in results["depth"][0].get("measured", {}):
-            pair = [
-                spread([r["measured"][name][measure] for r in results[target]], digits)
-                for target, measure, digits in (("reflectivity", "psnr", 2), ("depth", "rmse", 3))
-            ]
-            rows.append(
-                {"SBR": f"{sbr:g}", "trained on": WORDS[arm], "scene": name, "PSNR, dB": pair[0], "RMSE, m": pair[1]}
-            )
-    return rows
 
 
 def _csv_row(one: Run, result: Any) -> Row:

@@ -7,7 +7,6 @@ was stopped goes on where it was.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 from mars_lidar import Scene
 from mars_lidar._base import checks
 from studies import OtherRunsError, Request, Tell
+from studies.common.report import save_whole
 from studies.downstream.counts import count_bias
-from studies.downstream.data import CONFIGS, SYSTEM, WORDS, Config, Simulators, crop, examples, rgbd_scenes
+from studies.downstream.data import CONFIGS, SYSTEM, Config, Simulators, crop, rgbd_scenes, truths
 
 TARGETS = ("reflectivity", "depth")
 RESULT, SHOWN, CONFIG, COUNTS = "result.json", "shown.npz", "config.json", "counts.json"
@@ -73,7 +73,7 @@ def run(request: Request) -> list[Path]:
     found = {one: json.loads((folder / one.name / RESULT).read_text()) for one in runs(config)}
     if not (folder / COUNTS).exists():
         request.tell("downstream: counts of every simulator on the test scenes")
-        _write(folder / COUNTS, json.dumps(count_bias(config, data.test, data.simulators), indent=2) + "\n")
+        save_whole(folder / COUNTS, json.dumps(count_bias(config, data.test, data.simulators), indent=2) + "\n")
     return report(request, folder, config, found, json.loads((folder / COUNTS).read_text()))
 
 
@@ -84,7 +84,7 @@ def fixed(folder: Path, config: Config) -> None:
     path = folder / CONFIG
     if path.exists() and path.read_text() != record:
         raise OtherRunsError(f"{folder} holds runs of another configuration ({CONFIG}); give another --out")
-    _write(path, record)
+    save_whole(path, record)
 
 
 class Data:
@@ -124,7 +124,7 @@ def train_and_test(one: Run, config: Config, data: Data, folder: Path, tell: Tel
     """Train a network, or go on with it, and leave its result in `folder`."""
     import torch
 
-    from studies.downstream.fit import fit, predict
+    from studies.downstream.fit import Examples, fit, predict
     from studies.downstream.unet import CubeUNet, Target
 
     target: Target = "depth" if one.target == "depth" else "reflectivity"
@@ -134,8 +134,8 @@ def train_and_test(one: Run, config: Config, data: Data, folder: Path, tell: Tel
     plan = config.plan(one.seed)
     fitted = fit(
         network,
-        examples(training, data.training, target, config),
-        examples(validation, data.validation, target, config),
+        Examples(training, truths(data.training, target, config)),
+        Examples(validation, truths(data.validation, target, config)),
         folder,
         plan,
         about=asdict(one),
@@ -156,7 +156,7 @@ def train_and_test(one: Run, config: Config, data: Data, folder: Path, tell: Tel
             for k, (name, scene) in enumerate(data.measured.items())
         }
     np.savez_compressed(folder / SHOWN, own=own_maps[0], gold=gold_maps[0])
-    _write(folder / RESULT, json.dumps(result, indent=2) + "\n")
+    save_whole(folder / RESULT, json.dumps(result, indent=2) + "\n")
 
 
 def errors(maps: NDArray[np.float32], scenes: list[Scene], target: str, config: Config) -> dict[str, float]:
@@ -176,22 +176,6 @@ def errors(maps: NDArray[np.float32], scenes: list[Scene], target: str, config: 
 
 def by_arm(found: Mapping[Run, Any]) -> Iterator[tuple[str, float, dict[str, list[Any]]]]:
     """Results by arm and ratio: of each target, one for each seed."""
-    keys = dict.fromkeys((one.sbr, one.arm) for one in found)
-    for sbr, arm in keys:
-        yield (
-            arm,
-            sbr,
-            {
-                target: [r for one, r in found.items() if (one.sbr, one.arm, one.target) == (sbr, arm, target)]
-                for target in TARGETS
-            },
-        )
-
-
-def _write(path: Path, text: str) -> None:
-    unfinished = path.with_name(path.name + ".incomplete")
-    unfinished.write_text(text, encoding="utf-8")
-    os.replace(unfinished, path)
-
-
-__all__ = ["RESULT", "SHOWN", "TARGETS", "WORDS", "Data", "Run", "by_arm", "errors", "fixed", "run", "runs"]
+    for sbr, arm in dict.fromkeys((one.sbr, one.arm) for one in found):
+        here = {one: result for one, result in found.items() if (one.sbr, one.arm) == (sbr, arm)}
+        yield arm, sbr, {target: [r for one, r in here.items() if one.target == target] for target in TARGETS}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from studies import Request
-from studies.common.report import Row, write
+from studies.common.report import Row, picked, write
 from studies.hardware import alarms, cases
 from studies.hardware.cases import AT_FLOOR, FULL, PIXELS, QUICK, Case
 from studies.hardware.mismatches import mismatches, sensitivities
@@ -75,11 +75,7 @@ def _csv_row(case: Case) -> Row:
         "registrations": light.summary.registrations,
         "realizations": found.realizations,
         "cycles": found.system.cycles,
-        "signal": light.signal,
-        "background": light.background,
-        "delay_ns": light.delay_ns,
-        "dead_time_ns": light.dead_time_ns,
-        "hold_off_ns": light.hold_off_ns,
+        **picked(light, "signal background delay_ns dead_time_ns hold_off_ns"),
         "signal_error": light.errors.get("signal", float("nan")),
         "background_error": light.errors["background"],
         "rapp_total": light.rapp.total,

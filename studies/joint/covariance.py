@@ -1,17 +1,13 @@
 """Study "joint-covariance": the histogram's covariance in closed form against simulation.
 
-The systems are random, and those of reference cases in JSON files, which hold, beside what study `reference` reads,
-``bins``, ``reals``, ``hist_mean``, ``hist_var``, ``hist_cov_lag1`` (each (bins,)), ``win_mean`` and ``win_var``, of the
-window of +-3 sigma around the delay.
+The systems are random, and those of reference cases (`reference`).
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +15,9 @@ from scipy import stats
 
 from mars_lidar import Flux, JointLaw, System, joint_law, simulate
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.joint_pixel import Pixel
 from studies import Request, Tell
 from studies.common import sample
-from studies.common.report import Row, write
+from studies.common.report import Row, picked, write
 
 PERIOD_NS = 100.0
 OFTEN = 500  # exposures that must differ from the rest before a z-score is as good as Gaussian
@@ -181,71 +176,10 @@ def variance_scores(x: FloatArray, variance: FloatArray) -> FloatArray:
     return np.asarray(np.log(second * len(x) / (len(x) - 1) / variance) / spread)
 
 
-def leading(law: JointLaw, weights: FloatArray) -> float:
-    """Variance of a window by the term that grows with the exposure alone, without start and end."""
-    assert isinstance(law._pixel, Pixel)
-    assert law._pixel.law is not None
-    return law._pixel.law.leading(np.repeat(weights, law.grid_bins // weights.size))
-
-
-def reference_case(path: Path) -> Outcome:
-    """A case simulated by another program, from its JSON file."""
-    case: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    signal, background, delay = float(case["S"]), float(case["B"]), case["tau"] * PERIOD_NS
-    size, bins = int(case["reals"]), int(case["bins"])
-    system = system_of(case["sigma"], case["dead"], case["cycles"], bins)
-    law = joint_law(signal, background, system, delay_ns=delay, tolerance=TOLERANCE)
-    edges = (case["tau"] + 3.0 * case["sigma"] * np.array([-1.0, 1.0])) % 1.0
-    fine = next(n for n in (400, 800, 1000, 2000, 4000, 8000) if np.abs(edges * n - np.round(edges * n)).max() < 1e-6)
-    first, last = np.round(edges * fine).astype(int)
-    window = ((np.arange(fine) - first) % fine < (last - first) % fine).astype(float)
-    wide = joint_law(signal, background, system.replace(bins=fine), delay_ns=delay, tolerance=TOLERANCE)
-    mean, variance = (float(v) for v in wide.window(window))
-    kurtosis = _excess(case["count"])
-    often = law.variance * size >= OFTEN
-    pairs = often & np.roll(often, -1)
-    # Bins are binomial-like: kurtosis that of a Poisson number, an upper bound below it
-    fourth = np.sqrt((2.0 + 1.0 / law.variance[often]) / size)
-    v, lag = law.variance, law.lag(1)
-    return Outcome(
-        name=path.stem,
-        settings={"S": signal, "B": background, "t_d": case["dead"], "cycles": float(case["cycles"])},
-        law=law,
-        window=window,
-        single={
-            "count, mean": (case["count_mean"] - law.count_mean) / float(np.sqrt(law.count_variance / size)),
-            "count, variance": float(np.log(case["count_var"] / law.count_variance) / np.sqrt(kurtosis / size)),
-            "window, mean": (case["win_mean"] - mean) / float(np.sqrt(variance / size)),
-            "window, variance": float(np.log(case["win_var"] / variance) / np.sqrt((2.0 + 1.0 / variance) / size)),
-        },
-        bins=np.asarray(np.log(np.array(case["hist_var"])[often] / v[often]) / fourth),
-        bin_index=np.flatnonzero(often),
-        lags=np.asarray(
-            ((np.array(case["hist_cov_lag1"]) - lag) / np.sqrt((v * np.roll(v, -1) + lag**2) / size))[pairs]
-        ),
-        lag_index=np.flatnonzero(pairs),
-        leading={
-            "count": law.count_variance,
-            "count simulated": float(case["count_var"]),
-            "count leading": leading(law, np.ones(bins)),
-            "window": variance,
-            "window simulated": float(case["win_var"]),
-            "window leading": leading(wide, window),
-        },
-    )
-
-
-def _excess(count: dict[str, int]) -> float:
-    """Fourth central moment over the squared variance, less one, of a table of counts."""
-    n, times = np.array([int(k) for k in count]), np.array(list(count.values()), float)
-    p = times / times.sum()
-    deviation = n - p @ n
-    return float(p @ deviation**4 / (p @ deviation**2) ** 2 - 1.0)
-
-
 def run(request: Request) -> list[Path]:
     """Compare, draw and write; returns the paths written."""
     from studies.joint.covariance_figures import figure
+    from studies.joint.reference import reference_case
 
     settings = QUICK if request.quick else FULL
     systems = random_systems(settings, request.tell)
@@ -309,17 +243,13 @@ def _row(o: Outcome) -> Row:
     return {
         "name": o.name,
         **given,
-        "count_mean": o.law.count_mean,
-        "count_variance": o.law.count_variance,
+        **picked(o.law, "count_mean count_variance"),
         **{"z_" + name.replace(", ", "_").replace(" ", "_"): o.single.get(name, "") for name in _SINGLE},
         "bins": o.bins.size,
-        "rms_z_bins": float(np.sqrt(np.mean(o.bins**2))) if o.bins.size else "",
+        "rms_z_bins": _rms(o.bins) if o.bins.size else "",
         "lags": o.lags.size,
-        "rms_z_lags": float(np.sqrt(np.mean(o.lags**2))) if o.lags.size else "",
+        "rms_z_lags": _rms(o.lags) if o.lags.size else "",
         "worst_z": worst,
         "worst_of": what,
-        "grid_bins": o.law.grid_bins,
-        "movement": o.law.movement,
-        "sweeps": o.law.sweeps,
-        "settled": o.law.settled,
+        **picked(o.law, "grid_bins movement sweeps settled"),
     }

@@ -17,7 +17,7 @@ from scipy import stats
 
 from mars_lidar._base.types import FloatArray
 from studies import Request
-from studies.common.report import Row, write
+from studies.common.report import Row, picked, write
 from studies.common.sample import PERIOD_NS
 from studies.joint import classifiers, outcomes
 from studies.joint.outcomes import ENGINES, FULL, QUICK, RATIOS, TESTS, Outcome, Settings
@@ -182,12 +182,7 @@ def _csv_row(o: Outcome) -> Row:
     row: dict[str, object] = {
         "case": c.name,
         "random": int(o.random),
-        "signal": c.signal,
-        "background": c.background,
-        "dead": c.dead,
-        "delay": c.delay,
-        "sigma": c.sigma,
-        "cycles": c.cycles,
+        **picked(c, "signal background dead delay sigma cycles"),
         "engine": o.engine,
         "given_to_exact": int(o.handed),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -49,18 +50,15 @@ class NeuralEngine(Engine):
     any_system = False
 
     def __init__(self, model: NeuralMap | str | Path | None = None, *, level: str = "") -> None:
-        self._model: Any = model
+        self._given = model
         self.level = level
 
-    @property
+    @cached_property
     def model(self) -> NeuralMap:
         """The map, read when first asked for."""
-        if self._model is None:
-            self._model = NeuralMap.example()
-        elif not isinstance(self._model, NeuralMap):
-            self._model = NeuralMap.load(self._model)
-        network: NeuralMap = self._model
-        return network
+        if self._given is None:
+            return NeuralMap.example()
+        return self._given if isinstance(self._given, NeuralMap) else NeuralMap.load(self._given)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from mars_lidar import System
-from mars_lidar._base.files import TemporarySibling
+from mars_lidar._base import files
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
@@ -24,9 +24,6 @@ from studies.neural.pairs import FluxRange
 _FORMAT = 1
 _BATCH = 32  # always filled up to: the answer to a flux must not depend on what else is asked
 _TOLERANCE = 1e-9  # relative, of the range of fluxes
-_EXAMPLE = Path(__file__).with_name(
-    "example.npz"
-)  # for period 133.33 ns, dead time 75 ns, 1024 bins, Gaussian pulse of sigma 0.5 ns
 # what the stationary chain depends on; any number of cycles, and any start, is served
 _FIELDS = ("period_ns", "bins", "pulse", "detector")
 
@@ -130,7 +127,7 @@ class NeuralMap:
             "record": self.record,
         }
         weights = {name: value.cpu().numpy() for name, value in self.network.state_dict().items()}
-        with TemporarySibling(target).writing() as unfinished, unfinished.open("wb") as file:
+        with files.TemporarySibling(target).writing() as unfinished, unfinished.open("wb") as file:
             np.savez_compressed(file, header=np.array(json.dumps(header)), **weights)
 
     @classmethod
@@ -157,14 +154,10 @@ class NeuralMap:
         return cls(system, fluxes, network, header["record"])
 
     @staticmethod
+    @lru_cache(maxsize=1)
     def example() -> NeuralMap:
         """The network of this folder: period 133.33 ns, dead time 75 ns, 1024 bins, pulse of sigma 0.5 ns."""
-        return _example()
-
-
-@lru_cache(maxsize=1)
-def _example() -> NeuralMap:
-    return NeuralMap.load(_EXAMPLE)
+        return NeuralMap.load(Path(__file__).with_name("example.npz"))
 
 
 def check_target(path: str | Path, overwrite: bool) -> Path:
@@ -172,8 +165,5 @@ def check_target(path: str | Path, overwrite: bool) -> Path:
     target = Path(path)
     if target.suffix != ".npz":
         raise ValueError(f"path must end in .npz, got {str(path)!r}")
-    if target.exists() and not overwrite:
-        raise FileExistsError(f"{target} exists already; choose another name or give --overwrite")
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"{target} cannot be written: there is no folder {target.parent}")
+    files.check_target(target, folder=False, overwrite=overwrite)
     return target

@@ -9,7 +9,7 @@ import numpy as np
 
 from mars_lidar import System
 from mars_lidar._base import checks
-from mars_lidar._base.types import FloatArray, Progress
+from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import PhaseChain
 from mars_lidar.statistics.renewal import row_moments
 
@@ -96,16 +96,8 @@ class Training:
     def __post_init__(self) -> None:
         if not isinstance(self.fluxes, FluxRange):
             raise TypeError(f"fluxes must be a FluxRange, got {self.fluxes!r}")
-        for name, most in (
-            ("pairs", 10**7),
-            ("held_out", 10**6),
-            ("steps", 10**7),
-            ("batch", 10**5),
-            ("every", 10**7),
-            ("width", 256),
-            ("code", 4096),
-        ):
-            checks.integer(name, getattr(self, name), low=1, high=most)
+        for name in ("pairs", "held_out", "steps", "batch", "every", "width", "code"):
+            checks.integer(name, getattr(self, name), low=1, high=10**7)
         checks.integer("seed", self.seed, low=0, high=2**63 - 1)
 
 
@@ -119,12 +111,10 @@ class Pairs:
     mean_wait: FloatArray
 
     @classmethod
-    def of(cls, photons: FloatArray, system: System, progress: Progress | None = None) -> Pairs:
+    def of(cls, photons: FloatArray, system: System) -> Pairs:
         """The chain's answer to each flux (P, bins)."""
         pdf, wait = np.empty_like(photons), np.empty_like(photons)
         for k, row in enumerate(photons):
             chain = PhaseChain(row, system.dead_time_periods)
             pdf[k], wait[k] = chain.stationary().pdf, row_moments(chain)[0]
-            if progress is not None and k % 64 == 0:
-                progress(k, len(photons))
         return cls(photons, pdf, wait, (pdf * wait).sum(-1))

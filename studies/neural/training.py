@@ -14,8 +14,8 @@ from torch import Tensor
 
 from mars_lidar import System
 from mars_lidar._base import checks
-from mars_lidar._base.types import Progress
 from mars_lidar.statistics.gate import require_mode
+from studies.common.report import save_csv, save_figure
 from studies.neural.model import NeuralMap
 from studies.neural.network import PdfAutoencoder, canonical, one_thread, rolled
 from studies.neural.pairs import Pairs, Training
@@ -66,7 +66,6 @@ def train(
     system: System,
     training: Training | None = None,
     *,
-    progress: Progress | None = None,
     tell: Callable[[Point], object] | None = None,
 ) -> Trained:
     """Train the map of a system; the loss is the total variation to the chain plus the relative error of the mean.
@@ -77,8 +76,6 @@ def train(
         Mode ``"nonparalyzable"``, at least 128 bins, a multiple of 64. Cycles and start do not matter.
     training
         Default: under two minutes on one core for 1024 bins.
-    progress
-        Called as ``progress(done, total)``; an exception from it stops the training.
     tell
         Called after each validation.
     """
@@ -89,21 +86,17 @@ def train(
     system = system.detected()
     checks.integer("bins of the neural map", system.bins, low=_MIN_BINS, high=2**16)
     with one_thread():
-        return _train(system, chosen, progress, tell)
+        return _train(system, chosen, tell)
 
 
-def _train(
-    system: System, chosen: Training, progress: Progress | None, tell: Callable[[Point], object] | None
-) -> Trained:
+def _train(system: System, chosen: Training, tell: Callable[[Point], object] | None) -> Trained:
     torch.manual_seed(chosen.seed)
     network = PdfAutoencoder(system.bins, system.dead_time_periods, chosen.width, chosen.code)
     began, used = time.monotonic(), time.process_time()
-    total = chosen.steps + (chosen.pairs + chosen.held_out) // 16  # a step costs what some 16 pairs do
     learn_on, held_out = (
         _Tensors.of(Pairs.of(chosen.fluxes.draw(system, n, np.random.default_rng([chosen.seed, k])), system))
         for k, n in ((1, chosen.pairs), (2, chosen.held_out))
     )
-    made = total - chosen.steps
     mean_pdf = learn_on.pdf.mean(0)
     unconditional = float(0.5 * (held_out.pdf - mean_pdf).abs().sum(-1).mean())
     optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=1e-4)
@@ -120,8 +113,6 @@ def _train(
         optimizer.step()
         schedule.step()
         losses.append(float(loss.detach()))
-        if progress is not None:
-            progress(made + step, total)
         if step % chosen.every == 0 or step == chosen.steps:
             point = _validate_on(network, held_out, step, time.monotonic() - began, float(np.mean(losses)))
             curve.append(point)
@@ -170,19 +161,9 @@ def _validate_on(network: PdfAutoencoder, held_out: _Tensors, step: int, seconds
 
 def save_curves(trained: Trained, stem: Path) -> list[Path]:
     """Write the validation curve as `stem`.csv and `stem`.png; returns the paths."""
-    import csv
-    from dataclasses import astuple, fields
-
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    table = stem.with_suffix(".csv")
-    with table.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([field.name for field in fields(Point)])
-        writer.writerows([f"{v:.6g}" if isinstance(v, float) else v for v in astuple(p)] for p in trained.curve)
     figure = Figure(figsize=(6.4, 3.6), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     steps = [p.step for p in trained.curve]
     for name, words in (("tv_mean", "mean"), ("tv_95", "95 %"), ("tv_max", "largest")):
@@ -193,6 +174,5 @@ def save_curves(trained: Trained, stem: Path) -> list[Path]:
     axes.set(yscale="log", xlabel="step", ylabel="on held-out fluxes", ylim=(1e-5, 1.0))
     axes.legend(fontsize=7, ncols=2, frameon=False, loc="lower left")
     axes.grid(alpha=0.3)
-    picture = stem.with_suffix(".png")
-    figure.savefig(picture, metadata={"Software": None})
-    return [table, picture]
+    rows = [vars(point) for point in trained.curve]
+    return [save_csv(stem.with_suffix(".csv"), rows), save_figure(stem.with_suffix(".png"), figure)]

@@ -11,7 +11,7 @@ from mars_lidar.plot.style import COLOURS, INK, MUTED, style
 from studies.common.draw import panels
 from studies.common.report import save_figure
 from studies.runtime.contenders import NUMPY, TABLED
-from studies.runtime.run import Point, Settings
+from studies.runtime.timing import Point, Settings
 
 PAPER_TEASER = {"poisson": 0.2, TABLED: 0.3, "sequential": 16.1}  # seconds, of another workload
 _COLOURS = {

@@ -10,7 +10,6 @@ import math
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,6 @@ from mars_lidar.light.timestamps import Timestamps
 from mars_lidar.simulate import simulate_timestamps
 from studies import Tell
 
-Law = Literal["normal", "exponential"]
 ESTIMATES = ("dead time", "jitter", "background", "signal", "delay", "width", "all light, any shape")
 FLAT = "flat"  # told where no signal is seen
 _MOST_BINS = 2**20  # of a stream, as a file of others has them
@@ -251,60 +249,3 @@ def outcomes(settings: Settings, tell: Tell) -> list[Outcome]:
                 alarmed = sum(bool(one.alarms) for one in found)
                 tell(f"streams: {number + 1} of {settings.streams}, {alarmed} false alarms")
     return found
-
-
-def tail(pull: float, law: Law) -> float:
-    """Probability of a pull of more than this size."""
-    return math.exp(-pull) if law == "exponential" else math.erfc(pull / math.sqrt(2.0))
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """Pulls of an estimate: `stated` finite errors, shares within 1 and 2 of them, the largest, how many beyond 5.
-
-    `law`: of the pulls, normal, or exponential for a dead time that no interval has shown to be less; `p`: of as few
-    within 1 and 2, and of one as large, if errors are at least what they are stated to be; `values`: the pulls' sizes.
-    """
-
-    name: str
-    law: Law
-    stated: int
-    within_1: float
-    within_2: float
-    largest: float
-    beyond_5: int
-    p: dict[str, float]
-    values: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, name: str, values: list[float], law: Law = "normal") -> Coverage:
-        """Of the pulls of many streams, NaN where no error is stated."""
-        from scipy.stats import binom
-
-        pulls = np.abs(values)
-        pulls = pulls[np.isfinite(pulls)]
-        number = int(pulls.size)
-
-        inside = [int((pulls < limit).sum()) for limit in (1.0, 2.0)]
-        p = {
-            f"{name}, within {limit:g}": float(binom.cdf(count, number, 1.0 - tail(limit, law)))
-            for limit, count in zip((1.0, 2.0), inside, strict=True)
-        }
-        largest = float(pulls.max(initial=0.0))
-        p[f"{name}, largest"] = min(1.0, number * tail(largest, law))
-        shares = [count / max(number, 1) for count in inside]
-        return cls(name, law, number, shares[0], shares[1], largest, int((pulls > 5.0).sum()), p, pulls)
-
-
-def coverage(found: list[Outcome]) -> list[Coverage]:
-    """Of all estimates; of dead times by the way they were found, which have errors of another law."""
-    by = {"edge": "dead time, by the edge", "smallest interval": "dead time, by the smallest interval"}
-    covered = []
-    for name in ESTIMATES:
-        if name != "dead time":
-            covered.append(Coverage.of(name, [one.pulls[name] for one in found]))
-            continue
-        for way, text in by.items():
-            law: Law = "normal" if way == "edge" else "exponential"
-            covered.append(Coverage.of(text, [one.pulls[name] for one in found if one.by == way], law))
-    return covered

@@ -15,7 +15,7 @@ from mars_lidar import System, Table
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, style
 from mars_lidar.statistics import Exposure, exposure_moments
-from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf
 from studies import Request, Tell
 from studies.common.draw import panels
@@ -112,7 +112,7 @@ def _errors(
     # one pixel at a time: no copies of the whole table
     mixed = (w @ shapes[r].astype(np.float64) for r, w in zip(rows, weights, strict=True))
     # the law of four cumulants for both, so that what is left is the lookup's
-    laws = ([Pmf(w.first, w.pmf) for w in matched_pmf(c)] for c in (cumulants, truth.cumulants))
+    laws = (matched_pmf(c) for c in (cumulants, truth.cumulants))
     return {
         "mean": np.abs(cumulants[:, 0] - mean) / np.sqrt(variance),
         "variance": np.abs(cumulants[:, 1] / variance - 1.0),

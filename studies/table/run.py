@@ -11,7 +11,7 @@ from mars_lidar import QuantisationError, System, Table
 from mars_lidar.table import LawError
 from mars_lidar.table.axes import PAPER_GRID
 from studies import Request
-from studies.common.report import Row, write
+from studies.common.report import Row, picked, write
 from studies.common.sample import system_of
 
 _SEED = 20263
@@ -53,22 +53,12 @@ class Case:
 
     def quantisation(self) -> list[Row]:
         """Lines of the second table: bilinear, nearest."""
+        at_delay = "mean_rms mean_max variance_max third_max fourth_max shape_mean shape_max"
+        delayed = "delayed_mean_max delayed_variance_max delayed_shape_max"
+        found = [picked(errors, f"interpolation {at_delay} {delayed}") for errors in self.errors]
         return [
-            {
-                **self._name(),
-                "interpolation": e.interpolation,
-                "mean rms": e.mean_rms,
-                "mean max": e.mean_max,
-                "variance max": e.variance_max,
-                "third max": e.third_max,
-                "fourth max": e.fourth_max,
-                "shape mean": e.shape_mean,
-                "shape max": e.shape_max,
-                "delayed: mean max": e.delayed_mean_max,
-                "delayed: variance max": e.delayed_variance_max,
-                "delayed: shape max": e.delayed_shape_max,
-            }
-            for e in self.errors
+            self._name() | {key.replace("delayed_", "delayed: ").replace("_", " "): v for key, v in row.items()}
+            for row in found
         ]
 
     def exposures(self) -> Row:
@@ -96,7 +86,7 @@ class Case:
             "worst B": self.law.worst_background,
         }
 
-    def _name(self) -> Row:
+    def _name(self) -> dict[str, Any]:
         return {
             "t_d, ns": self.system.detector.dead_time_ns,
             "start": self.system.start,

@@ -15,6 +15,7 @@ from mars_lidar.statistics import mean_histogram
 from studies import Request
 from studies.common.draw import panels
 from studies.common.report import save_figure, write
+from studies.common.sample import settings_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,7 +72,9 @@ def run(request: Request) -> list[Path]:
         shown.append(seen_by(name, exposures))
     rows = [row(each) for each in shown]
     figures = [_draw(request.out / "transients.png", shown)]
-    facts = {"settings": _settings(exposures), "rows": rows}
+    light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND, "dead_time_ns": DEAD_NS}
+    settings = settings_of(view(DETECTORS["non-paralyzable"]), light, exposures, SEED)
+    facts = {"settings": settings, "rows": rows}
     return write(request, "transients", __name__, "report", facts, rows=rows, figures=figures)
 
 
@@ -116,10 +119,3 @@ def _panel(ax: Axes, system: System, arrivals: FloatArray, shown: list[Seen]) ->
         simulated = np.where(each.simulated > 0, each.simulated * scale, np.nan)
         ax.plot(system.time_ns, simulated, ".", ms=1.8, color=colour)
         ax.plot(system.time_ns, each.expected * scale, color=colour, lw=0.8, label=each.name)
-
-
-def _settings(exposures: int) -> dict[str, Any]:
-    system = view(DETECTORS["non-paralyzable"])
-    told = {field.name: getattr(system, field.name) for field in dataclasses.fields(system) if field.name != "detector"}
-    light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND}
-    return told | light | {"dead_time_ns": DEAD_NS, "exposures": exposures, "engine": "exact", "seed": SEED}

@@ -13,9 +13,8 @@ from mars_lidar.engines import MarsEngine
 from mars_lidar.engines.counts import Matched, Mended, Streams, Tabulated
 from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import Entries
-from mars_lidar.statistics.pmf import Window
+from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.table import Table
-from mars_lidar.table.law import distance
 
 AIM = 0.002
 SYSTEM = ml.System(
@@ -56,16 +55,16 @@ def laws_of(flux: ml.Flux, system: ml.System, **options: str) -> tuple[Mended, E
     return laws, entries, task.report
 
 
-def window(laws: Mended, k: int) -> Window:
+def window(laws: Mended, k: int) -> Pmf:
     law = int(laws.others.law[k])
     cumulative = laws.others.cumulative[laws.others.offsets[law] : laws.others.offsets[law + 1]]
-    return Window(int(laws.others.first[law]), np.diff(cumulative, prepend=0.0), 0.0)
+    return Pmf(int(laws.others.first[law]), np.diff(cumulative, prepend=0.0))
 
 
-def exact(flux: ml.Flux, system: ml.System, pixel: int) -> Window:
+def exact(flux: ml.Flux, system: ml.System, pixel: int) -> Pmf:
     delay = float(flux.delay_ns.ravel()[pixel])
     law = ml.count_law(flux.signal.ravel()[pixel], flux.background.ravel()[pixel], system, delay_ns=delay)
-    return Window(int(law.support[0]), law.pmf, 0.0)
+    return Pmf(int(law.support[0]), law.pmf)
 
 
 @pytest.mark.parametrize(("start", "cycles"), [("armed", 150), ("armed", 400), ("stationary", 150)])
@@ -74,7 +73,7 @@ def test_between_the_entries_the_law_is_exact(start: str, cycles: int):
     laws, entries, report = laws_of(flux, system)
     assert report["pixels_exact_count"] == report["laws_evaluated"] == laws.at.size == flux.signal.size
     some = range(0, laws.at.size, max(1, laws.at.size // 12))
-    errors = [distance(window(laws, k), exact(flux, system, int(entries.pixels[laws.at[k]]))) for k in some]
+    errors = [total_variation(window(laws, k), exact(flux, system, int(entries.pixels[laws.at[k]]))) for k in some]
     assert max(errors) < 1e-4  # far below the aim: only the grid of the nearest entries is the table's
 
 
@@ -84,7 +83,7 @@ def test_the_four_cumulants_would_not_do():
     found = lut.lookup(flux.signal, flux.background, delay_ns=flux.delay_ns)
     from mars_lidar.statistics.matched import matched_pmf
 
-    off = [distance(law, exact(flux, SYSTEM, k)) for k, law in enumerate(matched_pmf(found.cumulants)[:80])]
+    off = [total_variation(law, exact(flux, SYSTEM, k)) for k, law in enumerate(matched_pmf(found.cumulants)[:80])]
     assert max(off) > AIM
 
 
@@ -103,11 +102,11 @@ def test_at_the_entries_the_table_keeps_the_law(start: str):
     for k in range(0, laws.at.size, max(1, laws.at.size // 6)):
         pixel = int(entries.pixels[laws.at[k]])
         # evaluated on another grid: that of 64 bins in the table, that of a single bin here
-        assert distance(window(laws, k), exact(flux, system, pixel)) < 1e-6
+        assert total_variation(window(laws, k), exact(flux, system, pixel)) < 1e-6
     matched = matched_pmf(found.cumulants)
     for row in np.flatnonzero(sure)[::16]:
         law = ml.count_law(lut.signal[row // lut.background.size], lut.background[row % lut.background.size], system)
-        assert distance(matched[row], Window(int(law.support[0]), law.pmf, 0.0)) <= AIM
+        assert total_variation(matched[row], Pmf(int(law.support[0]), law.pmf)) <= AIM
 
 
 def test_other_delays_and_exposures_are_not_taken_from_the_entries():
@@ -125,7 +124,7 @@ def test_the_nearest_entry_gives_its_own_law():
     pixel = entries.pixels[laws.at[0]]
     signal, background = lut.signal[node // lut.background.size], lut.background[node % lut.background.size]
     law = ml.count_law(signal, background, SYSTEM, delay_ns=float(flux.delay_ns.ravel()[pixel]))
-    assert distance(window(laws, 0), Window(int(law.support[0]), law.pmf, 0.0)) < 1e-4
+    assert total_variation(window(laws, 0), Pmf(int(law.support[0]), law.pmf)) < 1e-4
 
 
 def test_counts_follow_the_exact_law():
@@ -135,8 +134,8 @@ def test_counts_follow_the_exact_law():
     cube = ml.simulate(one, SYSTEM, engine="mars", table=table(), realizations=4000, report=report)
     assert (report["pixels_exact_count"], report["laws_evaluated"]) == (8, 1)  # alike: evaluated once
     law = exact(one, SYSTEM, 0)
-    pmf = np.zeros(law.first + law.pmf.size)
-    pmf[law.first :] = law.pmf
+    pmf = np.zeros(law.first + law.p.size)
+    pmf[law.first :] = law.p
     require({"count law": counts_against_law(cube.sum(-1).ravel(), pmf)}, "doubted pixel from a table")
 
 
@@ -176,7 +175,7 @@ def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
 
 def test_a_part_of_mended_laws_is_mended_alike():
     cumulants = np.tile([[40.0, 3.0, -0.7, 0.3]], (9, 1))
-    other = Tabulated.of([Window(7, np.array([0.5, 0.5]), 0.0)], np.zeros(3, np.int64))
+    other = Tabulated.of([Pmf(7, np.array([0.5, 0.5]))], np.zeros(3, np.int64))
     laws = Mended(Matched(cumulants), np.array([1, 4, 8]), other)
     streams = Streams(np.arange(9, dtype=np.uint32), 4, 0, 1, 1)
     whole = laws.draw(streams)

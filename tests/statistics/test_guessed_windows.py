@@ -6,9 +6,9 @@ import pytest
 import mars_lidar as ml
 from mars_lidar.statistics import pmf as _pmf
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.pmf import exact_windows, guessed_windows
-from mars_lidar.table.law import distance
 
 SYSTEM = ml.System(
     period_ns=100.0,
@@ -39,7 +39,7 @@ def test_they_are_the_exact_ones(monkeypatch):
     for guess, truth in zip(
         guessed_windows(some, cumulants, bins, 1, told.append), exact_windows(some, cumulants, bins, 1), strict=True
     ):
-        assert distance(guess, truth) < 1e-11
+        assert total_variation(guess, truth) < 1e-11
     assert not asked
     assert told[-1] == some.size
 
@@ -60,5 +60,5 @@ def test_a_wrong_guess_is_noticed(monkeypatch, wrong):
     asked = alone(monkeypatch)
     guesses = guessed_windows(some, np.asarray(wrong(cumulants)), bins, 1)
     for guess, truth in zip(guesses, exact_windows(some, cumulants, bins, 1), strict=True):
-        assert distance(guess, truth) < 1e-6
+        assert total_variation(guess, truth) < 1e-6
     assert asked

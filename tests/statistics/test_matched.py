@@ -8,9 +8,9 @@ from harness import goodness, require
 from scipy import stats
 
 import mars_lidar as ml
+from mars_lidar.statistics.count_window import gaussian_window
 from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.statistics.matched import matched_counts, matched_pmf, trusted
-from mars_lidar.statistics.pmf import Window
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.count_law.matched import QUICK
@@ -30,7 +30,7 @@ FORMS = {
 
 
 def cumulants_of(window):
-    n, p = window.first + np.arange(window.pmf.size), window.pmf
+    n, p = window.first + np.arange(window.p.size), window.p
     mean = (p * n).sum()
     m2, m3, m4 = ((p * (n - mean) ** k).sum() for k in (2, 3, 4))
     return np.array([mean, m2, m3, m4 - 3 * m2**2])
@@ -50,10 +50,7 @@ def exact(dead, cycles, signal, background, start="armed"):
 
 def distances(law):
     return np.array(
-        [
-            total_variation(Pmf(w.first, w.pmf), Pmf(int(law.support[k, 0]), law.pmf[k]))
-            for k, w in enumerate(matched_pmf(law.cumulants))
-        ]
+        [total_variation(w, Pmf(int(law.support[k, 0]), law.pmf[k])) for k, w in enumerate(matched_pmf(law.cumulants))]
     )
 
 
@@ -76,7 +73,7 @@ def test_close_to_the_exact_law():
 
 def test_unlike_a_gaussian():
     law = exact(0.6375, 1000, np.array([0.001, 9.0]), np.array([0.002, 0.01]))
-    best = [Pmf.gaussian(*k[:2]) for k in law.cumulants]
+    best = [gaussian_window(*k[:2]) for k in law.cumulants]
     away = [total_variation(g, Pmf(int(law.support[k, 0]), law.pmf[k])) for k, g in enumerate(best)]
     assert min(away) > 10 * AIM
     assert distances(law).max() < AIM
@@ -86,8 +83,8 @@ def test_unlike_a_gaussian():
 def test_probabilities_have_the_cumulants(name):
     asked = np.array(FORMS[name])
     window = matched_pmf([asked])[0]
-    assert window.pmf.min() >= 0
-    assert window.pmf.sum() == pytest.approx(1, abs=1e-12)
+    assert window.p.min() >= 0
+    assert window.p.sum() == pytest.approx(1, abs=1e-12)
     found, spread = cumulants_of(window), np.sqrt(asked[1])
     scale = np.array([1.0, spread, spread**2, spread**3]) * spread
     # the quantile of the smooth form is a series, the others are exact
@@ -101,18 +98,18 @@ def test_draws_follow_the_listed_probabilities(name):
     drawn = matched_counts([FORMS[name]], random.random((1, 400_000)))[0]
     window = matched_pmf([FORMS[name]])[0]
     assert drawn.min() >= window.first
-    assert drawn.max() < window.first + window.pmf.size
-    observed = np.bincount(drawn - window.first, minlength=window.pmf.size)
-    require({"frequencies": goodness(observed, drawn.size * window.pmf)}, f"matched law, {name}")
+    assert drawn.max() < window.first + window.p.size
+    observed = np.bincount(drawn - window.first, minlength=window.p.size)
+    require({"frequencies": goodness(observed, drawn.size * window.p)}, f"matched law, {name}")
 
 
 @pytest.mark.parametrize("name", FORMS)
 def test_one_inversion(name):
     """The count at u is the quantile: at each edge of the distribution function it steps by one."""
     window = matched_pmf([FORMS[name]])[0]
-    below = np.cumsum(window.pmf)
+    below = np.cumsum(window.p)
     count = window.first + np.arange(below.size)
-    inside = (below > 1e-9) & (below < 1 - 1e-9) & (window.pmf > 1e-9) & (np.append(window.pmf[1:], 0) > 1e-9)
+    inside = (below > 1e-9) & (below < 1 - 1e-9) & (window.p > 1e-9) & (np.append(window.p[1:], 0) > 1e-9)
     edge = below[inside]
     assert matched_counts([FORMS[name]], [edge * (1 - 1e-11)])[0].tolist() == count[inside].tolist()
     assert matched_counts([FORMS[name]], [edge * (1 + 1e-11)])[0].tolist() == (count[inside] + 1).tolist()
@@ -140,9 +137,9 @@ def test_normal_quantile():
 @pytest.mark.parametrize("mean", [*np.geomspace(1e-9, 1e9, 19), 0.5, 3.0, 8.9, 9.1, 30.0])
 def test_poisson(mean):
     window = matched_pmf([[mean] * 4])[0]
-    n = window.first + np.arange(window.pmf.size)
+    n = window.first + np.arange(window.p.size)
     p = stats.poisson.pmf(n, mean)
-    assert 0.5 * (np.abs(window.pmf - p).sum() + 1 - p.sum()) < 5e-4
+    assert 0.5 * (np.abs(window.p - p).sum() + 1 - p.sum()) < 5e-4
     assert trusted([[mean] * 4])[0]
 
 
@@ -152,15 +149,15 @@ def test_binomial_of_few_cycles(cycles, fires):
     """A locked pixel of a few cycles."""
     q, v = 1 - fires, cycles * fires * (1 - fires)
     window = matched_pmf([(cycles * fires, v, v * (q - fires), v * (1 - 6 * fires * q))])[0]
-    p = stats.binom.pmf(window.first + np.arange(window.pmf.size), cycles, fires)
-    assert 0.5 * np.abs(window.pmf - p).sum() < 5e-3
+    p = stats.binom.pmf(window.first + np.arange(window.p.size), cycles, fires)
+    assert 0.5 * np.abs(window.p - p).sum() < 5e-3
 
 
 def test_extremes():
-    assert matched_pmf([(0.0, 0.0, 0.0, 0.0)])[0].pmf[0] == 1
+    assert matched_pmf([(0.0, 0.0, 0.0, 0.0)])[0].p[0] == 1
     assert matched_counts([(0.0, 0.0, 0.0, 0.0)], [[1e-300, 1 - 1e-16]]).tolist() == [[0, 0]]
     certain = matched_pmf([(41.0, 0.0, 0.0, 0.0)])[0]
-    assert (certain.first, certain.pmf[0]) == (41, 1.0)
+    assert (certain.first, certain.p[0]) == (41, 1.0)
     # a variance that no integer of this mean can have: the nearest law keeps the mean
     least = matched_pmf([(41.3, 0.1, 0.0, 0.0)])[0]
     np.testing.assert_allclose(cumulants_of(least)[:2], [41.3, 0.21])
@@ -179,14 +176,14 @@ def test_cumulants_that_no_count_has():
     cells = np.stack([mean, variance, *others], axis=-1)
     for window in matched_pmf(cells):
         assert window.first >= 0
-        assert window.pmf.min() >= 0
-        assert abs(window.pmf.sum() - 1) < 1e-9
+        assert window.p.min() >= 0
+        assert abs(window.p.sum() - 1) < 1e-9
     u = np.sort(random.uniform(1e-16, 1 - 1e-16, (size, 9)), axis=1)
     counts = matched_counts(cells, u)
     assert (np.diff(counts, axis=1) >= 0).all()
     wild = [(5.0, 2.0, 1e300, -1e300), (5.0, 2.0, -1e300, 1e300), (1e-300, 1e-300, 0.0, 0.0), (5.0, 1e9, 0.0, 0.0)]
     for window in matched_pmf(wild):
-        assert abs(window.pmf.sum() - 1) < 1e-9
+        assert abs(window.p.sum() - 1) < 1e-9
 
 
 @pytest.mark.parametrize("atoms", [2, 3, 4, 5])
@@ -194,7 +191,7 @@ def test_laws_on_a_few_integers_keep_mean_and_variance(atoms):
     random = np.random.default_rng(atoms)
     p = random.dirichlet(np.full(atoms, 0.3), 2000)
     first = random.integers(0, 5000, 2000)
-    cells = np.array([cumulants_of(Window(int(f), q, 0.0)) for f, q in zip(first, p, strict=True)])
+    cells = np.array([cumulants_of(Pmf(int(f), q)) for f, q in zip(first, p, strict=True)])
     spread = np.sqrt(np.maximum(cells[:, 1], 1e-12))
     found = np.array([cumulants_of(window) for window in matched_pmf(cells)])
     assert (np.abs(found[:, 0] - cells[:, 0]) <= 0.02 * spread + 1e-6).all()
@@ -206,7 +203,7 @@ def test_next_to_no_step_at_the_change_of_form():
     steps = []
     for variance, third, fourth in ((9.0, -3.0, 1.0), (9.0, 8.0, 7.0), (0.7, -0.1, 0.02)):
         one, other = (matched_pmf([(40.3, variance * scale, third, fourth)])[0] for scale in (1 - 1e-9, 1 + 1e-9))
-        steps.append(total_variation(Pmf(one.first, one.pmf), Pmf(other.first, other.pmf)))
+        steps.append(total_variation(one, other))
     assert max(steps) < 0.01
 
 

@@ -99,8 +99,6 @@ def test_bad_input():
         CubeUNet(16, "albedo")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="cubes must be"):
         Examples(np.zeros((1, 4, 4, 8)), np.zeros((1, 4, 5), np.float32))
-    with pytest.raises(ValueError, match="unknown key 'step'"):
-        FitPlan.from_dict({"step": 3})
     with pytest.raises(ValueError, match="scale"):
         FitPlan(steps=1, scale=0.0)
 

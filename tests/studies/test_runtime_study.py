@@ -10,14 +10,14 @@ from scipy import stats
 import mars_lidar as ml
 from mars_lidar.engines import ANY_SYSTEM
 from studies.__main__ import main
-from studies.runtime import contenders
+from studies.runtime import contenders, timing
 from studies.runtime import run as runtime
 from studies.runtime.numpy_pipeline import STAGES, NumpyTable, Stages, synthesize
 
 
 @pytest.fixture(scope="module")
 def system():
-    return runtime.system(runtime.QUICK, 300).replace(bins=64)
+    return timing.system(timing.QUICK, 300).replace(bins=64)
 
 
 def test_files(tmp_path):
@@ -84,7 +84,7 @@ def test_table_wants_logarithmic_axes(system):
 
 def points(axis, contender, seconds, hits):
     return [
-        runtime.Point(axis, float(k), contender, s, "", float(h))
+        timing.Point(axis, float(k), contender, s, "", float(h))
         for k, (s, h) in enumerate(zip(seconds, hits, strict=True), 1)
     ]
 
@@ -112,7 +112,7 @@ def test_crossover():
 def test_points_that_would_take_too_long_are_left_out(monkeypatch):
     """A contender whose time grows with the square of the axis is stopped; its clock is ours."""
     clock = [0.0]
-    monkeypatch.setattr(runtime.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
 
     def prepare(flux, system, realizations):
         def run(seed, out):
@@ -121,9 +121,9 @@ def test_points_that_would_take_too_long_are_left_out(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(runtime, "contenders", lambda tables: [contenders.Contender("slow", "slow", prepare)])
-    axis = runtime.Axis("cycles", "cycles", (10.0, 100.0, 1000.0, 10_000.0), 2)
-    found = runtime.along(runtime.QUICK, axis, str)
+    monkeypatch.setattr(timing, "contenders", lambda tables: [contenders.Contender("slow", "slow", prepare)])
+    axis = timing.Axis("cycles", "cycles", (10.0, 100.0, 1000.0, 10_000.0), 2)
+    found = timing.along(timing.QUICK, axis, str)
     assert [p.seconds is not None for p in found] == [True, True, False, False]
     assert found[2].why == found[3].why == "predicted 6.31 s"
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.count_window import Pmf
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +119,10 @@ class Tabulated(CountLaws):
     law: IndexArray
 
     @classmethod
-    def of(cls, windows: Sequence[Window], law: IndexArray) -> Tabulated:
+    def of(cls, windows: Sequence[Pmf], law: IndexArray) -> Tabulated:
         """From the probabilities of each law."""
-        sizes = [window.pmf.size for window in windows]
-        sums = [np.cumsum(window.pmf) for window in windows]
+        sizes = [window.p.size for window in windows]
+        sums = [np.cumsum(window.p) for window in windows]
         return cls(
             np.array([window.first for window in windows], np.int64),
             np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),

@@ -10,7 +10,7 @@ from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import Entries, TableReader
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.count_window import Pmf
 from mars_lidar.statistics.pmf import guessed_windows
 
 
@@ -57,7 +57,7 @@ def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Fl
     return np.stack([signal, background, np.where(signal > 0.0, phase - np.floor(phase), 0.5)], axis=-1)
 
 
-def _kept(run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray) -> list[Window | None]:
+def _kept(run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray) -> list[Pmf | None]:
     """Laws that the table keeps: of its entries, for its own number of cycles, at its delay."""
     table = reader.table
     if run.task.system.cycles != table.entries.cycles:

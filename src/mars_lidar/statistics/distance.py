@@ -3,51 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.pmf import gaussian_window
+from mars_lidar.statistics.count_window import Pmf as Pmf
 
 _POOLED = 5.0  # expected counts below which cells of a G-test are pooled
 KL_FLOOR = 1e-12  # of a law's probabilities in a Kullback-Leibler divergence, which is infinite without
 _NEGLIGIBLE = 1e-10  # probability left out of the bootstrap's classes, in one class of its own
-
-
-@dataclass(frozen=True, eq=False)
-class Pmf:
-    """Probabilities (w,) of the counts `first`, `first` + 1, ...; of simulated counts their frequencies."""
-
-    first: int
-    p: FloatArray
-
-    @classmethod
-    def of_counts(cls, counts: NDArray[np.integer[Any]]) -> Pmf:
-        """Frequencies of simulated counts (n,)."""
-        first = int(counts.min())
-        return cls(first, np.bincount((counts - first).astype(np.int64)) / counts.size)
-
-    @classmethod
-    def gaussian(cls, mean: float, variance: float) -> Pmf:
-        """The normal law on the integers, as `count_law` understands it."""
-        window = gaussian_window(mean, variance)
-        return cls(window.first, window.pmf)
-
-    def on(self, low: int, high: int) -> FloatArray:
-        """Probabilities of the counts low .. high (inclusive)."""
-        out = np.zeros(high - low + 1)
-        begin, end = max(low, self.first), min(high, self.last)
-        if begin <= end:
-            out[begin - low : end - low + 1] = self.p[begin - self.first : end - self.first + 1]
-        return out
-
-    @property
-    def last(self) -> int:
-        """The largest count with an entry."""
-        return self.first + self.p.size - 1
 
 
 def total_variation(a: Pmf, b: Pmf) -> float:

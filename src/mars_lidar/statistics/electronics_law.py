@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.count_window import Pmf
 from mars_lidar.statistics.electronics import refined, without_effect
 from mars_lidar.statistics.electronics_grid import LAW_EFFORT, RecordGrid, RecordRun, Rows
 from mars_lidar.statistics.exposure import refined_moments
@@ -30,7 +30,7 @@ _SETTLED, _QUIET = 1e-11, 1e-17
 _LIKE_MOMENTS = 3.0  # times the tolerance by which the pmf's mean and variance may differ from those of the grid
 
 
-def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Window]:
+def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
     alike, slower = without_effect(cells)
     if alike is not None:  # a pixel with the longer of the two dead times
@@ -41,9 +41,9 @@ def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Window]
     return [_window(alone.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
 
 
-def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Window:
+def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     if float(cell.total[0]) == 0.0:
-        return Window(0, np.ones(1), 0.0)
+        return Pmf(0, np.ones(1), 0.0)
     mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW_EFFORT)
     electronics = electronics_ns / cell.system.period_ns
     grids = [RecordGrid(cell, n, electronics, LAW_EFFORT) for n in (bins, bins // 2)]
@@ -73,7 +73,7 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Window:
         )
     pmf = np.maximum(pmf, 0.0)
     outside = _EDGE * ((first > 0) + (last < most)) * pmf.size
-    return Window(first, pmf / pmf.sum(), outside)
+    return Pmf(first, pmf / pmf.sum(), outside)
 
 
 def _folded(grid: RecordGrid, first: int, last: int, left: list[float]) -> FloatArray:

@@ -16,7 +16,7 @@ from mars_lidar.instrument.detector import MODES, Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import LAW_STEPS, Cells
-from mars_lidar.statistics.count_window import Window, gaussian_window, poisson_window
+from mars_lidar.statistics.count_window import Pmf, gaussian_window, poisson_window
 from mars_lidar.statistics.electronics_law import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
 from mars_lidar.statistics.gate import PLAIN
@@ -55,7 +55,7 @@ class CountLaw:
         self,
         method: str,
         cumulants: FloatArray,
-        windows: Callable[[], list[Window]],
+        windows: Callable[[], list[Pmf]],
         exposure: Exposure | None = None,
     ) -> None:
         self.method = method
@@ -74,7 +74,7 @@ class CountLaw:
         return self.cumulants[..., 1]
 
     @cached_property
-    def _windows(self) -> list[Window]:
+    def _windows(self) -> list[Pmf]:
         return self._evaluate()
 
     @cached_property
@@ -92,7 +92,7 @@ class CountLaw:
         """
         out = np.zeros((len(self._windows), self._width))
         for row, window in zip(out, self._windows, strict=True):
-            row[: window.pmf.size] = window.pmf
+            row[: window.p.size] = window.p
         return out.reshape(*self._shape, self._width)
 
     @cached_property
@@ -111,7 +111,7 @@ class CountLaw:
 
     @cached_property
     def _width(self) -> int:
-        return max(window.pmf.size for window in self._windows)
+        return max(window.p.size for window in self._windows)
 
     def __getstate__(self) -> dict[str, Any]:
         """The law with its probabilities: what evaluates them when first asked for does not go to other processes."""

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.count_window import Pmf
 
 _MAX_COUNTS = 2**24
 _MAX_MEAN = 1e15
 _OUTSIDE = 1.5e-15  # two normal tails beyond 8 standard deviations
 
 
-def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Window]:
+def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf]:
     """Probabilities of the laws on the integers n >= 0 that have four given cumulants.
 
     Parameters
@@ -31,7 +31,7 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Win
 
     Returns
     -------
-    list of Window
+    list of Pmf
         One for each cell.
 
     Raises
@@ -59,7 +59,7 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Win
     from mars_lidar._base.native import _core
 
     _core.matched_pmf(cumulants=given, first=first, start=start, out=flat, threads=team)
-    return [Window(int(first[k]), flat[start[k] : start[k + 1]].copy(), _OUTSIDE) for k in range(first.size)]
+    return [Pmf(int(first[k]), flat[start[k] : start[k + 1]].copy(), _OUTSIDE) for k in range(first.size)]
 
 
 def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | None = None) -> IndexArray:

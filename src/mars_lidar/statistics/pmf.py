@@ -17,7 +17,7 @@ from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.characteristic import Purse, TooLongError, characteristic
 from mars_lidar.statistics.count_window import TAIL
-from mars_lidar.statistics.count_window import Window as Window
+from mars_lidar.statistics.count_window import Pmf as Pmf
 from mars_lidar.statistics.count_window import gaussian_window as gaussian_window
 from mars_lidar.statistics.count_window import poisson_window as poisson_window
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
@@ -40,13 +40,13 @@ _QUIET = 1e-15  # of the transform of a wide law, that counts as 0
 _SHORT_VARIANCE, _SHORTER = 4.0, 6  # the exposure in which other peaks are looked for: variance, and how much shorter
 
 
-def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Window]:
+def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Pmf]:
     """Exact pmf of each cell, on the grid of `bins` (cells,) that its `cumulants` (cells, 4) needed."""
     if cells.system.dead_time_periods == 0.0:
         return [poisson_window(float(mean)) for mean in cumulants[:, 0]]
     cells = cells.resolved(1)
     dark = cells.total == 0.0
-    windows: list[Window | None] = [Window(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
+    windows: list[Pmf | None] = [Pmf(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
     for n in np.unique(bins[~dark]):
         index = np.flatnonzero((bins == n) & ~dark)
         cells.check_history(int(n))
@@ -66,7 +66,7 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
 
 def guessed_windows(
     cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int, waiting: Callable[[int], object] | None = None
-) -> list[Window]:
+) -> list[Pmf]:
     """Exact pmf of each cell where its cumulants (cells, 4) are known but roughly, as from a table.
 
     The support is guessed by them and the result tells whether the guess was right; where not, `exact_windows` of the
@@ -77,7 +77,7 @@ def guessed_windows(
     half = np.ceil(_REACH * spread + _MARGIN)
     size = (8.0 * np.ceil((2.0 * half + 1.0) / 8.0)).astype(np.int64)
     first = np.maximum(np.floor(cumulants[:, 0]) - half, 0.0).astype(np.int64)
-    windows: list[Window | None] = [None] * cells.size
+    windows: list[Pmf | None] = [None] * cells.size
     done = 0
     for n, width in np.unique(np.stack([bins, size], -1), axis=0):
         index = np.flatnonzero((bins == n) & (size == width))
@@ -103,7 +103,7 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
     return np.take_along_axis(folded, (first[:, None] + np.arange(size)) % size, axis=-1)
 
 
-def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Window | None:
+def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
     """The window if it holds all of the law: nothing at its ends, no negative probability, the mean where it was."""
     away = float(pmf @ (first + np.arange(pmf.size))) - mean
     ends = max(abs(float(pmf[-1])), abs(float(pmf[0])) if first > 0 else 0.0)
@@ -111,10 +111,10 @@ def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Window
         return None
     if not abs(float(pmf.sum()) - 1.0) <= _CONSISTENT:
         return None
-    return Window(first, np.maximum(pmf, 0.0), pmf.size * _EDGE)
+    return Pmf(first, np.maximum(pmf, 0.0), pmf.size * _EDGE)
 
 
-def _alone(cell: Cells, threads: int) -> Window:
+def _alone(cell: Cells, threads: int) -> Pmf:
     from mars_lidar.statistics.exposure import refined_moments
 
     own = refined_moments(cell, 1, tolerance=1e-4, threads=threads)
@@ -168,7 +168,7 @@ def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, 
     return first.astype(np.int64), last.astype(np.int64), (last - first) * _EDGE
 
 
-def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Window:
+def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
     counts, purse = last - first + 1, Purse()
     size = counts + counts % 2
     value = _narrow(cell, size, bins, threads, variance, purse) if size > _ALL_POINTS else None
@@ -179,7 +179,7 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
     # numpy's transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
     folded = np.fft.irfft(value, size)
     pmf = np.take(folded, np.arange(first, first + counts), mode="wrap")
-    return Window(first, pmf, outside)
+    return Pmf(first, pmf, outside)
 
 
 def _narrow(
@@ -218,9 +218,9 @@ def _narrow(
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None
 
 
-def _check(cells: Cells, cell: int, window: Window, cumulants: FloatArray) -> None:
+def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
     """The pmf must be one, and have the mean and variance that came another way; then rounding is removed."""
-    pmf: NDArray[np.float64] = window.pmf
+    pmf: NDArray[np.float64] = window.p
     offset = window.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
     if window.outside > TAIL * 4.0:  # a guessed support

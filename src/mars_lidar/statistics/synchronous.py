@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.count_window import Pmf
 from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
@@ -37,7 +37,7 @@ def first_arrivals(cells: Cells) -> FloatArray:
     return np.asarray(np.exp(-before[:, :-1]) * -np.expm1(-np.maximum(np.diff(before), 0.0)), dtype=np.float64)
 
 
-def synchronous_windows(cells: Cells) -> list[Window]:
+def synchronous_windows(cells: Cells) -> list[Pmf]:
     """Exact pmf of the count of each cell."""
     dead = cells.system.dead_time_periods
     whole = math.floor(dead)
@@ -48,11 +48,11 @@ def synchronous_windows(cells: Cells) -> list[Window]:
     ]
 
 
-def cumulants_of(window: Window) -> FloatArray:
+def cumulants_of(window: Pmf) -> FloatArray:
     """Mean, variance, third and fourth cumulant (4,) of a pmf."""
-    n = window.first + np.arange(window.pmf.size)
-    mean = float(window.pmf @ n)
-    m2, m3, m4 = (float(window.pmf @ (n - mean) ** k) for k in (2, 3, 4))
+    n = window.first + np.arange(window.p.size)
+    mean = float(window.p @ n)
+    m2, m3, m4 = (float(window.p @ (n - mean) ** k) for k in (2, 3, 4))
     return np.array([mean, m2, m3, m4 - 3.0 * m2**2])
 
 
@@ -126,10 +126,10 @@ class _Count:
         total = (found * weight).sum(-1)
         return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(total, 1.0)), dtype=np.float64)
 
-    def window(self) -> Window:
+    def window(self) -> Pmf:
         most = math.ceil(self.cycles / (self.whole + 1))
         if self.seen == 0.0:
-            return Window(0, np.ones(1), 0.0)
+            return Pmf(0, np.ones(1), 0.0)
         low, high = self._reach(most)
         if low >= _MANY_COUNTS and (high - low) * _SUMS * self._spread(float(most)) > _MANY_TERMS:
             survival = self._transformed(np.arange(low, high + 2, dtype=np.float64))
@@ -145,7 +145,7 @@ class _Count:
             survival = self.at_least(np.arange(low, high + 2, dtype=np.float64))
         survival[0], survival[-1] = 1.0, 0.0
         pmf = np.maximum(-np.diff(np.minimum.accumulate(survival)), 0.0)
-        return Window(low, pmf, tail * ((low > 0) + (high < most)))
+        return Pmf(low, pmf, tail * ((low > 0) + (high < most)))
 
     def _reach(self, most: int) -> tuple[int, int]:
         """Counts between which the law is, from mean and variance of the time of a registration."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.table.error import random_pixels
 from mars_lidar.table.nodes import Nodes
 
@@ -65,7 +65,7 @@ def law_error(table: Nodes, samples: int, seed: int, cycles: int | None, threads
     found = table.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
     exact = count_law(signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads)
     matched = matched_pmf(found.cumulants, threads=threads)
-    off = np.array([distance(w, Window(int(exact.support[k, 0]), exact.pmf[k], 0.0)) for k, w in enumerate(matched)])
+    off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
     good = found.trusted()
     worst = int(off.argmax())
     return LawError(
@@ -80,12 +80,3 @@ def law_error(table: Nodes, samples: int, seed: int, cycles: int | None, threads
         worst_background=float(background[worst]),
         worst_delay_ns=float(delay[worst]),
     )
-
-
-def distance(a: Window, b: Window) -> float:
-    """Total variation between two laws."""
-    first = min(a.first, b.first)
-    both = np.zeros((2, max(a.first + a.pmf.size, b.first + b.pmf.size) - first))
-    for row, window in zip(both, (a, b), strict=True):
-        row[window.first - first : window.first - first + window.pmf.size] = window.pmf
-    return 0.5 * float(np.abs(both[0] - both[1]).sum())

@@ -10,7 +10,7 @@ import numpy as np
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_window import Window
+from mars_lidar.statistics.count_window import Pmf
 from mars_lidar.statistics.pmf import guessed_windows
 from mars_lidar.table.entries import Entries
 
@@ -37,14 +37,14 @@ class NodeLaws:
     pmf: FloatArray
 
     @classmethod
-    def of(cls, row: IndexArray, windows: Sequence[Window]) -> NodeLaws:
+    def of(cls, row: IndexArray, windows: Sequence[Pmf]) -> NodeLaws:
         """From one window for each row."""
         trimmed = [_trimmed(window) for window in windows]
         return cls(
             np.asarray(row, dtype=np.int64),
             np.array([window.first for window in trimmed], np.int64),
-            np.concatenate([[0], np.cumsum([window.pmf.size for window in trimmed])]).astype(np.int64),
-            np.concatenate([np.empty(0), *(window.pmf for window in trimmed)]),
+            np.concatenate([[0], np.cumsum([window.p.size for window in trimmed])]).astype(np.int64),
+            np.concatenate([np.empty(0), *(window.p for window in trimmed)]),
         )
 
     @classmethod
@@ -57,22 +57,22 @@ class NodeLaws:
         """Size of the arrays."""
         return int(self.row.nbytes + self.first.nbytes + self.offsets.nbytes + self.pmf.nbytes)
 
-    def window(self, row: int) -> Window | None:
+    def window(self, row: int) -> Pmf | None:
         """Law of an entry; None where its cumulants are enough."""
         k = int(np.searchsorted(self.row, row))
         if k == self.row.size or self.row[k] != row:
             return None
-        return Window(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], _NEGLIGIBLE)
+        return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], _NEGLIGIBLE)
 
 
 _NEGLIGIBLE = 1e-12  # probability that is not kept at either end
 
 
-def _trimmed(window: Window) -> Window:
-    below = np.cumsum(window.pmf)
-    some = np.flatnonzero((below > _NEGLIGIBLE) & (below[-1] - below + window.pmf > _NEGLIGIBLE))
-    low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, window.pmf.size)
-    return Window(window.first + low, window.pmf[low:high], _NEGLIGIBLE)
+def _trimmed(window: Pmf) -> Pmf:
+    below = np.cumsum(window.p)
+    some = np.flatnonzero((below > _NEGLIGIBLE) & (below[-1] - below + window.p > _NEGLIGIBLE))
+    low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, window.p.size)
+    return Pmf(window.first + low, window.p[low:high], _NEGLIGIBLE)
 
 
 def node_laws(

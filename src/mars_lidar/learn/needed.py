@@ -1,0 +1,11 @@
+"""PyTorch, which every part of `mars_lidar.learn` but the ranges needs, or an error that says how to install it."""
+
+from __future__ import annotations
+
+from mars_lidar._base.optional import MissingLibraryError
+
+try:
+    import torch as torch
+    import torch.utils.data as _data  # noqa: F401
+except ImportError as _error:
+    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error

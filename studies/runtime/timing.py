@@ -1,0 +1,241 @@
+"""Times of every contender: a cube by stages, points along four axes, many exposures of one pixel."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import Flux, System, Table, simulate
+from studies import Tell
+from studies.common.sample import PERIOD_NS, system_of
+from studies.runtime.contenders import Contender, Run, Tables, contenders
+
+DEAD_TIME_NS, SIGMA_NS = 85.0, 0.5
+_CUBE_PART = 64  # of the cube's pixels, one in so many foretells its time
+FLUX = (0.05, 1.0)  # S and B uniform on this, photons per period
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis: what varies, its values, and the image, exposure and number that it varies from."""
+
+    name: str
+    words: str
+    values: tuple[float, ...]
+    pixels: int
+    cycles: int = 1000
+    realizations: int = 1
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Configuration of the study."""
+
+    side: int  # of the cube of the stages
+    bins: int
+    axes: tuple[Axis, ...]
+    teaser: tuple[int, int]  # cycles, realizations of the single pixel
+    repeats: int
+    limit_s: float  # a point predicted to take longer is left out
+    cube_limit_s: float  # the same of the cube, predicted from a part of it
+    enough_s: float  # repeats end once a contender has had so much
+    cube_table: tuple[int, int]  # points in S and B
+    axis_table: tuple[int, int]
+    seed: int = 20268
+
+
+def _decades(low: float, high: float, each: int) -> tuple[float, ...]:
+    """About `each` points a decade; whole numbers where the axis counts something."""
+    points = np.geomspace(low, high, round(np.log10(high / low) * each) + 1)
+    return tuple(float(v) for v in (np.unique(np.rint(points)) if low >= 1 else points))
+
+
+def _axes(pixels: int, most_pixels: int, high: float, each: int) -> tuple[Axis, ...]:
+    return (
+        Axis("cycles", "laser cycles", _decades(10, 10 * high, each), pixels),
+        Axis("flux", "photons per period, S + B, mean", _decades(1e-3, 1e-3 * high, each), pixels),
+        Axis("realizations", "realizations of one pixel", _decades(1, high, each), 1),
+        Axis("pixels", "pixels", _decades(1, most_pixels, each), 1),
+    )
+
+
+FULL = Settings(
+    side=128,
+    bins=1024,
+    axes=_axes(256, 262_144, 1e5, 2),
+    teaser=(1000, 10_000),
+    repeats=5,
+    limit_s=8.0,
+    cube_limit_s=30.0,
+    enough_s=0.5,
+    cube_table=(256, 100),
+    axis_table=(32, 24),
+)
+QUICK = Settings(
+    side=8,
+    bins=128,
+    axes=_axes(4, 16, 1e2, 1),
+    teaser=(100, 50),
+    repeats=1,
+    limit_s=0.5,
+    cube_limit_s=1.0,
+    enough_s=0.05,
+    cube_table=(4, 3),
+    axis_table=(4, 3),
+)
+
+
+@dataclass(frozen=True)
+class Point:
+    """One contender at one value of an axis: least seconds of its repeats, or why there are none."""
+
+    axis: str
+    value: float
+    contender: str
+    seconds: float | None
+    why: str = ""
+    registrations: float = 0.0  # mean of a pixel, one realization
+
+
+@dataclass(frozen=True)
+class Cube:
+    """One contender on the cube of the stages: least seconds, and the stages of that run.
+
+    `predicted` where it would have taken too long: seconds and stages are those of a part of the pixels, scaled.
+    """
+
+    contender: str
+    words: str
+    seconds: float
+    predicted: bool
+    stages: dict[str, float]
+    prepared: float  # seconds spent before, on a table or nothing
+
+
+def image(pixels: int, seed: int, level: float = 1.0) -> Flux:
+    """A row of pixels, S and B uniform on `FLUX` times `level`, delays anywhere but at the edges."""
+    random = np.random.default_rng([seed, pixels])
+    signal, background = (level * random.uniform(*FLUX, (1, pixels)) for _ in range(2))
+    return Flux(signal, background, random.uniform(0.1, 0.9, (1, pixels)) * PERIOD_NS)
+
+
+def system(settings: Settings, cycles: int) -> System:
+    """Armed start."""
+    return system_of(DEAD_TIME_NS, cycles, bins=settings.bins, sigma_ns=SIGMA_NS)
+
+
+def cube_stages(settings: Settings, tell: Tell) -> tuple[list[Cube], Table]:
+    """Every contender on one cube of side x side pixels, and the table that some of them used."""
+    flux, seen = image(settings.side**2, settings.seed), system(settings, 1000)
+    out, part = _memory(flux, seen, 1), max(1, settings.side**2 // _CUBE_PART)
+    found = []
+    tables = Tables(settings.cube_table)
+    for one in contenders(tables):
+        began = time.perf_counter()
+        run = one.prepare(flux, seen, 1)
+        prepared = time.perf_counter() - began
+        small = one.prepare(flux[:, :part], seen, 1)
+        seconds, stages = _least({one.name: small}, out[:, :, :part], replace(settings, repeats=1))[one.name]
+        scale = settings.side**2 / part
+        predicted = scale * seconds > settings.cube_limit_s
+        if predicted:
+            seconds, stages = scale * seconds, {name: scale * spent for name, spent in stages.items()}
+        else:
+            seconds, stages = _least({one.name: run}, out, settings)[one.name]
+        found.append(Cube(one.name, one.words, seconds, predicted, stages, prepared))
+        tell(f"runtime: cube, {one.words}: {seconds:.3g} s{' (predicted)' if predicted else ''}")
+    return found, tables.get(seen)
+
+
+def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
+    """Every contender along one axis; each is stopped where its next point would take too long."""
+    points: list[Point] = []
+    entrants = contenders(Tables(settings.axis_table))
+    for value in axis.values:
+        flux, seen, realizations = _at(settings, axis, value)
+        hits = registrations(flux, seen, settings.seed)
+        runs: dict[str, Run] = {}
+        for one in entrants:
+            why = _refusal(settings, one, flux, value, points)
+            if why:
+                points.append(Point(axis.name, value, one.name, None, why, hits))
+            else:
+                runs[one.name] = one.prepare(flux, seen, realizations)
+        out = _memory(flux, seen, realizations)
+        for name, (seconds, _) in _least(runs, out, settings).items():
+            points.append(Point(axis.name, value, name, seconds, "", hits))
+        tell(f"runtime: {axis.words} {value:.4g}: {len(runs)} contenders")
+    return points
+
+
+def teaser(settings: Settings, tell: Tell) -> list[Point]:
+    """Many exposures of one pixel, S = B = 1."""
+    cycles, realizations = settings.teaser
+    flux, seen = Flux(1.0, 1.0, 0.5 * PERIOD_NS), system(settings, cycles)
+    runs = {one.name: one.prepare(flux, seen, realizations) for one in contenders(Tables(settings.axis_table))}
+    timed = _least(runs, _memory(flux, seen, realizations), settings)
+    tell("runtime: teaser")
+    return [Point("teaser", float(realizations), name, seconds) for name, (seconds, _) in timed.items()]
+
+
+def registrations(flux: Flux, seen: System, seed: int) -> float:
+    """Mean registrations of a pixel in one exposure, from at most 16 of them."""
+    return float(simulate(flux[:, :16], seen.replace(bins=1), seed=seed).mean(dtype=np.float64))
+
+
+def _at(settings: Settings, axis: Axis, value: float) -> tuple[Flux, System, int]:
+    """Flux, system and realizations of one value of an axis."""
+    number = round(value)
+    pixels = number if axis.name == "pixels" else axis.pixels
+    cycles = number if axis.name == "cycles" else axis.cycles
+    realizations = number if axis.name == "realizations" else axis.realizations
+    level = value / sum(FLUX) if axis.name == "flux" else 1.0
+    return image(pixels, settings.seed, level), system(settings, cycles), realizations
+
+
+def _refusal(settings: Settings, one: Contender, flux: Flux, value: float, points: Sequence[Point]) -> str:
+    """Why a point is left out, or nothing."""
+    own = [p for p in points if p.contender == one.name]
+    if not one.takes(flux):
+        return "flux beyond the table"
+    if own and own[-1].why.startswith("predicted"):
+        return own[-1].why
+    timed = [p for p in own if p.seconds is not None]
+    if not timed:
+        return ""
+    last, slope = timed[-1], 1.0
+    if len(timed) > 1:
+        before = timed[-2]
+        rise = float(np.log((last.seconds or 1.0) / (before.seconds or 1.0)))
+        slope = min(max(rise / float(np.log(last.value / before.value)), 0.0), 1.5)
+    predicted = float(last.seconds or 0.0) * (value / last.value) ** slope
+    return f"predicted {predicted:.3g} s" if predicted > settings.limit_s else ""
+
+
+def _memory(flux: Flux, seen: System, realizations: int) -> NDArray[Any]:
+    """Memory for a cube, written to before."""
+    out = np.empty((realizations, *flux.shape, seen.bins), seen.histogram_dtype)
+    out.fill(1)
+    return out
+
+
+def _least(runs: dict[str, Run], out: NDArray[Any], settings: Settings) -> dict[str, tuple[float, dict[str, float]]]:
+    """Least seconds of each run and the stages of that repeat; all in turn, so that disturbances are shared."""
+    best: dict[str, tuple[float, dict[str, float]]] = {}
+    spent = dict.fromkeys(runs, 0.0)
+    for turn in range(settings.repeats):
+        for name, run in runs.items():
+            if turn and spent[name] >= settings.enough_s:
+                continue
+            began = time.perf_counter()
+            stages = run(settings.seed + turn, out)
+            seconds = time.perf_counter() - began
+            spent[name] += seconds
+            if name not in best or seconds < best[name][0]:
+                best[name] = seconds, stages
+    return best

@@ -45,7 +45,7 @@ def refused(call: Callable[[], Any], kind: type[Exception], *fragments: str) -> 
         ("cycles", 0, ValueError, ["[1, ", "got 0"]),
         ("cycles", -5, ValueError, ["[1, ", "got -5"]),
         ("cycles", 2**40, ValueError, ["[1, ", f"got {2**40}"]),
-        ("cycles", 1000.0, TypeError, ["integer", "got 1000.0", "float"]),
+        ("cycles", 1000.5, TypeError, ["integer", "got 1000.5", "float"]),
         ("cycles", "10", TypeError, ["integer", "got '10'"]),
         ("cycles", True, TypeError, ["integer", "got True"]),
         ("bins", 0, ValueError, ["[1, 1048576]", "got 0"]),
@@ -145,7 +145,7 @@ RANGE = "[0, 1e+06] photons per period"
         (flux_call([[1.0, 1.0], [1.0, INF]], 0.0, 5.0), ValueError, ["signal", RANGE, "got inf", "(1, 1)"]),
         (flux_call("1", 0.0, 5.0), TypeError, ["signal", "real numbers", "<U1"]),
         (flux_call(1j, 0.0, 5.0), TypeError, ["signal", "real numbers", "complex128"]),
-        (flux_call(np.ones((1, 1, 1)), 0.0, 5.0), ValueError, ["signal", "(H, W)", "(1, 1, 1)"]),
+        (flux_call(np.ones((1, 1, 1)), 0.0, 5.0), ValueError, ["delay_ns", "(R, H, W)", "(1, 1, 1)"]),
         (flux_call(np.ones((0, 3)), 0.0, 5.0), ValueError, ["signal", "at least one pixel", "(0, 3)"]),
         (flux_call(), ValueError, ["signal must be given", "waveform"]),
         (flux_call(1.0, -0.5, 5.0), ValueError, ["background", RANGE, "got -0.5"]),
@@ -203,11 +203,11 @@ CALLS = [
     ("engine", None, ValueError, ["'exact'", "got None"]),
     ("seed", -1, ValueError, [f"[0, {2**64 - 1}]", "got -1"]),
     ("seed", 2**64, ValueError, [f"[0, {2**64 - 1}]", f"got {2**64}"]),
-    ("seed", 1.0, TypeError, ["integer", "got 1.0"]),
+    ("seed", 1.5, TypeError, ["integer", "got 1.5"]),
     ("seed", None, TypeError, ["integer", "got None"]),
     ("threads", 0, ValueError, ["[1, 1024]", "got 0"]),
     ("threads", 5000, ValueError, ["[1, 1024]", "got 5000"]),
-    ("threads", 2.0, TypeError, ["integer", "got 2.0"]),
+    ("threads", 2.5, TypeError, ["integer", "got 2.5"]),
     ("progress", 5, TypeError, ["callable", "done, total", "got 5"]),
     ("pixel_index", [0, 1, 2], ValueError, ["(6,) or (2, 3)", "got (3,)"]),
     ("pixel_index", np.zeros((3, 2), int), ValueError, ["(6,) or (2, 3)", "got (3, 2)"]),
@@ -314,7 +314,8 @@ def test_what_is_no_array_of_counts_is_named_by_its_type(tmp_path):
 
     io.simulate_to(tmp_path / "a.zarr", FLUX, SYSTEM)
     cube = io.load(tmp_path / "a.zarr")
-    refused(lambda: ml.reconstruct(cube, SYSTEM), TypeError, "its histogram", "got Cube")
+    refused(lambda: ml.reconstruct([cube, cube], SYSTEM), TypeError, "its histogram", "got list")
+    refused(lambda: ml.reconstruct(cube.histogram[:]), TypeError, "system must be given")
     refused(lambda: ml.reconstruct("a.zarr", SYSTEM), TypeError, "array of counts", "got str")
     refused(lambda: ml.calibrate(np.zeros((3, 8))), TypeError, "Timestamps", "got ndarray")
 

@@ -120,7 +120,7 @@ def test_electronics_dead_time_has_statistics_for_some_modes_only():
         ("electronics_dead_time_ns", float("inf"), "electronics_dead_time_ns"),
         ("electronics_dead_time_ns", None, "electronics_dead_time_ns"),
         ("max_events_per_period", 0, "max_events_per_period must be an integer in \\[1"),
-        ("max_events_per_exposure", 1e3, "max_events_per_exposure must be an integer"),
+        ("max_events_per_exposure", 1.5, "max_events_per_exposure must be an integer"),
         ("jitter", 0.1, "jitter must be a Jitter or a SampledJitter, got 0.1"),
         ("code_density", [1.0], "code_density must be 2 to"),
         ("code_density", [1.0, -1.0], "non-negative"),
@@ -247,7 +247,7 @@ def test_the_poisson_engine_draws_detected_photons(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "error"),
     [
-        (("--detection-efficiency", 2), "detection_efficiency must be"),
+        (("--detection-efficiency", 2), "--detection-efficiency must be"),
         (("--jitter-tail-ns", 1), "need --jitter-fwhm-ns"),
         (("--jitter-fwhm-ns", 100), "sigma_ns of a jitter must lie in"),
         (("--jitter-bin-ns", 1), "belongs to --jitter-file"),

@@ -185,7 +185,7 @@ def test_bound_on_a_bin_is_never_exceeded():
 
 
 def test_numbers_with_an_exponent_are_numbers(tmp_path):
-    """PyYAML reads YAML 1.1, where 1e2 is text; a whole number of cycles still has to be written as one."""
+    """PyYAML reads YAML 1.1, where 1e2 is text; 1e3 is a whole number of cycles, 1.5e0 is none."""
     text = "period_ns: 1e2\ncycles: {}\nbins: 64\npulse: {{kind: gaussian, sigma_ns: 5E-1}}\n"
     text += "detector: {{dead_time_ns: 4.2e+1, dark_count_hz: 1e5}}\n"
     file = tmp_path / "spad.yaml"
@@ -194,5 +194,7 @@ def test_numbers_with_an_exponent_are_numbers(tmp_path):
     assert (system.period_ns, system.pulse.sigma_ns) == (100.0, 0.5)
     assert (system.detector.dead_time_ns, system.detector.dark_count_hz) == (42.0, 1e5)
     file.write_text(text.format("1e3"))
-    with pytest.raises(ValueError, match=r"spad\.yaml: cycles must be an integer.*got 1000\.0"):
+    assert ml.System.load(file).cycles == 1000
+    file.write_text(text.format("15e-1"))
+    with pytest.raises(ValueError, match=r"spad\.yaml.*: cycles must be an integer.*got 1\.5"):
         ml.System.load(file)

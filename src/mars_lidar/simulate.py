@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import Records, Task
 from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
+from mars_lidar.light.flux import MAX_RETURNS, Flux
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.timestamps import Timestamps
 
@@ -37,7 +38,7 @@ def simulate(
     threads: int | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
     out: Any = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     report: dict[str, float] | None = None,
     **options: Unpack[EngineOptions],
 ) -> NDArray[Any]:
@@ -74,7 +75,8 @@ def simulate(
         C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill; with
         ``device="cuda"`` a CuPy array.
     progress
-        Called as ``progress(done, total)`` a few times a second; an exception from it stops the run.
+        Called as ``progress(done, total)`` a few times a second; an exception from it stops the run. True: a bar, or
+        a line every 30 s where there is no terminal.
     report
         A dictionary that takes what the engine has to tell beside the counts, numbers by name.
     **options
@@ -119,7 +121,7 @@ def simulate_timestamps(
     seed: int = 0,
     threads: int | None = None,
     device: Literal["cpu", "cuda"] = "cpu",
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Timestamps:
     """Registration times of an image in one realization.
 
@@ -187,7 +189,7 @@ def _task(
     pixel_index: ArrayLike | None,
     seed: int,
     threads: int | None,
-    progress: Progress | None,
+    progress: Progress | bool | None,
     first_name: str = "first_realization",
 ) -> Task:
     if not isinstance(flux, Flux):
@@ -198,12 +200,13 @@ def _task(
         flux = flux[:]  # whole, or a MemoryError that says so
     first = checks.integer(first_name, first_realization, low=0, high=2**32 - 1)
     number = checks.integer("realizations", realizations, low=1, high=2**32 - first)
-    checks.integer("seed", seed, low=0, high=2**64 - 1)
+    seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
     team = thread_count(threads)
-    if progress is not None and not callable(progress):
-        raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
-    if len(flux.returns_signal) > 16:
-        raise ValueError(f"flux must have at most 16 returns, got {len(flux.returns_signal)}; use a waveform")
+    progress = shown(progress, "simulating")
+    if len(flux.returns_signal) > MAX_RETURNS:
+        raise ValueError(
+            f"flux must have at most {MAX_RETURNS} returns, got {len(flux.returns_signal)}; use a waveform"
+        )
     _check_registrations(flux.detected(system), system)
     check_detector(drawn_by, system)
     drawn_by.check(flux, system)

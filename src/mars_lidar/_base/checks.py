@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 from numbers import Integral, Real
 from typing import Any
@@ -20,8 +21,9 @@ def real(name: str, value: Any, *, low: float = -math.inf, high: float = math.in
 
 
 def integer(name: str, value: Any, *, low: int, high: int) -> int:
-    """An integer in [low, high]; floats are refused, even whole ones, so that 1e3 is a visible decision."""
+    """An integer in [low, high]; a float that is whole, such as 1e6, is one."""
     allowed = f"an integer in [{low}, {high}]"
+    value = whole(value)
     if isinstance(value, bool) or not isinstance(value, Integral):
         raise TypeError(f"{name} must be {allowed}, got {value!r} ({type(value).__name__})")
     number = int(value)
@@ -30,10 +32,17 @@ def integer(name: str, value: Any, *, low: int, high: int) -> int:
     return number
 
 
+def whole(value: Any) -> Any:
+    """A float that is a whole number as int, anything else as it is: people write 1e6, in Python, YAML and a shell."""
+    is_whole = isinstance(value, Real) and not isinstance(value, Integral) and math.isfinite(value)
+    return int(value) if is_whole and float(value).is_integer() else value
+
+
 def choice(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     """One of a few strings."""
     if not isinstance(value, str) or value not in allowed:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+        told = f"{name} must be one of {', '.join(map(repr, allowed))}"
+        raise ValueError(f"{told}, got {value!r}{_meant(value, allowed)}")
     return value
 
 
@@ -43,5 +52,11 @@ def known_keys(name: str, mapping: Any, allowed: tuple[str, ...]) -> dict[str, A
         raise TypeError(f"{name} must be a mapping with keys {', '.join(allowed)}, got {mapping!r}")
     unknown = [key for key in mapping if key not in allowed]
     if unknown:
-        raise ValueError(f"{name} has unknown key {unknown[0]!r}; allowed: {', '.join(allowed)}")
+        meant = _meant(unknown[0], allowed)
+        raise ValueError(f"{name} has unknown key {unknown[0]!r}{meant}; allowed: {', '.join(allowed)}")
     return mapping
+
+
+def _meant(word: Any, allowed: tuple[str, ...]) -> str:
+    near = difflib.get_close_matches(str(word), allowed, 1)
+    return f" (did you mean {near[0]!r}?)" if near else ""

@@ -16,6 +16,7 @@ from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
 from mars_lidar.cli.export import EXPORT_EPILOG, export
 from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
+from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.info import info, view
 from mars_lidar.cli.init import init
 from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
@@ -36,7 +37,8 @@ app = typer.Typer(
 def _add(command: Callable[..., None], epilog: str | None = None, **more: Any) -> None:
     """A command whose help flows: typer keeps the line ends of a docstring, whatever the width of the screen."""
     paragraphs = (command.__doc__ or "").split("\n\n")
-    app.command(help="\n\n".join(" ".join(text.split()) for text in paragraphs), epilog=epilog, **more)(command)
+    shown = "\n\n".join(" ".join(text.split()) for text in paragraphs)
+    app.command(help=shown, epilog=epilog, **more)(grouped(command))
 
 
 for _command, _epilog in (

@@ -7,10 +7,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from mars_lidar._base.progress import span
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, save_picture, table
 from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.info import parsed_pixel
 from mars_lidar.cli.options import _OUTPUT, _RUN, _option
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions
@@ -83,7 +83,6 @@ BudgetS = Annotated[
 ]
 
 
-@grouped
 def compare(
     *,
     scene: SceneOptions,
@@ -144,7 +143,7 @@ def compare(
         if numbers is not None:
             _write(numbers, json.dumps({"scene": view.source, **as_data(found)}, indent=1, allow_nan=False) + "\n")
         show(found)
-        rows = [("picture", str(out)), ("time", f"{time.perf_counter() - began:.3g} s in all")]
+        rows = [("picture", str(out)), ("time", f"{span(time.perf_counter() - began)} in all")]
         table(rows if numbers is None else [rows[0], ("numbers", str(numbers)), rows[1]])
 
 

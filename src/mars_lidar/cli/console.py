@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from mars_lidar._base.progress import Bar
+from mars_lidar.cli.groups import OPTIONS
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
-_PATIENCE_S = 0.5  # a bar that would vanish at once is not drawn
+_FIELDS = {"sigma_ns": "pulse_sigma_ns", "fwhm_ns": "pulse_fwhm_ns", "values": "pulse_file", "name": "scene"}
 
 
 def say(message: str) -> None:
@@ -52,52 +55,18 @@ def reported() -> Iterator[None]:
         say(f"failed: {_of_file(error)}")
         raise typer.Exit(FAILED) from None
     except (ValueError, TypeError, OverflowError, MemoryError) as error:
-        say(" ".join(str(error).split()) or type(error).__name__)
+        say(_with_options(" ".join(str(error).split())) or type(error).__name__)
         raise typer.Exit(BAD_INPUT) from None
 
 
 @contextlib.contextmanager
-def progress_bar(label: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A callback (done, total) that draws a bar with the time left, or None where nobody is watching."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    bar: Any = None
-    task: Any = None
-    began = time.monotonic()
-
-    def update(done: int, total: int) -> None:
-        nonlocal bar, task
-        if bar is None:
-            if time.monotonic() - began < _PATIENCE_S:
-                return
-            bar = _new_bar()
-            bar.start()
-            task = bar.add_task(label, total=total)
-        bar.update(task, completed=done, total=total)
-
+def progress_bar(label: str) -> Iterator[Bar]:
+    """A callback (done, total) that says how far a run is, and is gone at its end."""
+    bar = Bar(label)
     try:
-        yield update
+        yield bar
     finally:
-        if bar is not None:
-            bar.stop()
-
-
-def _new_bar() -> Any:
-    from rich import progress as columns
-    from rich.console import Console
-
-    return columns.Progress(
-        columns.TextColumn("{task.description}"),
-        columns.BarColumn(),
-        columns.TaskProgressColumn(),
-        columns.TextColumn("elapsed"),
-        columns.TimeElapsedColumn(),
-        columns.TextColumn("left"),
-        columns.TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    )
+        bar.close()
 
 
 def check_picture(out: Path | None, overwrite: bool) -> None:
@@ -137,6 +106,14 @@ def table(rows: list[tuple[str, str]]) -> None:
     for label, text in rows:
         grid.add_row(label, Text(text))
     Console(highlight=False).print(grid)
+
+
+def _with_options(message: str) -> str:
+    """A message of the package, which names arguments, with the options that they were given by."""
+    given = OPTIONS.get()
+    for name, option in {**{field: given[of] for field, of in _FIELDS.items() if of in given}, **given}.items():
+        message = re.sub(rf"(?<![\w./:'-]){name}(?= (must|needs|belongs)\b|=)", option, message)
+    return message
 
 
 def _of_file(error: OSError) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from mars_lidar._base.progress import span
 from mars_lidar.cli.console import BAD_INPUT, say, table
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
         *((f"system {k}", one.to_json()) for k, one in enumerate(recipe.systems)),
         ("light", f"signal/sbr {levels}{', ...' if len(recipe.light.levels) > 8 else ''}"),
         ("scenes", ", ".join(json.dumps(one) for one in recipe.scenes)),
-        ("left out", f"{problems} files" if problems else "nothing"),
+        ("left out", files(problems)),
         *(("", str(problem)) for problem in stored.problems[:20]),
         ("open with", f"xarray.open_zarr({str(path)!r})"),
     ]
@@ -61,7 +62,7 @@ def tell(done: Generated) -> None:
             ("time", f"{done.seconds:.3g} s for {exposures:,} pixel exposures{share}"),
             ("dataset", f"{done.path}, {_bytes(_on_disk(done.path))}"),
             ("open with", f"xarray.open_zarr({str(done.path)!r})"),
-            ("left out", f"{len(done.problems)} files" if done.problems else "nothing"),
+            ("left out", files(len(done.problems))),
         ]
     )
     _tell_problems(done.problems)
@@ -80,7 +81,7 @@ def tell_estimate(told: Estimate) -> None:
         ("scenes", f"{told.scenes:,}"),
         ("size", f"about {_bytes(told.bytes)} on disk, of {_bytes(told.dense_bytes)} dense; {shards}"),
         ("chunk", _size(told.chunk)),
-        ("time", f"about {_span(told.seconds)} on {told.threads} threads of this machine"),
+        ("time", f"about {span(told.seconds)} on {told.threads} threads of this machine"),
         ("memory", f"at most {_bytes(told.memory_bytes)}"),
     ]
     short = told.free_bytes is not None and told.bytes > told.free_bytes
@@ -104,15 +105,14 @@ def _on_disk(path: Path) -> int:
     return sum(part.stat().st_size for part in path.rglob("*") if part.is_file())
 
 
+def files(number: int) -> str:
+    """How many files, in words."""
+    return f"{number:,} file{'s' * (number > 1)}" if number else "nothing"
+
+
 def _bytes(number: float) -> str:
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if number < 1000 or unit == "TB":
             break
         number /= 1000
     return f"{number:.3g} {unit}"
-
-
-def _span(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.2g} s"
-    return f"{seconds / 60:.3g} minutes" if seconds < 7200 else f"{seconds / 3600:.3g} hours"

@@ -11,7 +11,6 @@ from mars_lidar.cli import options
 from mars_lidar.cli.console import FAILED, progress_bar, reported, say, table
 from mars_lidar.cli.dataset_tables import tell, tell_estimate
 from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.options import _option
 from mars_lidar.cli.scene_options import Ambient, Attenuation
 from mars_lidar.cli.system_options import SystemChanges
@@ -39,7 +38,6 @@ _TRANSIENTS = (".h5", ".hdf5")  # a depth is never in one; the other files of tr
 _SCENES, _LIGHT, _RUN, _OUTPUT = "Scenes", "Light", "Simulation", "Output"
 
 
-@grouped
 def generate(
     *,
     source: Annotated[

@@ -5,15 +5,23 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Callable
-from functools import wraps
-from typing import Any, get_type_hints
+from contextvars import ContextVar
+from functools import partial, wraps
+from typing import Any, get_args, get_type_hints
+
+import typer
+
+from mars_lidar._base import checks
+
+OPTIONS: ContextVar[dict[str, str]] = ContextVar("OPTIONS", default={})  # noqa: B039  # never changed in place
+"""Options given on the command line that is run, by the name of their parameter: what an error is to name."""
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
     """`command` for typer: each keyword that is a dataclass of options stands for the options that are its fields.
 
     ``def compare(*, instrument: SystemOptions, ...)`` has an option for each field of `SystemOptions`, at that place,
-    and is called with an instance of it. A field may be such a dataclass itself.
+    and is called with an instance of it. A field may be such a dataclass itself. Integers may be written 1e6.
     """
     hints = get_type_hints(command, include_extras=True)
     parameters: list[inspect.Parameter] = []
@@ -25,9 +33,12 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
             parameters += _options(kind)
         else:
             parameters.append(parameter.replace(annotation=kind))
+    for parameter in parameters:
+        _read_whole_numbers(parameter.annotation)
 
     @wraps(command)
     def run(**given: Any) -> None:
+        OPTIONS.set({p.name: _option_name(p) for p in parameters if given[p.name] not in (p.default, None, False, [])})
         built = {name: _taken(kind, given) for name, kind in groups.items()}
         command(**given, **built)
 
@@ -35,6 +46,38 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature  # type: ignore[attr-defined]  # what typer reads
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
+
+
+def _option_name(parameter: inspect.Parameter) -> str:
+    info = parameter.annotation.__metadata__[0]
+    names = [name for name in (info.default, *(info.param_decls or ())) if str(name).startswith("-")]
+    return str(max(names, key=len)).partition("/")[0] if names else parameter.name.upper()
+
+
+def _read_whole_numbers(annotation: Any) -> None:
+    kinds, info = get_args(annotation.__origin__) or (annotation.__origin__,), annotation.__metadata__[0]
+    if int in kinds and info.parser is None:
+        info.parser, info.metavar = partial(_whole, low=info.min, high=info.max), info.metavar or "INTEGER"
+
+
+def _whole(text: str, low: float | None, high: float | None) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = checks.whole(_number(text))
+    if not isinstance(number, int):
+        raise typer.BadParameter(f"{text!r} is not an integer.")
+    if (low is not None and number < low) or (high is not None and number > high):
+        limits = [f"at least {low}"] * (low is not None) + [f"at most {high}"] * (high is not None)
+        raise typer.BadParameter(f"{number} is not {' and '.join(limits)}.")
+    return number
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def _is_group(kind: Any) -> bool:

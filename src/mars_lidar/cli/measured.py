@@ -9,7 +9,6 @@ import typer
 
 from mars_lidar.cli.console import FAILED, check_picture, reported, save_picture, table
 from mars_lidar.cli.effect_options import StreamEffects
-from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
 from mars_lidar.cli.options import _OUTPUT, _option
 from mars_lidar.cli.stream_options import STREAM, DeadTimeNs, FitOptions, StreamOptions
@@ -64,7 +63,6 @@ SystemOut = Annotated[
 Overwrite = Annotated[bool, _option("--overwrite", panel=_OUTPUT, help="Replace an existing file.")]
 
 
-@grouped
 def inspect(
     stream: Stream,
     *,
@@ -104,7 +102,6 @@ def inspect(
         table(rows)
 
 
-@grouped
 def calibrate(
     stream: Stream,
     *,
@@ -128,7 +125,6 @@ def calibrate(
             table([("wrote", str(out))])
 
 
-@grouped
 def validate(
     stream: Stream,
     *,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mars_lidar._base.progress import span
 from mars_lidar.cli.console import progress_bar, reported, save_picture, say, table
 from mars_lidar.reconstruct import METHODS
 
@@ -93,7 +94,7 @@ def reconstruct(
             if picture:
                 _draw(stored, results, png)
                 rows.append(("picture", str(png)))
-        table([*rows, ("time", f"{time.perf_counter() - began:.3g} s in all")])
+        table([*rows, ("time", f"{span(time.perf_counter() - began)} in all")])
 
 
 def _methods(text: str, cube: Cube) -> list[str]:

@@ -6,11 +6,11 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mars_lidar._base.progress import span
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, save_picture, say
 from mars_lidar.cli.console import table as print_table
 from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions
 from mars_lidar.cli.scene_view import seen
 from mars_lidar.cli.system_options import SystemOptions
@@ -39,7 +39,6 @@ EPILOG = "\n\n".join(
 )
 
 
-@grouped
 def simulate(
     *,
     scene: SceneOptions,
@@ -126,7 +125,7 @@ def _summary(written: Written, png: Path | None, began: float) -> None:
 
     with load(written.path) as cube:
         count, height, width, bins = cube.shape
-        each = f", {written.ns_per_registration:.3g} ns per registration" if written.registrations else ""
+        each = f", {each_ns(written.ns_per_registration)} per registration" if written.registrations else ""
         rows = [
             (
                 "simulated",
@@ -135,8 +134,8 @@ def _summary(written: Written, png: Path | None, began: float) -> None:
             ),
             (
                 "time",
-                f"{written.simulate_s:.3g} s simulating{each}; {written.write_s:.3g} s writing; "
-                f"{time.perf_counter() - began:.3g} s in all",
+                f"{span(written.simulate_s)} simulating{each}; {span(written.write_s)} writing; "
+                f"{span(time.perf_counter() - began)} in all",
             ),
             ("cube", str(written.path)),
         ]
@@ -145,6 +144,11 @@ def _summary(written: Written, png: Path | None, began: float) -> None:
     if png is not None:
         rows.append(("picture", str(png)))
     print_table(rows)
+
+
+def each_ns(number: float) -> str:
+    """Nanoseconds, or microseconds, in words."""
+    return f"{number:.3g} ns" if number < 999.5 else f"{number / 1e3:.3g} µs"
 
 
 def _told(report: dict[str, float]) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mars_lidar._base.progress import span
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, table
 from mars_lidar.cli.effect_options import Effects
@@ -119,10 +120,11 @@ def build(
             else:
                 Table.build(system, *axes, progress=progress, **chosen).save(out, overwrite=overwrite)
                 path = out
-        table([*_rows(path), ("time", f"{time.perf_counter() - began:.3g} s in all")])
+        table([*_rows(path), ("time", f"{span(time.perf_counter() - began)} in all")])
 
 
 @app.command()
+@grouped
 def info(
     file: Annotated[
         Path | None, typer.Argument(help="A table: .h5 or .hdf5. Without it: the cache.", show_default=False)
@@ -142,6 +144,7 @@ def info(
 
 
 @app.command()
+@grouped
 def clear(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
 ) -> None:

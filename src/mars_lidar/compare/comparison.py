@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.compare.expected import Expected, PixelLaw, expected_counts, pixel_law
@@ -86,7 +87,7 @@ def compare(
     seed: int = 0,
     threads: int | None = None,
     budget_s: float = 4.0,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Comparison:
     """Run several engines on one image and compare what they draw.
 
@@ -143,7 +144,7 @@ def compare(
     n = checks.integer("realizations", realizations, low=50, high=10**7)
     cubes = checks.integer("repeats", repeats, low=1, high=1000)
     budget = checks.real("budget_s", budget_s, low=0.0, strict_low=True)
-    checks.integer("seed", seed, low=0, high=2**64 - 1)
+    seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
     team = thread_count(threads)
     depth = np.asarray(system.depth_m(flux.delay_ns % system.period_ns)) if depth_m is None else np.asarray(depth_m)
     if depth.shape != flux.shape:
@@ -156,7 +157,7 @@ def compare(
 
     skipped = _refusals(chosen, flux, system, against)
     runs = {name: engine for name, engine in chosen.items() if name not in skipped}
-    steps = _Steps(progress, 1 + len(runs) * (1 + len(places)))
+    steps = _Steps(shown(progress, "comparing"), 1 + len(runs) * (1 + len(places)))
     expected = expected_counts(flux, system, team, budget)
     steps.done()
     scenes: dict[str, SceneStatistics] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ MAPS = {
     "delay": ("delay of the return", "ns"),
 }
 _SHARD_BYTES = 16 * 2**20  # of one map
-_COORDINATES = "scene system signal_level sbr period_ns seed"  # for xarray, as CF has it
+_COORDINATES = "scene scene_name system signal_level sbr period_ns seed"  # for xarray, as CF has it
 
 
 def histogram_blocks(
@@ -132,6 +132,19 @@ def create_list(group: Any, name: str, values: NDArray[Any], dims: tuple[str, ..
         attributes={"long_name": told, "units": unit},
     )
     array[...] = values
+
+
+def create_texts(group: Any, name: str, texts: Sequence[str], dim: str, told: str) -> None:
+    """Create and write an array of texts, which xarray shows as such."""
+    array = group.create_array(
+        name,
+        shape=(len(texts),),
+        dtype=str,
+        chunks=(len(texts),),
+        dimension_names=(dim,),
+        attributes={"long_name": told},
+    )
+    array[...] = np.array(texts, dtype=object)
 
 
 def with_zeros(array: Any) -> Any:

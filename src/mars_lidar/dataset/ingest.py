@@ -19,6 +19,7 @@ from mars_lidar.dataset.arrays import (
     create_histogram,
     create_list,
     create_maps,
+    create_texts,
     histogram_blocks,
     mark,
 )
@@ -100,6 +101,7 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
     )
     for name, values, dims, told, unit in lists:
         create_list(group, name, values, dims, told, unit)
+    create_texts(group, "scene_name", [names[number] for number in scene], "sample", "name of the scene")
     if np.ptp(periods) == 0.0:
         times = recipe.systems[0].time_ns
         create_list(group, "time", times, ("time",), "time in the period, bin centre", "ns")

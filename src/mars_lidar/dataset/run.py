@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mars_lidar._base import checks
+from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 
@@ -66,7 +67,7 @@ def generate(
     threads: int | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Generated:
     """Simulate a dataset, scenes x systems x levels of light x realizations, into a Zarr store.
 
@@ -92,7 +93,7 @@ def generate(
     scheduler
         Address of a running dask scheduler, whose workers see `out` under the same path.
     progress
-        Called with (parts done, in all).
+        Called with (parts done, in all); True: a bar, or a line every 30 s where there is no terminal.
 
     Raises
     ------
@@ -109,6 +110,7 @@ def generate(
     from mars_lidar.io import Interrupted, WriteError
 
     began = time.perf_counter()
+    progress = shown(progress, "generating")
     target = Path(out)
     if target.suffix != ".zarr":
         raise ValueError(f"out must end in .zarr, got {str(target)!r}")
@@ -116,9 +118,10 @@ def generate(
         raise ValueError("resume and overwrite exclude each other")
     if workers is not None and scheduler is not None:
         raise ValueError("workers start a cluster and scheduler joins one: give one of them")
-    for name, value in (("threads", threads), ("workers", workers)):
-        if value is not None:
-            checks.integer(name, value, low=1, high=1024)
+    threads, workers = (
+        None if value is None else checks.integer(name, value, low=1, high=1024)
+        for name, value in (("threads", threads), ("workers", workers))
+    )
     wanted, folder = read_recipe(recipe)
     there = target.exists() and resume
     if there:

@@ -3,7 +3,7 @@
 ::
 
     depth, reflectivity, background  (scene, y, x)         as they were read; of the first layer
-    name                             (scene, letter)       UTF-8
+    name                             (scene)               text; (scene, letter) in UTF-8 before 0.3
     kind                             (scene, letter)       JSON: what is more than one surface in clear air
     layer_depth, layer_reflectivity  (scene, layer, y, x)  the other layers
     transient                        (scene, y, x, bin)    rendered light
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.dataset import samples
-from mars_lidar.dataset.arrays import blosc, create_list, create_maps
+from mars_lidar.dataset.arrays import blosc, create_list, create_maps, create_texts
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
 from mars_lidar.instrument.system import System
 from mars_lidar.light.fog import Fog
@@ -83,7 +83,7 @@ class SceneWriter:
         for array in self._arrays.values():
             array.resize((self._written, *array.shape[1:]))
         dims = ("scene", "letter")
-        create_list(self._group, "name", _rows(self.names), dims, "name of the scene, UTF-8", "1")
+        create_texts(self._group, "name", self.names, "scene", "name of the scene")
         if not self.plain:
             create_list(self._group, "kind", _rows(self._kinds), dims, "what it is, JSON", "1")
         return self._written
@@ -176,7 +176,8 @@ class SceneReader:
 
     def names(self) -> list[str]:
         """Names of all scenes."""
-        return _texts(self._group["name"])
+        stored = self._group["name"]
+        return _texts(stored) if stored.ndim > 1 else [str(one) for one in stored[...]]  # of a version before
 
     @cached_property
     def _kinds(self) -> list[str]:

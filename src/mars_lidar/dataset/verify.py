@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import Progress
 from mars_lidar._version import other_version
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.store import open_dataset
@@ -45,7 +46,7 @@ def verify(
     chunks: int | None = 16,
     seed: int = 0,
     threads: int | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | bool | None = None,
 ) -> Verified:
     """Make random chunks of a dataset again, with the maps of their samples, and compare every number.
 
@@ -63,13 +64,14 @@ def verify(
         As for `mars_lidar.generate`.
     """
 
+    progress = shown(progress, "verifying")
     dataset = open_dataset(path)
     array = dataset.histogram
     grid = tuple(math.ceil(n / step) for n, step in zip(array.shape, array.chunks, strict=True))
     total = math.prod(grid)
     number = total if chunks is None else min(total, checks.integer("chunks", chunks, low=1, high=2**62))
     if threads is not None:
-        checks.integer("threads", threads, low=1, high=1024)
+        threads = checks.integer("threads", threads, low=1, high=1024)
     random = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     chosen = np.arange(total) if number == total else np.sort(random.choice(total, number, replace=False))
     maker = Maker(dataset, thread_count(threads or None))

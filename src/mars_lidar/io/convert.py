@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import Progress
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save
 from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
 from mars_lidar.light.timestamps import Timestamps
@@ -89,7 +89,7 @@ def photons(
     *,
     realization: int = 0,
     threads: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | bool | None = None,
 ) -> Timestamps:
     """The photons of one exposure of a stored cube, simulated again from its recipe.
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mars_lidar._base.progress import shown
+from mars_lidar._base.types import Progress
 from mars_lidar.scene.scene import Scene
 
 MANIFEST = "manifest.csv"
 _COLUMNS = ("depth", "image", "index", "depth_unit_m", "focal_px")
 _DEPTH = (".png", ".tif", ".tiff", ".npy", ".pfm", ".exr")
 _ALONE = (".npz", ".pfm", ".exr")  # depth whatever their name
-_IMAGE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".npy")
+_IMAGE = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm", ".npy")
 _DEPTH_FOLDERS = ("depth", "depths")
 _IMAGE_WORDS = ("rgb", "colors", "color", "colours", "colour", "image", "images", "img")
 
@@ -60,7 +63,7 @@ def scan(
     depth_unit_m: float | None = None,
     focal_px: float | None = None,
     check: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | bool | None = None,
 ) -> tuple[list[SceneFile], list[Problem]]:
     """Find the scenes in a folder and in the folders below it.
 
@@ -74,8 +77,9 @@ def scan(
       (``("_depth.png", "_colors.png")``).
     - otherwise: Middlebury folders; NYUv2's labelled ``.mat``, every frame; ``.npz``, ``.pfm`` and ``.exr``
       files; and depth images or ``.npy`` whose name ends in ``depth`` (``0001_depth.png``) or that lie in a
-      folder ``depth``. The image is the file of the same name with ``rgb``, ``color``, ``colors``, ``image``
-      or ``img`` in place of ``depth``, in the name or in the folder's; without one, reflectivity is 1.
+      folder ``depth``. The image is the file of the same name (.png, .jpg, .webp, ...) without ``depth``, or with
+      ``rgb``, ``color``, ``colors``, ``image`` or ``img`` in place of it, in the name or in the folder's; without one,
+      reflectivity is 1, and a folder without any image is told by a warning.
 
     Parameters
     ----------
@@ -84,7 +88,7 @@ def scan(
     check
         Read every scene once, so that damaged files are found now and not in the middle of a long run.
     progress
-        Called as ``progress(done, total)``.
+        Called as ``progress(done, total)``; True: a bar.
 
     Returns
     -------
@@ -103,6 +107,7 @@ def scan(
         raise ValueError(f"image must be two texts that go with a pattern, got {image!r}")
     if pattern is not None and manifest is not None:
         raise ValueError("scenes come from a pattern or from a manifest, got both")
+    progress = shown(progress, "reading")
     problems: list[Problem] = []
     if manifest is None and pattern is None and (root / MANIFEST).is_file():
         manifest = root / MANIFEST
@@ -113,6 +118,8 @@ def scan(
     else:
         found = _recognised(root, problems)
     candidates = list(found)
+    if manifest is None:
+        _tell_images(root, candidates)
     if manifest is None:
         candidates = [_with(one, depth_unit_m, focal_px) for one in candidates]
     if not check:
@@ -223,13 +230,30 @@ def _partner(path: Path) -> Path | None:
     stems = []
     if path.stem.lower().endswith("depth"):
         stems += [path.with_name(path.stem[:-5] + word) for word in _IMAGE_WORDS]
+        if bare := path.stem[:-5].rstrip("_-. "):
+            stems.append(path.with_name(bare))  # 0001_depth.png and 0001.jpg
+    elif path.suffix.lower() in _ALONE:
+        stems.append(path.with_suffix(""))
     if path.parent.name.lower() in _DEPTH_FOLDERS:
         above = path.parent.parent
         for stem in [path.stem, *(one.name for one in stems)]:
             stems += [above / word / stem for word in _IMAGE_WORDS]
     for one in stems:
-        for suffix in _IMAGE:
+        for suffix in (*_IMAGE, *map(str.upper, _IMAGE)):
             found = one.with_name(one.name + suffix)
-            if found.is_file():
+            if found.is_file() and found != path:
                 return found
     return None
+
+
+def _tell_images(root: Path, found: list[SceneFile]) -> None:
+    """Warn where no scene of a folder has an image: reflectivity is then the same everywhere, which few want."""
+    alone = [one for one in found if one.image is None and one.depth.suffix.lower() in _DEPTH]
+    if alone and len(alone) == len(found):
+        warnings.warn(
+            f"{root}: no image was found to any of {len(found)} depth files, so that reflectivity is 1 everywhere; "
+            f"{alone[0].depth.name} takes one of the same name without 'depth', or with 'rgb', 'color' or 'image' in "
+            "place of it (docs/formats.md), or give pattern and image",
+            UserWarning,
+            stacklevel=3,
+        )

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.files import WriteError as WriteError
 from mars_lidar._base.files import reason
+from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
 from mars_lidar.engines.options import given
@@ -73,7 +74,7 @@ def simulate_to(
     reflectivity: ArrayLike | None = None,
     source: str = "",
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     **options: Unpack[EngineOptions],
 ) -> Written:
     """Simulate a cube into a ``.zarr``, ``.h5``, ``.hdf5`` or ``.npz`` of any size.
@@ -96,7 +97,7 @@ def simulate_to(
     overwrite
         Replace an existing file.
     progress
-        Called with (pixel exposures done, in all).
+        Called with (pixel exposures done, in all); True: a bar, or a line every 30 s where there is no terminal.
 
     Raises
     ------
@@ -109,6 +110,7 @@ def simulate_to(
     WriteError, Interrupted
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
+    progress = shown(progress, "simulating")
     chosen = given(options)
     recipe = Recipe(
         system=system,
@@ -198,12 +200,13 @@ def regenerate(
 
 
 def verify(
-    cube: Cube, *, threads: int | None = None, progress: Progress | None = None, table: Table | None = None
+    cube: Cube, *, threads: int | None = None, progress: Progress | bool | None = None, table: Table | None = None
 ) -> bool:
     """Whether simulating again gives the stored counts, bit for bit; one block in memory at a time.
 
     A cube that was made with a table needs that `table`; another one is refused.
     """
+    progress = shown(progress, "verifying")
     recipe = _repeatable(cube.simulation("simulating again"), table)
     for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
         again = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))

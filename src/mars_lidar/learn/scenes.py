@@ -171,7 +171,7 @@ class Arrays(Given):
 
 def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSource:
     """What `CubeStream` takes as scenes."""
-    checks.integer("reuse", reuse, low=1, high=2**31)
+    reuse = checks.integer("reuse", reuse, low=1, high=2**31)
     if isinstance(scenes, str) and scenes in Scene.example_names():
         return RayCast(scenes, (64, 64) if size is None else size, reuse)
     if isinstance(scenes, str | Path):

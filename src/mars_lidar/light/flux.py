@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,8 @@ from mars_lidar._base.late import late
 from mars_lidar._base.types import FloatArray
 from mars_lidar.light.photon_maps import MAX_PHOTONS as MAX_PHOTONS
 from mars_lidar.light.photon_maps import broadcast, check_photons, common_shape, frozen, light_map, waveform_maps
+
+MAX_RETURNS = 16
 
 if TYPE_CHECKING:
     from mars_lidar.instrument.system import System
@@ -29,11 +32,12 @@ class Flux:
     Parameters
     ----------
     signal
-        Signal photons per period S: scalar or (H, W).
+        Signal photons per period S: scalar or (H, W); or (R, H, W) of R returns in each pixel, 1 to 16, whose delays
+        are then (R, H, W) too. `Flux.multi` puts returns of several fluxes side by side.
     background
         Background photons per period B, uniform in time: scalar or (H, W).
     delay_ns
-        Delay tau of the return, ns: scalar or (H, W). Any finite value: it wraps into the laser period.
+        Delay tau of the return, ns: scalar or (H, W), or (R, H, W). Any finite value: it wraps into the laser period.
         NaN, for "no return", is allowed where the signal is 0.
     waveform
         Instead of `signal` and `delay_ns`: photons per period in each of T equal parts of the period
@@ -78,6 +82,11 @@ class Flux:
             return
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
+        if np.ndim(signal) == 3:
+            returns = _each_return(signal, delay_ns)
+            both = Flux.multi(*(Flux(s, background if k == 0 else 0.0, tau) for k, (s, tau) in enumerate(returns)))
+            _fill(self, both.returns_signal, both.returns_delay_ns, both.background, None, info)
+            return
         maps = [light_map("signal", signal), light_map("background", background)]
         maps.append(light_map("delay_ns", 0.0 if delay_ns is None else delay_ns, photons=False))
         s, b, tau = broadcast(("signal", "background", "delay_ns"), maps)
@@ -244,6 +253,16 @@ class Flux:
             f"Flux({h} x {w} pixels, {what}, mean signal {self.signal.mean():.4g}, "
             f"mean background {self.background.mean():.4g} photons per period)"
         )
+
+
+def _each_return(signal: Any, delay_ns: Any) -> Iterator[tuple[Any, Any]]:
+    """Signal and delay (H, W) of each return of arrays (R, H, W)."""
+    if not 1 <= len(signal) <= MAX_RETURNS:
+        raise ValueError(f"signal must be (R, H, W) of 1 to {MAX_RETURNS} returns, got shape {np.shape(signal)}")
+    if delay_ns is None or np.ndim(delay_ns) != 3 or len(delay_ns) != len(signal):
+        told = "None" if delay_ns is None else f"shape {np.shape(delay_ns)}"
+        raise ValueError(f"delay_ns must be (R, H, W) as signal of shape {np.shape(signal)} is, got {told}")
+    return zip(signal, delay_ns, strict=True)
 
 
 def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatArray:

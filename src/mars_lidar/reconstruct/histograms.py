@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.instrument.system import System
@@ -33,14 +34,13 @@ class Histograms:
 
 
 def checked(
-    cube: ArrayLike, system: System, threads: int | None, progress: Progress | None = None
+    cube: ArrayLike, system: System, threads: int | None, progress: Progress | bool | None = None
 ) -> tuple[Histograms, tuple[int, ...]]:
     """Histograms (pixels, bins) in a type that the native core takes, and the leading shape (...) of the cube."""
     if not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     team = thread_count(threads)
-    if progress is not None and not callable(progress):
-        raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
+    progress = shown(progress, "reconstructing")
     counts = np.asarray(cube)
     if counts.dtype.kind in "OUS":
         raise TypeError(f"cube must be an array of counts (of a loaded cube its histogram), got {type(cube).__name__}")

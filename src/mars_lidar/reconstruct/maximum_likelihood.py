@@ -43,7 +43,7 @@ class MaximumLikelihood(Method):
     windows = False
 
     def __post_init__(self) -> None:
-        checks.integer("starts", self.starts, low=1, high=8)
+        object.__setattr__(self, "starts", checks.integer("starts", self.starts, low=1, high=8))
         checks.real("false_alarm", self.false_alarm, low=1e-12, high=0.5)
 
     def least_gain(self, system: System) -> float:

@@ -41,7 +41,8 @@ class ChainCorrection(RateMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.integer("iterations", self.iterations, low=1, high=100_000)
+        count = checks.integer("iterations", self.iterations, low=1, high=100_000)
+        object.__setattr__(self, "iterations", count)
         checks.real("tolerance", self.tolerance, low=0.0, high=0.1, strict_low=True)
 
     def check(self, system: System) -> None:

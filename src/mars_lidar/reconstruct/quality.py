@@ -72,7 +72,11 @@ def map_error(truth: FloatArray, estimate: FloatArray) -> MapError:
 
 
 def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:
-    """Errors of depth, in m modulo the unambiguous range, and of reflectivity or else signal, of a known scene."""
+    """Errors of depth, in m modulo the unambiguous range, and of reflectivity or else signal, of a known scene.
+
+    Depth is judged where a return was seen, as in the picture of `mars_lidar.plot.reconstruction`: elsewhere the
+    estimate is a guess anywhere in the period, and counts as missing.
+    """
     out: dict[str, MapError] = {}
     if cube.measured:
         return out
@@ -81,7 +85,7 @@ def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:
         span = cube.system.unambiguous_range_m
         truth = np.where(lit, cube.depth_m, np.nan)
         lag = (found.depth_m - truth + 0.5 * span) % span - 0.5 * span
-        out["depth"] = map_error(truth, truth + lag)
+        out["depth"] = map_error(truth, np.where(found.seen, truth + lag, np.nan))
     if lit.any():
         if cube.reflectivity is not None:
             out["reflectivity"] = map_error(np.where(lit, cube.reflectivity, np.nan), found.reflectivity)

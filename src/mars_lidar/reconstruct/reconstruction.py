@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,15 +74,28 @@ class Reconstruction:
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
+@runtime_checkable
+class Recorded(Protocol):
+    """Counts with the system that recorded them, such as `mars_lidar.io.Cube`."""
+
+    @property
+    def system(self) -> System:
+        """How they were recorded."""
+
+    @property
+    def histogram(self) -> Any:
+        """(..., bins)."""
+
+
 def reconstruct(
-    cube: ArrayLike,
-    system: System,
+    cube: ArrayLike | Recorded,
+    system: System | None = None,
     method: str | Method = "maximum_likelihood",
     *,
     level: float | None = None,
     attenuation: Literal["none", "inverse_square"] = "none",
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Reconstruction:
     """Depth, signal and background of every pixel of a histogram cube.
 
@@ -90,8 +103,9 @@ def reconstruct(
     ----------
     cube
         (..., bins) counts, e.g. (realizations, H, W, bins) of `simulate`. Float cubes are means of counts per exposure.
+        Or a cube of `mars_lidar.io.load`, which carries its system.
     system
-        How they were recorded. Flux is periodic, with the system's pulse.
+        How they were recorded. Flux is periodic, with the system's pulse. None: the system that the cube carries.
     method
         A name in `mars_lidar.reconstruct.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says what
         each assumes), or a `Method` of your own settings. Each refuses detectors that it does not hold for.
@@ -111,6 +125,10 @@ def reconstruct(
     Reconstruction
         Maps of shape (...).
     """
+    if isinstance(cube, Recorded):
+        system, cube = cube.system if system is None else system, np.asarray(cube.histogram)
+    if system is None:
+        raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load carries its own)")
     used = find_method(method)
     checks.choice("attenuation", attenuation, ATTENUATIONS)
     if level is not None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.reconstruct.histograms import checked
@@ -37,7 +38,7 @@ def reconstruct_stored(
     level: float | None = None,
     attenuation: str | None = None,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> dict[str, Timed]:
     """Reconstruct a cube of `mars_lidar.io.load` with several methods, reading each part of its counts once.
 
@@ -55,6 +56,7 @@ def reconstruct_stored(
     dict
         By name of the method.
     """
+    progress = shown(progress, "reconstructing")
     system, recipe = cube.system, cube.recipe
     used = [find_method(method) for method in methods]
     for method in used:

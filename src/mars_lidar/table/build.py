@@ -8,6 +8,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
@@ -43,7 +44,7 @@ def build(
     tolerance: float = 1e-4,
     check_law: bool = False,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> N:
     """A table of the class `make`; arguments and errors as `Table.build`."""
     if not isinstance(system, System):
@@ -59,8 +60,7 @@ def build(
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     if not isinstance(check_law, bool):
         raise TypeError(f"check_law must be True or False, got {check_law!r}")
-    if progress is not None and not callable(progress):
-        raise TypeError(f"progress must be callable as progress(done, total), got {progress!r}")
+    progress = shown(progress, "building a table")
     recipe = Recipe(method, rearm, tolerance, thread_count(threads))
     began = time.perf_counter()
     if goal is None:

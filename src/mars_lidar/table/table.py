@@ -59,7 +59,7 @@ class Table(Nodes):
         tolerance: float = 1e-4,
         check_law: bool = False,
         threads: int | None = None,
-        progress: Progress | None = None,
+        progress: Progress | bool | None = None,
     ) -> Table:
         """Evaluate every entry.
 

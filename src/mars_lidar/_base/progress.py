@@ -1,0 +1,73 @@
+"""How far a long run is, for people: a line that moves on a terminal, a line every half minute anywhere else."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from mars_lidar._base.types import Progress
+
+_PATIENCE_S = 0.5  # a line that would vanish at once is not drawn
+_OFTEN_S, _SELDOM_S = 0.2, 30.0  # between lines on a terminal, and in a log
+LONG_S = 10.0
+"""What takes longer than this is told before, or as soon as it can be known."""
+
+
+def shown(progress: Any, label: str) -> Progress | None:
+    """The callback that an argument `progress` means: a function, True for a `Bar`, None or False for nothing."""
+    if progress is None or progress is False:
+        return None
+    if progress is True:
+        return Bar(label)
+    if not callable(progress):
+        raise TypeError(f"progress must be callable as progress(done, total), or True, got {progress!r}")
+    told: Progress = progress
+    return told
+
+
+class Bar:
+    """A callback (done, total) that says on standard error how far a run is, and how long it will still take."""
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._live = sys.stderr.isatty() or "ipykernel" in sys.modules
+        self._began = self._last = time.monotonic()
+        self._warned, self._width = False, 0
+
+    def __call__(self, done: int, total: int) -> None:
+        """Tell it, if it is time."""
+        now = time.monotonic()
+        spent = now - self._began
+        if done >= total:
+            self.close()
+        elif self._live and done and spent > _PATIENCE_S and now - self._last > _OFTEN_S:
+            self._last = now
+            text = self._text(done / total, spent)
+            sys.stderr.write("\r" + text.ljust(self._width))
+            sys.stderr.flush()
+            self._width = len(text)
+        elif not self._live and (now - self._last > _SELDOM_S or self._first_is_due(done, total, spent)):
+            self._last, self._warned = now, True
+            print(f"mars-lidar: {self._text(done / total, spent)}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._width:
+            sys.stderr.write("\r" + " " * self._width + "\r")
+            sys.stderr.flush()
+            self._width = 0
+
+    def _first_is_due(self, done: int, total: int, spent: float) -> bool:
+        return not self._warned and done > 0 and spent > 2.0 and spent * total / done > LONG_S
+
+    def _text(self, share: float, spent: float) -> str:
+        left = f", about {span(spent * (1.0 - share) / share)} left" if share > 0.0 else ""
+        return f"{self._label}: {100 * share:.0f} % after {span(spent)}{left}"
+
+
+def span(seconds: float) -> str:
+    """A time in words: two or three digits, and the unit that suits."""
+    if seconds < 120:
+        return f"{seconds:.0f} s" if seconds >= 10 else f"{seconds:.2g} s"
+    return f"{seconds / 60:.3g} minutes" if seconds < 7200 else f"{seconds / 3600:.3g} hours"

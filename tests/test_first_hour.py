@@ -1,0 +1,152 @@
+"""What a new user meets in the first quarter of an hour: own images, numbers as people write them, whole objects."""
+
+from __future__ import annotations
+
+import re
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import xarray
+from typer.testing import CliRunner
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar._base import progress as bars
+from mars_lidar.cli import app
+from mars_lidar.cli.simulate import each_ns
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=50, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
+)
+RECIPE = "scenes: {path: .}\nsystems: {file: spad.yaml}\nlight: {signal: 1, sbr: 1}\n"
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def write_depth(path, side: int = 8) -> None:
+    imageio.imwrite(path, np.full((side, side), 3000, np.uint16))
+
+
+@pytest.mark.parametrize("name", ["s00.jpg", "s00.jpeg", "s00.png", "s00.webp", "s00.JPG", "s00_rgb.webp"])
+def test_an_image_beside_its_depth_becomes_the_reflectivity(tmp_path, name):
+    write_depth(tmp_path / "s00_depth.png")
+    ramp = np.tile(np.linspace(0, 255, 8).astype(np.uint8), (8, 1))
+    imageio.imwrite(tmp_path / name, np.repeat(ramp[..., None], 3, axis=2), extension=name[name.index(".") :].lower())
+    SYSTEM.save(tmp_path / "spad.yaml")
+    (tmp_path / "recipe.yaml").write_text(RECIPE)
+    ml.generate(tmp_path / "recipe.yaml", tmp_path / "set.zarr")
+    with xarray.open_zarr(tmp_path / "set.zarr") as data:
+        share = data.reflectivity.values[0]
+        assert share[:, -1].mean() > 10 * share[:, 0].mean()
+        assert data.scene_name.values.tolist() == ["./s00_depth.png"]
+    with xarray.open_zarr(tmp_path / "set.zarr", group="scenes") as data:
+        assert data["name"].values.tolist() == ["./s00_depth.png"]
+
+
+def test_a_folder_without_any_image_says_so(tmp_path):
+    for k in range(3):
+        write_depth(tmp_path / f"s{k}_depth.png")
+    with pytest.warns(UserWarning, match=r"no image was found to any of 3 depth files.*s0_depth\.png"):
+        scenes, _ = io.scan(tmp_path)
+    assert [one.image for one in scenes] == [None] * 3
+    imageio.imwrite(tmp_path / "s1.jpg", np.full((8, 8), 200, np.uint8))
+    scenes, _ = io.scan(tmp_path)  # some have none, which is nothing odd
+    assert [one.image and one.image.name for one in scenes] == [None, "s1.jpg", None]
+
+
+def test_whole_floats_are_integers_everywhere(tmp_path):
+    assert SYSTEM.replace(cycles=1e6).cycles == 1_000_000
+    assert isinstance(SYSTEM.replace(cycles=np.float64(1e3)).cycles, int)
+    flux = ml.Flux(0.5, 0.1, 20.0)
+    assert np.array_equal(
+        ml.simulate(flux, SYSTEM, realizations=2.0, seed=3.0), ml.simulate(flux, SYSTEM, realizations=2, seed=3)
+    )
+    done = run(
+        "simulate", "--scene", "room", "--size", "1e1", "--cycles", "1e2", "--no-picture", "-o", tmp_path / "a.zarr"
+    )
+    assert done.exit_code == 0, done.output
+    with io.load(tmp_path / "a.zarr") as cube:
+        assert (cube.system.cycles, cube.shape[1]) == (100, 10)
+    done = run("simulate", "--scene", "room", "--cycles", "1.5e0", "-o", tmp_path / "b.zarr")
+    assert done.exit_code == 2
+    assert "'1.5e0' is not an integer" in done.output
+
+
+def test_words_that_are_nearly_right_are_guessed():
+    with pytest.raises(ValueError, match=r"unknown key 'dead_time' \(did you mean 'dead_time_ns'\?\)"):
+        ml.Detector.from_dict({"dead_time": 5.0})
+    with pytest.raises(ValueError, match=r"got 'exat' \(did you mean 'exact'\?\)"):
+        ml.simulate(ml.Flux(0.5, 0.1, 20.0), SYSTEM, engine="exat")
+
+
+def test_progress_true_is_a_bar_and_a_log_gets_a_line_every_half_minute(monkeypatch, capsys):
+    flux = ml.Flux(0.5, 0.1, 20.0)
+    assert np.array_equal(ml.simulate(flux, SYSTEM, progress=True), ml.simulate(flux, SYSTEM, progress=False))
+    assert len(ml.simulate_timestamps(flux, SYSTEM, progress=True)) > 0
+    assert capsys.readouterr().err == ""  # too short to speak of
+    with pytest.raises(TypeError, match="or True, got 5"):
+        ml.simulate(flux, SYSTEM, progress=5)  # type: ignore[arg-type]
+    now = [0.0]
+    monkeypatch.setattr(bars.time, "monotonic", lambda: now[0])
+    bar = bars.Bar("simulating")
+    for second in range(1, 101):
+        now[0] = float(second)
+        bar(second, 100)
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == "mars-lidar: simulating: 3 % after 3 s, about 97 s left"  # before a long run
+    assert [int(re.search(r"(\d+) %", line)[1]) for line in told] == [3, 34, 65, 96]
+    brief = bars.Bar("simulating")
+    for second in range(101, 106):
+        now[0] = float(second)
+        brief(second - 100, 6)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_loaded_cube_carries_its_system(tmp_path):
+    flux = ml.Scene.example("room", size=6).flux(SYSTEM, signal=2.0, sbr=5.0)
+    io.simulate_to(tmp_path / "a.zarr", flux, SYSTEM)
+    with io.load(tmp_path / "a.zarr") as cube:
+        alone, given = ml.reconstruct(cube), ml.reconstruct(cube.histogram[:], cube.system)
+    assert np.array_equal(alone.depth_m, given.depth_m, equal_nan=True)
+
+
+def test_several_returns_go_into_a_flux():
+    signal, delay = np.full((2, 3, 4), 0.25), np.stack([np.full((3, 4), 10.0), np.full((3, 4), 60.0)])
+    flux = ml.Flux(signal, 0.1, delay)
+    same = ml.Flux.multi(ml.Flux(signal[0], 0.1, delay[0]), ml.Flux(signal[1], 0.0, delay[1]))
+    assert np.array_equal(ml.simulate(flux, SYSTEM), ml.simulate(same, SYSTEM))
+    assert flux.returns_signal.shape == (2, 3, 4)
+    assert ml.Flux(
+        np.full((16, 1, 1), 0.1), 0.0, np.linspace(0, 90, 16).reshape(16, 1, 1)
+    ).signal.item() == pytest.approx(1.6)
+    with pytest.raises(ValueError, match="1 to 16 returns"):
+        ml.Flux(np.ones((17, 1, 1)), 0.0, np.ones((17, 1, 1)))
+    with pytest.raises(ValueError, match=r"delay_ns must be \(R, H, W\)"):
+        ml.Flux(np.ones((2, 3, 4)), 0.0, 5.0)
+
+
+def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
+    """Pixels without a detection have a depth that is a guess: the table counted it, the picture did not."""
+    pytest.importorskip("skimage")
+    from mars_lidar.compare.views import depth_error_m
+    from mars_lidar.reconstruct.quality import errors_against
+
+    flux = ml.Scene.example("room", size=12).flux(SYSTEM, signal=0.02, sbr=0.5)
+    io.simulate_to(tmp_path / "a.zarr", flux, SYSTEM)
+    with io.load(tmp_path / "a.zarr") as cube:
+        found = ml.reconstruct(cube)
+        assert 0.0 < found.seen.mean() < 1.0
+        drawn = depth_error_m(cube, np.where(found.seen[0], found.depth_m[0], np.nan))
+        told = errors_against(cube, found)["depth"]
+    assert told.rmse == pytest.approx(float(np.sqrt(np.nanmean(drawn**2))))
+    assert told.missing == pytest.approx(1.0 - float(found.seen.mean()))
+
+
+def test_small_words():
+    from mars_lidar.cli.dataset_tables import files
+
+    assert [each_ns(3.0), each_ns(3020.0)] == ["3 ns", "3.02 µs"]
+    assert [files(0), files(1), files(2)] == ["nothing", "1 file", "2 files"]

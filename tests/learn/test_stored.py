@@ -54,9 +54,31 @@ def test_examples_are_the_exposures(path):
         counts = np.asarray(stored.histogram[one["sample"], one["realization"]])
         np.testing.assert_array_equal(one["histogram"].permute(1, 2, 0).numpy(), counts)
         np.testing.assert_array_equal(one["signal"].numpy(), np.asarray(stored.maps["signal"][one["sample"]]))
-        assert one["seed"] == int(stored.seeds[one["sample"]])
+        assert one["seed"].item() == int(stored.seeds[one["sample"]])
     numbered = {"sample", "realization", "scene", "system", "signal_level", "sbr", "seed"}
     assert set(examples[0]) == {"histogram", "depth", "signal"} | numbered
+
+
+@pytest.mark.parametrize("seed", [0x243F6A8885A308D3, 0x13198A2E03707344, 0xA4093822299F31D0, 2**64 - 1])
+def test_the_documented_loop_over_any_dataset_seed(tmp_path, seed):
+    """Seeds of samples fill 64 bits: half of them overflow a signed integer, so collation must not see one."""
+    recipe = {
+        "scenes": {"example": "room", "size": [4, 5], "seeds": [0, 1, 2, 3]},
+        "systems": [SYSTEM],
+        "light": {"signal": [0.5]},
+        "seed": seed,
+    }
+    ml.generate(recipe, tmp_path / "set.zarr")
+    stored = ml.dataset.open_dataset(tmp_path / "set.zarr")
+    assert stored.seeds.max() >= 2**63  # of four samples: 1 in 16 by chance, and these seeds were not chosen for it
+    train = StoredDataset(tmp_path / "set.zarr", maps=["depth"], seed=1)
+    for epoch in range(2):
+        train.set_epoch(epoch)
+        told = {}
+        for batch in DataLoader(train, batch_size=2):
+            assert batch["histogram"].shape == (2, 32, 4, 5)
+            told |= dict(zip(batch["sample"].tolist(), batch["seed"].tolist(), strict=True))
+        assert told == dict(enumerate(stored.seeds.tolist()))
 
 
 def test_orders(path):

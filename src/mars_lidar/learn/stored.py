@@ -24,7 +24,7 @@ from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.store import Dataset, open_dataset
 from mars_lidar.learn.distributed import rank_of, worker_of
 
-_NUMBERS = ("sample", "realization", "scene", "system", "signal_level", "sbr", "seed")
+_NUMBERS = ("sample", "realization", "scene", "system", "signal_level", "sbr")
 
 
 class StoredDataset(IterableDataset[dict[str, Any]]):
@@ -36,7 +36,8 @@ class StoredDataset(IterableDataset[dict[str, Any]]):
     several ranks each gives the same number of examples, so that a few of them are left out of an epoch.
 
     An example is a dictionary: ``histogram`` (bins, H, W) or (H, W, bins), the chosen maps (H, W) as float32, and
-    numbers: ``sample``, ``realization``, ``scene``, ``system``, ``signal_level``, ``sbr``, ``seed``.
+    numbers: ``sample``, ``realization``, ``scene``, ``system``, ``signal_level``, ``sbr``; and ``seed``, a tensor of
+    torch.uint64, for seeds go up to 2^64, which no signed integer of a batch could hold.
 
     Parameters
     ----------
@@ -180,10 +181,11 @@ class StoredDataset(IterableDataset[dict[str, Any]]):
         histogram = torch.from_numpy(wide).to(self._dtype)
         if self._axes == "THW":
             histogram = histogram.permute(2, 0, 1).contiguous()
-        numbers = (sample, realization, scene, system, signal, sbr, int(self._dataset.seeds[sample]))
+        numbers = (sample, realization, scene, system, signal, sbr)
         example: dict[str, Any] = {"histogram": histogram}
         example.update({name: torch.from_numpy(one.copy()) for name, one in maps.items()})
         example.update(dict(zip(_NUMBERS, numbers, strict=True)))
+        example["seed"] = torch.tensor(int(self._dataset.seeds[sample]), dtype=torch.uint64)
         return example if self._transform is None else self._transform(example)
 
 

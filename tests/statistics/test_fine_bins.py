@@ -119,7 +119,7 @@ def test_light_that_cells_do_not_see():
     histogram = mean_histogram(8.0, 0.2, system, delay_ns=33.3)
     known = mean_histogram(8.0, 0.2, system.replace(bins=1001), delay_ns=33.3)
     assert abs(histogram[: BINS // 2].sum() - known[:500].sum() - 0.5 * known[500]) < 1e-3 * known.sum()
-    with pytest.raises(ConvergenceError, match="use fewer bins, .*engine 'exact'"):
+    with pytest.raises(ConvergenceError, match=r"use fewer bins, .*engine 'exact'"):
         ml.joint_law(8.0, 0.2, system, delay_ns=33.3)
     with pytest.raises(MemoryError, match="window"):
         ml.joint_law(0.5, 0.2, view(0.45, 100, 0.01)).covariance()

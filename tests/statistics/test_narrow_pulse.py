@@ -107,7 +107,7 @@ def test_near_whole_periods(law: Any, whole: int, apart: float, sigma: float) ->
         like_a_wide_one(law, 1.0, whole, apart, sigma)
     except ConvergenceError as error:
         refusal = str(error)
-    assert not refusal or "engine 'exact'" in refusal
+    assert not refusal or ("engine 'exact'" in refusal and "joint_law" not in refusal)  # which refuses it too
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.5, 0.5 + 2e-6])

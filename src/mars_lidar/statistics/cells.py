@@ -17,7 +17,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cell_input import broadcast, flat, photons, reals
 from mars_lidar.statistics.gate import PLAIN, require_mode
 from mars_lidar.statistics.gated_light import photons_before
-from mars_lidar.statistics.narrow_pulse import followed_bins, followed_edges, needed_bins
+from mars_lidar.statistics.narrow_pulse import followed_bins, followed_edges, meets_itself, needed_bins
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
@@ -168,8 +168,8 @@ class Cells:
     def instead(self) -> str:
         """What to use where an exact law is refused, for errors."""
         able = (
-            []
-            if self.system.detector.mode != "nonparalyzable"
+            []  # joint_law and the chain do not resolve such a pulse either
+            if self.system.detector.mode != "nonparalyzable" or meets_itself(self)
             else ["joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)"]
         )
         return f"use {', '.join(able)}{', or ' if able else ''}simulate it with engine 'exact'"

@@ -13,6 +13,7 @@ from mars_lidar.statistics.cells import LAW_STEPS, Cells
 from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments
 from mars_lidar.statistics.electronics_grid import LAW_EFFORT
 from mars_lidar.statistics.exposure import refined_moments
+from mars_lidar.statistics.fine_bins import fine_histograms
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
 from mars_lidar.statistics.timing import recorded
@@ -69,5 +70,9 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
         return np.asarray(armed * (mean / seen)[:, None], dtype=np.float64)
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)
-    exposure = refined_moments(cells, bins, tolerance=tolerance, threads=threads, steps=LAW_STEPS)
-    return exposure.histogram.reshape(cells.size, bins)
+
+    def compute(some: Cells, bins: int) -> FloatArray:
+        exposure = refined_moments(some, bins, tolerance=tolerance, threads=threads, steps=LAW_STEPS)
+        return exposure.histogram.reshape(some.size, bins)
+
+    return fine_histograms(cells, bins, tolerance, compute)

@@ -21,12 +21,15 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.fine_bins import MANY_BINS, light_before, misplaced
+from mars_lidar.statistics.joint_fine import FinePixel
 from mars_lidar.statistics.joint_pixel import INSTEAD, Pixel, movement
 from mars_lidar.statistics.joint_timed import TimedPixel
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 
 _MAX_BINS = 2**17  # of the grid, unless the histogram itself has more: a second or two
+_CELLS = (2**13, 2**15, 2**16)  # of a histogram of more than MANY_BINS, tried in turn
 _BLOCK = 64  # windows solved at a time
 
 
@@ -88,16 +91,37 @@ def joint_law(
         return replace(_law(cells, tolerance), system=system)
     timing = Timing(cells.system, cells.finest)
     law = _law(replace(cells, system=timing.untimed), tolerance)
-    pixel = TimedPixel(law._pixel, law.mean, timing) if isinstance(law._pixel, Pixel) else None
+    pixel = TimedPixel(law._pixel, law.mean, timing) if isinstance(law._pixel, Pixel | FinePixel) else None
     return replace(law, system=system, mean=timing.forward(law.mean), _pixel=pixel)
 
 
 def _law(cells: Cells, tolerance: float) -> JointLaw:
     """The law of registrations of checked cells."""
-    system = cells.system
-    if system.dead_time_periods == 0.0 or cells.signal[0] + cells.background[0] == 0.0:
+    out = cells.system.bins
+    if cells.system.dead_time_periods == 0.0 or cells.signal[0] + cells.background[0] == 0.0:
         return _poisson(cells)
-    out = system.bins
+    if out <= MANY_BINS:
+        law, _ = _refined(cells, out, tolerance)
+        return law
+    edges = np.arange(out + 1) / out
+    light = light_before(cells, edges)
+    for few in _CELLS:
+        if misplaced(light_before(cells, np.arange(few + 1) / few), edges, light) > 2.0 * tolerance:
+            continue
+        law, pixel = _refined(cells, few, tolerance)
+        fine = FinePixel(pixel, out)
+        moved = max(law.movement, movement(fine.wider(), fine))
+        if moved <= tolerance:
+            return replace(law, mean=fine.mean, movement=moved, _pixel=fine)
+    raise ConvergenceError(
+        f"joint law of {cells.name(0)}: {_CELLS[-1]} cells of the period do not tell the light within them, which "
+        f"{out} bins show; use fewer bins, {INSTEAD.removeprefix('use ')}"
+    )
+
+
+def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]:
+    """The law in `out` bins, of which its grid is a multiple."""
+    system = cells.system
     cells = cells.resolved(out)
     bins = cells.first_bins(out)
     if bins > max(_MAX_BINS, 4 * out):
@@ -110,7 +134,7 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
         fine = Pixel(cells, bins, out)
         moved = movement(coarse, fine)
         if moved <= tolerance:
-            return JointLaw(system, fine.mean, moved, bins, fine.settled, _pixel=fine)
+            return JointLaw(system, fine.mean, moved, bins, fine.settled, _pixel=fine), fine
         bins *= 2
         if bins > max(_MAX_BINS, 4 * out):
             raise ConvergenceError(
@@ -147,7 +171,7 @@ class JointLaw:
     movement: float
     grid_bins: int
     settled: int
-    _pixel: Pixel | TimedPixel | None = field(repr=False)
+    _pixel: Pixel | FinePixel | TimedPixel | None = field(repr=False)
 
     __repr__ = brief
 

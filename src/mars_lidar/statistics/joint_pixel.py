@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 
@@ -112,13 +113,32 @@ class Pixel:
         return columns
 
 
-def movement(coarse: Pixel, fine: Pixel) -> float:
+class Seen(Protocol):
+    """A pixel on one grid, its histogram in `out` bins."""
+
+    cells: Cells
+    out: int
+    mean: FloatArray
+
+    @property
+    def grid(self) -> FoldedGrid:
+        """That of the registrations."""
+
+    @property
+    def law(self) -> SettledLaw | None:
+        """The closed form; None where the exposure is run through."""
+
+    def monitored(self, weights: FloatArray) -> FloatArray:
+        """Variances (windows,) of the counts in windows `weights` (windows, bins)."""
+
+
+def movement(coarse: Seen, fine: Seen) -> float:
     """`JointLaw.movement` from one grid to the next; infinite where a bin or a variance is negative."""
     n = coarse.out
     mean = fine.mean.reshape(n, -1).sum(-1)
     total = max(float(mean.sum()), np.finfo(float).tiny)
     shape = 0.5 * float(np.abs(mean - coarse.mean).sum()) / total
-    few = fine.law is None or fine.grid.bins > _MANY_BINS  # a window costs much
+    few = fine.law is None or max(fine.grid.bins, fine.out) > _MANY_BINS  # a window costs much
     weights = _monitors(mean, fine.cells.system.dead_time_periods, few)
     means = weights @ mean
     before, after = coarse.monitored(weights), fine.monitored(np.repeat(weights, fine.out // n, axis=-1))
@@ -137,12 +157,12 @@ def _monitors(mean: FloatArray, dead: float, few: bool) -> FloatArray:
     j = np.arange(n)
     windows = [np.ones(n)]
     for start in (0,) if few else (0, n // 2):
-        windows.append(((j - start) % n < (n + 1) // 2).astype(float))
+        windows.append(np.roll(j < (n + 1) // 2, start).astype(float))
     peak = int(np.argmax(mean))
     echo = int(peak + dead % 1.0 * n) % n
     for centre in (peak, echo):
         for width in (1, max(1, n // 50)) if few else (1, 2, max(1, n // 50)):
             for side in (0,) if few else (0, 1):
-                windows.append(((j - centre + side * (width - 1) + side) % n < width).astype(float))
+                windows.append(np.roll(j < width, centre - side * width).astype(float))
     different = {window.tobytes(): window for window in windows}
     return np.array(list(different.values()))

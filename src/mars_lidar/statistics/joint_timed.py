@@ -12,15 +12,16 @@ import numpy as np
 
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.joint_fine import FinePixel
 from mars_lidar.statistics.joint_grid import FoldedGrid
 from mars_lidar.statistics.joint_pixel import Pixel
 from mars_lidar.statistics.timing import Timing
 
 
 class TimedPixel:
-    """A `Pixel` on fine parts of the period, with mean (parts,), seen through `timing`."""
+    """A `Pixel` or `FinePixel` on fine parts of the period, with mean (parts,), seen through `timing`."""
 
-    def __init__(self, pixel: Pixel, mean: FloatArray, timing: Timing) -> None:
+    def __init__(self, pixel: Pixel | FinePixel, mean: FloatArray, timing: Timing) -> None:
         self._pixel, self._mean, self._timing = pixel, mean, timing
 
     @property

@@ -18,6 +18,7 @@ from mars_lidar.statistics.gated_light import CellLight
 _PROBE = 2**12  # parts of a pulse's record
 _SEEN = 8.0  # standard deviations of bins that see a pulse: the refinement of the grid finds the rest
 _RESOLVED = 0.5  # and of bins that resolve it: there is nothing to gain from others
+_MOST_BINS = 2**15  # of a period: more take seconds
 _ROUNDING = 1e-12  # of a whole number of periods, relative
 _BLOCKS = 4  # of the period at least, so that none has both ends of a pulse's record at its own two
 _LEAST_CELLS = 8  # of a block, on a grid that follows the pulse: its pieces begin with cells of half as many
@@ -46,6 +47,11 @@ def followed_bins(cells: CellLight, coarsest: int, out_bins: int) -> int:
     blocks = _blocks(out_bins)
     bins = blocks * max(_LEAST_CELLS, 4 * math.ceil(_CELLS / (4 * blocks)))
     return bins if length <= _LONGEST * sigma and bins < _bins_of_pulse(cells) else 0
+
+
+def meets_itself(cells: CellLight) -> bool:
+    """Whether no law but the slowest resolves the pulse, which re-arms within the next one."""
+    return not _is_whole(cells) and _meets_itself(cells, _MOST_BINS, _RESOLVED)
 
 
 def _meets_itself(cells: CellLight, coarsest: int, resolved: float) -> bool:

@@ -11,6 +11,7 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED
+from mars_lidar.statistics.fine_bins import fine_histograms
 from mars_lidar.statistics.no_dead_time import recorded_light
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.warm import warm_history
@@ -22,11 +23,18 @@ def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threa
     team = thread_count(threads)
     if cells.system.dead_time_periods == 0.0:  # the light itself
         return recorded_light(cells, out_bins)
+    return fine_histograms(
+        cells, out_bins, tolerance, lambda some, bins: _refined(some, bins, tolerance=tolerance, team=team)
+    )
+
+
+def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> FloatArray:
+    """`stationary_histogram`, its grid a multiple of the bins."""
     cells = cells.resolved(out_bins)
     result = np.empty((cells.size, out_bins))
     pending = np.arange(cells.size)
     bins = cells.first_bins(out_bins)
-    most = max(MOST_BINS, 4 * out_bins, 2 * bins)
+    most = max(MOST_BINS, 4 * out_bins)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _stationary(cells, bins // 2, shared, team)
     while pending.size:

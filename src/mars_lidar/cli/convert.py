@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.foreign import ForeignOptions
+from mars_lidar.cli.groups import grouped
+
+if TYPE_CHECKING:
+    from mars_lidar.io import Converted
 
 CONVERT_EPILOG = "\n\n".join(
     (
@@ -15,6 +20,7 @@ CONVERT_EPILOG = "\n\n".join(
         "mars-lidar convert room.zarr room.h5",
         "mars-lidar convert set.zarr first.mat --realization 0",
         "mars-lidar convert lab.ptu lab.h5 --bins 1024",
+        "mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml",
         "Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
         "pip install 'mars-lidar[io]'. docs/formats.md tells what is in each.",
     )
@@ -31,19 +37,22 @@ TIMESTAMPS_EPILOG = "\n\n".join(
 _Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 
 
+@grouped
 def convert(
     source: Annotated[
-        Path, typer.Argument(help="A cube, or a photon stream (of a lab, too: .ptu, Photon-HDF5).", show_default=False)
+        Path,
+        typer.Argument(
+            help="A cube, a photon stream (of a lab, too: .ptu, Photon-HDF5), or histograms of another program.",
+            show_default=False,
+        ),
     ],
     target: Annotated[Path, typer.Argument(help="The new file; its suffix names the format.", show_default=False)],
     realization: Annotated[
         int | None,
         typer.Option("--realization", help="Of a cube, this exposure alone, from 0; a .mat holds one."),
     ] = None,
-    period_ns: Annotated[
-        float | None,
-        typer.Option("--period-ns", help="Laser period of a recorded stream that does not tell it (T2), ns."),
-    ] = None,
+    *,
+    foreign: ForeignOptions,
     bins: Annotated[
         int | None,
         typer.Option("--bins", help="Histogram bins of a recorded stream. [dim]Default: its finest clock.[/dim]"),
@@ -57,9 +66,24 @@ def convert(
 
         if is_dataset(source):
             raise ValueError(f"{source} is a dataset: mars-lidar export writes it as the files that networks load")
-        done = converted(source, target, realization=realization, period_ns=period_ns, bins=bins, overwrite=overwrite)
+        if foreign.of_histograms(source):
+            done = _imported(foreign, source, target, overwrite)
+        else:
+            done = converted(
+                source, target, realization=realization, period_ns=foreign.period_ns, bins=bins, overwrite=overwrite
+            )
         rows = [("wrote", str(done.path)), ("content", done.content)]
         table(rows + [("lost", text) for text in done.lost or ("nothing",)])
+
+
+def _imported(foreign: ForeignOptions, source: Path, target: Path, overwrite: bool) -> Converted:
+    from mars_lidar.io import save
+    from mars_lidar.io.convert import Converted
+
+    with foreign.opened(source) as cube:
+        save(target, cube, overwrite=overwrite)
+        sizes = " × ".join(map(str, cube.shape))
+        return Converted(target, f"measured cube {sizes} (realization, y, x, time)", ())
 
 
 def timestamps(

@@ -9,10 +9,13 @@ import typer
 
 from mars_lidar._version import other_version
 from mars_lidar.cli.console import check_picture, reported, save_picture, table
+from mars_lidar.cli.foreign import ForeignOptions, foreign_rows, is_foreign
+from mars_lidar.cli.groups import grouped
 
 if TYPE_CHECKING:
     from mars_lidar.instrument.detector import Detector
     from mars_lidar.io import Cube
+    from mars_lidar.light.flux import Flux
 
 
 def info(
@@ -40,6 +43,11 @@ def info(
         except IncompleteFileError as error:  # nothing in it can be read
             table([("file", str(file)), ("complete", f"NO: {error}")])
             return
+        except ValueError as error:
+            if not is_foreign(file, error):
+                raise
+            table(foreign_rows(file))
+            return
         with cube:
             table(_rows(cube))
             if not verify:
@@ -56,8 +64,17 @@ def info(
                 raise typer.Exit(FAILED)
 
 
+@grouped
 def view(
-    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of others: also .npy, .tif, .csv.",
+            show_default=False,
+        ),
+    ],
+    *,
+    foreign: ForeignOptions,
     out: Annotated[Path, typer.Option("-o", "--out", help="The picture: .png, .pdf or .svg.", show_default=False)],
     pixel: Annotated[
         list[str] | None,
@@ -73,14 +90,13 @@ def view(
 ) -> None:
     """Draw depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
 
-    Each histogram stands beside the incident rate, scaled to the same total: the difference is pile-up.
+    Each histogram stands beside the incident rate, scaled to the same total: the difference is pile-up. A measured cube
+    is shown with the light that maximum likelihood finds in it.
     """
     with reported():
         check_picture(out, overwrite)
         pixels = None if not pixel else [parsed_pixel(text) for text in pixel]
-        from mars_lidar.io import load
-
-        with load(file) as cube:
+        with foreign.opened(file) as cube:
             from mars_lidar.plot import overview
 
             figure = overview(cube, realization=realization, pixels=pixels)
@@ -98,13 +114,8 @@ def parsed_pixel(text: str) -> tuple[int, int]:
 
 
 def _rows(cube: Cube) -> list[tuple[str, str]]:
-    system, flux, recipe = cube.system, cube.flux, cube.recipe
+    system, recipe = cube.system, cube.recipe
     count, height, width, bins = cube.shape
-    photons = f"mean S {flux.signal.mean():.4g}, B {flux.background.mean():.4g} photons per laser period"
-    if flux.waveform is not None:
-        photons += f"; waveform of {flux.waveform.shape[-1]} parts"
-    elif len(flux.returns_signal) > 1:
-        photons += f"; {len(flux.returns_signal)} returns"
     complete = "yes" if cube.complete else "NO: the simulation did not finish"
     if cube.progress:
         complete += f"; {cube.progress}"
@@ -125,8 +136,9 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
     numbers = f"{first}" if count == 1 else f"{first} to {first + count - 1}"
     dead = system.detector.dead_time_ns
     made = "".join(f", {name} {_short(value)}" for name, value in cube.settings.items() if name != "table")
+    engine = "none: measured" if cube.measured else f"{cube.engine}{made}, seed {cube.seed}, realization {numbers}"
     rows += [
-        ("engine", f"{cube.engine}{made}, seed {cube.seed}, realization {numbers}"),
+        ("engine", engine),
         (
             "laser",
             f"period {system.period_ns:.6g} ns ({1e3 / system.period_ns:.4g} MHz, unambiguous to "
@@ -141,15 +153,12 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
         *_gate(system.detector),
         *_effects(system.detector),
         ("bins", f"{1e3 * system.bin_ns:.5g} ps, {system.depth_m(system.bin_ns):.3g} m of depth each"),
-        ("flux", photons),
+        *([] if cube.measured else _light(cube.flux)),
     ]
     if "table" in cube.settings:
         rows.append(("table", ", ".join(f"{name} {value}" for name, value in cube.settings["table"].items())))
-    made_of = [f"{k} {_short(v)}" for k, v in flux.info.items() if not k.endswith("_definition")]
-    if made_of:
-        rows.append(("flux made of", ", ".join(made_of)))
     if recipe.source:
-        rows.append(("scene", recipe.source))
+        rows.append(("source" if cube.measured else "scene", recipe.source))
     opener = f"xarray.open_zarr({str(cube.path)!r})" if str(cube.path).endswith(".zarr") else ""
     mine = f"mars_lidar.io.load({str(cube.path)!r})"
     if not cube.complete:
@@ -157,6 +166,16 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
     else:
         rows.append(("open with", f"{mine}  or  {opener}" if opener else mine))
     return rows
+
+
+def _light(flux: Flux) -> list[tuple[str, str]]:
+    photons = f"mean S {flux.signal.mean():.4g}, B {flux.background.mean():.4g} photons per laser period"
+    if flux.waveform is not None:
+        photons += f"; waveform of {flux.waveform.shape[-1]} parts"
+    elif len(flux.returns_signal) > 1:
+        photons += f"; {len(flux.returns_signal)} returns"
+    made_of = [f"{k} {_short(v)}" for k, v in flux.info.items() if not k.endswith("_definition")]
+    return [("flux", photons), *([("flux made of", ", ".join(made_of))] if made_of else [])]
 
 
 def _gate(detector: Detector) -> list[tuple[str, str]]:

@@ -12,6 +12,8 @@ import typer
 
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import progress_bar, reported, save_picture, say, table
+from mars_lidar.cli.foreign import ForeignOptions
+from mars_lidar.cli.groups import grouped
 from mars_lidar.reconstruct import METHODS
 
 if TYPE_CHECKING:
@@ -24,14 +26,24 @@ RECONSTRUCT_EPILOG = "\n\n".join(
         "[bold]Examples[/bold]",
         "mars-lidar reconstruct room.zarr -o maps.zarr",
         "mars-lidar reconstruct room.zarr --method all -o maps.h5",
+        "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
         "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
         f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
     )
 )
 
 
+@grouped
 def reconstruct(
-    cube: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
+    cube: Annotated[
+        Path,
+        typer.Argument(
+            help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of others: also .npy, .tif, .csv.",
+            show_default=False,
+        ),
+    ],
+    *,
+    foreign: ForeignOptions,
     out: Annotated[Path, typer.Option("-o", "--out", help="The maps: .zarr, .h5, .hdf5 or .npz.", show_default=False)],
     method: Annotated[
         str,
@@ -68,7 +80,6 @@ def reconstruct(
     with reported():
         began = time.perf_counter()
         from mars_lidar._base import checks
-        from mars_lidar.io import load
         from mars_lidar.io.maps import check_maps_output, save_maps
         from mars_lidar.reconstruct.reconstruction import ATTENUATIONS
         from mars_lidar.reconstruct.stored import reconstruct_stored
@@ -81,7 +92,7 @@ def reconstruct(
             raise ValueError(f"--out must not be the cube itself, got {str(out)!r}")
         if attenuation is not None:
             checks.choice("--attenuation", attenuation, ATTENUATIONS)
-        with load(cube) as stored:
+        with foreign.opened(cube) as stored:
             names = _methods(method, stored)
             with progress_bar("reconstructing") as progress:
                 found = reconstruct_stored(

@@ -100,17 +100,7 @@ def read_counts(
 ) -> ForeignCounts:
     """The array of a file, in order; `bins` is the length by which time is told from the image, if that is known."""
     source = Path(path)
-    if source.suffix.lower() not in FOREIGN_SUFFIXES:
-        raise ValueError(f"{source}: histograms of others are read from {', '.join(FOREIGN_SUFFIXES)}")
-    if not source.is_file():
-        raise FileNotFoundError(f"{source} does not exist")
-    try:
-        found = _READERS[source.suffix.lower()](source)
-    except (MemoryError, FileNotFoundError):
-        raise
-    except Exception as error:  # readers know a dozen errors of damaged files
-        raise ValueError(f"{source} cannot be read ({error})") from error
-    name, array = _chosen(source, found, variable)
+    name, array = _chosen(source, arrays(source), variable)
     if isinstance(array, np.ndarray) and array.dtype == object:
         return ForeignCounts(source, name, None, array, "")
     told = axes or _guessed(source, array.shape, bins)
@@ -118,6 +108,21 @@ def read_counts(
         return ForeignCounts(source, name, in_order(array, told, image), None, told)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{source}: {name or 'the array'}: {error}") from error
+
+
+def arrays(path: Path) -> dict[str, Any]:
+    """Every array of a file that could be histograms or photon times, by name: dense, sparse, or cells of times."""
+    if path.suffix.lower() not in FOREIGN_SUFFIXES:
+        raise ValueError(f"{path}: histograms of others are read from {', '.join(FOREIGN_SUFFIXES)}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist")
+    try:
+        found: dict[str, Any] = _READERS[path.suffix.lower()](path)
+    except (MemoryError, FileNotFoundError):
+        raise
+    except Exception as error:  # readers know a dozen errors of damaged files
+        raise ValueError(f"{path} cannot be read ({error})") from error
+    return {name: array for name, array in found.items() if len(array.shape)}
 
 
 def _chosen(path: Path, found: dict[str, Any], variable: str | None) -> tuple[str, Any]:

@@ -1,0 +1,184 @@
+"""Cubes of the command line: files of mars-lidar, and those of other programs with what they do not tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from mars_lidar.cli import options
+from mars_lidar.cli.options import _option
+from mars_lidar.cli.pulse_options import PulseOptions
+
+if TYPE_CHECKING:
+    from mars_lidar.instrument.system import System
+    from mars_lidar.io import Cube
+
+_PANEL = "A file of another program"
+_BINS = 1e-6  # relative difference by which a period may miss a whole number of bins
+_NEEDED = "--system, or --bin-ps (or --period-ns), --cycles, --dead-time-ns (or --detector) and --pulse-sigma-ns"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForeignOptions:
+    """What a file of another program does not tell of its histograms; nothing is needed for one of mars-lidar."""
+
+    system: options.System = None
+    bin_ns: Annotated[float | None, _option("--bin-ns", panel=_PANEL, help="Width of a histogram bin, ns ...")] = None
+    bin_ps: Annotated[float | None, _option("--bin-ps", panel=_PANEL, help="... or ps.")] = None
+    period_ns: Annotated[
+        float | None,
+        _option("--period-ns", panel=_PANEL, help="Laser period, ns.", default="the histogram's length"),
+    ] = None
+    cycles: Annotated[
+        int | None, _option("--cycles", panel=_PANEL, help="Laser periods that each histogram was accumulated over.")
+    ] = None
+    detector: options.DetectorPreset = None
+    dead_time_ns: Annotated[
+        float | None, _option("--dead-time-ns", panel=_PANEL, help="Dead time after a registration, ns.")
+    ] = None
+    pulse: PulseOptions = field(default_factory=PulseOptions)
+    start_ns: Annotated[
+        float,
+        _option(
+            "--start-ns", panel=_PANEL, help="Time from the laser pulse to the first bin (a gate), ns.", default="0"
+        ),
+    ] = 0.0
+    variable: Annotated[
+        str | None, _option("--variable", panel=_PANEL, help="Name of the array, of a file with several.")
+    ] = None
+    axes: Annotated[
+        str | None,
+        _option(
+            "--axes",
+            panel=_PANEL,
+            metavar="NYXT",
+            help="What its dimensions are, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
+            default="time last, or where the system's bins fit",
+        ),
+    ] = None
+    image: Annotated[
+        str | None, _option("--image", panel=_PANEL, metavar="H,W", help="Height and width of (yx) or (xy).")
+    ] = None
+    unit_ns: Annotated[float | None, _option("--unit-ns", panel=_PANEL, help="Unit of photon times, ns.")] = None
+
+    @property
+    def given(self) -> bool:
+        """Whether any option was given."""
+        return any(value not in (None, 0.0, PulseOptions()) for value in (getattr(self, f.name) for f in fields(self)))
+
+    def of_histograms(self, path: Path) -> bool:
+        """Whether `path` is taken for histograms: by its suffix, or by options that neither cubes nor streams have."""
+        if path.suffix.lower() in (".npy", ".csv", ".txt", ".tif", ".tiff"):
+            return True
+        return any(
+            getattr(self, name) is not None for name in ("system", "cycles", "bin_ns", "bin_ps", "axes", "image")
+        )
+
+    def opened(self, path: Path) -> Cube:
+        """The cube in a file of mars-lidar, or of another program."""
+        from mars_lidar.io import SUFFIXES, load
+        from mars_lidar.io.foreign import FOREIGN_SUFFIXES, read_counts
+
+        if not self.given and (path.suffix in SUFFIXES or path.suffix not in FOREIGN_SUFFIXES):
+            try:
+                return load(path)
+            except ValueError as error:
+                if not is_foreign(path, error):
+                    raise
+                raise ValueError(
+                    f"{path} is not a cube written by mars-lidar; for one of others give {_NEEDED}"
+                ) from error
+        base = self._file()
+        found = read_counts(
+            path,
+            variable=self.variable,
+            axes=self.axes,
+            image=None if self.image is None else _pair(self.image),
+            bins=None if base is None else base.bins,
+        )
+        length = None if found.counts is None else found.counts.shape[-1]
+        return found.cube(base or self._system(path, length), start_ns=self.start_ns, unit_ns=self.unit_ns)
+
+    def _file(self) -> System | None:
+        if self.system is None:
+            return None
+        from mars_lidar.instrument.system import System
+
+        single = ("bin_ns", "bin_ps", "period_ns", "cycles", "detector", "dead_time_ns")
+        given = [name for name in single if getattr(self, name) is not None]
+        if given or self.pulse != PulseOptions():
+            told = ", ".join(f"--{name.replace('_', '-')}" for name in given) or "a pulse"
+            raise ValueError(f"--system tells all of the system: it and {told} exclude each other")
+        return System.load(self.system)
+
+    def _system(self, path: Path, length: int | None) -> System:
+        from mars_lidar.instrument.system import Detector, System
+
+        pulse = self.pulse.build()
+        missing = [
+            told
+            for told, there in (
+                ("--cycles", self.cycles is not None),
+                ("--dead-time-ns", self.dead_time_ns is not None or self.detector is not None),
+                ("--pulse-sigma-ns", pulse is not None),
+                ("--bin-ps", (self.bin_ns, self.bin_ps, self.period_ns) != (None, None, None)),
+            )
+            if not there
+        ]
+        if missing or pulse is None or self.cycles is None:
+            raise ValueError(f"{path} does not tell how it was recorded: give {', '.join(missing)}, or --system")
+        period, bins = self._clock(path, length)
+        detector = Detector(dead_time_ns=0.0) if self.detector is None else Detector.preset(self.detector)
+        if self.dead_time_ns is not None:
+            detector = Detector.from_dict(detector.to_dict() | {"dead_time_ns": self.dead_time_ns})
+        return System(period_ns=period, cycles=self.cycles, bins=bins, pulse=pulse, detector=detector)
+
+    def _clock(self, path: Path, length: int | None) -> tuple[float, int]:
+        """Laser period, ns, and bins in it."""
+        if self.bin_ns is not None and self.bin_ps is not None:
+            raise ValueError("--bin-ns and --bin-ps exclude each other")
+        width = self.bin_ns if self.bin_ps is None else 1e-3 * self.bin_ps
+        if width is not None and not width > 0.0:
+            raise ValueError(f"--bin-ps or --bin-ns must be positive, got {width:g} ns")
+        if width is None or self.period_ns is None:
+            if length is None:
+                raise ValueError(f"{path} holds photon times: give --period-ns and --bin-ps")
+            return (length * width, length) if width is not None else (float(self.period_ns or 0.0), length)
+        bins = self.period_ns / width
+        if abs(bins - round(bins)) > _BINS * bins:
+            below, above = int(bins) * width, (int(bins) + 1) * width
+            raise ValueError(
+                f"--period-ns must be a whole number of bins of {width:g} ns, got {self.period_ns:g}; "
+                f"{below:.7g} and {above:.7g} would be"
+            )
+        return self.period_ns, round(bins)
+
+
+def is_foreign(path: Path, error: ValueError) -> bool:
+    """Whether `mars_lidar.io.load` refused a file because another program wrote it, of a kind that can be read."""
+    from mars_lidar.io import SUFFIXES
+    from mars_lidar.io.foreign import FOREIGN_SUFFIXES
+
+    known = path.suffix.lower() in FOREIGN_SUFFIXES
+    return known and (path.suffix not in SUFFIXES or "not a cube written by mars-lidar" in str(error))
+
+
+def foreign_rows(path: Path) -> list[tuple[str, str]]:
+    """What `mars-lidar info` tells of a file of another program."""
+    from mars_lidar.io.foreign import arrays
+
+    rows = [("file", f"{path} (not written by mars-lidar)")]
+    for name, array in arrays(path).items():
+        size = " × ".join(map(str, array.shape))
+        told = f"photon times of {size} pixels" if array.dtype == object else f"{size} {array.dtype}"
+        rows.append(("array", f"{name} {told}".strip()))
+    return [*rows, ("reconstruct with", _NEEDED)]
+
+
+def _pair(text: str) -> tuple[int, int]:
+    try:
+        height, width = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--image must be two integers H,W, got {text!r}") from None
+    return height, width

@@ -13,7 +13,7 @@ from mars_lidar import CountLaw, Flux, System
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import Engine
 from mars_lidar.engines.alignment import Alignment
-from mars_lidar.engines.count_shape import normalised
+from mars_lidar.engines.count_shape import as_shapes
 from mars_lidar.engines.counts import RoundedGaussian
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import Group, groups, single_return
@@ -128,7 +128,7 @@ class NeuralEngine(Engine):
             signal, background = cells.signal[cell], cells.background[cell]
             rate = mean[cell] / system.cycles
             alignment = Alignment.of(system, signal, background, delay[group.pixels], rate)
-        return Batch.unmixed(group.pixels, normalised(pdf), cell, laws, alignment)
+        return Batch.unmixed(group.pixels, as_shapes(pdf), cell, laws, alignment)
 
 
 def _cells(signal: ArrayLike, background: ArrayLike, system: System, delay_ns: ArrayLike | None) -> Cells:

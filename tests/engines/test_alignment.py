@@ -10,7 +10,7 @@ from harness.pvalues import goodness
 import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.engines.alignment import Alignment
-from mars_lidar.engines.count_shape import normalised
+from mars_lidar.engines.count_shape import as_shapes
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.table import Table
 
@@ -41,7 +41,7 @@ def moved(system: ml.System, signal: float, background: float, moves: np.ndarray
     rows, weights = np.zeros((n, 4), np.int64), np.zeros((n, 4))
     weights[:, 0] = 1.0
     job = _core.ShapeJob(
-        shapes=normalised(canonical.histogram),
+        shapes=as_shapes(canonical.histogram),
         rows=rows,
         weights=weights,
         pixel_index=np.arange(n, dtype=np.uint32),

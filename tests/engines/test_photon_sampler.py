@@ -13,7 +13,7 @@ from scipy import stats
 import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.engines.alignment import Alignment
-from mars_lidar.engines.count_shape import normalised
+from mars_lidar.engines.count_shape import as_shapes
 from mars_lidar.statistics import exposure_moments
 
 BINS = 200
@@ -32,7 +32,7 @@ def shapes_of(dead: float, signals: tuple[float, ...], backgrounds: tuple[float,
         start="stationary",
     )
     s, b = np.meshgrid(signals, backgrounds, indexing="ij")
-    return system, normalised(exposure_moments(s.ravel(), b.ravel(), system).histogram)
+    return system, as_shapes(exposure_moments(s.ravel(), b.ravel(), system).histogram)
 
 
 class Pixels:

@@ -134,7 +134,8 @@ def test_large_counts_keep_their_value():
 
 
 def test_without_torch(monkeypatch):
-    monkeypatch.delitem(sys.modules, "mars_lidar.learn.stored")
+    for module in ("stored", "needed"):
+        monkeypatch.delitem(sys.modules, f"mars_lidar.learn.{module}")
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(io.MissingLibraryError, match=r"pip install 'mars-lidar\[learn\]'"):
         from mars_lidar.learn.stored import StoredDataset  # noqa: F401

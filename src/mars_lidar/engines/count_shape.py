@@ -15,6 +15,7 @@ from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import PIXELS, Entries, TableReader
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.exposure_result import normalised
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
@@ -66,10 +67,6 @@ class CountTimesShape(Engine):
         """Draws pixels without a table."""
 
 
-def normalised(histogram: FloatArray) -> NDArray[np.float32]:
-    """Shapes (cells, bins) of sum 1; uniform where nothing registers."""
-    flat = histogram.reshape(-1, histogram.shape[-1])
-    total = flat.sum(-1, keepdims=True)
-    dark = total == 0.0
-    shape = np.where(dark, 1.0 / flat.shape[-1], flat / np.where(dark, 1.0, total))
-    return np.ascontiguousarray(shape.astype(np.float32))
+def as_shapes(histogram: FloatArray) -> NDArray[np.float32]:
+    """Shapes (cells, bins) of histograms (..., bins), as the sampler takes them."""
+    return np.ascontiguousarray(normalised(histogram.reshape(-1, histogram.shape[-1])).astype(np.float32))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,55 +58,45 @@ class CountLaws(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class RoundedGaussian(CountLaws):
+class OfPixels(CountLaws):
+    """Laws of one kind, whose parameters are arrays (pixels, ...): fields, named as `native` names them."""
+
+    native: ClassVar[str]  # function of the native core that draws them
+
+    def part(self, pixels: slice) -> Self:
+        """The laws of some of the pixels."""
+        return replace(self, **{name: values[pixels] for name, values in vars(self).items()})
+
+    def fill(self, streams: Streams, out: IndexArray) -> None:
+        """Draw counts into `out` (realizations, pixels)."""
+        from mars_lidar._base.native import _core
+
+        streams.fill(getattr(_core, self.native), out, **vars(self))
+
+
+@dataclass(frozen=True, eq=False)
+class RoundedGaussian(OfPixels):
     """The count law of the MaRS paper: a normal number of given mean and variance (pixels,), rounded, at least 0."""
 
     mean: FloatArray
     variance: FloatArray
-
-    def part(self, pixels: slice) -> RoundedGaussian:
-        """The laws of some of the pixels."""
-        return RoundedGaussian(self.mean[pixels], self.variance[pixels])
-
-    def fill(self, streams: Streams, out: IndexArray) -> None:
-        """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar._base.native import _core
-
-        streams.fill(_core.gaussian_counts, out, mean=self.mean, variance=self.variance)
+    native = "gaussian_counts"
 
 
 @dataclass(frozen=True, eq=False)
-class Poisson(CountLaws):
+class Poisson(OfPixels):
     """No dead time: Poisson of a given mean (pixels,)."""
 
     mean: FloatArray
-
-    def part(self, pixels: slice) -> Poisson:
-        """The laws of some of the pixels."""
-        return Poisson(self.mean[pixels])
-
-    def fill(self, streams: Streams, out: IndexArray) -> None:
-        """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar._base.native import _core
-
-        streams.fill(_core.poisson_counts, out, mean=self.mean)
+    native = "poisson_counts"
 
 
 @dataclass(frozen=True, eq=False)
-class Matched(CountLaws):
+class Matched(OfPixels):
     """The discrete law with four given cumulants (pixels, 4): `mars_lidar.statistics.matched`."""
 
     cumulants: FloatArray
-
-    def part(self, pixels: slice) -> Matched:
-        """The laws of some of the pixels."""
-        return Matched(self.cumulants[pixels])
-
-    def fill(self, streams: Streams, out: IndexArray) -> None:
-        """Draw counts into `out` (realizations, pixels)."""
-        from mars_lidar._base.native import _core
-
-        streams.fill(_core.matched_counts, out, cumulants=self.cumulants)
+    native = "matched_counts"
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.engines.count_shape import CountTimesShape, normalised
+from mars_lidar.engines.count_shape import CountTimesShape, as_shapes
 from mars_lidar.engines.counts import CountLaws, Matched, Mended, Poisson, RoundedGaussian, Tabulated
 from mars_lidar.engines.options import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
@@ -102,7 +102,7 @@ class MarsEngine(CountTimesShape):
             laws: CountLaws = Tabulated.of(windows, group.cell)
         else:
             laws = self._laws(task.system, cumulants[group.cell])
-        return Batch.unmixed(group.pixels, normalised(exposure.histogram), group.cell, laws)
+        return Batch.unmixed(group.pixels, as_shapes(exposure.histogram), group.cell, laws)
 
     def _laws_of(self, run: Run, reader: TableReader, entries: Entries) -> CountLaws:
         laws = self._laws(run.task.system, entries.cumulants)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.alignment import Alignment
-from mars_lidar.engines.count_shape import CountTimesShape, normalised
+from mars_lidar.engines.count_shape import CountTimesShape, as_shapes
 from mars_lidar.engines.counts import CountLaws, RoundedGaussian
 from mars_lidar.engines.options import Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups, single_return
@@ -98,4 +98,4 @@ def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:
         chain = PhaseChain.from_flux(signal, background, system, delay_ns=delay, waveform=waveform)
         stationary = chain.stationary()
         shapes[k], rates[k] = stationary.pdf.reshape(system.bins, -1).sum(-1), stationary.rate
-    return normalised(shapes), rates
+    return as_shapes(shapes), rates

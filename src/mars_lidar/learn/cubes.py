@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
 from mars_lidar.engines import Engine, check_detector
 from mars_lidar.instrument.system import System
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.sample import Sample
 from mars_lidar.simulate import simulate
 

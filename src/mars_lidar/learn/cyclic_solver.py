@@ -26,8 +26,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import torch
-
+from mars_lidar.learn.needed import torch
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 Rows = torch.Tensor  # (pixels, bins), double

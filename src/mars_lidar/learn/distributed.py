@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 
-import torch
-from torch.utils.data import get_worker_info
-
 from mars_lidar._base import checks
+from mars_lidar.learn.needed import torch
 
 
 def rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
@@ -29,5 +27,5 @@ def rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
 
 def worker_of() -> tuple[int, int]:
     """Number of this worker and of all workers of a DataLoader; 0 of 1 outside of one."""
-    info = get_worker_info()
+    info = torch.utils.data.get_worker_info()
     return (0, 1) if info is None else (info.id, info.num_workers)

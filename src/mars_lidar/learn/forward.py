@@ -5,18 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mars_lidar._base.optional import MissingLibraryError
-
-try:
-    import torch
-except ImportError as _error:
-    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
-
 from mars_lidar._base import checks
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.cyclic_solver import TOLERANCE, Delay, fired, registered
 from mars_lidar.learn.light import bin_photons, check_detector, detected, inputs
+from mars_lidar.learn.needed import torch
 
 _FINE = 4.0  # parts of a sigma of the pulse
 _BLOCK = 2**22  # pixels x bins of photons that are held at a time

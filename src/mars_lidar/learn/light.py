@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import math
 
-from mars_lidar._base.optional import MissingLibraryError
-
-try:
-    import torch
-except ImportError as _error:
-    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
-
 from mars_lidar._base import checks
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
+from mars_lidar.learn.needed import torch
 
 
 def bin_photons(

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from mars_lidar._base.optional import MissingLibraryError
-
-try:
-    import torch
-except ImportError as _error:
-    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
-
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.cyclic_solver import Delay
 from mars_lidar.learn.light import bin_photons, check_detector, detected, inputs
+from mars_lidar.learn.needed import torch
 
 
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch.utils.data import get_worker_info
 
 from mars_lidar._base import checks
 from mars_lidar.io.scan import SceneFile, scan
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.scene_cache import SharedScenes
 from mars_lidar.scene.scene import Scene
 
@@ -78,7 +78,7 @@ class RayCast(SceneSource):
 
     def load(self, number: int) -> Scene:
         """Cast it, or take it from another worker."""
-        shared = None if get_worker_info() is None else self._shared
+        shared = None if torch.utils.data.get_worker_info() is None else self._shared
         found = None if shared is None else shared.get(number)
         if found is None:
             found = Scene.example(self._name, self._size, number)

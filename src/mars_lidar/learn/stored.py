@@ -12,22 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.optional import MissingLibraryError
-
-try:
-    import torch
-    from torch.utils.data import IterableDataset
-except ImportError as _error:
-    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
-
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.store import Dataset, open_dataset
 from mars_lidar.learn.distributed import rank_of, worker_of
+from mars_lidar.learn.needed import torch
 
 _NUMBERS = ("sample", "realization", "scene", "system", "signal_level", "sbr")
 
 
-class StoredDataset(IterableDataset[dict[str, Any]]):
+class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     """The exposures of a stored dataset, as examples for a `torch.utils.data.DataLoader`.
 
     Every epoch takes the blocks of the store (all that one chunk holds, or an image of several chunks) in another

@@ -10,22 +10,15 @@ from typing import Any, Literal
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar._base.optional import MissingLibraryError
-from mars_lidar._base.threads import thread_count
-
-try:
-    import torch
-    from torch.utils.data import IterableDataset, get_worker_info
-except ImportError as _error:
-    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
-
 from mars_lidar._base.resample import image_size
+from mars_lidar._base.threads import thread_count
 from mars_lidar.engines import Engine, find_engine
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scan import SceneFile
 from mars_lidar.learn.ahead import ahead as made_ahead
 from mars_lidar.learn.cubes import CubeMaker
 from mars_lidar.learn.distributed import rank_of, worker_of
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.sample import Recipe, Sample, maps_of, numbers_of
 from mars_lidar.learn.scenes import as_source
@@ -34,7 +27,7 @@ from mars_lidar.scene.scene import Scene
 _LAST = 2**62
 
 
-class CubeStream(IterableDataset[dict[str, Any]]):
+class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     """Cubes and their ground truth for a `torch.utils.data.DataLoader`, simulated as they are asked for.
 
     Sample k of an epoch is a function of (`seed`, epoch, k) and of the settings here, never of workers, ranks,
@@ -225,7 +218,7 @@ class CubeStream(IterableDataset[dict[str, Any]]):
     def __iter__(self) -> Iterator[Any]:
         epoch, start = self._state.tolist()
         worker, workers = worker_of()
-        in_worker = get_worker_info() is not None
+        in_worker = torch.utils.data.get_worker_info() is not None
         if in_worker and self._maker.on_gpu:
             raise ValueError("device='cuda' simulates in the process of the loader: use num_workers=0")
         threads = self._threads or max(1, thread_count(None) // workers)

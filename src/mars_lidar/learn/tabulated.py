@@ -6,15 +6,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mars_lidar._base.optional import MissingLibraryError
-
-try:
-    import torch
-except ImportError as _error:
-    raise MissingLibraryError(f"mars_lidar.learn needs PyTorch: pip install 'mars-lidar[learn]' ({_error})") from _error
-
 from mars_lidar.learn.cyclic_solver import Delay
 from mars_lidar.learn.light import check_detector, inputs, wrapped_energy
+from mars_lidar.learn.needed import torch
 from mars_lidar.table import Table
 
 _BLOCK = 2**18  # pixels x bins evaluated at a time

@@ -8,13 +8,12 @@ equations (10) to (13).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
-from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
@@ -22,6 +21,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.electronics_grid import MOST_EFFORT, Effort, RecordGrid, RecordRun
 from mars_lidar.statistics.exposure import refined_moments
+from mars_lidar.statistics.exposure_result import Moments
 from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
@@ -31,26 +31,7 @@ _A_BLOCK = 2e4  # multiplications that take as long as what comes with a block
 _SETTLED = 1e-11
 
 
-@dataclass(frozen=True, eq=False)
-class ElectronicsMoments:
-    """Statistics of the number N of records and of the histogram of one exposure, for cells of shape (...).
-
-    Attributes
-    ----------
-    mean, variance
-        (...) of N.
-    histogram
-        (..., bins) mean records per bin; sums to the mean.
-    bins
-        (...) bins per period of the grid that was needed, which is not the histogram's.
-    """
-
-    mean: FloatArray
-    variance: FloatArray
-    histogram: FloatArray
-    bins: NDArray[np.int64]
-
-    __repr__ = brief
+ElectronicsMoments = Moments
 
 
 def electronics_moments(

@@ -61,6 +61,28 @@ class Exposure:
         return self.cumulants[..., 1]
 
 
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Statistics of the number N of records and of the histogram of one exposure, for cells of shape (...).
+
+    Attributes
+    ----------
+    mean, variance
+        (...) of N.
+    histogram
+        (..., bins) mean records per bin; sums to the mean.
+    bins
+        (...) bins per period of the grid that was needed, which is not the histogram's.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    histogram: FloatArray
+    bins: IndexArray
+
+    __repr__ = brief
+
+
 def darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
     """Nothing is registered where nothing arrives."""
     for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
@@ -116,3 +138,11 @@ def put(
 def shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
     """As (...) instead of (cells,)."""
     return Exposure(**{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(flat).items()})
+
+
+def normalised(histogram: FloatArray) -> FloatArray:
+    """Shapes (..., bins) of sum 1 of histograms; uniform where nothing registers."""
+    total = histogram.sum(-1, keepdims=True)
+    dark = total == 0.0
+    shape = np.where(dark, 1.0 / histogram.shape[-1], histogram / np.where(dark, 1.0, total))
+    return np.asarray(shape, dtype=np.float64)

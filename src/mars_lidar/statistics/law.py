@@ -180,15 +180,12 @@ def count_law(
         waveform=waveform,
         what=f"count_law of method {method!r}",
         modes=_LAW_MODES[method],
-        effects=_law_effects(method, system),
+        effects=histogram_effects(system) if method == "exact" else LIGHT_EFFECTS + TIMING_EFFECTS,
     )
     team = thread_count(threads)
-    if method == "exact" and "electronics_dead_time_ns" in cells.system.detector.effects:
-        windows = record_windows(cells, max(tolerance, 1e-3), team)
-        found = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
-        return CountLaw(method, found, lambda: windows)
-    if method == "exact" and system.detector.mode == "synchronous":
-        windows = synchronous_windows(cells)
+    slow = "electronics_dead_time_ns" in cells.system.detector.effects
+    if method == "exact" and (slow or system.detector.mode == "synchronous"):
+        windows = record_windows(cells, max(tolerance, 1e-3), team) if slow else synchronous_windows(cells)
         found = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
         return CountLaw(method, found, lambda: windows)
     if method == "exact":
@@ -207,10 +204,6 @@ def count_law(
         cumulants,
         lambda: [gaussian_window(float(m), float(v)) for m, v in zip(mean, variance, strict=True)],
     )
-
-
-def _law_effects(method: str, system: System) -> tuple[str, ...]:
-    return histogram_effects(system) if method == "exact" else LIGHT_EFFECTS + TIMING_EFFECTS
 
 
 def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]) -> tuple[FloatArray, FloatArray]:

@@ -8,16 +8,15 @@ are independent. Equation numbers: docs/detectors.md.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
-from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.exposure_result import Moments
 from mars_lidar.statistics.gated_light import photons_before
 from mars_lidar.statistics.narrow_pulse import knots
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
@@ -28,26 +27,7 @@ _ROUNDING = 1e-12  # of a mean
 _MAX_WHOLE = 20_000  # whole periods of a dead time: each is a step of the variance's start-up
 
 
-@dataclass(frozen=True, eq=False)
-class ParalyzableMoments:
-    """Statistics of the count N and the histogram of one exposure, for cells of shape (...).
-
-    Attributes
-    ----------
-    mean, variance
-        (...) of N.
-    histogram
-        (..., bins) mean registrations per bin; sums to the mean.
-    bins
-        (...) bins per period of the grid that was needed, which is not the histogram's.
-    """
-
-    mean: FloatArray
-    variance: FloatArray
-    histogram: FloatArray
-    bins: FloatArray
-
-    __repr__ = brief
+ParalyzableMoments = Moments
 
 
 def paralyzable_moments(
@@ -110,7 +90,7 @@ def paralyzable_histograms(cells: Cells, tolerance: float) -> FloatArray:
 def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> ParalyzableMoments:
     tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
     system = cells.system
-    mean, variance, bins = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size)
+    mean, variance, bins = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size, np.int64)
     histogram = np.empty((cells.size, system.bins))
     for k in range(cells.size):
         cell = cells.part(slice(k, k + 1))

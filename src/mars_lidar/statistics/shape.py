@@ -15,6 +15,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.electronics_shape import stationary_records
+from mars_lidar.statistics.exposure_result import normalised
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects, mean_histograms
 from mars_lidar.statistics.methods import pixel_of, rearm_of
@@ -67,7 +68,7 @@ def registration_pdf(
         waveform=waveform,
         what=f"registration_pdf of method {method!r}",
         modes=PLAIN if method == "chain" else MODES,
-        effects=_shape_effects(method, system),
+        effects=LIGHT_EFFECTS if method == "chain" else histogram_effects(system),
     )
     if method == "chain":
         shape = _chain_shapes(cells, edge)
@@ -80,16 +81,7 @@ def registration_pdf(
         slow = "electronics_dead_time_ns" in system.detector.effects
         compute = stationary_records if slow else stationary_histogram
         shape = recorded(cells, lambda some, parts: compute(some, parts, tolerance=tolerance, threads=threads))
-    total = shape.sum(-1, keepdims=True)
-    dark = total == 0.0
-    shape = np.where(dark, 1.0 / system.bins, shape / np.where(dark, 1.0, total))
-    return np.asarray(shape.reshape(*cells.shape, system.bins), dtype=np.float64)
-
-
-def _shape_effects(method: str, system: System) -> tuple[str, ...]:
-    if method == "chain":
-        return LIGHT_EFFECTS
-    return histogram_effects(system)
+    return normalised(shape).reshape(*cells.shape, system.bins)
 
 
 def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:

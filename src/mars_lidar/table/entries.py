@@ -15,6 +15,7 @@ from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
+from mars_lidar.statistics.exposure_result import normalised
 
 Shapes = NDArray[np.float32]
 
@@ -120,9 +121,7 @@ def exposure_entries(
         entries.cumulants[some], entries.rates[some] = part.cumulants, part.cumulant_rates
         entries.enough[some] = np.where(part.settled < 0, -1, np.maximum(part.settled - window, 1))
         entries.bins[some] = part.bins
-        total = part.histogram.sum(-1, keepdims=True)
-        dark = total == 0.0
-        entries.shape[some] = np.where(dark, 1.0 / bins, part.histogram / np.where(dark, 1.0, total))
+        entries.shape[some] = normalised(part.histogram)
         if entries.startup is not None:
             rest = part.histogram - system.cycles * part.histogram_rate
             entries.startup[some] = np.where(np.isnan(rest), 0.0, rest)

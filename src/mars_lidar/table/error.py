@@ -13,6 +13,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.exposure import exposure_moments
+from mars_lidar.statistics.exposure_result import normalised
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.table.nodes import Interpolation, Nodes
 from mars_lidar.table.recipe import Recipe
@@ -174,7 +175,5 @@ def _delayed(
     exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads)
     found = table.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
     scale = np.maximum(np.sqrt(exact.variance), _LEAST_SPREAD)[:, None] ** np.arange(1, 5)
-    total = exact.histogram.sum(-1, keepdims=True)
-    own = np.where(total > 0, exact.histogram / np.where(total > 0, total, 1.0), 1.0 / system.bins)
     turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
-    return np.abs(found.cumulants - exact.cumulants) / scale, 0.5 * np.abs(turned - own).sum(-1)
+    return np.abs(found.cumulants - exact.cumulants) / scale, 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.simulate import tell_time
 
 CONVERT_EPILOG = "\n\n".join(
     (
@@ -85,6 +86,7 @@ def timestamps(
 
         check_output(out, overwrite=overwrite)
         with load(cube) as stored, progress_bar("simulating") as progress:
+            tell_time(stored.flux, stored.system, stored.engine, 1, threads, {})
             times = photons(stored, realization=realization, threads=threads, progress=progress)
         times.save(out, overwrite=overwrite)
         unit = resolution_ns(out, times)

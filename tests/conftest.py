@@ -13,6 +13,14 @@ pytest.register_assert_rewrite("harness")
 from harness import ledger  # noqa: E402  (after the line above, so that its assertions explain themselves)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def tables_of_this_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tables that commands keep go into a folder of the run, not into the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MARS_LIDAR_CACHE", str(tmp_path_factory.mktemp("tables")))
+        yield
+
+
 @pytest.fixture
 def system() -> System:
     """The system of the MaRS paper, shortened."""

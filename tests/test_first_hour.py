@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 
 import imageio.v3 as imageio
 import numpy as np
@@ -15,6 +16,8 @@ from mars_lidar import io
 from mars_lidar._base import progress as bars
 from mars_lidar.cli import app
 from mars_lidar.cli.simulate import each_ns
+from mars_lidar.compare.comparison import compare
+from mars_lidar.io.advice import advice
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=50, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
@@ -96,8 +99,8 @@ def test_progress_true_is_a_bar_and_a_log_gets_a_line_every_half_minute(monkeypa
         now[0] = float(second)
         bar(second, 100)
     told = capsys.readouterr().err.splitlines()
-    assert told[0] == "mars-lidar: simulating: 3 % after 3 s, about 97 s left"  # before a long run
-    assert [int(re.search(r"(\d+) %", line)[1]) for line in told] == [3, 34, 65, 96]
+    assert told[0] == "mars-lidar: simulating: 5 % after 5 s, about 95 s left"  # before a long run
+    assert [int(re.search(r"(\d+) %", line)[1]) for line in told] == [5, 36, 67, 98]
     brief = bars.Bar("simulating")
     for second in range(101, 106):
         now[0] = float(second)
@@ -150,3 +153,60 @@ def test_small_words():
 
     assert [each_ns(3.0), each_ns(3020.0)] == ["3 ns", "3.02 µs"]
     assert [files(0), files(1), files(2)] == ["nothing", "1 file", "2 files"]
+
+
+LONG = SYSTEM.replace(cycles=10_000_000)
+
+
+def test_a_long_run_is_told_before_with_what_is_faster():
+    flux = ml.Scene.example("room", size=32).flux(LONG, signal=1.0, sbr=1.0)
+    told = advice(flux, LONG)
+    assert 10.0 < told.seconds < 10_000.0
+    assert told.auto_s < told.seconds / 3
+    assert re.fullmatch(r"about .* on this machine; --engine auto: about .*, same law", str(told))
+    assert str(advice(flux, SYSTEM)) == ""
+    gated = LONG.replace(detector=ml.Detector(dead_time_ns=50.0, max_events_per_period=1))
+    assert "auto" not in str(advice(flux, gated))  # which cannot do it
+
+
+def test_the_time_told_is_about_the_time_taken():
+    system = SYSTEM.replace(cycles=40_000)
+    flux = ml.Scene.example("room", size=48).flux(system, signal=1.0, sbr=1.0)
+    began = time.perf_counter()
+    ml.simulate(flux, system, realizations=4)
+    spent = time.perf_counter() - began
+    assert spent / 6 < advice(flux, system, realizations=4).seconds < 6 * spent  # other work on the machine included
+
+
+def test_commands_say_how_long_they_take(tmp_path, monkeypatch):
+    monkeypatch.setattr("mars_lidar._base.progress.LONG_S", 1e-9)
+    monkeypatch.setattr("mars_lidar.io.advice.LONG_S", 1e-9)
+    monkeypatch.setattr("mars_lidar.io.advice._SHORT_S", 1.0)
+    small = ["--size", "8", "--cycles", "50", "--bins", "64"]
+    words = "on this machine"
+    done = run("simulate", "--scene", "room", *small, "--no-picture", "-o", tmp_path / "a.zarr")
+    assert (done.exit_code, words in done.stderr) == (0, True), done.output
+    done = run("timestamps", tmp_path / "a.zarr", "-o", tmp_path / "a.npz")
+    assert (done.exit_code, words in done.stderr) == (0, True), done.output
+    done = run("generate", "room", *small, "-o", tmp_path / "set.zarr")
+    assert (done.exit_code, words in done.stderr) == (0, True), done.output
+
+
+def test_mars_takes_a_table_over_the_range_of_an_image(tmp_path, monkeypatch):
+    monkeypatch.setenv("MARS_LIDAR_CACHE", str(tmp_path / "cache"))
+    given = ["simulate", "--scene", "room", "--size", "24", "--cycles", "50", "--bins", "64", "--no-picture"]
+    done = run(*given, "--engine", "mars", "-o", tmp_path / "a.zarr")
+    assert done.exit_code == 0, done.output
+    assert "mars: a table" in done.stderr
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    with io.load(tmp_path / "a.zarr") as cube:
+        assert io.verify(cube)  # with the table of the cache
+        law = [ml.count_law(*(float(x[9, 9]) for x in (cube.flux.signal, cube.flux.background)), cube.system)]
+        assert abs(cube.histogram[0, 9, 9].sum() - law[0].mean) < 6 * law[0].variance ** 0.5
+    done = run(*given, "--engine", "mars", "--table", "none", "-o", tmp_path / "b.zarr")
+    assert (done.exit_code, done.stderr) == (0, "")
+    found = compare(cube.flux, cube.system, ["mars"], realizations=50, repeats=1, pixels=1)
+    assert "by a table" in found.table
+    (next((tmp_path / "cache").iterdir())).unlink()
+    with io.load(tmp_path / "a.zarr") as cube, pytest.raises(ValueError, match="table must be the one"):
+        io.verify(cube)

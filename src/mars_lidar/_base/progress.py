@@ -59,7 +59,7 @@ class Bar:
             self._width = 0
 
     def _first_is_due(self, done: int, total: int, spent: float) -> bool:
-        return not self._warned and done > 0 and spent > 2.0 and spent * total / done > LONG_S
+        return not self._warned and done >= 0.05 * total and spent > 2.0 and spent * total / done > LONG_S
 
     def _text(self, share: float, spent: float) -> str:
         left = f", about {span(spent * (1.0 - share) / share)} left" if share > 0.0 else ""

@@ -143,8 +143,9 @@ def compare(
         if numbers is not None:
             _write(numbers, json.dumps({"scene": view.source, **as_data(found)}, indent=1, allow_nan=False) + "\n")
         show(found)
-        rows = [("picture", str(out)), ("time", f"{span(time.perf_counter() - began)} in all")]
-        table(rows if numbers is None else [rows[0], ("numbers", str(numbers)), rows[1]])
+        rows = [("table", found.table)] if found.table else []
+        rows += [("picture", str(out)), ("time", f"{span(time.perf_counter() - began)} in all")]
+        table(rows if numbers is None else [*rows, ("numbers", str(numbers))])
 
 
 def _names(engines: str | None) -> list[str]:

@@ -10,6 +10,7 @@ import typer
 from mars_lidar.cli.console import progress_bar, reported, table
 from mars_lidar.cli.foreign import ForeignOptions
 from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.simulate import tell_time
 
 if TYPE_CHECKING:
     from mars_lidar.io import Converted
@@ -109,6 +110,7 @@ def timestamps(
 
         check_output(out, overwrite=overwrite)
         with load(cube) as stored, progress_bar("simulating") as progress:
+            tell_time(stored.flux, stored.system, stored.engine, 1, threads, {})
             times = photons(stored, realization=realization, threads=threads, progress=progress)
         times.save(out, overwrite=overwrite)
         unit = resolution_ns(out, times)

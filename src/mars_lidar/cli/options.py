@@ -112,8 +112,9 @@ Table = Annotated[
     _option(
         "--table",
         panel=_RUN,
-        help="For --engine mars and renewal: a table of this system (mars-lidar table build).",
-        default="every distinct pixel is evaluated by itself, which is slow",
+        help="For --engine mars and renewal: a table of this system (mars-lidar table build), or none: every distinct "
+        "pixel is evaluated by itself, some ms each.",
+        default="one over the image's range, built and kept in the cache",
     ),
 ]
 Count = Annotated[

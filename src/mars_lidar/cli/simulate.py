@@ -16,8 +16,10 @@ from mars_lidar.cli.scene_view import seen
 from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
+    from mars_lidar.engines import EngineOptions
     from mars_lidar.instrument.system import System
     from mars_lidar.io import Written
+    from mars_lidar.light.flux import Flux
     from mars_lidar.table import Table
 
 EPILOG = "\n\n".join(
@@ -74,6 +76,15 @@ def simulate(
         view = seen(scene, light, system, in_parts=True)
         from mars_lidar.io import simulate_to
 
+        lookup, table_outside = _table(table, system, engine, view.flux, table_outside, threads)
+        chosen: EngineOptions = {
+            "table": lookup,
+            "count": count,  # type: ignore[typeddict-item]  # checked there
+            "interpolation": interpolation,  # type: ignore[typeddict-item]
+            "outside": table_outside,  # type: ignore[typeddict-item]
+        }
+        if device == "cpu":
+            tell_time(view.flux, system, engine, realizations, threads, chosen)
         with progress_bar("simulating") as progress:
             written = simulate_to(
                 out,
@@ -89,22 +100,49 @@ def simulate(
                 source=view.source,
                 overwrite=overwrite,
                 progress=progress,
-                table=_table(table, system),
-                count=count,  # type: ignore[arg-type]  # checked there
-                interpolation=interpolation,  # type: ignore[arg-type]
-                outside=table_outside,  # type: ignore[arg-type]
+                **chosen,
             )
         if picture:
             _draw(out, png)
         _summary(written, png if picture else None, began)
 
 
-def _table(file: Path | None, system: System) -> Table | None:
-    if file is None:
-        return None
+def tell_time(
+    flux: Flux, system: System, engine: str, realizations: int, threads: int | None, options: EngineOptions
+) -> None:
+    """Say how long a long run will take, and what is faster."""
+    from mars_lidar.io.advice import advice
+
+    told = str(advice(flux, system, engine, realizations=realizations, threads=threads, options=options))
+    if told:
+        say(told)
+
+
+def _table(
+    file: Path | None, system: System, engine: str, flux: Flux, outside: str | None, threads: int | None
+) -> tuple[Table | None, str | None]:
+    """The table that is given; or for an engine that would evaluate each pixel, one of the image's range."""
+    from mars_lidar.engines import ENGINES
+    from mars_lidar.engines.image_table import image_table
+    from mars_lidar.light.stored_flux import StoredFlux
     from mars_lidar.table import Table
 
-    return Table.load(file, system)
+    if file is not None and str(file) != "none":
+        return Table.load(file, system), outside
+    takes = "table" in ENGINES[engine].options if engine in ENGINES else False
+    if file is not None or not takes or isinstance(flux, StoredFlux):
+        return None, outside
+    began = time.perf_counter()
+    with progress_bar("building a table") as progress:
+        table = image_table(flux, system, threads, progress)
+    if table is None:
+        return None, outside
+    size = f"{table.signal.size} × {table.background.size}"
+    say(
+        f"{engine}: a table {size} over the image's range, found or built in {span(time.perf_counter() - began)} and "
+        "kept in the cache (mars-lidar table info); --table none evaluates every pixel by itself"
+    )
+    return table, outside or "exact"
 
 
 def _draw(cube: Path, png: Path) -> None:

@@ -7,6 +7,7 @@ stated errors hold also between engines that would share their draws.
 
 from __future__ import annotations
 
+import time
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ from mars_lidar.compare.pixel import (
 from mars_lidar.compare.sample import Sample
 from mars_lidar.compare.scene import SceneStatistics, scene_statistics
 from mars_lidar.engines import ENGINES, Engine, find_engine
+from mars_lidar.engines.image_table import image_table
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.statistics import ConvergenceError
@@ -53,6 +55,10 @@ class Comparison:
         By pixel, then by engine.
     skipped
         Engines that were not run, and why.
+    unpredicted
+        Pixels without a prediction, and why.
+    table
+        How the whole image was drawn by engines that evaluate each pixel: from which table; "" without one.
     """
 
     flux: Flux
@@ -67,6 +73,7 @@ class Comparison:
     statistics: dict[str, dict[str, PixelStatistics]]
     skipped: dict[str, str]
     unpredicted: dict[str, str]
+    table: str = ""
 
     @property
     def engines(self) -> list[str]:
@@ -97,7 +104,9 @@ def compare(
         As `simulate`.
     engines
         Names, or engines of your own settings; none: all there are. One that cannot do this flux and system
-        is skipped, and the reason kept.
+        is skipped, and the reason kept. Those that evaluate every pixel (``"mars"``, ``"renewal"``), by name, draw the
+        whole image from a table over its range, from the cache or built (`mars_lidar.engines.image_table`), and the
+        single pixels without it.
     against
         Name of the reference engine, run in any case.
     realizations
@@ -161,7 +170,8 @@ def compare(
     expected = expected_counts(flux, system, team, budget)
     steps.done()
     scenes: dict[str, SceneStatistics] = {}
-    for name, engine in list(runs.items()):
+    whole, table = _with_table(runs, flux, system, team)
+    for name, engine in list(whole.items()):
         try:
             scenes[name] = scene_statistics(
                 flux, system, engine, expected, depth, cubes, _stream(seed, name), team, budget, scenes.get(against)
@@ -207,6 +217,7 @@ def compare(
         {pixel: {name: found[name] for name in order} for pixel, found in statistics.items()},
         skipped,
         unpredicted,
+        table,
     )
 
 
@@ -236,6 +247,18 @@ def _refusals(engines: dict[str, Engine], flux: Flux, system: System, against: s
                 raise
             reasons[name] = str(error)
     return reasons
+
+
+def _with_table(runs: dict[str, Engine], flux: Flux, system: System, team: int) -> tuple[dict[str, Engine], str]:
+    """The engines for the whole image, those that would evaluate each of its pixels with a table; and which it is."""
+    slow = [name for name, engine in runs.items() if engine is ENGINES.get(name) and "table" in engine.options]
+    began = time.perf_counter()
+    table = image_table(flux, system, team) if slow else None
+    if table is None:
+        return runs, ""
+    told = f"{table.signal.size} × {table.background.size}, found or built in {time.perf_counter() - began:.2g} s"
+    changed = {name: find_engine(name, table=table, outside="exact") for name in slow}
+    return runs | changed, f"{' and '.join(slow)}: the whole image by a table {told}; single pixels without"
 
 
 def _check_places(places: dict[str, tuple[int, int]], flux: Flux) -> None:

@@ -17,6 +17,7 @@ from mars_lidar.statistics.distance import Pmf, sampling_floor, total_variation
 SIGNIFICANT = 5.0  # standard scores from which a deviation is called wrong: 6e-7 by chance
 _LARGEST_SCORE = 37.0  # of a p-value that a double still holds
 _DRAWS = 120  # of the bootstrap
+_GROUPS = 1000  # of exposures, whose weights it draws
 _LEAST = 25.0  # registrations in a cell of the mean histogram: rarer bins are merged with their neighbours
 _BLOCK_BYTES = 2**25
 
@@ -95,7 +96,7 @@ class Sample:
             return Estimate(math.nan)
         product = np.empty(self.size)
         for rows in self._blocks():
-            d = self.histograms[rows] - mean
+            d = self.histograms[rows] - mean.astype(np.float32)  # rounded to 1e-7: far below what sampling leaves open
             product[rows] = np.einsum("ij,ij->i", d[:, :-1], d[:, 1:]) + d[:, -1] * d[:, 0]
         value = float(product.sum()) / (self.size - 1)
         return Estimate(value / total, float(product.std(ddof=1)) / math.sqrt(self.size) / total)
@@ -103,16 +104,17 @@ class Sample:
     def shape_noise(self, cells: NDArray[np.intp], random: np.random.Generator) -> FloatArray:
         """Errors (draws, cells) of the shape summed over `cells`, by the multiplier bootstrap.
 
-        Whatever the bins' dependence: whole exposures are reweighted. The count of an exposure leaves the
-        shape alone, so that residuals are taken from the shape times the count.
+        Whatever the bins' dependence: whole exposures are reweighted, groups of them together where there are many,
+        whose sums have the same covariance. The count of an exposure leaves the shape alone, so that residuals are
+        taken from the shape times the count.
         """
         starts = np.flatnonzero(np.diff(cells, prepend=-1))
-        noise = np.zeros((_DRAWS, starts.size))
-        shape = np.add.reduceat(self.shape, starts)
-        for rows in self._blocks():
-            some = np.add.reduceat(self.histograms[rows].astype(np.float32), starts, axis=1)
-            some -= (self.counts[rows, None] * shape).astype(np.float32)
-            noise += random.standard_normal((_DRAWS, len(some)), dtype=np.float32) @ some
+        step = -(-self.size // _GROUPS)
+        groups = np.arange(0, self.size, step)
+        summed = np.stack([self.histograms[k : k + step].sum(0, dtype=np.uint32) for k in groups])
+        residual = np.add.reduceat(summed, starts, axis=1, dtype=np.float64)
+        residual -= np.add.reduceat(self.counts, groups)[:, None] * np.add.reduceat(self.shape, starts)
+        noise = random.standard_normal((_DRAWS, len(groups)), dtype=np.float32) @ residual.astype(np.float32)
         return np.asarray(noise / max(float(self.counts.sum()), 1.0), dtype=np.float64)
 
     def _blocks(self) -> list[slice]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
 from mars_lidar.dataset.sample_content import Rendered, Shown
 from mars_lidar.dataset.sources import Candidate, Named, candidates, scenes
+from mars_lidar.io.advice import Advice, advice
 from mars_lidar.io.scan import Problem
 
 if TYPE_CHECKING:
@@ -110,6 +112,28 @@ def estimate(
         chunk=chunk,
         problems=tuple(problems),
     )
+
+
+def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: int | None = None) -> Advice:
+    """How long `generate` will take about, from one scene: quick also where a chunk takes minutes."""
+    plan, folder = read_recipe(recipe)
+    assert plan is not None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # generate itself tells them
+        found, problems = candidates(plan, folder)
+        looked, each_s = _looked_at(found[:1], plan, problems)
+        if not looked:
+            return Advice(0.0)
+        total = samples.count_samples(plan, len(found) * (plan.crops if plan.crop else 1))
+        chosen = sorted({round(k) for k in np.linspace(0, samples.count_samples(plan, 1) - 1, 3)})
+        told = []
+        for sample in chosen:
+            _, system, signal, sbr = samples.sample_parts(plan, sample)
+            flux = looked[0].flux(plan.systems[system], plan.light, signal, sbr)
+            made = plan.realizations * total
+            told.append(advice(flux, plan.systems[system], plan.engine, realizations=made, threads=threads))
+    reading = each_s * len(found)
+    return Advice(*(reading + float(np.mean([getattr(one, name) for one in told])) for name in ("seconds", "auto_s")))
 
 
 def _looked_at(found: list[Candidate], plan: DatasetRecipe, problems: list[Problem]) -> tuple[list[Shown], float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from dataclasses import dataclass, field
@@ -242,6 +243,8 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
     recorded = recipe.settings
     table = recipe.options.get("table") if table is None else table
     if table is None and "table" in recorded:
+        table = _from_cache(recipe.system, recorded["table"])
+    if table is None and "table" in recorded:
         raise ValueError(f"table must be the one that the cube was made with, got None: {_grid(recorded['table'])}")
     options = given(
         {
@@ -256,6 +259,23 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
         was = _grid(recorded["table"]) if "table" in recorded else "none"
         raise ValueError(f"table must be the one that the cube was made with ({was}), got {_grid(settings['table'])}")
     return recipe.replace(options=options)
+
+
+def _from_cache(system: System, record: dict[str, Any]) -> Table | None:
+    """The table of that record, where the user's cache has it."""
+    from mars_lidar.engines.table_reader import table_record
+    from mars_lidar.table import Table, cache
+
+    for path in cache.files():
+        with contextlib.suppress(OSError, ValueError):
+            table = Table.load(path, system)
+            sizes = [table.signal.size, table.background.size]
+            if (
+                sizes == [record["signal"][2], record["background"][2]]
+                and table_record(table)["hash"] == record["hash"]
+            ):
+                return table
+    return None
 
 
 def _grid(record: dict[str, Any]) -> str:

@@ -313,7 +313,7 @@ def test_existing_output_is_refused(tmp_path):
 
 def test_files_that_cannot_be_read_are_named(tmp_path):
     (tmp_path / "junk.h5").write_bytes(b"junk")
-    wrong = {"none.zarr": "does not exist", "junk.h5": "is not an HDF5 file", "a.doc": "must end in"}
+    wrong = {"none.zarr": "does not exist", "junk.h5": "cannot be read as a cube", "a.doc": "must end in"}
     for name, words in wrong.items():
         done = run("info", tmp_path / name)
         assert done.exit_code == 2

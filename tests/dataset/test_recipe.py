@@ -70,7 +70,7 @@ def test_options_replace_values(write):
         ("path: nyu", "paths: nyu", 6, "must give one of example, path and transient"),
         ('pattern: "*_depth.png"', "pattern: 4", 7, "pattern must be a text"),
         ("size: 8,", "size: 0,", 8, r"crop.size must be an integer in \[1, 8192\], got 0"),
-        ("system.yaml", "other.yaml", 10, "No such file"),
+        ("system.yaml", "other.yaml", 10, "does not exist"),
         ("1e-1, 1]", "1e-1, -1]", 12, "signal must be a finite number"),
         ("sbr: [inf, 2]", "sbr: [0]", 13, "sbr must be a finite number in"),
         ("sbr: [inf, 2]", "sbr: [2, 2.0]", 12, "levels that differ"),

@@ -96,7 +96,7 @@ def test_exr(tmp_path):
     whole = (tmp_path / "d.exr").read_bytes()
     for content in (b"", b"garbage", whole[:60], whole[:-20]):
         (tmp_path / "bad.exr").write_bytes(content)
-        with pytest.raises(ValueError, match=r"bad\.exr: cannot be read"):
+        with pytest.raises(ValueError, match=r"bad\.exr: "):
             read_rgbd(tmp_path / "bad.exr")
 
 
@@ -142,7 +142,7 @@ def test_nyu_frames(tmp_path):
 def test_bad_nyu(tmp_path):
     path = tmp_path / "nyu.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file")
-    with pytest.raises(ValueError, match=r"nyu\.mat: cannot be read \(NYUv2's labelled \.mat is MATLAB v7\.3"):
+    with pytest.raises(ValueError, match=r"nyu\.mat: cannot be read as NYUv2's labelled \.mat, of MATLAB v7\.3"):
         read_rgbd(path, index=0)
     with h5py.File(path, "w") as file:
         file["depths"] = np.ones((2, 4, 3))

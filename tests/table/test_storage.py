@@ -100,7 +100,7 @@ def test_files_that_are_not_tables(tmp_path, monkeypatch):
     with pytest.raises(FileNotFoundError, match="does not exist"):
         ml.Table.load(tmp_path / "no.h5", table.system)
     (tmp_path / "text.h5").write_text("no")
-    with pytest.raises(ValueError, match="not an HDF5 file"):
+    with pytest.raises(ValueError, match="cannot be read as an HDF5 file"):
         ml.Table.load(tmp_path / "text.h5", table.system)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file.attrs["kind"] = "something"

@@ -1,20 +1,41 @@
-"""Files that are whole or not there: written beside the target, renamed at the end, and where they may lie.
+"""The door that every file is read through, and files that are whole or not there.
 
-The rule for every format: what is half written never looks complete, whatever stops the process.
+Reading: `reading` turns whatever a library makes of a damaged file into one error that names the file, and
+`check_claim` refuses what a header claims before memory is asked for. Writing: a file is written beside its target
+and renamed at the end, so that what is half written never looks complete, whatever stops the process.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
-from collections.abc import Iterator
+import stat
+import zipfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.memory import check_memory
+
+if TYPE_CHECKING:
+    import h5py
+    from numpy.lib.npyio import NpzFile
+
+LIMIT = "MARS_LIDAR_READ_GIB"  # of the environment: what the arrays of one file may take in memory
+_LEAST_LIMIT, _TIMES = 512 * 2**20, 512  # without it: so many bytes, or so many times the file
 INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is written to
 
 
-class IncompleteFileError(ValueError):
+class FileError(ValueError):
+    """A file that cannot be read: damaged, cut short, of another kind, or no file at all; its text names the file."""
+
+
+class IncompleteFileError(FileError):
     """The file was left by a simulation that did not finish."""
 
 
@@ -80,3 +101,146 @@ def check_target(path: Path, *, folder: bool, overwrite: bool) -> None:
         raise FileExistsError(f"{path} exists and is not a Zarr store; it will not be overwritten")
     if not folder and not path.is_file():
         raise FileExistsError(f"{path} exists and is not a file; it will not be overwritten")
+
+
+@contextlib.contextmanager
+def reading(path: str | Path, kind: str = "file") -> Iterator[Path]:
+    """Whatever goes wrong inside names the file; `kind` says in words what it should be.
+
+    Raises
+    ------
+    FileNotFoundError, PermissionError
+        As the operating system says it.
+    MemoryError
+        The file does not fit in memory.
+    FileError
+        Anything else: a pipe or a device, which would never end; a damaged file, whatever its library raised.
+    """
+    source = Path(path)
+    check_source(source)
+    try:
+        yield source
+    except (FileError, ImportError):  # of a door inside of this one; `MissingLibraryError`, which says what to install
+        raise
+    except Exception as error:
+        text = " ".join(str(error).split())
+        named = str(source) in text or (isinstance(error, OSError) and error.filename is not None)
+        if named and isinstance(error, MemoryError | OSError):
+            raise
+        if named and type(error) is ValueError:
+            raise FileError(str(error)) from error
+        if isinstance(error, MemoryError):
+            raise MemoryError(f"{source}: does not fit in memory ({text[:300]})") from error
+        if not (text and isinstance(error, ValueError | TypeError | OSError)):  # such as a KeyError
+            text = f"{type(error).__name__} {text}".strip()
+        if not (_is_ours(error) or "cannot be read" in text):
+            text = f"cannot be read as {kind} ({text[:600]})"
+        raise FileError(f"{source}: {text}") from error
+
+
+def _is_ours(error: BaseException) -> bool:
+    """Whether this package raised it: its own words need no comment."""
+    if not isinstance(error, ValueError | TypeError):
+        return False
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    return last is not None and str(last.tb_frame.f_globals.get("__name__")).startswith("mars_lidar.")
+
+
+def check_source(path: Path) -> None:
+    """Raise unless `path` is a file or a folder: pipes and devices would be read without an end."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path} does not exist") from None
+    except (OSError, ValueError) as error:  # a name that is too long, a circle of links, a null byte
+        raise FileError(f"{path}: cannot be opened ({error})") from error
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise FileError(f"{path} is no file but a pipe, socket or device")
+
+
+def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts: bool = False) -> None:
+    """Raise where a file claims more than its size makes likely, or, unless it is read in parts, than there is memory.
+
+    Nothing that was ever recorded is smaller by 512 times when it is packed; a bomb, or a damaged header, is.
+    """
+    given = os.environ.get(LIMIT)
+    try:
+        limit = max(_LEAST_LIMIT, _TIMES * _size(path)) if given is None else float(given) * 2**30
+    except ValueError:
+        raise ValueError(f"{LIMIT} must be a number of GiB, got {given!r}") from None
+    if nbytes > limit:
+        raise FileError(
+            f"{path}: {what} would take {nbytes / 2**30:.3g} GiB, more than {limit / 2**30:.3g}: is it damaged? "
+            f"The variable {LIMIT} of the environment raises the limit"
+        )
+    if not in_parts:
+        check_memory(math.ceil(nbytes), f"{what} of {path}", "read it on a larger machine")
+
+
+@contextlib.contextmanager
+def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[NpzFile]:
+    """An .npz, or a `stream` of one inside of the file, whose arrays are as large as their headers claim.
+
+    All of them must fit in memory, but for the one called `beside`.
+    """
+    with reading(path, "an .npz"):
+        with zipfile.ZipFile(stream or path) as archive:
+            members = [one for one in archive.infolist() if one.filename != f"{beside}.npy"]
+            check_claim(path, sum(one.file_size for one in members))
+            for one in members:
+                with archive.open(one) as member:
+                    shape, dtype = npy_header(member)
+                    if math.prod(shape) * dtype.itemsize > one.file_size:
+                        raise ValueError(f"{one.filename} cannot hold an array of shape {shape}")
+        if stream is not None:
+            stream.seek(0)
+        with np.load(stream or path, allow_pickle=False) as arrays:
+            yield arrays
+
+
+def npy_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an open .npy."""
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    return shape, dtype
+
+
+def read_npy(path: Path) -> NDArray[Any]:
+    """The array of a .npy, mapped: NumPy refuses what the file is too small for."""
+    with reading(path, "a .npy"):
+        return np.lib.format.open_memmap(path, mode="r")
+
+
+@contextlib.contextmanager
+def open_hdf5(path: Path, **options: Any) -> Iterator[h5py.File]:
+    """An HDF5 file; read its data sets with `whole`."""
+    import h5py
+
+    with reading(path, "an HDF5 file"), h5py.File(path, "r", **options) as file:
+        yield file
+
+
+def whole(data: Any) -> NDArray[Any]:
+    """All of a data set of HDF5 or an array of Zarr, if that is no more than the file can hold."""
+    path = Path(data.file.filename) if hasattr(data, "file") else Path(data.store.root) / data.path
+    check_claim(path, math.prod(data.shape) * data.dtype.itemsize, data.name)
+    return np.asarray(data[...])
+
+
+def _size(path: Path) -> int:
+    parts = path.rglob("*") if path.is_dir() else (path,)
+    return sum(part.stat().st_size for part in parts)
+
+
+def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
+    """Variables of a MATLAB file of version 5, all or those of these names that are there."""
+    from scipy.io import loadmat, whosmat
+
+    with reading(path, "a .mat of version 5"):
+        wanted = None if names is None else list(names)
+        listed = [(math.prod(shape), kind) for name, shape, kind in whosmat(path) if wanted is None or name in wanted]
+        check_claim(path, sum(8 * size for size, kind in listed if kind != "sparse"))
+        return dict(loadmat(path, variable_names=wanted))

@@ -149,11 +149,8 @@ def _together(values: dict[str, Any], names: str) -> dict[str, Any] | None:
 
 def read_array(option: str, file: Path) -> Any:
     """The array of a .npy file that `option` names."""
-    import numpy as np
+    from mars_lidar._base.files import read_npy
 
     if file.suffix != ".npy":
         raise ValueError(f"{option} must be a 1-D .npy array, got {str(file)!r}")
-    try:
-        return np.load(file, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{file}: {error}") from error
+    return read_npy(file)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mars_lidar._base.files import FileError
 from mars_lidar.dataset import values
 from mars_lidar.dataset.light import Light, read_light, refuse_for_transients
 from mars_lidar.dataset.scene_entries import read_scenes
@@ -129,7 +130,7 @@ class DatasetRecipe:
             return cls.from_dict(data, source.parent)
         except RecipeError as error:
             line = line_of(error.key, str(error), lines) if error.key[:1] not in {(k,) for k in replaced} else None
-            raise ValueError(f"{source}{'' if line is None else f':{line}'}: {error}") from error
+            raise FileError(f"{source}{'' if line is None else f':{line}'}: {error}") from error
 
 
 def _merged(old: Any, new: Any) -> Any:

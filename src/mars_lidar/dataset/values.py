@@ -49,7 +49,7 @@ def numbers(key: Key, value: Any, name: str = "seeds") -> Any:
     if isinstance(value, dict):
         known = mapping(key, value, ("first", "count"), needed=("count",))
         first = integer((*key, "first"), known.get("first", 0), low=0, high=2**63)
-        return {"first": first, "count": integer((*key, "count"), known["count"], low=1, high=2**31)}
+        return {"first": first, "count": integer((*key, "count"), known["count"], low=1, high=2**20)}
     if not isinstance(value, list) or not value:
         raise RecipeError(key, f"{name} must be a list of integers, or first and count, got {value!r}")
     found = [integer((*key, k), one, low=0, high=2**64 - 1, name=name) for k, one in enumerate(value)]

@@ -6,6 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+from mars_lidar._base.files import FileError
+from mars_lidar._base.yaml import opened
+
 Key = tuple[str | int, ...]  # ("scenes", 0, "path")
 
 
@@ -19,26 +22,12 @@ class RecipeError(ValueError):
 
 def read_yaml(path: Path) -> tuple[Any, dict[Key, int]]:
     """The data of a YAML file and the line (from 1) of each key, numbers of list entries among them."""
-    import yaml
-
-    from mars_lidar._base.yaml import loader as exponents
-
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        loader = exponents()(text)
+    with opened(path) as (loader, node):
         try:
-            node = loader.get_single_node()
             lines: dict[Key, int] = {}
             return (None if node is None else _plain(loader, node, (), lines)), lines
-        finally:
-            loader.dispose()
-    except RecipeError as error:
-        raise ValueError(f"{path}:{error.key[-1]}: {error}") from error
-    except yaml.MarkedYAMLError as error:
-        line = "" if error.problem_mark is None else f":{error.problem_mark.line + 1}"
-        raise ValueError(f"{path}{line}: {error.problem or error}") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: cannot be read as YAML ({error})") from error
+        except RecipeError as error:
+            raise FileError(f"{path}:{error.key[-1]}: {error}") from error
 
 
 def line_of(key: Key, message: str, lines: dict[Key, int]) -> int | None:

@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.files import check_claim, reading
+from mars_lidar._base.yaml import opened
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.pulse import Pulse, pulse_from_dict
@@ -198,14 +200,9 @@ class System:
         source = Path(path)
         if source.suffix not in (".json", ".yaml", ".yml"):
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
-        text = source.read_text(encoding="utf-8-sig")
-        try:
-            if source.suffix == ".json":
-                return cls.from_dict(json.loads(text))
-            import yaml
-
-            from mars_lidar._base.yaml import loader
-
-            return cls.from_dict(yaml.load(text, Loader=loader()))  # a safe loader
-        except Exception as error:
-            raise ValueError(f"{source}: {error}") from error
+        if source.suffix != ".json":
+            with opened(source) as (loader, node):
+                return cls.from_dict(None if node is None else loader.construct_document(node))
+        with reading(source, "a system"):
+            check_claim(source, 8 * source.stat().st_size, "its numbers")
+            return cls.from_dict(json.loads(source.read_text(encoding="utf-8-sig")))

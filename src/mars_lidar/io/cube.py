@@ -12,12 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.brief import brief
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, WriteError, check_target, reason
+from mars_lidar._base.files import (
+    INCOMPLETE_SUFFIX,
+    FileError,
+    IncompleteFileError,
+    WriteError,
+    check_target,
+    reading,
+    reason,
+)
 from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.store import CountArray, Writer
+from mars_lidar.io.store import CountArray, OnDisk, OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz", ".mat", ".ptu")
@@ -192,8 +200,8 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
         No such file.
     IncompleteFileError
         The file was left by an unfinished run (a ValueError).
-    ValueError
-        Not a cube of mars-lidar.
+    FileError
+        Not a cube of mars-lidar, or damaged (a ValueError that names the file); a store that lacks a part.
     """
     source = Path(path)
     form = _format(source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX)), "path")
@@ -202,16 +210,29 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
         if leftover.exists():
             raise IncompleteFileError(f"{source} was never finished: a stopped run left {leftover}")
         raise FileNotFoundError(f"{source} does not exist")
-    store = form.open_store(source)
+    if source.name.endswith((".mat" + INCOMPLETE_SUFFIX, ".ptu" + INCOMPLETE_SUFFIX)):  # no part of them is of use
+        raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
+    try:
+        with reading(source, "a cube of mars-lidar"):
+            return _opened(form.open_store(source), source, allow_incomplete)
+    except FileError as error:
+        if source.name.endswith(INCOMPLETE_SUFFIX) and not isinstance(error, IncompleteFileError):
+            raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it") from error
+        raise
+
+
+def _opened(store: OpenedStore, source: Path, allow_incomplete: bool) -> Cube:
     try:
         complete = store.complete and not source.name.endswith(INCOMPLETE_SUFFIX)
         if not (complete or allow_incomplete):
             told = f" ({store.progress})" if store.progress else ""
             raise IncompleteFileError(f"{source} is incomplete: its simulation did not finish{told}")
-        recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]), store.rows_of)
+        rows_of = store.rows_of
+        rows = None if rows_of is None else lambda name: OnDisk(rows_of(name), source)
+        recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]), rows)
         total = store.attrs.get("registrations")
         return Cube(
-            histogram=store.histogram,
+            histogram=OnDisk(store.histogram, source),
             recipe=recipe,
             complete=complete,
             registrations=None if total is None else int(total),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, TemporarySibling
+from mars_lidar._base.files import TemporarySibling, whole
 from mars_lidar._base.hdf5 import ForgivingFile
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
@@ -101,12 +101,7 @@ def open_store(path: Path) -> OpenedStore:
     """Open a file for reading; chunks are read when the histogram is indexed."""
     import h5py
 
-    try:
-        file = h5py.File(path, "r", rdcc_nbytes=32 * _CHUNK_BYTES)
-    except OSError as error:
-        if path.name.endswith(INCOMPLETE_SUFFIX):
-            raise IncompleteFileError(f"{path} is incomplete: a run that was stopped left it") from error
-        raise ValueError(f"{path} is not an HDF5 file that can be read: {error}") from error
+    file = h5py.File(path, "r", rdcc_nbytes=32 * _CHUNK_BYTES)
     try:
         attrs = {name: _plain(value) for name, value in file.attrs.items()}
         layout.check_format(path, attrs)
@@ -116,12 +111,10 @@ def open_store(path: Path) -> OpenedStore:
         file.close()
         raise
     complete = attrs.get("complete") == 1
-
-    def read(name: str) -> NDArray[Any]:
-        return np.asarray(file[name][...])
-
     names = frozenset(file)
-    return OpenedStore(attrs, names, read, file["histogram"], complete, "", file.close, lambda name: file[name])
+    return OpenedStore(
+        attrs, names, lambda name: whole(file[name]), file["histogram"], complete, "", file.close, file.__getitem__
+    )
 
 
 def _label(dataset: Any, labels: dict[str, str]) -> None:

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import TemporarySibling, check_target
+from mars_lidar._base.files import TemporarySibling, check_target, open_hdf5, open_npz, reading, whole
 from mars_lidar.instrument.system import System
 
 FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
@@ -86,26 +86,46 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
     source = Path(path)
     if not source.exists():
         raise FileNotFoundError(f"{source} does not exist")
+    with reading(source, "maps of mars-lidar"):
+        found, attrs = _read(source)
+        if attrs.get("format") != FORMAT:
+            raise ValueError(f"{source} is not a file of maps of mars-lidar (no attribute format = {FORMAT!r})")
+        _check(found, attrs)
+        return found, attrs
+
+
+def _read(source: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     if source.suffix == ".zarr":
         import zarr
 
         group: Any = zarr.open_group(source, mode="r")
-        attrs = dict(group.attrs)
-        found = {name: np.asarray(group[name][...]) for name in group.array_keys()}
-    elif source.suffix == ".npz":
-        with np.load(source, allow_pickle=False) as archive:
+        return {name: whole(group[name]) for name in group.array_keys()}, dict(group.attrs)
+    if source.suffix == ".npz":
+        with open_npz(source) as archive:
             attrs = json.loads(archive["attributes"].item()) if "attributes" in archive.files else {}
-            found = {name: archive[name] for name in archive.files if name != "attributes"}
-    else:
-        import h5py
-
-        with h5py.File(source) as file:
-            attrs = dict(file.attrs)
-            found = {name: np.asarray(file[name][...]) for name in file}
+            return {name: archive[name] for name in archive.files if name != "attributes"}, attrs
+    with open_hdf5(source) as file:
+        found = {name: whole(file[name]) for name in file}
         found["method"] = found["method"].astype(str) if "method" in found else np.empty(0)
-    if attrs.get("format") != FORMAT:
-        raise ValueError(f"{source} is not a file of maps of mars-lidar (no attribute format = {FORMAT!r})")
-    return found, attrs
+        return found, dict(file.attrs)
+
+
+def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
+    """Raise ValueError unless these are the maps that `save_maps` writes."""
+    version = int(attrs.get("format_version", 0))
+    if version != FORMAT_VERSION:
+        raise ValueError(f"has layout version {version}; version {FORMAT_VERSION} can be read")
+    System.from_json(str(attrs["system"]))
+    missing = [name for name in (*DIMS, "depth", "flags") if name not in found]
+    if missing:
+        raise ValueError(f"has no variable {missing[0]!r}")
+    shape = tuple(found[dim].size for dim in DIMS)
+    for name in _VARIABLES:
+        values = found.get(name)
+        if values is not None and (values.shape != shape or values.dtype.kind not in "fiu"):
+            raise ValueError(f"{name} must be numbers {shape} {DIMS}, got {values.dtype} {values.shape}")
+        if name.endswith("_error") and values is not None and (values < 0).any():
+            raise ValueError(f"{name} must not be negative, got {np.nanmin(values):g}")
 
 
 def _contents(

@@ -31,7 +31,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, TemporarySibling
+from mars_lidar._base.files import FileError, TemporarySibling, read_mat5
 from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
@@ -221,8 +221,6 @@ def open_writer(path: Path, recipe: Recipe) -> Writer:
 
 def open_store(path: Path) -> OpenedStore:
     """Open a file for reading; its variables are read at once, its counts stay sparse."""
-    if path.name.endswith(INCOMPLETE_SUFFIX):
-        raise IncompleteFileError(f"{path} is incomplete: a run that was stopped left it")
     found = read_variables(path)
     if "mars_lidar" not in found:
         raise ValueError(
@@ -245,14 +243,12 @@ def open_store(path: Path) -> OpenedStore:
 
 
 def read_variables(path: Path) -> dict[str, Any]:
-    """All variables of a v5 file; ValueError where it is none or is damaged."""
-    from scipy.io import loadmat
-
-    content = path.read_bytes()
-    if content.startswith((b"MATLAB 7.3", b"\x89HDF")):
-        raise ValueError(f"{path} is a MATLAB v7.3 file (HDF5), and a v5 .mat is needed: save it with -v7")
+    """All variables of a v5 file; FileError where it is none or is damaged."""
     try:
-        file: Any = BytesIO(content)  # scipy's stubs know paths only
-        return dict(loadmat(file))
-    except Exception as error:
-        raise ValueError(f"{path} is not a .mat file that can be read ({error})") from error
+        return read_mat5(path)
+    except FileError as error:
+        if isinstance(error.__cause__, NotImplementedError):
+            raise FileError(
+                f"{path} is a MATLAB v7.3 file (HDF5), and a v5 .mat is needed: save it with -v7"
+            ) from error
+        raise

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, TemporarySibling
+from mars_lidar._base.files import TemporarySibling, open_npz
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
@@ -100,17 +100,13 @@ def open_writer(path: Path, recipe: Recipe) -> Writer:
 
 def open_store(path: Path) -> OpenedStore:
     """Open an archive for reading."""
-    if not zipfile.is_zipfile(path):  # the archive's directory is the last thing written
-        if path.name.endswith(INCOMPLETE_SUFFIX):
-            raise IncompleteFileError(f"{path} is incomplete: a run that was stopped left it")
-        raise ValueError(f"{path} is not an .npz archive")
-    with np.load(path, allow_pickle=False) as archive:
+    with open_npz(path, beside="histogram") as archive:
         names = frozenset(archive.files)
         attrs = json.loads(archive["attributes"].item()) if "attributes" in names else {}
     layout.check_format(path, attrs)
 
     def read(name: str) -> NDArray[Any]:
-        with np.load(path, allow_pickle=False) as archive:
+        with open_npz(path, beside="histogram") as archive:
             return np.asarray(archive[name])
 
     complete = attrs.get("complete") is True

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mars_lidar._base.files import check_claim, reading
 from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
 from mars_lidar.scene.scene import Scene
@@ -149,15 +150,13 @@ def _with(one: SceneFile, unit: float | None, focal: float | None) -> SceneFile:
 
 
 def _listed(path: Path, unit: float | None, focal: float | None, problems: list[Problem]) -> Iterator[SceneFile]:
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(f"{path}: no such file")
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as lines:
-            reader = csv.DictReader(lines)
-            names = list(reader.fieldnames or ())
-            rows = list(reader)
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path}: cannot be read as CSV ({error})") from error
+    with reading(path, "CSV"), open(path, newline="", encoding="utf-8-sig") as lines:
+        check_claim(path, 64 * path.stat().st_size, "its rows")
+        reader = csv.DictReader(lines)
+        names = list(reader.fieldnames or ())
+        rows = list(reader)
     unknown = [name for name in names if name not in _COLUMNS]
     if "depth" not in names or unknown:
         raise ValueError(f"{path}: columns must be depth and any of {', '.join(_COLUMNS[1:])}, got {', '.join(names)}")
@@ -195,7 +194,12 @@ def _recognised(root: Path, problems: list[Problem]) -> Iterator[SceneFile]:
     if middlebury.is_scene(root):
         yield SceneFile(depth=root)
         return
-    for path in sorted(root.iterdir()):
+    try:
+        inside = sorted(root.iterdir())
+    except OSError as error:
+        problems.append(Problem(root, f"cannot be opened ({error})"))
+        return
+    for path in inside:
         suffix = path.suffix.lower()
         if path.is_dir():
             yield from _recognised(path, problems)
@@ -214,7 +218,7 @@ def _frames(path: Path, image: Path | None, problems: list[Problem]) -> Iterator
 
     try:
         count = nyu.frames(path)
-    except ValueError as error:
+    except (ValueError, OSError, MemoryError) as error:
         problems.append(Problem(path, str(error)))
         return
     for k in range(count):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import check_target
+from mars_lidar._base.files import check_target, reading
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import mat
 from mars_lidar.io.cube import Cube
@@ -52,8 +52,11 @@ def read_mat(path: str | Path) -> SpadMat:
     ValueError
         Not such a file, or damaged; the message starts with the file.
     """
-    source = Path(path)
-    found = mat.read_variables(source)
+    with reading(path, "a .mat of counts") as source:
+        return _spad(source, mat.read_variables(source))
+
+
+def _spad(source: Path, found: dict[str, Any]) -> SpadMat:
     missing = [name for name in ("spad", "rates", "bin", "bin_hr", "SBR", "photons") if name not in found]
     if missing:
         raise ValueError(f"{source}: has no variable {', '.join(missing)}")

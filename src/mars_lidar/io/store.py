@@ -6,13 +6,18 @@ written never looks complete, whatever stops the process.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mars_lidar._base.files import reading
+from mars_lidar._base.memory import check_memory
 
 
 class CountArray(Protocol):
@@ -53,6 +58,39 @@ class LazyCounts(ABC):
 
     def __len__(self) -> int:
         return self.shape[0]
+
+
+class OnDisk:
+    """An array of a file, of h5py, Zarr or our own: what goes wrong when it is read names the file."""
+
+    def __init__(self, array: Any, path: Path) -> None:
+        self._array, self._path = array, path
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # of protocols that it has not
+            raise AttributeError(name)
+        return getattr(self._array, name)
+
+    def __getitem__(self, key: Any) -> Any:
+        return self._read(lambda: self._array[key])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        size = math.prod(self._array.shape) * self._array.dtype.itemsize
+        check_memory(size, f"all values of {self._path}", "index it to read a part")
+        found: NDArray[Any] = self._read(lambda: np.asarray(self._array, dtype=dtype))
+        return found.copy() if copy else found
+
+    def __len__(self) -> int:
+        return int(self._array.shape[0])
+
+    def _read(self, read: Callable[[], Any]) -> Any:
+        try:
+            return read()
+        except (IndexError, TypeError):  # of the key
+            raise
+        except Exception as error:
+            with reading(self._path, "an array"):
+                raise error
 
 
 @dataclass(frozen=True, eq=False)

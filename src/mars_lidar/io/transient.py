@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.memory import check_memory
+from mars_lidar._base.files import check_claim, open_hdf5, open_npz, read_mat5, read_npy, reading
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.light.transient import Transient
 
 SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _NAME = "transient"
+_TIMES: tuple[str, ...] = ("bin_ns", "start_ns")
 _T_SX_SY = 1  # tal.enums.HFormat (github.com/diegoroyo/tal)
 _TAL_FORMATS = {0: "UNKNOWN", 1: "T_Sx_Sy", 2: "T_Lx_Ly_Sx_Sy", 3: "T_Si", 4: "T_Li_Si"}
 
@@ -61,12 +61,19 @@ def read_transient(
     source = Path(path)
     if not source.is_file():
         raise ValueError(f"{source}: no such file")
+    with reading(source, "a transient"):
+        return _read(source, bin_ns, start_ns, name, channel)
+
+
+def _read(
+    source: Path, bin_ns: float | None, start_ns: float | None, name: str | None, channel: int | None
+) -> Transient:
     told: dict[str, float] = {}
     suffix = source.suffix.lower()
     if suffix == ".npy":
         if name is not None:
             raise ValueError(f"{source}: a .npy has one array without a name, got name {name!r}")
-        values: Any = _mapped(source)
+        values: Any = read_npy(source)
     elif suffix == ".npz":
         values, told = _from_npz(source, name or _NAME)
     elif suffix in (".h5", ".hdf5"):
@@ -85,76 +92,51 @@ def read_transient(
         values = _Channel(values, channel)
     elif channel is not None:
         raise ValueError(f"{source}: channel is for (H, W, T, C) arrays, got shape {tuple(values.shape)}")
-    try:
-        return Transient(values, width, start_ns=start, source=str(source))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{source}: {error}") from error
-
-
-def _mapped(path: Path) -> NDArray[Any]:
-    try:
-        return np.asanyarray(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from error
+    return Transient(values, width, start_ns=start, source=str(source))
 
 
 def _from_npz(path: Path, name: str) -> tuple[NDArray[Any], dict[str, float]]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            if name not in archive.files:
-                raise ValueError(f"no array {name!r}, got {', '.join(archive.files) or 'none'}")
-            check_memory(_stored_bytes(path, name), f"the values of {path}", "a .npy or .h5 is read in parts")
-            told = {key: float(archive[key]) for key in ("bin_ns", "start_ns") if key in archive.files}
-            return archive[name], told
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from error
-
-
-def _stored_bytes(path: Path, name: str) -> int:
-    with zipfile.ZipFile(path) as archive:
-        return archive.getinfo(f"{name}.npy").file_size
+    with open_npz(path) as archive:
+        if name not in archive.files:
+            raise ValueError(f"{path}: cannot be read (no array {name!r}, got {', '.join(archive.files) or 'none'})")
+        told = {key: float(archive[key]) for key in _TIMES if key in archive.files}
+        return archive[name], told
 
 
 def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            if name is None and "H" in file and "H_format" in file:
-                return _tal(path, file)
-            wanted = name or _NAME
-            if not isinstance(file.get(wanted), h5py.Dataset):
-                names = ", ".join(file) or "nothing"
-                raise ValueError(f"no data set {wanted!r} and no capture of tal ('H', 'H_format'), got {names}")
-            data = file[wanted]
-            told = {key: float(data.attrs[key]) for key in ("bin_ns", "start_ns") if key in data.attrs}
-            return _Rows(path, wanted, tuple(data.shape), turned=False), told
-    except (ValueError, TypeError, OSError, KeyError) as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from error
+    with open_hdf5(path) as file:
+        if name is None and "H" in file and "H_format" in file:
+            return _tal(path, file)
+        wanted = name or _NAME
+        if not isinstance(file.get(wanted), h5py.Dataset):
+            names = ", ".join(file) or "nothing"
+            raise ValueError(f"{path}: no data set {wanted!r} and no capture of tal ('H', 'H_format'), got {names}")
+        data = file[wanted]
+        check_claim(path, data.size * data.dtype.itemsize, wanted, in_parts=True)
+        told = {key: float(data.attrs[key]) for key in _TIMES if key in data.attrs}
+        return _Rows(path, wanted, tuple(data.shape), turned=False), told
 
 
 def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
     import h5py
 
-    try:
-        if h5py.is_hdf5(path):  # version 7.3; MATLAB's first axis comes last
-            with h5py.File(path, "r") as file:
-                if not isinstance(file.get(name), h5py.Dataset) or file[name].ndim != 3:
-                    raise ValueError(f"no variable {name!r} of three axes, got {', '.join(file) or 'nothing'}")
-                told = {key: float(np.ravel(file[key])[0]) for key in ("bin_ns", "start_ns") if key in file}
-                bins, width, height = file[name].shape
-                return _Rows(path, name, (height, width, bins), turned=True), told
-        from scipy.io import loadmat, whosmat
+    if h5py.is_hdf5(path):  # version 7.3; MATLAB's first axis comes last
+        with open_hdf5(path) as file:
+            if not isinstance(file.get(name), h5py.Dataset) or file[name].ndim != 3:
+                raise ValueError(f"{path}: no variable {name!r} of three axes, got {', '.join(file) or 'nothing'}")
+            told = {key: float(np.ravel(file[key])[0]) for key in _TIMES if key in file}
+            check_claim(path, file[name].size * file[name].dtype.itemsize, name, in_parts=True)
+            bins, width, height = file[name].shape
+            return _Rows(path, name, (height, width, bins), turned=True), told
+    from scipy.io import whosmat
 
-        listed = {key: shape for key, shape, _ in whosmat(path)}
-        if name not in listed:
-            raise ValueError(f"no variable {name!r}, got {', '.join(listed) or 'nothing'}")
-        check_memory(8 * int(np.prod(listed[name])), f"the values of {path}", "a .mat of version 7.3 is read in parts")
-        wanted = [key for key in (name, "bin_ns", "start_ns") if key in listed]
-        found = loadmat(path, variable_names=wanted)
-    except (ValueError, TypeError, OSError, KeyError, NotImplementedError, IndexError) as error:
-        raise ValueError(f"{path}: cannot be read ({error})") from error
-    return found[name], {key: float(np.ravel(found[key])[0]) for key in wanted[1:]}
+    found = read_mat5(path, (name, *_TIMES))
+    if name not in found:
+        there = ", ".join(each for each, _, _ in whosmat(path))
+        raise ValueError(f"{path}: cannot be read (no variable {name!r}, got {there or 'nothing'})")
+    return found[name], {key: float(np.ravel(found[key])[0]) for key in _TIMES if key in found}
 
 
 def _tal(path: Path, file: Any) -> tuple[Any, dict[str, float]]:
@@ -163,6 +145,7 @@ def _tal(path: Path, file: Any) -> tuple[Any, dict[str, float]]:
     if form != _T_SX_SY or len(shape) != 3:
         known = _TAL_FORMATS.get(form, str(form))
         raise ValueError(f"H must be T_Sx_Sy, an image of (T, x, y), got H_format {known} and shape {shape}")
+    check_claim(path, file["H"].size * file["H"].dtype.itemsize, "H", in_parts=True)
     told = {}
     for key, label in (("delta_t", "bin_ns"), ("t_start", "start_ns")):
         if key in file and file[key].shape is not None:  # tal stores None as an empty data set
@@ -178,15 +161,10 @@ class _Rows:
         self.shape = shape
 
     def __getitem__(self, key: Any) -> NDArray[Any]:
-        import h5py
-
-        try:
-            with h5py.File(self._path, "r") as file:
-                if self._turned:
-                    return np.asarray(file[self._name][:, :, key]).transpose(2, 1, 0)
-                return np.asarray(file[self._name][key])
-        except OSError as error:
-            raise ValueError(f"{self._path}: cannot be read ({error})") from error
+        with open_hdf5(self._path) as file:
+            if self._turned:
+                return np.asarray(file[self._name][:, :, key]).transpose(2, 1, 0)
+            return np.asarray(file[self._name][key])
 
 
 class _Channel:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import open_hdf5, open_npz, read_mat5, reading, whole
 from mars_lidar._base.types import FloatArray
 
 NAMES = ("depth", "reflectivity")
@@ -37,8 +38,11 @@ def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray
     ValueError
         Another shape, or values that cannot be: the message starts with the file.
     """
-    source = Path(path)
-    found = _read(source)
+    with reading(path, "a transient with depth and reflectivity") as source:
+        return _checked(source, _read(source), shape)
+
+
+def _checked(source: Path, found: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, FloatArray]:
     told: dict[str, FloatArray] = {}
     for name, stored in found.items():
         if stored.shape != shape or stored.dtype.kind not in "fiu":
@@ -57,21 +61,15 @@ def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray
 def _read(path: Path) -> dict[str, NDArray[Any]]:
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        with np.load(path, allow_pickle=False) as archive:
+        with open_npz(path) as archive:
             return {name: archive[name] for name in NAMES if name in archive.files}
     import h5py
 
     if suffix in (".h5", ".hdf5", ".mat") and h5py.is_hdf5(path):
-        with h5py.File(path, "r") as file:
-            turned = suffix == ".mat"
-            return {name: _turned(file[name][()], turned) for name in NAMES if isinstance(file.get(name), h5py.Dataset)}
+        with open_hdf5(path) as file:
+            found = {name: whole(file[name]) for name in NAMES if isinstance(file.get(name), h5py.Dataset)}
+            return {name: stored.T for name, stored in found.items()} if suffix == ".mat" else found
     if suffix == ".mat":
-        from scipy.io import loadmat
-
-        found: Mapping[str, Any] = loadmat(path, variable_names=list(NAMES))
-        return {name: np.asarray(found[name]) for name in NAMES if name in found}
+        variables = read_mat5(path, NAMES)
+        return {name: np.asarray(variables[name]) for name in NAMES if name in variables}
     return {}
-
-
-def _turned(stored: Any, turned: bool) -> NDArray[Any]:
-    return np.asarray(stored).T if turned else np.asarray(stored)

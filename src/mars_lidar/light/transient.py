@@ -27,6 +27,7 @@ from mars_lidar.light.stored_flux import StoredFlux
 _BAND_BYTES = 64 * 2**20
 _WORK_BYTES = 8 * 2**20  # of rows that are folded and convolved together, some six times over
 _MAX_PARTS = 2**20
+_MAX_PERIODS = 2**12  # that light may last: each is folded on its own
 _DELAYS = 64  # midpoints inside a part for the pulse's average: error below (part / pulse width)^2 / 1e5
 
 
@@ -168,7 +169,8 @@ class Transient:
         first, last, stride = rows.indices(self.shape[0])
         if stride != 1 or first >= last:
             raise ValueError(f"rows must select a run of at least one of {self.shape[0]}, got {rows!r}")
-        number = checks.integer("parts", parts_of(self, system) if parts is None else parts, low=1, high=_MAX_PARTS)
+        fitting = parts_of(self, system)
+        number = checks.integer("parts", fitting if parts is None else parts, low=1, high=_MAX_PARTS)
         lit = self.totals[self.totals > 0]
         if lit.size == 0:
             raise ValueError("values must have light in some pixel, got none")
@@ -265,8 +267,16 @@ class Transient:
 
 
 def parts_of(transient: Transient, system: System) -> int:
-    """Parts of a waveform as fine as the transient and the histogram."""
-    return max(system.bins, math.ceil(system.period_ns / transient.bin_ns * (1 - 1e-12)))
+    """Parts of a waveform as fine as the transient and the histogram; ValueError where its bins are absurd."""
+    parts = system.period_ns / transient.bin_ns * (1 - 1e-12)
+    periods = (transient.values.shape[2] * transient.bin_ns + abs(transient.start_ns)) / system.period_ns
+    if parts > _MAX_PARTS or periods > _MAX_PERIODS:
+        raise ValueError(
+            f"{transient.source or 'the transient'}: bin_ns of {transient.bin_ns:g} from {transient.start_ns:g} ns on "
+            f"makes {max(parts, 1.0):.3g} parts of a laser period and {periods:.3g} periods; at most {_MAX_PARTS} and "
+            f"{_MAX_PERIODS} can be: is it in ns?"
+        )
+    return max(system.bins, math.ceil(parts))
 
 
 def through_pulse(light: FloatArray, system: System) -> FloatArray:

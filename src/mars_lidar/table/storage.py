@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import TemporarySibling, check_target
+from mars_lidar._base.files import TemporarySibling, check_target, open_hdf5, reading, whole
 from mars_lidar.instrument.system import System
 from mars_lidar.table.entries import Entries
 from mars_lidar.table.node_laws import NodeLaws
@@ -41,6 +41,11 @@ def load(make: type[N], path: Path, system: System | None) -> N:
     """A table of the class `make`; arguments and errors as `Table.load`."""
     if system is not None and not isinstance(system, System):
         raise TypeError(f"system must be a System, got {type(system).__name__}")
+    with reading(path, "a table of mars-lidar"):
+        return _loaded(make, path, system)
+
+
+def _loaded(make: type[N], path: Path, system: System | None) -> N:
     header, arrays = _read(path)
     made_for = System.from_json(header["system"])
     system = made_for if system is None else system.detected()
@@ -76,7 +81,11 @@ def load(make: type[N], path: Path, system: System | None) -> N:
 
 def read_header(path: Path) -> dict[str, Any]:
     """What a file says about its table: system, axes, method, provenance; no shapes are read."""
-    header, arrays = _read(path)
+    with reading(path, "a table of mars-lidar"):
+        return _shown(path, *_read(path))
+
+
+def _shown(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
     return {
         "system": System.from_json(header["system"]),
         "method": header["method"],
@@ -135,25 +144,18 @@ def _laws(laws: NodeLaws) -> dict[str, NDArray[Any]]:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Attributes and arrays; the large ones are mapped, the others read."""
-    import h5py
-
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist")
     if path.is_dir():
         raise ValueError(f"{path} is not a table of mars-lidar")
-    try:
-        with h5py.File(path, "r") as file:
-            header = dict(file.attrs.items())
-            if header.get("kind") != _KIND:
-                raise ValueError(f"{path} is not a table of mars-lidar")
-            if int(header["format"]) not in _READABLE:
-                raise ValueError(
-                    f"{path} is a table of format {header['format']}; this version reads "
-                    f"{' and '.join(map(str, _READABLE))}"
-                )
-            arrays = {name: _mapped(path, data) if name in _MAPPED else _own(data[()]) for name, data in file.items()}
-    except OSError as error:
-        raise ValueError(f"{path} is not an HDF5 file that can be read: {error}") from error
+    with open_hdf5(path) as file:
+        header = dict(file.attrs.items())
+        if header.get("kind") != _KIND:
+            raise ValueError(f"{path} is not a table of mars-lidar")
+        if int(header["format"]) not in _READABLE:
+            raise ValueError(
+                f"{path} is a table of format {header['format']}; this version reads "
+                f"{' and '.join(map(str, _READABLE))}"
+            )
+        arrays = {name: _mapped(path, data) if name in _MAPPED else _own(whole(data)) for name, data in file.items()}
     arrays["phase_settled"] = arrays["phase_settled"].astype(bool)
     if "law_row" not in arrays:
         arrays.update(_laws(NodeLaws.none()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.files import FileError, open_npz, reading
 from mars_lidar._base.types import FloatArray
 from mars_lidar.io.rgbd import pixels
 
@@ -65,6 +65,13 @@ def read_rgbd(
     unit, focal = _positive("depth_unit_m", depth_unit_m), _positive("focal_px", focal_px)
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
+    with reading(source, "a scene"):
+        return _read(source, image, unit, focal, index)
+
+
+def _read(
+    source: Path, image: Path | None, unit: float | None, focal: float | None, index: int | None
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     suffix = source.suffix.lower()
     if (index is not None) != (suffix == ".mat" and source.is_file()):
         told = "needs index, the frame from 0" if index is None else f"has no frames, got index {index!r}"
@@ -92,7 +99,7 @@ def read_rgbd(
     if image is not None:
         reflectivity = pixels.reflectivity(image, pixels.array(image))
         if reflectivity.shape != depth.shape:
-            raise ValueError(
+            raise FileError(
                 f"{image}: image must have the size of the depth, {pixels.size(depth)} in {source}, "
                 f"got {pixels.size(reflectivity)}"
             )
@@ -140,11 +147,8 @@ def _npz(path: Path, unit: float | None) -> tuple[FloatArray, FloatArray | None,
 
 def _npz_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Everything in the file, a ``depth`` among it."""
-    try:
-        with np.load(BytesIO(path.read_bytes()), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except Exception as error:
-        raise ValueError(f"{path}: cannot be read ({pixels.reason(error)})") from error
+    with open_npz(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
     if "depth" not in arrays:
         raise ValueError(f"{path}: must hold an array 'depth', got {', '.join(sorted(arrays)) or 'none'}")
     return arrays

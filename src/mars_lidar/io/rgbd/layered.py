@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mars_lidar._base.files import reading
 from mars_lidar.io.rgbd.stack import is_stack, read_stack
 from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
@@ -22,9 +23,7 @@ def read_layers(path: str | Path, *, depth_unit_m: float | None = None, focal_px
     source = Path(path)
     if not is_stack(source):
         raise ValueError(f"{source}: must be an .npz with a depth of (layers, H, W)")
-    depth, reflectivity, background = read_stack(source, depth_unit_m=depth_unit_m, focal_px=focal_px)
-    try:
+    with reading(source, "a scene"):
+        depth, reflectivity, background = read_stack(source, depth_unit_m=depth_unit_m, focal_px=focal_px)
         first = Scene(depth[0], reflectivity[0], background)
         return LayeredScene([first, *map(Scene, depth[1:], reflectivity[1:])])
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar.io.rgbd.pixels import describe, reason
+from mars_lidar._base.files import check_claim, reading
+from mars_lidar.io.rgbd.pixels import describe
 
 
 def frames(path: Path) -> int:
@@ -30,10 +31,8 @@ def read_frame(path: Path, index: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     with _opened(path) as file:
         depths, images = file["depths"], file["images"]
         k = checks.integer("index", index, low=0, high=int(depths.shape[0]) - 1)
-        try:
-            depth, image = np.asarray(depths[k]), np.asarray(images[k])
-        except OSError as error:
-            raise ValueError(f"{path}: frame {k} cannot be read ({reason(error)})") from error
+        check_claim(path, 4 * 8 * depths[:1].size, f"frame {k}")
+        depth, image = np.asarray(depths[k]), np.asarray(images[k])
     return depth.T, image.transpose(2, 1, 0)
 
 
@@ -41,13 +40,7 @@ def read_frame(path: Path, index: Any) -> tuple[NDArray[Any], NDArray[Any]]:
 def _opened(path: Path) -> Iterator[Any]:
     import h5py
 
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise ValueError(
-            f"{path}: cannot be read (NYUv2's labelled .mat is MATLAB v7.3, HDF5: {reason(error)})"
-        ) from error
-    with file:
+    with reading(path, "NYUv2's labelled .mat, of MATLAB v7.3"), h5py.File(path, "r") as file:
         for name in ("depths", "images"):
             if not isinstance(file.get(name), h5py.Dataset):
                 raise ValueError(f"{path}: must hold 'depths' and 'images' as NYUv2 does, got {', '.join(file)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from io import BytesIO
 from pathlib import Path
@@ -10,26 +11,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import FileError, check_claim, read_npy, reading
 from mars_lidar._base.types import FloatArray
 
+_PIXEL_BYTES = 4 + 3 * 8  # of a colour image: as it is stored, and as linear light
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, the primaries of sRGB
 
 
 def array(path: Path) -> NDArray[Any]:
     """The pixels of an image file or the array of a .npy file."""
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
-    try:
-        content = path.read_bytes()  # decoders that fail leave the files they opened open
-        if path.suffix.lower() == ".npy":
-            return np.asarray(np.load(BytesIO(content), allow_pickle=False))
+    if not path.exists():
+        raise FileError(f"{path}: no such file")
+    if path.suffix.lower() == ".npy":
+        return read_npy(path)
+    with reading(path, "an image"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the decoder, about metadata and large images
         import imageio.v3 as iio
+        from PIL import Image
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of the decoder, about metadata
-            return np.asarray(iio.imread(content, extension=path.suffix, plugin="pillow"))
-    except Exception as error:
-        raise ValueError(f"{path}: cannot be read ({reason(error)})") from error
+        content = path.read_bytes()  # decoders that fail leave the files they opened open
+        with Image.open(BytesIO(content)) as header:  # which reads no pixels
+            check_claim(path, _PIXEL_BYTES * math.prod(header.size), "its pixels")
+        return np.asarray(iio.imread(content, extension=path.suffix, plugin="pillow"))
 
 
 def reflectivity(path: Path, stored: NDArray[Any]) -> FloatArray:
@@ -43,7 +46,7 @@ def linear(path: Path, stored: NDArray[Any]) -> FloatArray:
     """Reflectivity (H, W), float64, checked to lie in [0, 1]."""
     values = floats(path, "reflectivity", stored)
     if not ((values >= 0.0) & (values <= 1.0)).all():
-        raise ValueError(f"{path}: reflectivity must lie in [0, 1], got {values.min():g} to {values.max():g}")
+        raise FileError(f"{path}: reflectivity must lie in [0, 1], got {values.min():g} to {values.max():g}")
     return values
 
 
@@ -54,14 +57,14 @@ def luminance(path: Path, stored: NDArray[Any]) -> FloatArray:
     elif stored.dtype.kind == "f":
         encoded = stored.astype(np.float64)
         if not ((encoded >= 0.0) & (encoded <= 1.0)).all():
-            raise ValueError(f"{path}: an image of floats must lie in [0, 1]")
+            raise FileError(f"{path}: an image of floats must lie in [0, 1]")
     else:
-        raise ValueError(f"{path}: image must have 8 or 16 bits per channel, got {describe(stored)}")
+        raise FileError(f"{path}: image must have 8 or 16 bits per channel, got {describe(stored)}")
     if encoded.ndim == 2:
         encoded = encoded[:, :, None]
     if encoded.ndim != 3 or encoded.size == 0 or encoded.shape[2] not in (1, 2, 3, 4):
         told = describe(stored)
-        raise ValueError(f"{path}: image must be grey or RGB, (H, W) or (H, W, 1 to 4), got {told}")
+        raise FileError(f"{path}: image must be grey or RGB, (H, W) or (H, W, 1 to 4), got {told}")
     colours = encoded[:, :, : 3 if encoded.shape[2] >= 3 else 1]
     light = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     luminance: FloatArray = light[:, :, 0] if light.shape[2] == 1 else np.minimum(light @ _LUMINANCE, 1.0)
@@ -71,14 +74,14 @@ def luminance(path: Path, stored: NDArray[Any]) -> FloatArray:
 def floats(path: Path, name: str, stored: NDArray[Any]) -> FloatArray:
     """Real numbers (H, W), float64."""
     if stored.ndim != 2 or stored.size == 0 or stored.dtype.kind not in "fiu":
-        raise ValueError(f"{path}: {name} must be real numbers (H, W), got {describe(stored)}")
+        raise FileError(f"{path}: {name} must be real numbers (H, W), got {describe(stored)}")
     return stored.astype(np.float64)
 
 
 def known(path: Path, depth: FloatArray) -> FloatArray:
     """The depth, unless no pixel has one."""
     if np.isnan(depth).all():
-        raise ValueError(f"{path}: no pixel has a depth")
+        raise FileError(f"{path}: no pixel has a depth")
     return depth
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mars_lidar._base.files import npy_header, reading
 from mars_lidar._base.types import FloatArray
 from mars_lidar.io.rgbd import _depth, _npz_arrays, _obliquity, pixels
 
@@ -16,11 +17,9 @@ def is_stack(path: Path) -> bool:
     if path.suffix.lower() != ".npz" or not path.is_file():
         return False
     try:
-        with zipfile.ZipFile(path) as archive, archive.open("depth.npy") as member:
-            version = np.lib.format.read_magic(member)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            return len(read(member)[0]) == 3
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        with reading(path), zipfile.ZipFile(path) as archive, archive.open("depth.npy") as member:
+            return len(npy_header(member)[0]) == 3
+    except (OSError, ValueError, MemoryError):
         return False  # the reader of scenes says what is wrong
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import open_hdf5, open_npz, read_mat5, whole
 from mars_lidar.light.timestamps import Timestamps
 
 _BINS = 1024  # of times that are no whole numbers of a unit, where none are asked for
@@ -26,10 +27,7 @@ def read(
     path: Path, period_ns: float | None, bins: int | None, unit_ns: float | None, variable: str | None
 ) -> Timestamps:
     """Read a stream; see `Timestamps.load`."""
-    try:
-        found = mat_cells(path) if path.suffix == ".mat" else _npz(path)
-    except Exception as error:  # whatever the readers make of a damaged file: they know a dozen errors
-        raise ValueError(f"{path} cannot be read ({error})") from error
+    found = mat_cells(path) if path.suffix == ".mat" else _npz(path)
     name, cells = _chosen(path, found, variable)
     unit = unit_ns
     if unit is None:
@@ -124,7 +122,7 @@ def _is_times(values: Any) -> bool:
 
 
 def _npz(path: Path) -> dict[str, _Cells]:
-    with np.load(path, allow_pickle=False) as archive:
+    with open_npz(path) as archive:
         arrays = {name: archive[name] for name in archive.files}
     return {name: _one(values) for name, values in arrays.items() if _is_times(np.atleast_1d(values))}
 
@@ -137,10 +135,8 @@ def mat_cells(path: Path) -> dict[str, _Cells]:
 
 
 def _mat_5(path: Path) -> dict[str, _Cells]:
-    from scipy.io import loadmat
-
     out: dict[str, _Cells] = {}
-    for name, values in loadmat(path).items():
+    for name, values in read_mat5(path).items():
         if name.startswith("__") or not isinstance(values, np.ndarray):
             continue
         if values.dtype == object:
@@ -157,21 +153,21 @@ def _mat_73(path: Path) -> dict[str, _Cells]:
     import h5py
 
     out: dict[str, _Cells] = {}
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         for name, item in file.items():
             if not isinstance(item, h5py.Dataset):
                 continue
             if item.dtype == h5py.ref_dtype:
-                references = np.atleast_2d(item[()]).T
+                references = np.atleast_2d(whole(item)).T
                 cells = np.empty(references.shape, object)
                 for place, reference in np.ndenumerate(references):
                     part = file[reference]
                     empty = bool(part.attrs.get("MATLAB_empty", 0))
-                    cells[place] = np.empty(0) if empty else np.asarray(part[()]).ravel()
+                    cells[place] = np.empty(0) if empty else whole(part).ravel()
                 if all(cell.dtype.kind in "fiu" for cell in cells.ravel()):
                     out[name] = cells
             elif item.dtype.kind in "fiu" and not item.attrs.get("MATLAB_empty", 0):
-                values = np.asarray(item[()])
+                values = whole(item)
                 if _is_times(values):
                     out[name] = _one(values)
     return out

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-import zlib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,7 +12,14 @@ from typing import Any
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError, TemporarySibling, check_target
+from mars_lidar._base.files import (
+    INCOMPLETE_SUFFIX,
+    IncompleteFileError,
+    TemporarySibling,
+    check_target,
+    open_npz,
+    reading,
+)
 from mars_lidar.io.streams.attributes import FORMAT, attributes, from_attributes
 from mars_lidar.light.timestamps import Timestamps
 
@@ -69,15 +75,23 @@ def load(
     if not bare and (unit_ns is not None or variable is not None):
         raise ValueError(f"unit_ns and variable are for .mat and .npz: a {plain.suffix} tells both, got {str(path)!r}")
     module = None if bare else _module(plain)
-    if not source.is_file():
+    if not source.exists():
         if source.with_name(source.name + INCOMPLETE_SUFFIX).exists():
             raise IncompleteFileError(f"{source} was never finished: a stopped run left a {INCOMPLETE_SUFFIX} file")
         raise FileNotFoundError(f"{source} does not exist")
     if plain != source:
         raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
-    if module is not None:
+    with reading(source, "a photon stream"):
+        if module is None:
+            return _read_bare(source, period_ns, bins, unit_ns, variable)
         times: Timestamps = module.read(source, period_ns, bins)
         return times
+
+
+def _read_bare(
+    source: Path, period_ns: float | None, bins: int | None, unit_ns: float | None, variable: str | None
+) -> Timestamps:
+    """Of a format that may have no header."""
     if source.suffix == ".mat" or _npz_attributes(source).get("format") is None:
         from mars_lidar.io.streams import bare_stream
 
@@ -89,11 +103,10 @@ def load(
 
 def is_stream(path: Path) -> bool:
     """Whether the file at `path` is a photon stream, not a cube or something else; ValueError if damaged."""
-    if path.suffix == ".npz":
-        return _npz_attributes(path).get("format") == FORMAT
-    if path.suffix in STREAM_SUFFIXES:
-        return bool(_module(path).is_stream(path))
-    return False
+    with reading(path, "cube or photon stream"):
+        if path.suffix == ".npz":
+            return _npz_attributes(path).get("format") == FORMAT
+        return path.suffix in STREAM_SUFFIXES and bool(_module(path).is_stream(path))
 
 
 def _module(path: Path) -> Any:
@@ -120,23 +133,14 @@ def _write_npz(path: Path, times: Timestamps) -> None:
 
 
 def _npz_attributes(path: Path) -> dict[str, Any]:
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path} is not an .npz archive")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            attrs = json.loads(archive["attributes"].item()) if "attributes" in archive.files else {}
-    except (ValueError, zipfile.BadZipFile, OSError, zlib.error) as error:
-        raise ValueError(f"{path} is damaged ({error})") from error
-    return dict(attrs)
+    with open_npz(path) as archive:
+        return dict(json.loads(archive["attributes"].item())) if "attributes" in archive.files else {}
 
 
 def _read_npz(path: Path) -> Timestamps:
     attrs = _npz_attributes(path)
     if attrs.get("format") != FORMAT:
         raise ValueError(f"{path} is not a file of timestamps written by mars-lidar (no format = {FORMAT!r})")
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            counts = np.diff(archive["offsets"])
-            return from_attributes(attrs, archive["times_ns"], archive["cycle"], archive["bin"], counts)
-    except (ValueError, KeyError, zipfile.BadZipFile, OSError, zlib.error) as error:
-        raise ValueError(f"{path} is damaged ({error})") from error
+    with open_npz(path) as archive:
+        counts = np.diff(archive["offsets"])
+        return from_attributes(attrs, archive["times_ns"], archive["cycle"], archive["bin"], counts)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import INCOMPLETE_SUFFIX
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, open_hdf5, whole
 from mars_lidar._base.optional import needed
 from mars_lidar.light.timestamps import Timestamps
 
@@ -108,30 +108,26 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     """Read a stream; `period_ns` and `bins` are for files of others."""
     from mars_lidar.io.streams.attributes import from_attributes, measured
 
-    with _opened(path) as file:
+    with open_hdf5(path) as file:
         if _PHOTONS not in file:
             raise ValueError(f"{path} is not Photon-HDF5 of one spot: it has no group 'photon_data'")
-        try:
-            data = file[_PHOTONS]
-            timestamps = np.asarray(data["timestamps"][...])
-            detectors = data["detectors"][...] if "detectors" in data else np.zeros(timestamps.shape, np.uint8)
-            unit_s = float(data["timestamps_specs/timestamps_unit"][()])
-            own = file.get(f"user/{_GROUP}/{_ATTRIBUTES}")
-            attrs = {} if own is None else json.loads(_text(own[()]))
-            if "nanotimes" not in data:
-                if period_ns is None:
-                    raise ValueError("it has no nanotimes: give period_ns, and the timestamps are folded with it")
-                periods = (timestamps.astype(np.float64) + 0.5) * (1e9 * unit_s) / period_ns
-                cycle = np.floor(periods).astype(np.int64)
-                tick = 1e9 * unit_s if bins is None else period_ns / bins
-                rest = (periods - cycle) * (period_ns / tick) - 0.5
-                return measured(cycle, rest, tick, detectors, period_ns, bins, str(path), 1e9 * unit_s)
-            nanotimes = np.asarray(data["nanotimes"][...])
-            tcspc_s = _tcspc_unit(file)
-        except (KeyError, OSError, ValueError) as error:
-            told = str(error).strip("'\"")
-            raise ValueError(f"{path} cannot be read as Photon-HDF5 ({told})") from error
-        rates = file["setup/laser_repetition_rates"][...] if "setup/laser_repetition_rates" in file else []
+        data = file[_PHOTONS]
+        timestamps = whole(data["timestamps"])
+        detectors = whole(data["detectors"]) if "detectors" in data else np.zeros(timestamps.shape, np.uint8)
+        unit_s = float(data["timestamps_specs/timestamps_unit"][()])
+        own = file.get(f"user/{_GROUP}/{_ATTRIBUTES}")
+        attrs = {} if own is None else json.loads(_text(own[()]))
+        if "nanotimes" not in data:
+            if period_ns is None:
+                raise ValueError("it has no nanotimes: give period_ns, and the timestamps are folded with it")
+            periods = (timestamps.astype(np.float64) + 0.5) * (1e9 * unit_s) / period_ns
+            cycle = np.floor(periods).astype(np.int64)
+            tick = 1e9 * unit_s if bins is None else period_ns / bins
+            rest = (periods - cycle) * (period_ns / tick) - 0.5
+            return measured(cycle, rest, tick, detectors, period_ns, bins, str(path), 1e9 * unit_s)
+        nanotimes = whole(data["nanotimes"])
+        tcspc_s = _tcspc_unit(file)
+        rates: Any = whole(file["setup/laser_repetition_rates"]) if "setup/laser_repetition_rates" in file else []
     if not attrs:
         known = period_ns
         if known is None:
@@ -155,7 +151,7 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
 
 def is_stream(path: Path) -> bool:
     """Whether the file has a group of photons."""
-    with _opened(path) as file:
+    with open_hdf5(path) as file:
         return _PHOTONS in file
 
 
@@ -174,21 +170,12 @@ def _rename(path: Path, target: Path) -> None:
             file[place].attrs.update(labels)
 
 
-def _opened(path: Path) -> Any:
-    import h5py
-
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise ValueError(f"{path} is not an HDF5 file that can be read: {error}") from error
-
-
 def _tcspc_unit(file: Any) -> float:
     """Unit of the nanotimes in s: below the photons, or (format 0.5) one per detector."""
     place = f"{_PHOTONS}/nanotimes_specs/tcspc_unit"
     if place in file:
         return float(file[place][()])
-    units = np.unique(file["setup/detectors/tcspc_unit"][...])
+    units = np.unique(whole(file["setup/detectors/tcspc_unit"]))
     if units.size != 1:
         raise ValueError(f"its detectors have {units.size} different TCSPC units, and one is needed")
     return float(units[0])

@@ -135,7 +135,7 @@ def open_store(path: Path) -> OpenedStore:
     ptu = ptu_header.opened(path)
     try:
         attrs = ptu_header.attributes(ptu.tags)
-        arrays = ptu_header.variables(ptu.tags)
+        arrays = ptu_header.variables(path, ptu.tags)
         told = int(ptu.tags.get("ImgHdr_MaxFrames", 0))
         attrs["registrations"] = int(ptu.tags.get(ptu_header.PHOTONS, 0))
     finally:

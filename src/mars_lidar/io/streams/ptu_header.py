@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, IncompleteFileError
+from mars_lidar._base.files import open_npz, reading
 from mars_lidar._base.optional import needed
 
 MAX_BINS = 2**15  # 15 bits of delay in a generic T3 record
@@ -62,12 +62,12 @@ def attributes(found: Mapping[str, Any]) -> dict[str, Any]:
     return dict(told) if isinstance(told, dict) else {}
 
 
-def variables(found: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """The arrays in the tags `found`."""
+def variables(path: Path, found: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """The arrays in the tags `found` of a file."""
     blob = found.get(_VARIABLES, b"")
     if not blob:
         return {}
-    with np.load(BytesIO(blob), allow_pickle=False) as archive:
+    with open_npz(path, BytesIO(blob)) as archive:
         return {name: archive[name] for name in archive.files}
 
 
@@ -76,14 +76,10 @@ def opened(path: Path) -> Any:
     ptufile = needed("ptufile", "a .ptu")
     with open(path, "rb") as file:
         magic = file.read(8)
-    if path.name.endswith(INCOMPLETE_SUFFIX):
-        raise IncompleteFileError(f"{path} is incomplete: a run that was stopped left it")
     if magic != _MAGIC:
         raise ValueError(f"{path} is not a PTU file: it starts with {magic!r}, not {_MAGIC!r}")
-    try:
+    with reading(path, "a PTU file"):
         ptu = ptufile.PtuFile(path, trimdims="")
-    except Exception as error:
-        raise ValueError(f"{path}: the header of this PTU file cannot be read ({error})") from error
     stored, told = (path.stat().st_size - ptu.record_offset) // 4, ptu.tags.get("TTResult_NumberOfRecords", 0)
     if told > stored:
         ptu.close()

@@ -31,6 +31,7 @@ LAW_STEPS = 40_000_000  # of the laws, which are to take 2 s at most
 _WARM_PERIODS = 400  # sweeps for a warm state; beyond, an equation is solved (_warm.py)
 _CHUNK_BYTES = 64 << 20
 _MAX_HISTORY_BYTES = 1 << 30  # for each thread
+_SIMULATE = "simulate it with engine 'exact'"
 _SETTLED = 1e-12  # relative change of the state per period (20)
 
 
@@ -167,12 +168,13 @@ class Cells:
     @property
     def instead(self) -> str:
         """What to use where an exact law is refused, for errors."""
-        able = (
-            []  # joint_law and the chain do not resolve such a pulse either
-            if self.system.detector.mode != "nonparalyzable" or meets_itself(self)
-            else ["joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)"]
-        )
-        return f"use {', '.join(able)}{', or ' if able else ''}simulate it with engine 'exact'"
+        return self.alternatives()
+
+    def alternatives(self, *names: str) -> str:
+        """`instead`, after what has these `names`."""
+        if self.system.detector.mode == "nonparalyzable" and not meets_itself(self):
+            names = (*names, "joint_law (mean, variance and mean histogram)", "method 'mars' (a Gaussian)")
+        return f"use {', '.join(names)}, or {_SIMULATE}" if names else _SIMULATE
 
     @property
     def _sharpness(self) -> float:

@@ -22,6 +22,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure_result import Exposure as Exposure
 from mars_lidar.statistics.exposure_result import blank, darkness, movement, put, shaped, take
+from mars_lidar.statistics.narrow_pulse import meets_itself
 from mars_lidar.statistics.no_dead_time import without_dead_time
 from mars_lidar.statistics.paralyzable_rate import RATES_STEPS, registration_rates
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
@@ -184,10 +185,11 @@ def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, steps: int
 
 
 def _too_long(cells: Cells, steps: int | None) -> str:
-    more = "" if steps is None else "exposure_moments, which goes on for some minutes, or "
+    slower = steps is not None and not meets_itself(cells)
+    instead = cells.alternatives("exposure_moments, which goes on for some minutes") if slower else cells.instead
     return (
         "the state of the pixel does not repeat from period to period for so long that the exposure cannot be run to "
-        f"its end; use {more}{cells.instead.removeprefix('use ')}"
+        f"its end; {instead}"
     )
 
 

@@ -25,6 +25,7 @@ from mars_lidar.statistics.fine_bins import MANY_BINS, light_before, misplaced
 from mars_lidar.statistics.joint_fine import FinePixel
 from mars_lidar.statistics.joint_pixel import INSTEAD, Pixel, movement
 from mars_lidar.statistics.joint_timed import TimedPixel
+from mars_lidar.statistics.narrow_pulse import meets_itself
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 
@@ -122,12 +123,13 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
 def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]:
     """The law in `out` bins, of which its grid is a multiple."""
     system = cells.system
+    instead = cells.instead if meets_itself(cells) else INSTEAD
     cells = cells.resolved(out)
     bins = cells.first_bins(out)
     if bins > max(_MAX_BINS, 4 * out):
         raise ConvergenceError(
             f"joint law of {cells.name(0)}: {bins} bins per period are needed to resolve the pulse, which meets itself "
-            f"a dead time later; {INSTEAD}"
+            f"a dead time later; {instead}"
         )
     coarse = Pixel(cells, bins // 2, math.gcd(bins // 2, out))
     while True:
@@ -139,7 +141,7 @@ def _refined(cells: Cells, out: int, tolerance: float) -> tuple[JointLaw, Pixel]
         if bins > max(_MAX_BINS, 4 * out):
             raise ConvergenceError(
                 f"joint law of {cells.name(0)}: with {bins // 2} bins per period it still moves by {moved:.2g} "
-                f"(tolerance {tolerance:g}); {INSTEAD}"
+                f"(tolerance {tolerance:g}); {instead}"
             )
         coarse = fine
 

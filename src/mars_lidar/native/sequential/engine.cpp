@@ -8,6 +8,7 @@
 #include "sequential/events.h"
 #include "sequential/pixel.h"
 #include "sequential/recorder.h"
+#include "sequential/warm_up.h"
 
 namespace mars {
 namespace {
@@ -17,11 +18,6 @@ constexpr double kBlockPhotons = 2048.0;
 // During the warm-up, most of a block may be skipped after one registration of a long dead time.
 constexpr double kWarmUpBlockPhotons = 256.0;
 constexpr double kChunkPhotons = 1 << 20;  // some 20 ms of work
-
-// Length of the warm-up of a stationary start, in units of one dead time and one period: the start is uniform
-// on [kSettle, kSettle + kSpread] before the exposure.
-constexpr double kSettle = 256.0;
-constexpr double kSpread = 64.0;
 
 // One item (a pixel in a realization) after the other; one of these per thread and chunk.
 template <class Pixel>
@@ -62,11 +58,8 @@ class Simulator {
     // It begins at a random time, in the state in which a constant rate of the same energy would leave it:
     // blind with probability x / (1 + x), x = photons per dead time, and then for a time uniform on the dead
     // time. Under a constant rate that is stationary at once. Under a pulsed one the phase of the
-    // registrations settles while it runs, and the random beginning averages over whatever does not: with a
-    // dead time of many periods and a bright pulse, registrations lock to every k-th period, and *which*
-    // periods those are is never forgotten. What remains is of the order of (initial error) / kSpread there,
-    // and where phases drift slowly (a bright pulse, hardly any background, a dead time just short of a whole
-    // number of periods) the memory of more than kSettle dead times.
+    // registrations settles while it runs, and the random beginning averages over whatever does not
+    // (warm_up.h).
     void warm_up(Arrivals& arrivals, Xoshiro256& random, Pixel& pixel) {
         if constexpr (Pixel::kForgets) {  // nothing before the last dead time matters
             const int64_t enough = static_cast<int64_t>(job_.dead_time) + 2;
@@ -78,10 +71,11 @@ class Simulator {
             }
             return;
         }
-        const double length = (job_.dead_time + 1.0) * (kSettle + kSpread * random.uniform());
+        const double photons = arrivals.photons_per_period();
+        const double length = warm_up_periods(job_.dead_time, job_.dead_time + 1.0, photons, random.uniform());
         pixel.ready = Time{0, 0}.plus(-length);
         int64_t start = pixel.ready.cycle;
-        const double x = arrivals.photons_per_period() * job_.dead_time;
+        const double x = photons * job_.dead_time;
         if (random.uniform() * (1.0 + x) < x) pixel.ready = pixel.ready.plus(random.uniform() * job_.dead_time);
         pixel.ready = pixel.armed(pixel.ready);
         const int64_t block = arrivals.block_cycles(kWarmUpBlockPhotons);

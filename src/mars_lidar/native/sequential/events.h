@@ -11,6 +11,7 @@
 
 #include "sequential/pixel.h"
 #include "sequential/recorder.h"
+#include "sequential/warm_up.h"
 
 namespace mars {
 namespace {
@@ -111,10 +112,11 @@ class EventSimulator {
         int64_t start = 0;
         for (Member& member : pixels_) {
             const double settle = job_.dead_time + 1.0 + 0.125 * job_.traps.mean_delay;
-            const double length = settle * (256.0 + 64.0 * member.random.uniform());
+            const double photons = member.arrivals.photons_per_period();
+            const double length = warm_up_periods(job_.dead_time, settle, photons, member.random.uniform());
             member.pixel.ready = Time{0, 0}.plus(-length);
             start = std::min(start, member.pixel.ready.cycle);
-            const double x = member.arrivals.photons_per_period() * job_.dead_time;
+            const double x = photons * job_.dead_time;
             if (member.random.uniform() * (1.0 + x) < x)
                 member.pixel.ready = member.pixel.ready.plus(member.random.uniform() * job_.dead_time);
             member.pixel.ready = member.pixel.armed(member.pixel.ready);

@@ -42,7 +42,7 @@ def test_one_command_writes_a_cube_and_a_picture(tmp_path):
     assert done.exit_code == 0, done.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["room.png", "room.zarr"]
     assert (tmp_path / "room.png").read_bytes().startswith(b"\x89PNG")
-    for word in ("registrations", "ns per registration", "room.zarr", "room.png"):
+    for word in ("registrations", "per registration", "room.zarr", "room.png"):
         assert word in done.output
     scene = ml.Scene.example("room", size=12)
     system = DEFAULT_SYSTEM.replace(cycles=50, bins=64)

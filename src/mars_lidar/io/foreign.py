@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import check_claim, open_hdf5, open_npz, read_mat5, read_npy, reading, whole
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
@@ -114,14 +116,8 @@ def arrays(path: Path) -> dict[str, Any]:
     """Every array of a file that could be histograms or photon times, by name: dense, sparse, or cells of times."""
     if path.suffix.lower() not in FOREIGN_SUFFIXES:
         raise ValueError(f"{path}: histograms of others are read from {', '.join(FOREIGN_SUFFIXES)}")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist")
-    try:
+    with reading(path, "arrays of histograms"):
         found: dict[str, Any] = _READERS[path.suffix.lower()](path)
-    except (MemoryError, FileNotFoundError):
-        raise
-    except Exception as error:  # readers know a dozen errors of damaged files
-        raise ValueError(f"{path} cannot be read ({error})") from error
     return {name: array for name, array in found.items() if len(array.shape)}
 
 
@@ -154,7 +150,7 @@ def _guessed(path: Path, shape: tuple[int, ...], bins: int | None) -> str:
 
 
 def _npz(path: Path) -> dict[str, Any]:
-    with np.load(path, allow_pickle=False) as archive:
+    with open_npz(path) as archive:
         if {"format", "shape", "data"} <= set(archive.files):
             from scipy import sparse
 
@@ -165,46 +161,35 @@ def _npz(path: Path) -> dict[str, Any]:
 def _mat(path: Path) -> dict[str, Any]:
     import h5py
 
-    if h5py.is_hdf5(path):
-        arrays = {name: array if _is_sparse(array) else array.T for name, array in _hdf5(path).items()}
-    else:
-        from scipy.io import loadmat
-
-        every = loadmat(str(path))
-        arrays = {
-            name: array
-            for name, array in every.items()
-            if not name.startswith("__")
-            and (_is_sparse(array) or getattr(array, "dtype", np.dtype(object)).kind in "iuf")
-        }
-    images = {name: np.squeeze(array) if not _is_sparse(array) else array for name, array in arrays.items()}
-    return images | {name: cells for name, cells in mat_cells(path).items() if cells.size > 1}
-
-
-def _is_sparse(array: Any) -> bool:
-    return hasattr(array, "toarray")
+    found = _hdf5(path) if h5py.is_hdf5(path) else read_mat5(path)
+    arrays: dict[str, Any] = {}
+    for name, array in found.items():
+        if hasattr(array, "toarray"):
+            arrays[name] = array
+        elif isinstance(array, np.ndarray) and array.dtype.kind in "iuf" and not name.startswith("__"):
+            arrays[name] = np.squeeze(array.T if h5py.is_hdf5(path) else array)  # HDF5 has MATLAB's dimensions reversed
+    return arrays | {name: cells for name, cells in mat_cells(path).items() if cells.size > 1}
 
 
 def _hdf5(path: Path) -> dict[str, Any]:
     """The arrays of numbers of a file, of all its groups; a sparse one of MATLAB is a group of three."""
     import h5py
+    from scipy import sparse
 
     out: dict[str, Any] = {}
     parts: list[str] = []
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
-            from scipy import sparse
-
-            data = np.asarray(item["data"][()]) if "data" in item else np.zeros(0)
-            inner = np.asarray(item["ir"][()]) if "ir" in item else np.zeros(0, int)
-            shape = (int(item.attrs["MATLAB_sparse"]), len(item["jc"]) - 1)
-            out[name] = sparse.csc_array((data, inner.astype(np.int64), item["jc"][()].astype(np.int64)), shape=shape)
+            columns = whole(item["jc"]).astype(np.int64)
+            data, rows = (whole(item[part]) if part in item else np.zeros(0) for part in ("data", "ir"))
+            shape = (int(item.attrs["MATLAB_sparse"]), len(columns) - 1)
+            out[name] = sparse.csc_array((data, rows.astype(np.int64), columns), shape=shape)
             parts.extend(f"{name}/{part}" for part in item)
         elif isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and item.ndim and name not in parts:
-            out[name] = item[()]
+            out[name] = whole(item)
 
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         file.visititems(visit)
     return out
 
@@ -212,25 +197,28 @@ def _hdf5(path: Path) -> dict[str, Any]:
 def _tiff(path: Path) -> dict[str, Any]:
     import imageio.v3 as iio
 
+    claimed = iio.improps(path, index=..., plugin="pillow")  # type: ignore[arg-type]  # all pages, as imageio says
+    check_claim(path, math.prod(claimed.shape) * claimed.dtype.itemsize, "its pages")
     return {"": np.stack(list(iio.imiter(path, plugin="pillow")))}
 
 
 def _table(path: Path) -> dict[str, Any]:
-    rows = []
+    check_claim(path, 64 * path.stat().st_size)
+    rows: list[list[float]] = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             rows.append([float(part) for part in line.replace(",", " ").replace(";", " ").split()])
         except ValueError:
-            if len(rows) > 0:
+            if rows:  # lines of words are only above the numbers
                 raise ValueError(f"line {line[:40]!r} holds no numbers") from None
     rows = [row for row in rows if row]
-    if not rows or {len(row) for row in rows} - {1, 2} or len({len(row) for row in rows}) != 1:
+    if not rows or {len(row) for row in rows} not in ({1}, {2}):
         raise ValueError("a histogram as text is a column of counts, or times and counts")
     return {"": np.asarray(rows)[:, -1]}
 
 
 _READERS = {
-    ".npy": lambda path: {"": np.load(path, mmap_mode="r", allow_pickle=False)},
+    ".npy": lambda path: {"": read_npy(path)},
     ".npz": _npz,
     ".mat": _mat,
     ".h5": _hdf5,

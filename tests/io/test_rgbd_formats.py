@@ -91,13 +91,36 @@ def test_exr(tmp_path):
         np.testing.assert_array_equal(read_rgbd(tmp_path / "d.exr")[0], want)
     with openexr.File(header, {"U": values, "V": values}) as file:
         file.write(str(tmp_path / "uv.exr"))
-    with pytest.raises(ValueError, match=r"uv\.exr: must have a channel Z, Y or R, got U, V"):
+    with pytest.raises(ValueError, match=r"uv\.exr: must have a channel of depth"):
         read_rgbd(tmp_path / "uv.exr")
+    colours = {name: values + shift for name, shift in (("R", 0), ("G", 1), ("B", 2))}
+    with openexr.File(header, colours) as file:
+        file.write(str(tmp_path / "image.exr"))
+    with pytest.raises(ValueError, match=r"image\.exr: holds colours, not depth: its channels are B, G, R"):
+        read_rgbd(tmp_path / "image.exr")
+    with openexr.File(header, {f"ViewLayer.Combined.{name}": one for name, one in colours.items()}) as file:
+        file.write(str(tmp_path / "layers.exr"))
+    with pytest.raises(ValueError, match=r"layers\.exr: must have a channel of depth"):
+        read_rgbd(tmp_path / "layers.exr")
     whole = (tmp_path / "d.exr").read_bytes()
     for content in (b"", b"garbage", whole[:60], whole[:-20]):
         (tmp_path / "bad.exr").write_bytes(content)
         with pytest.raises(ValueError, match=r"bad\.exr: "):
             read_rgbd(tmp_path / "bad.exr")
+
+
+@pytest.mark.parametrize("nothing", [1e10, 65504.0, np.inf])
+def test_a_render_of_blender(tmp_path, nothing):
+    """A multilayer file: depth among colours, and a background where no surface is."""
+    openexr = pytest.importorskip("OpenEXR", reason="OpenEXR (extra io) is not installed")
+    depth = np.linspace(1.0, 4.0, 12, dtype=np.float32).reshape(3, 4)
+    depth[0, :2] = nothing
+    channels = {"ViewLayer.Depth.Z": depth, "ViewLayer.Combined.R": depth, "ViewLayer.Combined.G": depth}
+    with openexr.File({"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}, channels) as file:
+        file.write(str(tmp_path / "render.exr"))
+    found = read_rgbd(tmp_path / "render.exr")[0]
+    assert np.isnan(found[0, :2]).all()
+    np.testing.assert_array_equal(found[1:], depth[1:].astype(np.float64))
 
 
 def test_exr_without_the_library(tmp_path, monkeypatch):

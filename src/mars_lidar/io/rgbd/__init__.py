@@ -15,6 +15,7 @@ from mars_lidar.io.rgbd import pixels
 
 _DEPTH_IMAGES = (".png", ".tif", ".tiff")
 _DEPTH_FLOATS = (".pfm", ".exr")
+_NOTHING = (65504.0, 1e10)  # what Blender and others write for no surface: the largest half float, or a depth
 
 
 def read_rgbd(
@@ -27,12 +28,13 @@ def read_rgbd(
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Depth in m (NaN = no return), reflectivity in [0, 1], and the background map or None; (H, W) each.
 
-    Depth, by the kind of `depth_path`; 0, NaN and inf in a file mean "no return":
+    Depth, by the kind of `depth_path`; 0, NaN and inf in a file mean "no return", and so do 65504 and 1e10 in files of
+    floats, which renderers write where a ray meets nothing:
 
     - 16-bit PNG or TIFF, one channel: integers of `depth_unit_m` each, by default 0.001 (millimetres; other
       data sets use 1/5000 or 1/256).
-    - ``.pfm`` (one channel) and ``.exr`` (the channel Z, else Y, R or the only one; needs the extra ``io``):
-      metres, or `depth_unit_m` each.
+    - ``.pfm`` (one channel) and ``.exr`` (the channel Z, that of a layer such as ``ViewLayer.Depth.Z``, or the only one;
+      needs the extra ``io``): metres, or `depth_unit_m` each.
     - ``.npy``: (H, W), metres, or `depth_unit_m` each. Integers need `depth_unit_m`: they are rarely metres.
     - ``.npz``: ``depth`` as above; optionally ``reflectivity`` (linear, [0, 1]) or ``image`` (as an image
       file), and ``background`` (relative, >= 0).
@@ -171,6 +173,8 @@ def _depth(path: Path, stored: NDArray[Any], unit: float | None) -> FloatArray:
     else:
         raise ValueError(f"{path}: depth must be a .png, .tif, .tiff, .pfm, .exr, .npy, .npz or .mat file or a folder")
     depth = unit * pixels.floats(path, "depth", stored)
+    if stored.dtype.kind == "f":
+        depth[np.isin(stored, _NOTHING)] = np.nan
     if (depth < 0.0).any():
         raise ValueError(f"{path}: depth must not be negative, got {depth[depth < 0.0][0]:g} m")
     return pixels.known(path, np.where((depth > 0.0) & (depth < np.inf), depth, np.nan))

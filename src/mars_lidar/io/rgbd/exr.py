@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from mars_lidar._base.files import check_claim, check_source, reading
 from mars_lidar._base.optional import needed
 
-_CHANNELS = ("Z", "Y", "R")  # depth, luminance; red where a grey image was written in colour
+_DEPTHS = ("Z", "V", "Depth", "depth")  # last part of a channel's name in a layer: ViewLayer.Depth.Z of Blender
 
 
 def read_exr(path: Path) -> NDArray[Any]:
-    """The channel Z (H, W), else Y, R or the only one.
+    """The depth (H, W): the channel Z, else that of a layer (``*.Depth.Z``), Y, the only one, or grey written as RGB.
 
     Raises
     ------
     ValueError
-        Not an EXR that can be read, or several channels of which none is depth; the message starts with the
+        Not an EXR that can be read, several channels of which none is depth, or colours; the message starts with the
         file. `mars_lidar.io.MissingLibraryError` where OpenEXR is not installed.
     """
     openexr = needed("OpenEXR", f"{path}: depth in .exr")
@@ -37,7 +37,23 @@ def read_exr(path: Path) -> NDArray[Any]:
             check_claim(path, 8 * claimed * max(1, len(file.channels())), "its pixels")
         with openexr.File(str(path), separate_channels=True) as file:
             found = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    for name in _CHANNELS if len(found) > 1 else tuple(found):
+    return _depth(path, found)
+
+
+def _depth(path: Path, found: dict[str, NDArray[Any]]) -> NDArray[Any]:
+    told = ", ".join(sorted(found)) or "none"
+    for name in ("Z", "Y") if len(found) > 1 else tuple(found):
         if name in found:
             return found[name]
-    raise ValueError(f"{path}: must have a channel Z, Y or R, got {', '.join(sorted(found)) or 'none'}")
+    layers = [name for name in found if name.rpartition(".")[2] in _DEPTHS]
+    deep = [name for name in layers if "depth" in name.lower()] or [name for name in layers if name.endswith("Z")]
+    if len(deep) == 1:
+        return found[deep[0]]
+    if deep:
+        raise ValueError(f"{path}: has several channels of depth: {', '.join(deep)}; write one of them")
+    grey = [found[name] for name in ("R", "G", "B") if name in found]
+    if grey and all(np.array_equal(one, grey[0], equal_nan=True) for one in grey):
+        return grey[0]
+    if len(grey) > 1:
+        raise ValueError(f"{path}: holds colours, not depth: its channels are {told}")
+    raise ValueError(f"{path}: must have a channel of depth (Z, *.Depth.Z) or one channel, got {told}")

@@ -19,6 +19,7 @@ SYSTEM = ml.System(
     detector=ml.Detector(dead_time_ns=25.0),
 )
 DELAY = np.linspace(5.0, 35.0, 64).reshape(8, 8)
+CLOUD = ["--focal-px", "10", "--cloud"]
 TOLD = ["--bin-ps", "200", "--cycles", "4e3", "--dead-time-ns", "25", "--pulse-sigma-ns", "0.5"]
 
 
@@ -35,7 +36,22 @@ def run(*words: object) -> int:
 
 def test_reconstruct_from_a_bare_array(tmp_path: Path, counts: np.ndarray) -> None:
     np.save(tmp_path / "face.npy", counts.transpose(2, 0, 1))
-    assert run("reconstruct", tmp_path / "face.npy", "-o", tmp_path / "maps.npz", "--axes", "tyx", *TOLD) == 0
+    assert (
+        run(
+            "reconstruct",
+            tmp_path / "face.npy",
+            "-o",
+            tmp_path / "maps.npz",
+            "--axes",
+            "tyx",
+            *TOLD,
+            *CLOUD,
+            tmp_path / "face.ply",
+        )
+        == 0
+    )
+    assert b"element vertex 64" in (tmp_path / "face.ply").read_bytes()
+    assert b"depth_error" in (tmp_path / "face.ply").read_bytes()
     found = ml.io.maps.load_maps(tmp_path / "maps.npz")[0]
     error = np.asarray(found["depth"])[0, 0] - SYSTEM.depth_m(DELAY)
     assert np.abs(error).max() < 5 * np.nanmax(found["depth_error"])
@@ -73,6 +89,7 @@ def test_info_lists_what_is_in_a_foreign_file(
         ([*TOLD, "--bin-ns", "0.2"], "exclude each other"),
         ([*TOLD, "--period-ns", "40.1"], "40 and 40.2 would be"),
         ([*TOLD, "--axes", "yx"], "axes must be made of"),
+        ([*TOLD, "--cloud", "a.ply"], "belong together"),
         ([*TOLD, "--image", "3"], "two integers"),
         ([*TOLD, "--start-ns", "0.3"], "0.2 or 0.4"),
         (["--cycles", "10", *TOLD[:2], *TOLD[4:]], "cycles must be the laser periods"),

@@ -59,6 +59,7 @@ __all__ = [
     "registration_pdf",
     "simulate",
     "simulate_timestamps",
+    "to_xarray",
     "validate",
 ]
 
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
     from mars_lidar import io as io
     from mars_lidar import learn as learn
     from mars_lidar import plot as plot
+    from mars_lidar.io import to_xarray as to_xarray
 else:
     _LATER = ("io", "learn", "plot")  # with what they import, only where they are used: `ml.io.load`
 
@@ -74,6 +76,10 @@ else:
             from importlib import import_module
 
             return import_module(f"mars_lidar.{name}")
+        if name == "to_xarray":
+            from mars_lidar.io import to_xarray
+
+            return to_xarray
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
     def __dir__() -> list[str]:

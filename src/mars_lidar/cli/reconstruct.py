@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from mars_lidar._base.progress import span
@@ -26,6 +27,7 @@ RECONSTRUCT_EPILOG = "\n\n".join(
         "[bold]Examples[/bold]",
         "mars-lidar reconstruct room.zarr -o maps.zarr",
         "mars-lidar reconstruct room.zarr --method all -o maps.h5",
+        "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
         "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
         "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
         f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
@@ -70,6 +72,18 @@ def reconstruct(
     threads: Annotated[
         int | None, typer.Option("--threads", min=1, help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
     ] = None,
+    cloud: Annotated[
+        Path | None,
+        typer.Option(
+            "--cloud",
+            help="Points of the first method and exposure, .ply, with reflectivity and standard error of depth.",
+            show_default=False,
+        ),
+    ] = None,
+    focal_px: Annotated[
+        float | None,
+        typer.Option("--focal-px", help="Focal length of the image in pixels, for --cloud.", show_default=False),
+    ] = None,
     picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Draw the maps beside OUT, as .png.")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
@@ -80,6 +94,7 @@ def reconstruct(
     with reported():
         began = time.perf_counter()
         from mars_lidar._base import checks
+        from mars_lidar._base.files import check_target
         from mars_lidar.io.maps import check_maps_output, save_maps
         from mars_lidar.reconstruct.reconstruction import ATTENUATIONS
         from mars_lidar.reconstruct.stored import reconstruct_stored
@@ -90,6 +105,10 @@ def reconstruct(
             raise FileExistsError(f"{png} exists already; give --overwrite, --no-picture or another --out")
         if out.resolve() == cube.resolve():
             raise ValueError(f"--out must not be the cube itself, got {str(out)!r}")
+        if (cloud is None) != (focal_px is None):
+            raise ValueError("--cloud and --focal-px belong together: points need the camera's focal length")
+        if cloud is not None:
+            check_target(cloud, folder=False, overwrite=overwrite)
         if attenuation is not None:
             checks.choice("--attenuation", attenuation, ATTENUATIONS)
         with foreign.opened(cube) as stored:
@@ -102,6 +121,8 @@ def reconstruct(
             _show(stored, found)  # first: a disk that is full takes nothing from what is known
             save_maps(out, results, source=str(cube), overwrite=overwrite)
             rows = [("maps", str(out))]
+            if cloud is not None and focal_px is not None:
+                rows.append(("cloud", f"{cloud}, {_save_cloud(cloud, results, focal_px, overwrite):,} points"))
             if picture:
                 _draw(stored, results, png)
                 rows.append(("picture", str(png)))
@@ -183,6 +204,15 @@ def _grid(head: list[str], lines: list[list[str]]) -> None:
     for row in lines:
         grid.add_row(*row)
     Console(highlight=False).print(grid)
+
+
+def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:
+    from mars_lidar.io import save_cloud
+
+    found = next(iter(results.values()))
+    depth, share = np.where(found.seen, found.depth_m, np.nan)[0], found.reflectivity[0]
+    error = None if found.depth_error_m is None else found.depth_error_m[0]
+    return save_cloud(path, depth, focal_px, intensity=share, error_m=error, overwrite=overwrite)
 
 
 def _draw(cube: Cube, results: dict[str, Reconstruction], png: Path) -> None:

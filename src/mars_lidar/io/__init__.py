@@ -5,9 +5,11 @@ Every library is imported when its format is first used.
 
 from mars_lidar._base.files import IncompleteFileError
 from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar.io.cloud import points, save_cloud
 from mars_lidar.io.convert import Converted, convert, photons
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save
 from mars_lidar.io.foreign import foreign_cube
+from mars_lidar.io.labelled import to_xarray
 from mars_lidar.io.measured import from_histograms, from_photon_times
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.scan import Problem, SceneFile, scan
@@ -37,12 +39,15 @@ __all__ = [
     "from_photon_times",
     "load",
     "photons",
+    "points",
     "read_mat",
     "read_transient",
     "regenerate",
     "save",
+    "save_cloud",
     "save_mat",
     "scan",
     "simulate_to",
+    "to_xarray",
     "verify",
 ]

@@ -33,8 +33,8 @@ def read_rgbd(
 
     - 16-bit PNG or TIFF, one channel: integers of `depth_unit_m` each, by default 0.001 (millimetres; other
       data sets use 1/5000 or 1/256).
-    - ``.pfm`` (one channel) and ``.exr`` (the channel Z, that of a layer such as ``ViewLayer.Depth.Z``, or the only one;
-      needs the extra ``io``): metres, or `depth_unit_m` each.
+    - ``.pfm`` (one channel) and ``.exr`` (the channel Z, that of a layer such as ``ViewLayer.Depth.Z``, or the only
+      one; needs the extra ``io``): metres, or `depth_unit_m` each.
     - ``.npy``: (H, W), metres, or `depth_unit_m` each. Integers need `depth_unit_m`: they are rarely metres.
     - ``.npz``: ``depth`` as above; optionally ``reflectivity`` (linear, [0, 1]) or ``image`` (as an image
       file), and ``background`` (relative, >= 0).

@@ -1,0 +1,86 @@
+"""Point clouds: depth along the ray of each pixel of a pinhole camera, as PLY."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mars_lidar._base import checks
+from mars_lidar._base.files import TemporarySibling, check_target
+from mars_lidar._base.types import FloatArray
+
+
+def points(depth_m: ArrayLike, focal_px: float) -> FloatArray:
+    """Points (H, W, 3), m, of ranges (H, W), m: x to the right, y down, z forward; NaN where the range is.
+
+    Parameters
+    ----------
+    depth_m
+        Range along the ray, as `mars_lidar.Scene` and `mars_lidar.Reconstruction` have it.
+    focal_px
+        Focal length in pixels of this image; its centre is the principal point.
+    """
+    depth = np.asarray(depth_m, np.float64)
+    if depth.ndim != 2:
+        raise ValueError(f"depth_m must be a map (H, W), got shape {depth.shape}")
+    focal = checks.real("focal_px", focal_px, low=0.0, strict_low=True)
+    height, width = depth.shape
+    ray = np.empty((height, width, 3))
+    ray[..., 0] = np.arange(width) - 0.5 * (width - 1)
+    ray[..., 1] = (np.arange(height) - 0.5 * (height - 1))[:, None]
+    ray[..., 2] = focal
+    return np.asarray(ray * (depth / np.linalg.norm(ray, axis=-1))[..., None])
+
+
+def save_cloud(
+    path: str | Path,
+    depth_m: ArrayLike,
+    focal_px: float,
+    *,
+    intensity: ArrayLike | None = None,
+    error_m: ArrayLike | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Write a ``.ply`` (binary, little endian) of the pixels with a depth; returns how many points it has.
+
+    Parameters
+    ----------
+    path
+        The file.
+    depth_m, focal_px
+        As for `points`; pixels of depth NaN or inf are left out.
+    intensity
+        (H, W) property of the points, such as reflectivity or signal.
+    error_m
+        (H, W) standard error of the depth, m; the property ``depth_error``.
+    overwrite
+        Replace an existing file.
+
+    Raises
+    ------
+    ValueError
+        Another suffix, or maps of different shapes.
+    OSError
+        `path` exists and `overwrite` is false, or cannot be written.
+    """
+    target = Path(path)
+    if target.suffix != ".ply":
+        raise ValueError(f"path of a point cloud must end in .ply, got {str(path)!r}")
+    place = points(depth_m, focal_px)
+    columns = {"x": place[..., 0], "y": place[..., 1], "z": place[..., 2]}
+    for name, told, values in (("intensity", "intensity", intensity), ("depth_error", "error_m", error_m)):
+        if values is not None:
+            columns[name] = np.asarray(values, np.float64)
+            if columns[name].shape != place.shape[:2]:
+                raise ValueError(f"{told} must have the shape of depth_m, {place.shape[:2]}, got {columns[name].shape}")
+    check_target(target, folder=False, overwrite=overwrite)
+    seen = np.isfinite(place).all(-1)
+    rows = np.stack([values[seen] for values in columns.values()], axis=-1).astype("<f4")
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [*(f"property float {name}" for name in columns), "end_header", ""]
+    with TemporarySibling(target).writing() as unfinished, open(unfinished, "wb") as file:
+        file.write("\n".join(header).encode())
+        file.write(rows.tobytes())
+    return len(rows)

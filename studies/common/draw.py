@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +26,12 @@ def panels(height: float, rows: int, columns: int, **options: Any) -> tuple[Any,
     for ax in axes.flat:
         ax.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def legend_below(figure: Any, axes: Iterable[Axes], columns: int, **options: Any) -> None:
+    """One legend of all labels of some axes, each once, below them."""
+    shown = {label: line for ax in axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(shown.values(), shown.keys(), frameon=False, loc="outside lower center", ncols=columns, **options)
 
 
 def log_edges(centres: Sequence[float]) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import datetime
+import math
 import os
 import platform
 import re
@@ -93,6 +94,20 @@ def table(rows: Iterable[Row]) -> str:
     keys = list(lines[0])
     head = ["| " + " | ".join(keys) + " |", "|" + "---|" * len(keys)]
     return "\n".join(head + ["| " + " | ".join(number(row[key]) for key in keys) + " |" for row in lines])
+
+
+def crossed(cells: Iterable[tuple[str, str, str]], corner: str = "case") -> list[Row]:
+    """Rows of a table from (row, column, text) of each cell; `corner` is the title of the first column."""
+    rows: dict[str, dict[str, str]] = {}
+    for row, column, text in cells:
+        rows.setdefault(row, {corner: row})[column] = text
+    return list(rows.values())
+
+
+def marked(pair: tuple[float, float], star: bool) -> str:
+    """A value with its standard error in brackets, starred or not; "-" for NaN."""
+    value, error = pair
+    return "-" if math.isnan(value) else f"{value:.3f} ({error:.3f}){'*' if star else ''}"
 
 
 FILTERS = {

@@ -12,7 +12,7 @@ from mars_lidar import Flux, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
 from mars_lidar.statistics import exposure_moments
-from studies.common.draw import panels
+from studies.common.draw import legend_below, panels
 from studies.common.report import save_figure
 from studies.common.sample import PERIOD_NS
 from studies.common.simulators import arrival_shape
@@ -177,7 +177,7 @@ def _shape(path: Path, settings: Settings, cells: Sequence[Cell], sweep: dict[st
         ax.set(yscale="log", xlabel="$t_d / t_r$", ylim=(1e-6, 1.0))
         ax.set_title(words, loc="left")
     axes[0, 0].set_ylabel("total variation of the shape")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=3)
+    legend_below(figure, axes[0, :1], 3)
     return save_figure(path, figure)
 
 

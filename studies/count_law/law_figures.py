@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
-from studies.common.draw import heat, panels
+from studies.common.draw import heat, legend_below, panels
 from studies.common.report import save_figure
 from studies.count_law.law import LAWS, Cell, Settings
 
@@ -104,7 +104,7 @@ def _gaussian(path: Path, settings: Settings, flux: Sequence[Cell], exposure: Se
     marks = ((".", "E N < 10"), ("_", "E N at least 10, Var N < 1"))
     for mark, words in marks:
         axes[0, 0].plot([], [], mark, ms=4, color=COLOURS[0], label=words)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=2)
+    legend_below(figure, axes[0, :1], 2)
     _frame(figure, axes, settings, mesh, "total variation,\nbest Gaussian to exact law")
     return save_figure(path, figure)
 
@@ -133,8 +133,7 @@ def _shown(path: Path, cells: Sequence[Cell]) -> Path:
         ax.set_xlabel("registrations N")
     for row in axes:
         row[0].set_ylabel("P(N)")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=5)
+    legend_below(figure, axes[0, :1], 5)
     return save_figure(path, figure)
 
 

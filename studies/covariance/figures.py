@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
-from studies.common.draw import heat, panels
+from studies.common.draw import heat, legend_below, panels
 from studies.common.report import save_figure
 from studies.covariance.run import (
     CUTOFFS,
@@ -118,8 +118,7 @@ def _truncation(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
         ax.set(xlabel="cut-off $c$", xlim=(-0.5, 600), ylim=(1e-6, None))
         ax.set_title(f"{grid.name}, {grid.size} cells", loc="left")
     axes[0, 0].set_ylabel(r"mean |error| of $\sum\gamma_l$, ns$^2$")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, loc="outside lower center", ncols=4)
+    legend_below(figure, axes[0, :1], 4)
     return save_figure(path, figure)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
-from studies.common.draw import panels
+from studies.common.draw import legend_below, panels
 from studies.common.report import save_figure
 from studies.detectors.run import BACKGROUND, DELAY_NS, REACH, SIGNAL, Outcome, of_figure
 
@@ -39,7 +39,7 @@ def _mode(path: Path, shown: Sequence[Outcome]) -> Path:
     axes[0, 2].set(xlabel="periods between registrations", ylabel="intervals per exposure", yscale="log")
     axes[0, 2].set_title("inter-registration times")
     axes[0, 2].set_xlim(0, REACH)
-    figure.legend(loc="outside lower center", ncols=4, frameon=False)
+    legend_below(figure, axes.flat, 4)
     return save_figure(path, figure)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mars_lidar.plot.style import COLOURS, DPI, INK, MISSING, style
-from studies.common.draw import WIDTH
+from studies.common.draw import WIDTH, legend_below
 from studies.common.report import save_figure
 from studies.joint.outcomes import ENGINES, TESTS, Outcome, Settings
 from studies.joint.run import chance
@@ -33,9 +33,7 @@ def figure(path: Path, settings: Settings, outcomes: Sequence[Outcome]) -> Path:
         for ax, test in zip(lower.subplots(1, 2, sharey=True), TESTS[:2], strict=True):
             _random(ax, test, drawn, 2.0 * chance(settings.random_exposures))
         lower.axes[0].set_ylabel("share of systems below")
-        lower.legend(
-            *above[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(ENGINES), frameon=False
-        )
+        legend_below(lower, above[:1], len(ENGINES))
         return save_figure(path, page)
 
 

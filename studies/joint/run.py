@@ -17,7 +17,7 @@ from scipy import stats
 
 from mars_lidar._base.types import FloatArray
 from studies import Request
-from studies.common.report import Row, picked, write
+from studies.common.report import Row, crossed, marked, picked, write
 from studies.common.sample import PERIOD_NS
 from studies.joint import classifiers, outcomes
 from studies.joint.outcomes import ENGINES, FULL, QUICK, RATIOS, TESTS, Outcome, Settings
@@ -55,8 +55,11 @@ def run(request: Request) -> list[Path]:
         "gone": given_to_exact(found),
         "asked": sum(o.engine == "feedback" for o in found),
         "band": [2 * chance(n) for n in (settings.exposures, settings.random_exposures)],
-        "aucs": {test: _auc_rows(named, test, settings) for test in TESTS},
-        "ratios": [_ratio_rows(named, key) for key in RATIOS],
+        "aucs": {
+            test: crossed((o.case.name, o.engine, _auc_cell(o, test, settings)) for o in named if o.engine != "exact")
+            for test in TESTS
+        },
+        "ratios": [crossed((o.case.name, o.engine, _ratio_cell(o, key)) for o in named) for key in RATIOS],
         "random": [_random_row(drawn, engine, test, settings) for test in TESTS[:2] for engine in ENGINES],
         "spread": [_spread_row(drawn, engine) for engine in ("exact", *ENGINES)],
         "worst": _worst_rows(drawn, settings),
@@ -99,28 +102,13 @@ def _finding(engine: str, named: Sequence[Outcome], settings: Settings) -> dict[
     }
 
 
-def _auc_rows(named: list[Outcome], test: str, settings: Settings) -> list[Row]:
-    rows: dict[str, dict[str, str]] = {}
-    for o in named:
-        if o.engine == "exact":
-            rows[o.case.name] = {"case": o.case.name}
-        elif o.handed:
-            rows[o.case.name][o.engine] = "exact"
-        else:
-            value, error = o.aucs[test]
-            star = "*" if abs(auc_score(o, test, settings)) > _SEEN else ""
-            rows[o.case.name][o.engine] = f"{value:.3f} ({error:.3f}){star}"
-    return list(rows.values())
+def _auc_cell(o: Outcome, test: str, settings: Settings) -> str:
+    return "exact" if o.handed else marked(o.aucs[test], abs(auc_score(o, test, settings)) > _SEEN)
 
 
-def _ratio_rows(named: list[Outcome], key: str) -> list[Row]:
-    rows: dict[str, dict[str, str]] = {}
-    for o in named:
-        value, error = o.ratios[key]
-        words = "-" if np.isnan(value) else f"{value:.3f} ({error:.3f})"
-        star = "*" if abs(value - 1.0) > _SEEN * error else ""
-        rows.setdefault(o.case.name, {"case": o.case.name})[o.engine] = words + star
-    return list(rows.values())
+def _ratio_cell(o: Outcome, key: str) -> str:
+    value, error = o.ratios[key]
+    return marked((value, error), abs(value - 1.0) > _SEEN * error)
 
 
 def _random_row(drawn: list[Outcome], engine: str, test: str, settings: Settings) -> Row:
@@ -151,7 +139,7 @@ def _spread_row(drawn: list[Outcome], engine: str) -> Row:
         z = (value - 1.0) / error
         worst = int(np.abs(z).argmax()) if z.size else -1
         row[f"{key}: z"] = f"{z.mean():+.2f}, {z.std():.2f}" if z.size else "-"
-        row[f"{key}: worst"] = f"{value[worst]:.3f} ({error[worst]:.3f})" if z.size else "-"
+        row[f"{key}: worst"] = marked((value[worst], error[worst]), False) if z.size else "-"
     return row
 
 
@@ -172,7 +160,7 @@ def _worst_rows(drawn: list[Outcome], settings: Settings) -> list[Row]:
         for test in TESTS[:2]:
             row[test] = f"{o.aucs[test][0]:.3f} (z {auc_score(o, test, settings):+.1f})"
         row[f"{AGAIN}, QDA"] = f"{again[o.case.name].aucs[TESTS[0]][0]:.3f}"
-        row["window variance"] = "{:.3f} ({:.3f})".format(*o.ratios["window"])
+        row["window variance"] = marked(o.ratios["window"], False)
         rows.append(row)
     return rows
 

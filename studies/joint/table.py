@@ -6,7 +6,6 @@ variance of the count in a signal window, the variance of single bins, and the c
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from mars_lidar import Flux, System
 from mars_lidar._base.types import FloatArray
 from mars_lidar.engines import ANY_SYSTEM
 from studies import Request, Tell
-from studies.common.report import Row, write
+from studies.common.report import Row, crossed, marked, write
 from studies.common.sample import PERIOD_NS, histograms, system_of
 
 ENOUGH = 0.5  # mean counts of a coarse bin that takes part
@@ -226,7 +225,9 @@ def run(request: Request) -> list[Path]:
         "period_ns": PERIOD_NS,
         "findings": [_finding(engine, [s for s in scores if s.engine == engine]) for engine in engines],
         "known": [(s, noted[s.case]) for s in scores if s.engine == "mars" and s.case in noted],
-        "tables": {key: _rows(scores, key) for key in _COMPARED},
+        "tables": {
+            key: crossed((s.case, s.engine, marked(_pair(s, key), beyond(s, key))) for s in scores) for key in _COMPARED
+        },
         "spent": time.monotonic() - began,
     }
     rows = [_csv_row(s) for s in scores]
@@ -242,19 +243,6 @@ def beyond(score: Score, key: str) -> bool:
     """Whether a figure differs from the exact engine's by more than chance."""
     value, error = _pair(score, key)
     return abs(value - _COMPARED[key][1]) > _SCORES * error
-
-
-def _rows(scores: Sequence[Score], key: str) -> list[Row]:
-    rows: list[Row] = []
-    for case in dict.fromkeys(s.case for s in scores):
-        row: dict[str, object] = {"case": case}
-        for s in scores:
-            if s.case == case:
-                value, error = _pair(s, key)
-                told = f"{value:.3f} ({error:.3f}){'*' if beyond(s, key) else ''}"
-                row[s.engine] = "-" if math.isnan(value) else told
-        rows.append(row)
-    return rows
 
 
 def _finding(engine: str, here: Sequence[Score]) -> dict[str, object]:

@@ -10,7 +10,7 @@ import numpy as np
 from mars_lidar.plot.figures import _draw_map, _limits
 from mars_lidar.plot.style import COLOURS, INK, style
 from mars_lidar.reconstruct import METHODS
-from studies.common.draw import panels
+from studies.common.draw import legend_below, panels
 from studies.common.report import Row, save_figure
 from studies.reconstruction.run import Picture
 
@@ -47,16 +47,8 @@ def flux_figure(path: Path, rows: Sequence[Row]) -> Path:
                     ax.set_title(TITLE[detector], loc="left")
                 if line == len(quantities) - 1:
                     ax.set_xlabel("signal = background photons per period")
-        drawn = {text: line for ax in axes[0] for line, text in zip(*ax.get_legend_handles_labels(), strict=True)}
-        figure.legend(
-            drawn.values(),
-            drawn.keys(),
-            loc="outside lower center",
-            ncols=len(drawn),
-            frameon=False,
-            handlelength=1.2,
-            columnspacing=1.0,
-        )
+        methods = dict.fromkeys(row["method"] for row in rows)
+        legend_below(figure, axes[0], len(methods) + 1, handlelength=1.2, columnspacing=1.0)
         axes[2, 0].set_ylim(1.0, 1e3)
         axes[3, 0].set_ylim(1e-2, 1e3)
         axes[0, 0].set_ylim(1.0, 3e2)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
-from studies.common.draw import panels
+from studies.common.draw import legend_below, panels
 from studies.common.report import save_figure
 from studies.runtime.contenders import NUMPY, TABLED
 from studies.runtime.timing import Point, Settings
@@ -63,9 +63,7 @@ def _axes(path: Path, settings: Settings, points: Sequence[Point]) -> Path:
         ax.set_title(others.get(axis.name, f"{axis.cycles} cycles"), loc="left")
     for row in axes:
         row[0].set_ylabel("seconds")
-    figure.legend(
-        *axes[0, 0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=min(len(names), 6)
-    )
+    legend_below(figure, axes[0, :1], min(len(names), 6))
     return save_figure(path, figure)
 
 

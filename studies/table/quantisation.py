@@ -18,7 +18,7 @@ from mars_lidar.statistics import Exposure, exposure_moments
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf
 from studies import Request, Tell
-from studies.common.draw import panels
+from studies.common.draw import legend_below, panels
 from studies.common.report import Row, save_figure, write
 from studies.common.sample import PERIOD_NS, system_of
 
@@ -150,7 +150,7 @@ def _figure(path: Path, settings: Settings, costs: Sequence[Cost]) -> Path:
     figure, axes = panels(2.5, 1, len(ERRORS), sharex=True)
     for ax, key in zip(axes[0], ERRORS, strict=True):
         _panel(ax, settings, costs, key)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=4)
+    legend_below(figure, axes[0, :1], 4)
     return save_figure(path, figure)
 
 

@@ -36,21 +36,6 @@ class Case:
     errors: tuple[QuantisationError, QuantisationError]
     law: LawError
 
-    def content(self) -> Row:
-        """A line of the first table."""
-        kept, phases = self.table, self.table.start_phases
-        enough = kept.entries.enough
-        return {
-            **self._name(),
-            "entries": f"{kept.signal.size} x {kept.background.size}",
-            "MB": kept.nbytes / 1e6,
-            "shapes, MB": kept.entries.shape.nbytes / 1e6,
-            "phases": phases.phase.size,
-            "(S, B) of the phases": f"{phases.signal.size} x {phases.background.size}",
-            "unsettled": int((enough < 0).sum()),
-            "others serve from N_r =": int(enough.max()),
-        }
-
     def quantisation(self) -> list[Row]:
         """Lines of the second table: bilinear, nearest."""
         at_delay = "mean_rms mean_max variance_max third_max fourth_max shape_mean shape_max"
@@ -61,30 +46,11 @@ class Case:
             for row in found
         ]
 
-    def exposures(self) -> Row:
-        """A line of the third table: what becomes of the mean's error in longer exposures."""
+    @property
+    def longest(self) -> QuantisationError | None:
+        """The errors at 1e8 cycles, where every entry serves them."""
         made = self.table.provenance["error_longest"]
-        longest = None if made is None else QuantisationError(**made)
-        return {
-            **self._name(),
-            "mean max": max(self.errors[0].mean_max, self.errors[0].delayed_mean_max),
-            "at 1e8 cycles": "not served" if longest is None else max(longest.mean_max, longest.delayed_mean_max),
-            "variance max": "" if longest is None else max(longest.variance_max, longest.delayed_variance_max),
-            "within 0.05 up to": "" if longest is None else longest.cycles_within(0.05),
-        }
-
-    def laws(self) -> Row:
-        """A line of the last table."""
-        return {
-            **self._name(),
-            "TV mean": self.law.mean,
-            "TV max": self.law.largest,
-            "within 0.002": self.law.within,
-            "trusted": self.law.trusted,
-            "TV max of those": self.law.largest_trusted,
-            "worst S": self.law.worst_signal,
-            "worst B": self.law.worst_background,
-        }
+        return None if made is None else QuantisationError(**made)
 
     def _name(self) -> dict[str, Any]:
         return {
@@ -110,10 +76,8 @@ def run(request: Request) -> list[Path]:
         "grids": grids,
         "samples": samples,
         "laws": laws,
-        "content": [case.content() for case in cases],
+        "cases": cases,
         "rows": rows,
-        "exposures": [case.exposures() for case in cases],
-        "count_laws": [case.laws() for case in cases],
     }
     return write(request, "table", __name__, "report", facts, rows=rows)
 

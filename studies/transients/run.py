@@ -13,7 +13,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
 from mars_lidar.statistics import mean_histogram
 from studies import Request
-from studies.common.draw import panels
+from studies.common.draw import legend_below, panels
 from studies.common.report import save_figure, write
 from studies.common.sample import settings_of
 
@@ -107,8 +107,7 @@ def _draw(path: Path, shown: list[Seen]) -> Path:
         axes[0, 0].set_ylabel("per period and ns")
         axes[0, 0].set_title("fog, glass and wall")
         axes[0, 1].set_title("the wall")
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+        legend_below(figure, axes[0, :1], 4)
         return save_figure(path, figure)
 
 

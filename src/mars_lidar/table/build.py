@@ -16,6 +16,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.table.axes import Grid, axis_values, describe
+from mars_lidar.table.entries import part_of
 from mars_lidar.table.error import QuantisationError, long_error, quantisation_error
 from mars_lidar.table.law import law_error
 from mars_lidar.table.node_laws import NodeLaws, node_laws
@@ -92,7 +93,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
     settled = cells + max(1, cells // 10)  # the start phases take about so much of the time
     total = settled + max(1, cells // 20)  # and the laws of some entries so much
     entries = recipe.entries(
-        np.repeat(signal, background.size), np.tile(background, signal.size), system, _part(progress, 0, cells, total)
+        np.repeat(signal, background.size), np.tile(background, signal.size), system, part_of(progress, 0, cells, total)
     )
     phases, laws = StartPhases.none(), NodeLaws.none()
     if recipe.method == "exposure":
@@ -103,10 +104,15 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
             entries.cumulants,
             entries.bins,
             threads=recipe.threads,
-            progress=_part(progress, cells, settled, total),
+            progress=part_of(progress, cells, settled, total),
         )
         laws = node_laws(
-            system, signal, background, entries, threads=recipe.threads, progress=_part(progress, settled, total, total)
+            system,
+            signal,
+            background,
+            entries,
+            threads=recipe.threads,
+            progress=part_of(progress, settled, total, total),
         )
     if progress is not None:
         progress(total, total)
@@ -131,17 +137,3 @@ def _refined(
         f"refine must be an error that can be met, got {goal:g}: reached {error.largest:.2g} with "
         f"{axes[0].size} x {axes[1].size} points at S = {error.worst_signal:g}, B = {error.worst_background:g}"
     )
-
-
-def _part(progress: Progress | None, first: int, last: int, total: int) -> Progress | None:
-    """Progress of one part of the work, from `first` to `last` of `total`; never backward."""
-    if progress is None:
-        return None
-    reached = first
-
-    def update(done: int, of: int) -> object:
-        nonlocal reached
-        reached = max(reached, first + (last - first) * done // max(of, 1))
-        return progress(reached, total)
-
-    return update

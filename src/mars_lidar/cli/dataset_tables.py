@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from mars_lidar._base import manifest
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import BAD_INPUT, say, table
 
@@ -33,9 +34,10 @@ def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
     array, recipe = stored.histogram, stored.recipe
     levels = ", ".join(f"{s:g}/{b:g}" for s, b in recipe.light.levels[:8])
     problems = len(stored.problems)
+    whole = f"yes; {manifest.told(path)}" if stored.complete else "NO: all parts are there; continue with --resume"
     return [
         *rows,
-        ("complete", f"NO: {total - len(left)} of {total} parts are there; continue with --resume" if left else "yes"),
+        ("complete", f"NO: {total - len(left)} of {total} parts are there; continue with --resume" if left else whole),
         ("counts", f"{_shape(array.shape)} {array.dtype}, {recipe.layout}"),
         ("size", f"{_bytes(math.prod(array.shape) * array.dtype.itemsize)} dense, {_bytes(_on_disk(path))} on disk"),
         ("chunk", f"{_size(array.chunks)} of a shard of {_size(array.shards)}"),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mars_lidar._base import manifest
 from mars_lidar._version import other_version
 from mars_lidar.cli.console import check_picture, reported, save_picture, table
 from mars_lidar.cli.foreign import ForeignOptions, foreign_rows, is_foreign
@@ -58,7 +59,8 @@ def info(
                 raise ValueError(f"{file} is incomplete: there is nothing to verify")
             with progress_bar("verifying") as progress:
                 same = same_again(cube, progress=progress)
-            different = f"NO: counts differ{other_version(cube.version)}"
+            damaged = next(manifest.damage(file), "counts differ") if file.suffix == ".zarr" else "counts differ"
+            different = f"NO: {damaged}{other_version(cube.version)}"
             table([("verified", "simulated again, every count is the same" if same else different)])
             if not same:
                 raise typer.Exit(FAILED)
@@ -117,6 +119,8 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
     system, recipe = cube.system, cube.recipe
     count, height, width, bins = cube.shape
     complete = "yes" if cube.complete else "NO: the simulation did not finish"
+    if cube.complete and cube.path is not None and cube.path.suffix == ".zarr":
+        complete += f"; {manifest.told(cube.path)}"
     if cube.progress:
         complete += f"; {cube.progress}"
     rows = [

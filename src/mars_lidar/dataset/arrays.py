@@ -92,14 +92,14 @@ def packing(layout: str, dtype: np.dtype[Any]) -> dict[str, Any]:
 
     if layout == "sparse":
         return {"serializer": SparseCodec(), "compressors": (Crc32cCodec(),)}
-    return {"compressors": (blosc(dtype, "lz4", 5, "bitshuffle"), Crc32cCodec())}
+    return {"compressors": blosc(dtype, "lz4", 5, "bitshuffle")}
 
 
 def blosc(dtype: np.dtype[Any], name: Any, level: int, shuffle: Any) -> Any:
-    """A Blosc compressor for elements of this type; benchmarks/storage.py tells why which one."""
-    from zarr.codecs import BloscCodec
+    """Blosc for elements of this type, and a CRC-32C of what it makes; benchmarks/storage.py tells why which one."""
+    from zarr.codecs import BloscCodec, Crc32cCodec
 
-    return BloscCodec(cname=name, clevel=level, shuffle=shuffle, typesize=dtype.itemsize)
+    return BloscCodec(cname=name, clevel=level, shuffle=shuffle, typesize=dtype.itemsize), Crc32cCodec()
 
 
 def create_maps(
@@ -113,7 +113,7 @@ def create_maps(
         dtype=dtype,
         chunks=chunk,
         shards=samples.fitting(shape, chunk, dtype.itemsize, _SHARD_BYTES),
-        compressors=(blosc(dtype, "zstd", 1, "shuffle"),),
+        compressors=blosc(dtype, "zstd", 1, "shuffle"),
         fill_value=np.nan,
         dimension_names=dims,
         attributes={"long_name": told, "units": unit},
@@ -127,7 +127,7 @@ def create_list(group: Any, name: str, values: NDArray[Any], dims: tuple[str, ..
         shape=values.shape,
         dtype=values.dtype,
         chunks=values.shape,
-        compressors=(blosc(values.dtype, "zstd", 1, "shuffle"),),
+        compressors=blosc(values.dtype, "zstd", 1, "shuffle"),
         dimension_names=dims,
         attributes={"long_name": told, "units": unit},
     )

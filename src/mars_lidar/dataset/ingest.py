@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import (
@@ -81,13 +82,39 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
     """Create all arrays of the samples, write the small ones, and mark the store as planned."""
     names, shape = writer.names, writer.shape
     assert shape is not None
+    lists = coordinates(recipe, names, shape)
+    for name, values, dims, told, unit in lists:
+        create_list(group, name, values, dims, told, unit)
+    create_texts(group, "scene_name", scene_names(recipe, names), "sample", "name of the scene")
+    number = samples.count_samples(recipe, len(names))
+    for name, (told, unit) in MAPS.items():
+        create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), told, unit)
+    create_histogram(group, recipe, number, shape)
+    plain = [[str(one.path), one.reason] for one in problems]
+    systems = [one.to_dict() for one in recipe.systems]
+    attrs: dict[str, Any] = {"stage": "counts", "systems": json.dumps(systems), "problems": plain}
+    if not writer.plain:
+        attrs["format_version"] = MORE_VERSION
+    mark(group, attrs)
+
+
+def scene_names(recipe: DatasetRecipe, names: list[str]) -> list[str]:
+    """Name of the scene of every sample."""
+    number = samples.count_samples(recipe, len(names))
+    return [names[samples.sample_parts(recipe, k)[0]] for k in range(number)]
+
+
+def coordinates(
+    recipe: DatasetRecipe, names: list[str], shape: tuple[int, int]
+) -> list[tuple[str, NDArray[Any], tuple[str, ...], str, str]]:
+    """Name, values, dimensions, meaning and unit of every small array, of scenes of these names and shape (H, W)."""
     number = samples.count_samples(recipe, len(names))
     parts = [samples.sample_parts(recipe, k) for k in range(number)]
     texts = [one.to_json() for one in recipe.systems]
     seeds = [seed_of(recipe, names[scene], texts[system], s, b) for scene, system, s, b in parts]
     scene, system, signal, sbr = (np.array(column) for column in zip(*parts, strict=True))
     periods = np.array([one.period_ns for one in recipe.systems])
-    lists = (
+    lists: list[tuple[str, NDArray[Any], tuple[str, ...], str, str]] = [
         ("sample", np.arange(number), ("sample",), "sample", "1"),
         ("realization", np.arange(recipe.realizations), ("realization",), "realization number", "1"),
         ("y", np.arange(shape[0]), ("y",), "image row", "pixel"),
@@ -98,19 +125,7 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
         ("sbr", sbr, ("sample",), "mean signal / mean ambient photons", "1"),
         ("period_ns", periods[system], ("sample",), "laser period", "ns"),
         ("seed", np.array(seeds, np.uint64), ("sample",), "seed of the sample", "1"),
-    )
-    for name, values, dims, told, unit in lists:
-        create_list(group, name, values, dims, told, unit)
-    create_texts(group, "scene_name", [names[number] for number in scene], "sample", "name of the scene")
+    ]
     if np.ptp(periods) == 0.0:
-        times = recipe.systems[0].time_ns
-        create_list(group, "time", times, ("time",), "time in the period, bin centre", "ns")
-    for name, (told, unit) in MAPS.items():
-        create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), told, unit)
-    create_histogram(group, recipe, number, shape)
-    plain = [[str(one.path), one.reason] for one in problems]
-    systems = [one.to_dict() for one in recipe.systems]
-    attrs: dict[str, Any] = {"stage": "counts", "systems": json.dumps(systems), "problems": plain}
-    if not writer.plain:
-        attrs["format_version"] = MORE_VERSION
-    mark(group, attrs)
+        lists.append(("time", recipe.systems[0].time_ns, ("time",), "time in the period, bin centre", "ns"))
+    return lists

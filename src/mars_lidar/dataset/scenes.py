@@ -19,6 +19,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import blosc, create_list, create_maps, create_texts
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
 from mars_lidar.instrument.system import System
+from mars_lidar.io.store import OnDisk
 from mars_lidar.light.fog import Fog
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import MOST, LayeredScene
@@ -118,7 +120,7 @@ class SceneWriter:
                 shape=shape,
                 dtype=_DOUBLE,
                 chunks=samples.fitting((1, *shape[1:]), (1, 1, 1, bins), _DOUBLE.itemsize, _RATE_BYTES),
-                compressors=(blosc(_DOUBLE, "zstd", 1, "shuffle"),),
+                compressors=blosc(_DOUBLE, "zstd", 1, "shuffle"),
                 fill_value=0.0,
                 dimension_names=("scene", "y", "x", "bin"),
                 attributes={"long_name": "rendered light per bin", "units": "relative"},
@@ -141,8 +143,8 @@ class SceneWriter:
 class SceneReader:
     """Scenes by their number; several threads may read."""
 
-    def __init__(self, group: Any) -> None:
-        self._group = group
+    def __init__(self, group: Any, path: Path) -> None:
+        self._group = {name: OnDisk(array, path) for name, array in group.arrays()}
         self._block: tuple[int, tuple[NDArray[np.float64], ...] | None] = (0, None)
 
     def read(self, number: int) -> Shown:

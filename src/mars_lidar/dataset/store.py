@@ -24,12 +24,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import IncompleteFileError
+from mars_lidar._base import manifest
+from mars_lidar._base.files import FileError, IncompleteFileError, reading
 from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.sample_content import Rendered
 from mars_lidar.dataset.scenes import SceneReader
 from mars_lidar.io.scan import Problem
+from mars_lidar.io.store import OnDisk
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import LayeredScene
 from mars_lidar.scene.scene import Scene
@@ -53,21 +55,21 @@ class Dataset:
         from mars_lidar.dataset import codec  # noqa: F401  (registers it)
 
         self.path = path
-        if not (path / "zarr.json").is_file():
-            raise FileNotFoundError(f"{path} is not a Zarr v3 store (it has no zarr.json)")
-        self.group = zarr.open_group(path, mode="r+", use_consolidated=False)
-        self.attrs: dict[str, Any] = dict(self.group.attrs)
+        self.attrs: dict[str, Any] = manifest.root_document(path).get("attributes", {})
         if self.attrs.get("format") != FORMAT:
             raise ValueError(f"{path} is not a dataset written by mars-lidar (no attribute format = {FORMAT!r})")
         if self.attrs.get("format_version") not in (FORMAT_VERSION, MORE_VERSION):
             told = self.attrs.get("format_version")
             raise ValueError(f"{path} has layout version {told}; {FORMAT_VERSION} and {MORE_VERSION} can be read")
+        if self.complete:
+            manifest.require(path)
+        self.group: Any = zarr.open_group(path, mode="r+", use_consolidated=False)
         self.recipe = DatasetRecipe.from_dict(json.loads(self.attrs["recipe"]))
 
     def __repr__(self) -> str:
         if not self.planned:
             return f"Dataset({str(self.path)!r}, its scenes are not all there)"
-        sizes = " x ".join(map(str, self.group["histogram"].shape))  # type: ignore[union-attr]
+        sizes = " x ".join(map(str, self.group["histogram"].shape))
         state = "" if self.complete else ", incomplete"
         return f"Dataset({str(self.path)!r}, {sizes} (sample, realization, y, x, time){state})"
 
@@ -84,18 +86,17 @@ class Dataset:
     @cached_property
     def histogram(self) -> Any:
         """The counts, read when indexed."""
-        return with_zeros(self.group["histogram"])
+        return OnDisk(with_zeros(self.group["histogram"]), self.path)
 
     @cached_property
     def maps(self) -> dict[str, Any]:
         """The arrays (sample, y, x)."""
-        return {name: with_zeros(self.group[name]) for name in MAPS}
+        return {name: OnDisk(with_zeros(self.group[name]), self.path) for name in MAPS}
 
     @cached_property
     def seeds(self) -> NDArray[np.uint64]:
         """Seed of each sample."""
-        array: Any = self.group["seed"]
-        return np.asarray(array[...])
+        return np.asarray(OnDisk(self.group["seed"], self.path))
 
     @cached_property
     def problems(self) -> list[Problem]:
@@ -110,7 +111,7 @@ class Dataset:
     @cached_property
     def scenes(self) -> SceneReader:
         """All that samples show."""
-        return SceneReader(self.group["scenes"])
+        return SceneReader(self.group["scenes"], self.path)
 
     def scene_names(self) -> list[str]:
         """Names of all scenes."""
@@ -159,9 +160,11 @@ class Dataset:
                 leftover.unlink(missing_ok=True)
 
     def finish(self) -> None:
-        """Mark the store complete, with one replacement of its root document."""
-        mark(self.group, {"stage": "done", "complete": True})
-        self.attrs = dict(self.group.attrs)
+        """Mark the store complete, with one replacement of its root document, after its manifest."""
+        (self.path / manifest.NAME).unlink(missing_ok=True)  # of a run that was stopped in the next line but one
+        mark(self.group, {})
+        manifest.seal(self.path, {"stage": "done", "complete": True})
+        self.attrs = manifest.root_document(self.path)["attributes"]
 
 
 def _whole(file: Path, chunks: int) -> bool:
@@ -180,10 +183,9 @@ def _whole(file: Path, chunks: int) -> bool:
 def is_dataset(path: str | Path) -> bool:
     """Whether a folder is a dataset, complete or not."""
     try:
-        root = json.loads((Path(path) / "zarr.json").read_text())
-    except (OSError, ValueError):
+        return bool(manifest.root_document(Path(path)).get("attributes", {}).get("format") == FORMAT)
+    except (OSError, ValueError, MemoryError):
         return False
-    return isinstance(root, dict) and root.get("attributes", {}).get("format") == FORMAT
 
 
 def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset:
@@ -191,12 +193,17 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset
 
     Raises
     ------
-    FileNotFoundError, ValueError
-        Nothing there, or no dataset.
+    FileNotFoundError, FileError
+        Nothing there, or no dataset; one that lacks a part, or whose metadata is damaged (a ValueError).
     IncompleteFileError
         Its generation did not finish (a ValueError).
     """
-    dataset = Dataset(Path(path))
-    if not (dataset.complete or allow_incomplete):
-        raise IncompleteFileError(f"{path} is incomplete: its generation did not finish; continue it with --resume")
-    return dataset
+    with reading(path, "a dataset of mars-lidar") as source:
+        dataset = Dataset(source)
+        if not (dataset.complete or allow_incomplete):
+            raise IncompleteFileError(f"{path} is incomplete: its generation did not finish; continue it with --resume")
+        if dataset.complete and not manifest.is_sealed(source):  # of an earlier version: all of its parts have names
+            gone = [str(file) for item in dataset.items() for file in dataset.files(item) if not file.is_file()]
+            if gone:
+                raise FileError(f"{path} is damaged: {gone[0]} is missing, the first of {len(gone)}")
+        return dataset

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mars_lidar._base import checks
+from mars_lidar._base import checks, manifest
+from mars_lidar._base.files import FileError, reading
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import other_version
 from mars_lidar.dataset.arrays import MAPS
-from mars_lidar.dataset.store import open_dataset
+from mars_lidar.dataset.ingest import coordinates, scene_names
+from mars_lidar.dataset.store import Dataset, open_dataset
 from mars_lidar.dataset.write import Maker
 
 
@@ -50,7 +53,9 @@ def verify(
 ) -> Verified:
     """Make random chunks of a dataset again, with the maps of their samples, and compare every number.
 
-    The store's own scenes and recipe are used: files of the source are not needed.
+    The store's own scenes and recipe are used: files of the source are not needed. Every byte of the store is compared
+    with its manifest, and every coordinate and label with the recipe. Stores of earlier versions have no manifest:
+    their scenes and the rest of their metadata cannot be checked.
 
     Parameters
     ----------
@@ -63,7 +68,6 @@ def verify(
     threads, progress
         As for `mars_lidar.generate`.
     """
-
     progress = shown(progress, "verifying")
     dataset = open_dataset(path)
     array = dataset.histogram
@@ -75,7 +79,8 @@ def verify(
     random = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     chosen = np.arange(total) if number == total else np.sort(random.choice(total, number, replace=False))
     maker = Maker(dataset, thread_count(threads or None))
-    different = []
+    with reading(dataset.path, "a dataset of mars-lidar"):
+        different = [*manifest.damage(dataset.path), *_labels(dataset)]
     for k, flat in enumerate(chosen):
         place = np.unravel_index(int(flat), grid)
         region = tuple(
@@ -90,6 +95,31 @@ def verify(
     return Verified(number, total, tuple(different))
 
 
+def _labels(dataset: Dataset) -> Iterator[str]:
+    """What is wrong with the coordinates and labels of a dataset: all of them follow from its recipe and scenes."""
+    for name, values, dims, told, unit in coordinates(
+        dataset.recipe, dataset.scene_names(), dataset.histogram.shape[2:4]
+    ):
+        array = dataset.group[name]
+        try:
+            if not np.array_equal(array[...], values):
+                yield f"{name} is not that of the recipe"
+        except Exception as error:  # whatever the codecs make of a damaged chunk
+            yield f"{name} cannot be read ({error})"
+        if (array.attrs.get("long_name"), array.attrs.get("units"), array.metadata.dimension_names) != (
+            told,
+            unit,
+            dims,
+        ):
+            yield f"the labels of {name} are not its own"
+    if "scene_name" in dataset.group:  # not in stores of version 0.1
+        try:
+            if list(dataset.group["scene_name"][...]) != scene_names(dataset.recipe, dataset.scene_names()):
+                yield "scene_name is not that of the scenes"
+        except Exception as error:
+            yield f"scene_name cannot be read ({error})"
+
+
 def _compare(maker: Maker, region: tuple[slice, ...]) -> str:
     """Empty, or what is wrong with a chunk."""
     dataset = maker.dataset
@@ -97,12 +127,13 @@ def _compare(maker: Maker, region: tuple[slice, ...]) -> str:
     try:
         stored = np.asarray(dataset.histogram[region])
         maps = {name: np.asarray(dataset.maps[name][region[0]]) for name in MAPS}
-    except (OSError, ValueError) as error:
+        wrong = int(np.count_nonzero(stored != maker.counts(region)))
+        made = maker.maps(region[0])
+    except FileError as error:
         return f"histogram[{told}] cannot be read: {' '.join(str(error).split())}"
-    wrong = int(np.count_nonzero(stored != maker.counts(region)))
     if wrong:
         return f"histogram[{told}] differs in {wrong} bins"
-    for name, again in maker.maps(region[0]).items():
+    for name, again in made.items():
         if not np.array_equal(maps[name], again, equal_nan=True):
             return f"{name}[{region[0].start}:{region[0].stop}] differs"
     return ""

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.dataset.arrays import with_zeros
 from mars_lidar.dataset.sample_content import Shown
 from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.shard import chunks_of, packer, write_shard
@@ -55,7 +56,7 @@ class Maker:
         began = time.perf_counter()
         if item.kind == "maps":
             for name, values in self.maps(item.region[0]).items():
-                self.dataset.maps[name][item.region] = values
+                with_zeros(self.dataset.group[name])[item.region] = values
             return Made(0, 0.0, time.perf_counter() - began)
         self._simulate_s = 0.0
         (path,) = self.dataset.files(item)

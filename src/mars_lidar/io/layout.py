@@ -164,6 +164,7 @@ def recipe_from(
             source=str(attrs["source"]),
         )
     flux: Flux
+    system = System.from_json(attrs["system"])
     background, info = read("background"), json.loads(attrs["flux"])
     if "waveform" in names:
         stored = None if rows_of is None else rows_of("waveform")
@@ -177,8 +178,8 @@ def recipe_from(
         flux = Flux.multi(*[Flux(s, zero if k else background, tau) for k, (s, tau) in enumerate(returns)], info=info)
     else:
         flux = Flux(read("signal"), background, read("delay"), info=info)
-    return Recipe(
-        system=System.from_json(attrs["system"]),
+    recipe = Recipe(
+        system=system,
         flux=flux,
         engine=str(attrs["engine"]),
         seed=int(attrs["seed"]),
@@ -190,6 +191,10 @@ def recipe_from(
         source=str(attrs["source"]),
         settings=json.loads(attrs.get("engine_settings", "{}")),
     )
+    for told in variables(recipe):
+        if told.dims == (told.name,) and told.name in names and not np.array_equal(read(told.name), told.data):
+            raise ValueError(f"the coordinate {told.name} is not that of its system and flux: it is damaged")
+    return recipe
 
 
 def _stored_flux(waveforms: Any, signal: NDArray[Any], background: NDArray[Any], info: dict[str, Any]) -> StoredFlux:

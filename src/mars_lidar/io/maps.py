@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import manifest
 from mars_lidar._base.files import TemporarySibling, check_target, open_hdf5, open_npz, reading, whole
 from mars_lidar.instrument.system import System
 
@@ -70,7 +71,8 @@ def save_maps(path: str | Path, results: Mapping[str, Maps], *, source: str = ""
     with TemporarySibling(target).writing() as unfinished:
         if target.suffix == ".zarr":
             shutil.rmtree(unfinished, ignore_errors=True)
-            _write_zarr(unfinished, variables, attrs)
+            _write_zarr(unfinished, variables)
+            manifest.seal(unfinished, dict(attrs))
             if target.exists():
                 (target / "zarr.json").unlink(missing_ok=True)
                 shutil.rmtree(target)
@@ -98,6 +100,7 @@ def _read(source: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     if source.suffix == ".zarr":
         import zarr
 
+        manifest.require(source)
         group: Any = zarr.open_group(source, mode="r")
         return {name: whole(group[name]) for name in group.array_keys()}, dict(group.attrs)
     if source.suffix == ".npz":
@@ -158,10 +161,11 @@ def _contents(
     return variables, attrs
 
 
-def _write_zarr(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
+def _write_zarr(path: Path, variables: Mapping[str, Any]) -> None:
     import warnings
 
     import xarray
+    from zarr.codecs import Crc32cCodec, ZstdCodec
 
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Consolidated metadata", category=UserWarning)
@@ -169,8 +173,12 @@ def _write_zarr(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, An
         xarray.Dataset(
             {name: value for name, value in variables.items() if name not in DIMS},
             coords={name: variables[name] for name in DIMS},
-            attrs=dict(attrs),
-        ).to_zarr(path, mode="w", zarr_format=3)
+        ).to_zarr(
+            path,
+            mode="w",
+            zarr_format=3,
+            encoding={name: {"compressors": (ZstdCodec(), Crc32cCodec())} for name in variables},
+        )
 
 
 def _write_npz(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:

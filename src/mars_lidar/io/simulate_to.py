@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base import manifest
 from mars_lidar._base.files import WriteError as WriteError
 from mars_lidar._base.files import reason
 from mars_lidar._base.progress import shown
@@ -205,10 +206,13 @@ def verify(
 ) -> bool:
     """Whether simulating again gives the stored counts, bit for bit; one block in memory at a time.
 
-    A cube that was made with a table needs that `table`; another one is refused.
+    A cube that was made with a table needs that `table`; another one is refused. Of a Zarr store every byte is compared
+    with its manifest as well.
     """
     progress = shown(progress, "verifying")
     recipe = _repeatable(cube.simulation("simulating again"), table)
+    if cube.path is not None and cube.path.suffix == ".zarr" and any(manifest.damage(cube.path)):
+        return False
     for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
         again = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))
         if not np.array_equal(again, np.asarray(cube.histogram[images, rows])):

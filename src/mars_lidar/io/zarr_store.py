@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import manifest
+from mars_lidar._base.files import whole
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.store import OpenedStore, Writer
@@ -47,7 +49,7 @@ class ZarrWriter(Writer):
                 shape=v.data.shape,
                 dtype=v.data.dtype,
                 chunks=_map_chunks(v.data),
-                compressors=_compressor(v.data.dtype, "shuffle"),
+                compressors=_compressors(v.data.dtype, "shuffle"),
                 dimension_names=v.dims,
                 attributes={**v.labels},
             )
@@ -59,7 +61,7 @@ class ZarrWriter(Writer):
             shape=recipe.shape,
             dtype=recipe.dtype,
             chunks=self.chunks,
-            compressors=_compressor(recipe.dtype, "bitshuffle"),
+            compressors=_compressors(recipe.dtype, "bitshuffle"),
             dimension_names=layout.DIMS,
             attributes={**layout.HISTOGRAM_LABELS},
         )
@@ -72,8 +74,8 @@ class ZarrWriter(Writer):
         self._histogram[realizations, rows] = block
 
     def finish(self, registrations: int) -> None:
-        """Mark the store complete: one atomic replacement of its root document."""
-        self._group.update_attributes({"registrations": registrations, "complete": True})
+        """Mark the store complete: one atomic replacement of its root document, after its manifest."""
+        manifest.seal(self._path, {"registrations": registrations, "complete": True})
 
     def abandon(self) -> str:
         """Leave what is there, marked incomplete."""
@@ -89,12 +91,12 @@ def open_store(path: Path) -> OpenedStore:
     """Open a store for reading; chunks are read when the histogram is indexed."""
     import zarr
 
-    if not (path / "zarr.json").is_file():
-        raise ValueError(f"{path} is not a Zarr v3 store (it has no zarr.json)")
-    group = zarr.open_group(path, mode="r")
-    attrs = dict(group.attrs)
+    attrs = manifest.root_document(path).get("attributes", {})
     layout.check_format(path, attrs)
     complete = attrs.get("complete") is True
+    if complete:
+        manifest.require(path)
+    group: Any = zarr.open_group(path, mode="r")
     names = frozenset(group.array_keys())
     if "histogram" not in names:
         raise ValueError(f"{path} has no variable 'histogram': its writing stopped at the very start")
@@ -103,23 +105,21 @@ def open_store(path: Path) -> OpenedStore:
     if not complete:
         progress = f"at least {histogram.nchunks_initialized} of {histogram.nchunks} chunks are written"
 
-    def read(name: str) -> NDArray[Any]:
-        array: Any = group[name]
-        return np.asarray(array[...])
-
-    return OpenedStore(attrs, names, read, histogram, complete, progress, lambda: None, lambda name: group[name])
+    return OpenedStore(
+        attrs, names, lambda name: whole(group[name]), histogram, complete, progress, lambda: None, group.__getitem__
+    )
 
 
-def _compressor(dtype: np.dtype[Any], shuffle: Any) -> Any:
-    """Blosc zstd at level 1, with bitshuffle for counts.
+def _compressors(dtype: np.dtype[Any], shuffle: Any) -> Any:
+    """Blosc zstd at level 1, with bitshuffle for counts, and a CRC-32C of what it makes.
 
     Measured on a room of 128 x 128 x 1024 uint16 counts (61 % zeros, 34 MB, 2 cores; write, read, size):
     zstd-1 bitshuffle 0.11 s, 0.03 s, 3.6 MB; lz4 bitshuffle 0.15 s, 0.04 s, 4.6 MB; zstd-1 byte shuffle
     0.15 s, 0.06 s, 4.5 MB; zstd alone 0.20 s, 0.08 s, 5.8 MB; none 0.12 s, 0.07 s, 34 MB.
     """
-    from zarr.codecs import BloscCodec
+    from zarr.codecs import BloscCodec, Crc32cCodec
 
-    return BloscCodec(cname="zstd", clevel=1, shuffle=shuffle, typesize=dtype.itemsize)
+    return BloscCodec(cname="zstd", clevel=1, shuffle=shuffle, typesize=dtype.itemsize), Crc32cCodec()
 
 
 def _map_chunks(data: Any) -> tuple[int, ...]:

@@ -1,0 +1,193 @@
+"""No damage goes unnoticed: a part that is missing, a bit that flips, a label that changes, in stores and datasets."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from dataset.conftest import files
+from typer.testing import CliRunner
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar._base import manifest
+from mars_lidar._base.files import FileError
+from mars_lidar.cli import app
+from mars_lidar.dataset import open_dataset, verify
+from mars_lidar.io.maps import load_maps, save_maps
+from mars_lidar.io.store import OnDisk
+
+FLIPS = int(os.environ.get("MARS_LIDAR_FLIPS", "200"))
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
+)
+
+
+@pytest.fixture
+def dataset(tmp_path) -> Path:
+    recipe = {
+        "scenes": {"example": "room", "size": [4, 6], "seeds": [0, 1]},
+        "systems": [SYSTEM],
+        "light": {"signal": [0.5, 1.0]},
+        "realizations": 2,
+        "store": {"layout": "sparse", "chunk_mib": 0.004, "shard_mib": 0.008},
+    }
+    ml.generate(recipe, tmp_path / "set.zarr")
+    return tmp_path / "set.zarr"
+
+
+@pytest.fixture
+def cube(tmp_path) -> Path:
+    flux = ml.Flux(np.linspace(0.1, 1.0, 24).reshape(4, 6), 0.1, 40.0)
+    io.simulate_to(tmp_path / "cube.zarr", flux, SYSTEM)
+    return tmp_path / "cube.zarr"
+
+
+@pytest.fixture
+def maps(cube) -> Path:
+    found = ml.reconstruct(np.asarray(io.load(cube).histogram), SYSTEM)
+    return save_maps(cube.with_name("maps.zarr"), {"maximum_likelihood": found})
+
+
+def all_of(dataset: Path) -> None:
+    """Reads every array of a dataset."""
+    open_dataset(dataset)
+    group = zarr.open_group(dataset, mode="r")
+    for _, array in (*group.arrays(), *group["scenes"].arrays()):
+        np.asarray(OnDisk(array, dataset))
+
+
+READERS = {"set": all_of, "cube": lambda path: np.asarray(io.load(path).histogram), "maps": load_maps}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_every_missing_file_is_noticed_on_opening(dataset, cube, maps, name):
+    store = {"set": dataset, "cube": cube, "maps": maps}[name]
+    READERS[name](store)
+    for path in sorted(store.rglob("*")):
+        if not path.is_file():
+            continue
+        content = path.read_bytes()
+        path.unlink()
+        with pytest.raises((FileError, FileNotFoundError), match=r"is damaged: .* is missing|not a Zarr"):
+            {"set": open_dataset, "cube": io.load, "maps": load_maps}[name](store)
+        path.write_bytes(content)
+    READERS[name](store)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_every_flipped_bit_is_found(dataset, cube, maps, name):
+    """Metadata and what is read, on reading; everything by `verify`. Bits are drawn file by file, with a fixed seed."""
+    store = {"set": dataset, "cube": cube, "maps": maps}[name]
+    random = np.random.default_rng(20261122)
+    every = [path for path in sorted(store.rglob("*")) if path.is_file()]
+    for k in range(FLIPS):
+        path = every[k % len(every)] if k < len(every) else every[random.integers(len(every))]
+        content = bytearray(path.read_bytes())
+        content[random.integers(len(content))] ^= 1 << int(random.integers(8))
+        path_was = path.read_bytes()
+        path.write_bytes(content)
+        try:
+            in_manifest = path.name == manifest.NAME  # a wrong sum of data that is good
+            told = ""
+            try:
+                READERS[name](store)
+            except (FileError, FileNotFoundError) as error:
+                told = str(error)
+            noticed = str(store) in told
+            assert noticed or in_manifest, f"a flipped bit of {path} goes unnoticed by its reader"
+            if name == "set":
+                try:
+                    found = not verify(store, chunks=1).good
+                except ValueError:  # it cannot be opened
+                    found = True
+                assert found, f"verify does not find a flipped bit of {path}"
+            assert noticed or list(manifest.damage(store))
+        finally:
+            path.write_bytes(path_was)
+    READERS[name](store)
+
+
+def test_changed_labels_coordinates_and_inputs_are_found_without_a_manifest_too(dataset):
+    """As in a store of 0.1.0: coordinates and labels follow from the recipe. What does not, only a manifest tells."""
+    group = zarr.open_group(dataset, mode="r+", use_consolidated=False)
+    for name in ("sbr", "signal_level", "period_ns", "seed", "scene", "time", "y"):
+        was = group[name][...]
+        group[name][0] = 3
+        with pytest.raises(FileError, match=f"{name}/c/0 is not as it was written"):
+            verify(dataset, chunks=1)
+        group[name][...] = was
+    scene = dataset / "scenes/depth/c/0/0/0"
+    was_there = scene.read_bytes()
+    scene.write_bytes(was_there[:-1] + b"\0")
+    found = verify(dataset).different
+    assert found[0] == "scenes/depth/c/0/0/0 is not as it was written"
+    assert "cannot be read" in found[1]
+    scene.write_bytes(was_there)
+    document = json.loads((dataset / "zarr.json").read_text())
+    del document["attributes"]["manifest"]
+    (dataset / "zarr.json").write_text(json.dumps(document))
+    (dataset / manifest.NAME).unlink()
+    assert verify(dataset).good
+    group["sbr"][0] = 3
+    group["period_ns"].update_attributes({"units": "s"})
+    assert verify(dataset).different == ("sbr is not that of the recipe", "the labels of period_ns are not its own")
+
+
+def test_a_store_without_a_manifest_says_so(tmp_path):
+    with zipfile.ZipFile(Path(__file__).parents[1] / "data" / "files_of_0.1.0.zip") as archive:
+        archive.extractall(tmp_path)
+    for name in ("cube.zarr", "set.zarr"):
+        told = CliRunner().invoke(app, ["info", str(tmp_path / name)]).output
+        assert "cannot be checked" in " ".join(told.split())
+    shard = next(path for path in (tmp_path / "set.zarr/histogram/c").rglob("*") if path.is_file())
+    shard.unlink()
+    with pytest.raises(FileError, match=r"is damaged: .* is missing, the first of 1"):
+        open_dataset(tmp_path / "set.zarr")
+
+
+def test_opening_says_what_it_made_sure_of(dataset, cube):
+    for path in (dataset, cube):
+        told = CliRunner().invoke(app, ["info", str(path)]).output
+        assert "every file of its manifest.sha256 is there" in " ".join(told.split())
+    (cube / "histogram/c/0/0/0/0").unlink()
+    refused = CliRunner().invoke(app, ["info", str(cube)])
+    assert refused.exit_code == 2
+    assert "histogram/c/0/0/0/0 is missing" in refused.output
+
+
+def test_sha256sum_reads_the_manifest(dataset):
+    done = subprocess.run(["sha256sum", "--quiet", "-c", manifest.NAME], cwd=dataset, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+def test_killed_between_manifest_and_root_document(dataset):
+    """The store is incomplete then, and goes on."""
+    whole = files(dataset)
+    root = dataset / "zarr.json"
+    root.write_text(root.read_text().replace('"complete": true', '"complete": false'))
+    script = """
+import os, signal, sys
+from mars_lidar._base import manifest
+from mars_lidar.dataset import generate
+real, calls = os.replace, []
+def replace(a, b):
+    real(a, b)
+    if str(b).endswith(manifest.NAME):
+        os.kill(os.getpid(), signal.SIGKILL)
+manifest.os.replace = replace
+generate(None, sys.argv[1], resume=True)
+"""
+    assert subprocess.run([sys.executable, "-c", script, str(dataset)]).returncode == -9
+    with pytest.raises(io.IncompleteFileError):
+        open_dataset(dataset)
+    ml.generate(None, dataset, resume=True)
+    assert files(dataset) == whole

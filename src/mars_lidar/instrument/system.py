@@ -194,18 +194,12 @@ class System:
 
     @classmethod
     def load(cls, path: str | Path) -> System:
-        """Read what `save` wrote; an error names the file and the key."""
+        """Read what `save` wrote; an error names the file, the line and the key."""
         source = Path(path)
         if source.suffix not in (".json", ".yaml", ".yml"):
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
-        text = source.read_text(encoding="utf-8-sig")
-        try:
-            if source.suffix == ".json":
-                return cls.from_dict(json.loads(text))
-            import yaml
+        from mars_lidar._base.yaml import located, read_yaml
 
-            from mars_lidar._base.yaml import loader
-
-            return cls.from_dict(yaml.load(text, Loader=loader()))  # a safe loader
-        except Exception as error:
-            raise ValueError(f"{source}: {error}") from error
+        data, lines = read_yaml(source)
+        with located(source, lines):
+            return cls.from_dict(data)

@@ -209,7 +209,10 @@ def test_training(tmp_path, of_transients):
 @pytest.mark.parametrize(
     ("scene", "told"),
     [
-        ({"transient": "x.npz", "path": "y"}, "must give one of example, path and transient"),
+        (
+            {"transient": "x.npz", "path": "y"},
+            "transient, got path and transient",
+        ),
         ({"transient": "x.npz", "fog": FOGS[0]}, "unknown key 'fog'"),
         ({"transient": "x.npz", "bin_ns": 0}, r"scenes\[0\].bin_ns must be a finite number"),
         ({"transient": "x.npz", "pulse": 1}, "pulse must be true or false"),

@@ -1,18 +1,32 @@
-"""YAML as people write it: 1e-3 is a number, as in YAML 1.2 and in Python, which PyYAML (1.1) takes for text."""
+"""YAML as people write it, with the line of every key, so that an error can point at it.
+
+1e-3 is a number, as in YAML 1.2 and in Python, which PyYAML (1.1) takes for text.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from mars_lidar._base.files import FileError, reading
 
+Key = tuple[str | int, ...]  # ("scenes", 0, "path")
+Lines = dict[Key, int]
+
 _EXPONENT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
 _MOST_BYTES, _MOST_NODES = 2**20, 2**17  # PyYAML reads a megabyte in 10 s
+
+
+class RecipeError(ValueError):
+    """A value of a description that cannot be; `key` is where it stands."""
+
+    def __init__(self, key: Key, message: str) -> None:
+        super().__init__(message)
+        self.key = key
 
 
 @lru_cache(maxsize=1)
@@ -59,3 +73,60 @@ def _expanded(node: Any, known: dict[int, int]) -> int:
             for one in children
         )
     return known[id(node)]
+
+
+def read_yaml(path: Path) -> tuple[Any, Lines]:
+    """The data of a YAML file and the line (from 1) of each key, numbers of list entries among them."""
+    with opened(path) as (reader, node):
+        try:
+            lines: Lines = {}
+            return (None if node is None else _plain(reader, node, (), lines)), lines
+        except RecipeError as error:
+            raise FileError(f"{path}:{error.key[-1]}: {error}") from error
+
+
+@contextlib.contextmanager
+def located(path: Path, lines: Lines, elsewhere: Callable[[Key], bool] = lambda key: False) -> Iterator[None]:
+    """Turn what is wrong with the data of a file into ``FILE:LINE: what``; no line for keys that stand `elsewhere`."""
+    try:
+        yield
+    except (ValueError, TypeError) as error:
+        key = error.key if isinstance(error, RecipeError) else ()
+        line = None if elsewhere(key) else line_of(key, str(error), lines)
+        raise FileError(f"{path}{'' if line is None else f':{line}'}: {error}") from error
+
+
+def line_of(key: Key, message: str, lines: Lines) -> int | None:
+    """Line of a key, or of what stands nearest above it; a key below it that `message` names comes first."""
+    unknown = re.search(r"unknown key '(.*?)'", message)
+    words = [unknown[1]] if unknown else re.findall(r"\w+", message)
+    for word in words:
+        if (*key, word) in lines:
+            return lines[(*key, word)]
+    for word in words[:1]:  # the argument that a message begins with, deeper down
+        deeper = [line for one, line in lines.items() if one[: len(key)] == key and one[-1:] == (word,)]
+        if deeper:
+            return deeper[0]
+    while key and key not in lines:
+        key = key[:-1]
+    return lines.get(key)
+
+
+def _plain(loader: Any, node: Any, key: Key, lines: Lines) -> Any:
+    import yaml
+
+    lines.setdefault(key, node.start_mark.line + 1)
+    if isinstance(node, yaml.SequenceNode):
+        return [_plain(loader, child, (*key, k), lines) for k, child in enumerate(node.value)]
+    if not isinstance(node, yaml.MappingNode):
+        return loader.construct_object(node, deep=True)
+    out: dict[Any, Any] = {}
+    for name_node, child in node.value:
+        name, line = loader.construct_object(name_node, deep=True), name_node.start_mark.line + 1
+        if not isinstance(name, str):
+            raise RecipeError((*key, line), f"keys must be words, got {name!r}")
+        if name in out:
+            raise RecipeError((*key, line), f"{name} is given twice")
+        lines[(*key, name)] = line
+        out[name] = _plain(loader, child, (*key, name), lines)
+    return out

@@ -18,7 +18,7 @@ from mars_lidar.cli.export import EXPORT_EPILOG, export
 from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
 from mars_lidar.cli.groups import grouped
 from mars_lidar.cli.info import info, view
-from mars_lidar.cli.init import init
+from mars_lidar.cli.init import init, schema
 from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
 from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
 from mars_lidar.cli.simulate import EPILOG, simulate
@@ -58,6 +58,7 @@ for _command, _epilog in (
 ):
     _add(_command, _epilog, no_args_is_help=True)
 _add(init)
+_add(schema)
 app.add_typer(table_app, name="table")
 
 

@@ -19,7 +19,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
-_FIELDS = {"sigma_ns": "pulse_sigma_ns", "fwhm_ns": "pulse_fwhm_ns", "values": "pulse_file", "name": "scene"}
+_FIELDS = {  # of the package, where an option has another name
+    "sigma_ns": "pulse_sigma_ns",
+    "fwhm_ns": "pulse_fwhm_ns",
+    "values": "pulse_file",
+    "example": "scene",
+    "channel": "transient_channel",
+    "start_ns": "transient_start_ns",
+    "bin_ns": "transient_bin_ns",
+}
 
 
 def say(message: str) -> None:
@@ -112,7 +120,7 @@ def _with_options(message: str) -> str:
     """A message of the package, which names arguments, with the options that they were given by."""
     given = OPTIONS.get()
     for name, option in {**{field: given[of] for field, of in _FIELDS.items() if of in given}, **given}.items():
-        message = re.sub(rf"(?<![\w./:'-]){name}(?= (must|needs|belongs)\b|=)", option, message)
+        message = re.sub(rf"(?<![\w./:'-])(?:light\.)?{name}(?= (must|needs|belongs)\b|=)", option, message)
     return message
 
 

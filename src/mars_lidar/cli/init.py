@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -63,6 +64,27 @@ def commented(file: Path) -> str:
     """The text of the file."""
     effects = [f"#   {line}" for effect in FIELDS.values() for line in effect.example.splitlines()]
     return TEMPLATE.format(name=file, effects="\n".join(effects))
+
+
+def schema(
+    file: Annotated[str, typer.Argument(help="Of which file: scene, recipe or system.")] = "recipe",
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="A .json file, else standard output.", show_default=False)
+    ] = None,
+) -> None:
+    """Write the JSON Schema of a scene file, a recipe or a system file, with which editors complete and check keys.
+
+    In the first line of the YAML file:  # yaml-language-server: $schema=recipe.json
+    """
+    with reported():
+        from mars_lidar.dataset.schema import json_schema
+
+        text = json.dumps(json_schema(file), indent=1, ensure_ascii=False) + "\n"
+        if out is None:
+            print(text, end="")
+            return
+        out.write_text(text, encoding="utf-8")
+        table([("wrote", str(out))])
 
 
 def init(

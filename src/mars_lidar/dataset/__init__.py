@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from mars_lidar.dataset.light import Light
     from mars_lidar.dataset.read import read_sparse
     from mars_lidar.dataset.recipe import DatasetRecipe
+    from mars_lidar.dataset.schema import json_schema
     from mars_lidar.dataset.store import Dataset, open_dataset
     from mars_lidar.dataset.verify import Verified, verify
+    from mars_lidar.dataset.view import View, read_view
 
 _MODULES = {
     "Dataset": "store",
@@ -22,10 +24,13 @@ _MODULES = {
     "Exported": "export",
     "Light": "light",
     "Verified": "verify",
+    "View": "view",
     "estimate": "estimate",
     "export": "export",
+    "json_schema": "schema",
     "open_dataset": "store",
     "read_sparse": "read",
+    "read_view": "view",
     "verify": "verify",
 }
 
@@ -48,10 +53,13 @@ __all__ = [
     "Generated",
     "Light",
     "Verified",
+    "View",
     "estimate",
     "export",
     "generate",
+    "json_schema",
     "open_dataset",
     "read_sparse",
+    "read_view",
     "verify",
 ]

@@ -136,11 +136,14 @@ def create_list(group: Any, name: str, values: NDArray[Any], dims: tuple[str, ..
 
 def create_texts(group: Any, name: str, texts: Sequence[str], dim: str, told: str) -> None:
     """Create and write an array of texts, which xarray shows as such."""
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+
     array = group.create_array(
         name,
         shape=(len(texts),),
         dtype=str,
         chunks=(len(texts),),
+        compressors=(ZstdCodec(level=1), Crc32cCodec()),
         dimension_names=(dim,),
         attributes={"long_name": told},
     )

@@ -82,7 +82,7 @@ def estimate(
 
     plan, folder = read_recipe(recipe)
     assert plan is not None
-    found, problems = candidates(plan, folder)
+    found, problems = candidates(plan.scenes, folder)
     looked, each_s = _looked_at(found, plan, problems)
     if not looked:
         raise ValueError("none of the scenes looked at can be used:\n" + "\n".join(f"  {one}" for one in problems[:5]))
@@ -120,7 +120,7 @@ def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: i
     assert plan is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # generate itself tells them
-        found, problems = candidates(plan, folder)
+        found, problems = candidates(plan.scenes, folder)
         looked, each_s = _looked_at(found[:1], plan, problems)
         if not looked:
             return Advice(0.0)

@@ -38,7 +38,7 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
     ValueError
         No scene can be used; the text says why. Nothing is left at `path` then.
     """
-    found, problems = candidates(recipe, folder)
+    found, problems = candidates(recipe.scenes, folder)
     group = writer = None
     for candidate in found:
         for one in scenes(candidate, recipe, None if writer is None else writer.shape):

@@ -3,20 +3,39 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mars_lidar._base.files import FileError
+from mars_lidar._base.yaml import Key, RecipeError, located, read_yaml
 from mars_lidar.dataset import values
-from mars_lidar.dataset.light import Light, read_light, refuse_for_transients
+from mars_lidar.dataset.light import Light, plain_levels, read_light, refuse_for_transients
 from mars_lidar.dataset.scene_entries import read_scenes
-from mars_lidar.dataset.yaml_lines import Key, RecipeError, line_of, read_yaml
+from mars_lidar.dataset.values import Fields
 from mars_lidar.instrument.system import System
 
 LAYOUTS = ("sparse", "dense")
-_ROOT = ("seed", "scenes", "size", "crop", "systems", "light", "engine", "realizations", "store")
+STORE: Fields = {
+    "layout": values.choice("dense: any Zarr library reads it; sparse: smaller.", LAYOUTS).or_else("dense"),
+    "chunk_mib": values.real("What is read at once, MiB of dense counts.", low=0.001, high=512.0).or_else(8.0),
+    "shard_mib": values.real("A file, MiB of dense counts.", low=0.001, high=1024.0),
+}
+_CROP: Fields = {
+    "size": values.size("Side, or [height, width]."),
+    "count": values.integer("Parts per scene.", low=1, high=2**20).or_else(1),
+}
+ROOT: Fields = {
+    "seed": values.integer("Seed of the dataset.", low=0, high=2**64 - 1).or_else(0),
+    "scenes": values.other("Where scenes come from.", {}),
+    "size": values.size("Resample every scene: the longer side, or [height, width]."),
+    "crop": values.mapping("Parts at random places.", _CROP, ("size",)),
+    "systems": values.other("Lasers, detectors and histograms.", {}),
+    "light": values.other("Levels of light.", {}),
+    "engine": values.other("As for simulate.", {"type": "string"}).or_else("exact"),
+    "realizations": values.integer("Exposures of each sample.", low=1, high=2**31).or_else(1),
+    "store": values.mapping("How the counts lie on disk.", STORE),
+}
+"""The keys of a recipe; `mars_lidar.dataset.schema` puts in what scenes, systems and light are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +79,7 @@ class DatasetRecipe:
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which `from_dict` makes an equal recipe: the form of the YAML file, files read in."""
         light = asdict(self.light)
-        light["levels"] = [[s, "inf" if math.isinf(b) else b] for s, b in self.light.levels]
+        light["levels"] = plain_levels(self.light)
         return {
             "seed": self.seed,
             "scenes": [dict(one) for one in self.scenes],
@@ -86,31 +105,33 @@ class DatasetRecipe:
         RecipeError
             A ValueError whose `key` says which entry is wrong.
         """
-        root = values.mapping((), data, _ROOT, needed=("scenes", "systems"))
-        crop, crops = _crop(root.get("crop"))
-        store = values.mapping(("store",), root.get("store") or {}, ("layout", "chunk_mib", "shard_mib"))
-        chunk = values.real(("store", "chunk_mib"), store.get("chunk_mib", 8.0), low=0.001, high=512.0)
-        shard = values.real(("store", "shard_mib"), store.get("shard_mib", max(64.0, chunk)), low=0.001, high=1024.0)
+        root = values.read_mapping((), data, ROOT, needed=("scenes", "systems"))
+        crop, store = root.get("crop", {}), root.get("store") or values.read_mapping(("store",), {}, STORE)
+        store.setdefault("shard_mib", max(64.0, store["chunk_mib"]))
+        chunk, shard = store["chunk_mib"], store["shard_mib"]
         if shard < chunk:
             raise RecipeError(("store", "shard_mib"), f"shard_mib must be at least chunk_mib, {chunk:g}, got {shard:g}")
         systems = _systems(root["systems"], folder or Path())
-        engine = values.checked(("engine",), _engine, root.get("engine", "exact"), systems)
+        engine = values.checked(("engine",), _engine, root["engine"], systems)
         scenes, light = read_scenes(root["scenes"]), read_light(root.get("light") or {})
         if any("transient" in one for one in scenes):
             refuse_for_transients(light)
+        if light.photons_per_unit is not None:
+            told = (
+                "photons_per_unit is for a single transient (simulate, compare): the samples of a dataset have a signal"
+            )
+            raise RecipeError(("light", "photons_per_unit"), told)
         return cls(
             scenes=scenes,
             systems=systems,
             light=light,
-            size=values.size(("size",), root.get("size")),
-            crop=crop,
-            crops=crops,
+            size=_pair(root.get("size")),
+            crop=None if not crop else _pair([crop["size"]] * 2 if isinstance(crop["size"], int) else crop["size"]),
+            crops=crop.get("count", 1),
             engine=engine,
-            realizations=values.integer(("realizations",), root.get("realizations", 1), low=1, high=2**31),
-            seed=values.integer(("seed",), root.get("seed", 0), low=0, high=2**64 - 1),
-            layout=values.choice(("store", "layout"), store.get("layout", "dense"), LAYOUTS),
-            chunk_mib=chunk,
-            shard_mib=shard,
+            realizations=root["realizations"],
+            seed=root["seed"],
+            **store,
         )
 
     @classmethod
@@ -124,13 +145,18 @@ class DatasetRecipe:
         """
         source = Path(path)
         data, lines = read_yaml(source)
-        try:
-            if isinstance(data, dict):
-                data = data | {name: _merged(data.get(name), value) for name, value in replaced.items()}
+        if isinstance(data, dict):
+            data = data | {name: _merged(data.get(name), value) for name, value in replaced.items()}
+        with located(source, lines, lambda key: bool(key) and key[0] in replaced):
             return cls.from_dict(data, source.parent)
-        except RecipeError as error:
-            line = line_of(error.key, str(error), lines) if error.key[:1] not in {(k,) for k in replaced} else None
-            raise FileError(f"{source}{'' if line is None else f':{line}'}: {error}") from error
+
+
+_FILE: Fields = {"file": values.text("A system of its own file.")}
+
+
+def _pair(size: Any) -> Any:
+    """A size as the package has it."""
+    return tuple(size) if isinstance(size, list) else size
 
 
 def _merged(old: Any, new: Any) -> Any:
@@ -148,9 +174,7 @@ def _systems(data: Any, folder: Path) -> tuple[System, ...]:
         if isinstance(entry, System):
             systems.append(entry)
         elif isinstance(entry, dict) and "file" in entry:
-            file = values.mapping(key, entry, ("file",))["file"]
-            if not isinstance(file, str):
-                raise RecipeError((*key, "file"), f"file must be a text, got {file!r}")
+            file = values.read_mapping(key, entry, _FILE, ("file",))["file"]
             systems.append(values.checked((*key, "file"), System.load, folder / file))
         else:
             systems.append(values.checked(key, System.from_dict, entry))
@@ -163,17 +187,6 @@ def _systems(data: Any, folder: Path) -> tuple[System, ...]:
         if systems[k] in systems[:k]:
             raise RecipeError(key, f"{values.key_name(key)} is the same as an earlier system")
     return tuple(systems)
-
-
-def _crop(data: Any) -> tuple[tuple[int, int] | None, int]:
-    if data is None:
-        return None, 1
-    known = values.mapping(("crop",), data, ("size", "count"), needed=("size",))
-    size = values.size(("crop", "size"), known["size"])
-    if size is None:
-        raise RecipeError(("crop", "size"), "size of a crop must be an integer or [height, width], got None")
-    crop = (size, size) if isinstance(size, int) else size
-    return crop, values.integer(("crop", "count"), known.get("count", 1), low=1, high=2**20)
 
 
 def _engine(engine: Any, systems: tuple[System, ...]) -> str:

@@ -63,10 +63,13 @@ class Surfaces:
         """Parts of the period in its waveforms; 0 where returns are enough."""
         return 0 if self.fog is None else PARTS_PER_BIN * system.bins
 
-    def flux(self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None) -> Flux:
-        """Photons. Pixels without return or beyond the range are told once, not for every sample."""
+    def flux(
+        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
+    ) -> Flux:
+        """Photons; pixels without return or beyond the range are no matter for every sample, unless to `tell` them."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
+            if not tell:
+                warnings.simplefilter("ignore", UserWarning)
             clear = self.scene.flux(
                 system,
                 signal=signal,
@@ -115,11 +118,14 @@ class Rendered:
         """Parts of the period in its waveforms."""
         return parts_of(self.transient, system)
 
-    def flux(self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None) -> Flux:
+    def flux(
+        self, system: System, light: Light, signal: float, sbr: float, dark: float | None = None, *, tell: bool = False
+    ) -> Flux:
         """Photons, made row by row as they are used."""
         return self.transient.stored_flux(
             system,
-            signal=signal,
+            signal=signal if light.photons_per_unit is None else None,
+            photons_per_unit=light.photons_per_unit,
             sbr=sbr,
             pulse=self.pulse,
             dark_counts_per_s=light.dark_counts_per_s if dark is None else dark,

@@ -1,19 +1,74 @@
-"""The entries under `scenes` of a recipe: where scenes come from, and what stands before them, as plain data."""
+"""Where a scene comes from, and what stands before it, as plain data: recipes, scene files, command line, Python.
+
+`KINDS` declares every key once; `mars_lidar.dataset.schema` makes of them what editors read.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+from mars_lidar._base.yaml import Key, RecipeError
 from mars_lidar.dataset import values
-from mars_lidar.dataset.yaml_lines import Key, RecipeError
+from mars_lidar.dataset.values import Fields
+from mars_lidar.scene.scene import Scene
 
-KINDS = ("example", "path", "transient")
-_BEFORE = ("fog", "pane")  # what stands before surfaces
-_EXAMPLE = ("example", "size", "seeds", *_BEFORE)
-_PATH = ("path", "pattern", "image", "manifest", "depth_unit_m", "focal_px", "frames", *_BEFORE)
-_TRANSIENT = ("transient", "pattern", "bin_ns", "start_ns", "name", "channel", "pulse")
-_FOG = ("extinction_per_m", "backscatter", "nearest_m")
-_PANE = ("depth_m", "reflectivity", "transmission")
+FOG: Fields = {
+    "extinction_per_m": values.real("Extinction coefficient, 1/m: 3.91 / visibility.", low=0.0, strict_low=True),
+    "backscatter": values.real("Photons per period that fog without a target sends back, per unit of signal.", low=0.0),
+    "nearest_m": values.real("Depth from which on the laser is seen, m.", low=0.0, strict_low=True).or_else(1.0),
+}
+PANE: Fields = {
+    "depth_m": values.real("Depth of the pane, m.", low=0.0, strict_low=True),
+    "reflectivity": values.real("Reflectivity of the pane.", low=0.0, high=1.0),
+    "transmission": values.real("What passes it, there and back.", low=0.0, high=1.0, strict_low=True).or_else(1.0),
+}
+_SIZE = values.size("Resample: the longer side, or [height, width].")
+_BEFORE: Fields = {
+    "fog": values.several(
+        values.mapping("Fog before the surfaces; several are a scene each.", FOG, ("extinction_per_m", "backscatter"))
+    ),
+    "pane": values.mapping("A pane before the surfaces.", PANE, ("depth_m", "reflectivity")),
+}
+_IMAGE = {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}, "minItems": 1, "maxItems": 2}]}
+KINDS: dict[str, Fields] = {
+    "example": {
+        "example": values.choice("A built-in scene.", Scene.example_names()),
+        "size": values.size("The longer side, or [height, width].").or_else(128),
+        "seeds": values.numbers("Seeds, one scene each: a list, or first and count.", "seeds").or_else([0]),
+        **_BEFORE,
+    },
+    "path": {
+        "path": values.text("Depth: a file, or a folder of scenes."),
+        "pattern": values.text("Of a folder: which depth files, such as **/*_depth.png."),
+        "image": values.other("The image to a file; to a pattern, a text of it and what stands in its place.", _IMAGE),
+        "manifest": values.text("Of a folder: a CSV with a column depth."),
+        "depth_unit_m": values.real("Metres per stored unit of depth.", low=0.0, strict_low=True),
+        "focal_px": values.real("Focal length, pixels: depth becomes range.", low=0.0, strict_low=True),
+        "frames": values.numbers("Of NYUv2: which frames.", "frames"),
+        "size": _SIZE,
+        **_BEFORE,
+    },
+    "transient": {
+        "transient": values.text("Rendered light (y, x, time): a file, or a folder of them."),
+        "pattern": values.text("Of a folder: which files."),
+        "bin_ns": values.real("Width of a time bin, ns.", low=0.0, strict_low=True),
+        "start_ns": values.real("Travel time at the first bin, ns."),
+        "name": values.text("Which array of the file."),
+        "channel": values.integer("Which channel of (y, x, time, channel).", low=0, high=2**31),
+        "pulse": values.flag("Whether the system's pulse is still to be applied."),
+        "size": _SIZE,
+    },
+}
+SINGLE: dict[str, Fields] = {
+    "path": {
+        "depth": values.text("Depth: a file, or a Middlebury folder; the same as path."),
+        "index": values.integer("Of NYUv2: which frame; the same as frames of one.", low=0, high=2**31),
+    },
+    "example": {"seed": values.integer("Seed; the same as seeds of one.", low=0, high=2**64 - 1)},
+    "transient": {},
+}
+_STANDS_FOR = {"depth": "path", "index": "frames", "seed": "seeds"}
+"""Keys of a single scene, and those of many that they stand for."""
 
 
 def read_scenes(data: Any) -> tuple[dict[str, Any], ...]:
@@ -21,94 +76,29 @@ def read_scenes(data: Any) -> tuple[dict[str, Any], ...]:
     entries = data if isinstance(data, list) else [data]
     if not entries:
         raise RecipeError(("scenes",), "scenes must have at least one entry")
-    return tuple(_scene(("scenes", k) if isinstance(data, list) else ("scenes",), e) for k, e in enumerate(entries))
+    return tuple(read_scene(("scenes", k) if isinstance(data, list) else ("scenes",), e) for k, e in enumerate(entries))
 
 
-def _scene(key: Key, entry: Any) -> dict[str, Any]:
-    kinds = [kind for kind in KINDS if isinstance(entry, dict) and kind in entry]
+def read_scene(key: Key, entry: Any) -> dict[str, Any]:
+    """One entry; keys of a single scene become those of many."""
+    name = values.key_name(key) or "a scene file"
+    kinds = [kind for kind in ("example", "depth", *KINDS) if isinstance(entry, dict) and kind in entry]
+    kinds = list(dict.fromkeys(kinds))
     if len(kinds) != 1:
-        raise RecipeError(key, f"{values.key_name(key)} must give one of example, path and transient, got {entry!r}")
-    return {"example": _example, "path": _path, "transient": _transient}[kinds[0]](key, entry)
-
-
-def _example(key: Key, entry: dict[str, Any]) -> dict[str, Any]:
-    from mars_lidar.scene.scene import Scene
-
-    known = values.mapping(key, entry, _EXAMPLE)
-    return {
-        "example": values.choice((*key, "example"), known["example"], Scene.example_names()),
-        "size": values.listed(values.size((*key, "size"), known.get("size", 128))),
-        "seeds": values.numbers((*key, "seeds"), known.get("seeds", [0])),
-        **_before(key, known),
-    }
-
-
-def _path(key: Key, entry: dict[str, Any]) -> dict[str, Any]:
-    known = {name: value for name, value in values.mapping(key, entry, _PATH).items() if value is not None}
-    for name in ("path", "pattern", "manifest"):
-        if name in known:
-            values.text((*key, name), known[name])
-    for name in ("depth_unit_m", "focal_px"):
-        if name in known:
-            known[name] = values.real((*key, name), known[name], low=0.0, strict_low=True)
-    if "frames" in known:
-        known["frames"] = values.numbers((*key, "frames"), known["frames"], "frames")
-    if "image" in known:
-        image = known["image"]
-        texts = image if isinstance(image, list) else [image]
-        if not all(isinstance(one, str) and one for one in texts) or len(texts) > 2:
-            raise RecipeError((*key, "image"), f"image must be a file, or two texts with a pattern, got {image!r}")
-    return known | _before(key, known)
-
-
-def _transient(key: Key, entry: dict[str, Any]) -> dict[str, Any]:
-    """Keys and values as in a scene file of `mars-lidar simulate`; a pattern where it is a folder."""
-    known = {name: value for name, value in values.mapping(key, entry, _TRANSIENT).items() if value is not None}
-    for name in ("transient", "pattern", "name"):
-        if name in known:
-            values.text((*key, name), known[name])
-    if "bin_ns" in known:
-        known["bin_ns"] = values.real((*key, "bin_ns"), known["bin_ns"], low=0.0, strict_low=True)
-    if "start_ns" in known:
-        known["start_ns"] = values.real((*key, "start_ns"), known["start_ns"])
-    if "channel" in known:
-        known["channel"] = values.integer((*key, "channel"), known["channel"], low=0, high=2**31)
-    if not isinstance(known.get("pulse", True), bool):
-        raise RecipeError((*key, "pulse"), f"pulse must be true or false, got {known['pulse']!r}")
-    return known
-
-
-def _before(key: Key, known: dict[str, Any]) -> dict[str, Any]:
-    """Fog, a list of them, each a scene of its own; and a pane."""
-    told: dict[str, Any] = {}
-    if known.get("fog") is not None:
-        given = known["fog"]
-        place: Key = (*key, "fog")
-        if isinstance(given, list):
-            told["fog"] = [_fog((*place, k), one) for k, one in enumerate(given)]
-        else:
-            told["fog"] = [_fog(place, given)]
-        if not told["fog"] or any(one in told["fog"][:k] for k, one in enumerate(told["fog"])):
-            raise RecipeError(place, f"fog must be one or several that differ from each other, got {given!r}")
-    if known.get("pane") is not None:
-        place = (*key, "pane")
-        pane = values.mapping(place, known["pane"], _PANE, needed=("depth_m", "reflectivity"))
-        told["pane"] = {
-            "depth_m": values.real((*place, "depth_m"), pane["depth_m"], low=0.0, strict_low=True),
-            "reflectivity": values.real((*place, "reflectivity"), pane["reflectivity"], low=0.0, high=1.0),
-            "transmission": values.real(
-                (*place, "transmission"), pane.get("transmission", 1.0), low=0.0, high=1.0, strict_low=True
-            ),
-        }
+        got = " and ".join(kinds) or "none of them"
+        raise RecipeError(key, f"{name} must give one of example, depth (or path) and transient, got {got}")
+    kind = _STANDS_FOR.get(kinds[0], kinds[0])
+    told = values.read_mapping(key, entry, {**SINGLE[kind], **KINDS[kind]}, name=name)
+    for one, many in _STANDS_FOR.items():
+        if one in told:
+            if entry.get(many) is not None:
+                raise RecipeError((*key, one), f"{one} stands for {many} of one: give one of them")
+            told[many] = told.pop(one) if many == "path" else [told.pop(one)]
+    image = told.get("image")
+    texts = image if isinstance(image, list) else [image]
+    if image is not None and not (all(isinstance(one, str) and one for one in texts) and len(texts) in (1, 2)):
+        raise RecipeError((*key, "image"), f"image must be a file, or two texts with a pattern, got {image!r}")
+    fogs = told.get("fog", [None])
+    if not fogs or any(one in fogs[:k] for k, one in enumerate(fogs)):
+        raise RecipeError((*key, "fog"), f"fog must be one or several that differ from each other, got {fogs!r}")
     return told
-
-
-def _fog(key: Key, given: Any) -> dict[str, float]:
-    known = values.mapping(key, given, _FOG, needed=("extinction_per_m", "backscatter"))
-    return {
-        "extinction_per_m": values.real(
-            (*key, "extinction_per_m"), known["extinction_per_m"], low=0.0, strict_low=True
-        ),
-        "backscatter": values.real((*key, "backscatter"), known["backscatter"], low=0.0),
-        "nearest_m": values.real((*key, "nearest_m"), known.get("nearest_m", 1.0), low=0.0, strict_low=True),
-    }

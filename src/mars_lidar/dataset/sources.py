@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,8 +48,8 @@ class Named:
     scene: Shown
 
 
-def candidates(recipe: DatasetRecipe, folder: Path) -> tuple[list[Candidate], list[Problem]]:
-    """All scenes that a recipe names, in its order, and entries of manifests that are no scenes.
+def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Candidate], list[Problem]]:
+    """All scenes that the entries of a recipe name, in its order, and entries of manifests that are no scenes.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def candidates(recipe: DatasetRecipe, folder: Path) -> tuple[list[Candidate], li
     """
     found: list[Candidate] = []
     problems: list[Problem] = []
-    for entry in recipe.scenes:
+    for entry in entries:
         before = len(found)
         if "example" in entry:
             found += [one for clear in _examples(entry) for one in _behind_all(clear, entry)]
@@ -66,11 +66,11 @@ def candidates(recipe: DatasetRecipe, folder: Path) -> tuple[list[Candidate], li
         if "transient" in entry:
             for path, load in transient_files(entry, folder):
                 name = _named(entry["transient"], folder, path)
-                found.append(Candidate(name, path, load, name))
+                found.append(_sized(Candidate(name, path, load, name), entry))
             continue
         for file in _files(entry, folder, problems):
             name = _named(entry["path"], folder, file.depth) + ("" if file.index is None else f", frame {file.index}")
-            found += _behind_all(Candidate(name, file.depth, partial(_surfaces, file), name), entry)
+            found += _behind_all(_sized(Candidate(name, file.depth, partial(_surfaces, file), name), entry), entry)
         if len(found) == before and not problems:
             raise ValueError(f"{folder / entry['path']}: no scene found; docs/formats.md tells what is one")
     names = [one.name for one in found]
@@ -184,6 +184,19 @@ def _examples(entry: dict[str, Any]) -> Iterator[Candidate]:
 
 def _example(name: str, size: Any, seed: int) -> Shown:
     return Surfaces(Scene.example(name, tuple(size) if isinstance(size, list) else size, seed))
+
+
+def _sized(whole: Candidate, entry: dict[str, Any]) -> Candidate:
+    """The scene at the size that its entry gives."""
+    size = entry.get("size")
+    if size is None:
+        return whole
+    name, place = (f"{text}, size {size}" for text in (whole.name, whole.place))
+    return Candidate(name, whole.path, partial(_resized, whole.load, size), place)
+
+
+def _resized(load: Callable[[], Shown], size: Any) -> Shown:
+    return load().resize(tuple(size) if isinstance(size, list) else size)
 
 
 def _surfaces(file: SceneFile) -> Shown:

@@ -1,61 +1,134 @@
-"""Values of a recipe, read and checked: every complaint is a `RecipeError` that says which key it is about."""
+"""Keys of descriptions that people write: each is declared once, with its check, its text and its JSON Schema."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mars_lidar._base import checks
-from mars_lidar.dataset.yaml_lines import Key, RecipeError
+from mars_lidar._base.yaml import Key, RecipeError
+
+MAX_SIDE = 1 << 13
 
 
-def mapping(key: Key, data: Any, allowed: tuple[str, ...], needed: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A mapping of known keys."""
-    name = key_name(key) or "the recipe"
-    known: dict[str, Any] = checked(key, checks.known_keys, name, data, allowed)
-    for one in needed:
-        if one not in known:
-            raise RecipeError(key, f"{name} must give {one}")
-    return known
+@dataclass(frozen=True)
+class Field:
+    """A value of a description: `read` checks it and makes it what the package uses; `schema` is for editors."""
+
+    read: Callable[[Key, Any], Any]
+    schema: dict[str, Any]
+    default: Any = None  # left out where None
+
+    def or_else(self, default: Any) -> Field:
+        """With a default."""
+        return replace(self, default=default, schema=self.schema | {"default": default})
 
 
-def level(key: Key, name: str, value: Any) -> float:
-    """A positive number; of sbr, inf too."""
-    given = number(value)
-    if name == "sbr" and isinstance(given, float) and math.isinf(given) and given > 0:
-        return given
-    return float(checked(key, lambda: checks.real(name, given, low=0.0, strict_low=True)))
+Fields = dict[str, Field]
 
 
-def size(key: Key, value: Any) -> int | tuple[int, int] | None:
-    """The longer side of an image, or (height, width)."""
-    if value is None:
-        return None
+def _field(told: str, read: Callable[[Key, Any], Any], **schema: Any) -> Field:
+    return Field(read, {"description": told, **schema} if told else schema)
+
+
+def real(
+    told: str, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False, infinite: bool = False
+) -> Field:
+    """A number in [low, high]; inf too, where it may be `infinite`."""
+    limits: dict[str, Any] = {"type": ["number", "string"] if infinite else "number"}
+    if math.isfinite(low):
+        limits["exclusiveMinimum" if strict_low else "minimum"] = low
+    if math.isfinite(high):
+        limits["maximum"] = high
+    if infinite:
+        limits["pattern"] = "^inf$"
+
+    def read(key: Key, value: Any) -> float:
+        given = number(value)
+        if infinite and given == math.inf:
+            return math.inf
+        return float(checked(key, lambda: checks.real(key_name(key), given, low=low, high=high, strict_low=strict_low)))
+
+    return _field(told, read, **limits)
+
+
+def integer(told: str, *, low: int, high: int, name: str | None = None) -> Field:
+    """An integer in [low, high]."""
+
+    def read(key: Key, value: Any) -> int:
+        return int(checked(key, lambda: checks.integer(name or key_name(key), number(value), low=low, high=high)))
+
+    return _field(told, read, type="integer", minimum=low, maximum=high)
+
+
+def choice(told: str, allowed: tuple[str, ...]) -> Field:
+    """One of some words."""
+    return _field(told, lambda key, value: checked(key, checks.choice, key_name(key), value, allowed), enum=[*allowed])
+
+
+def text(told: str) -> Field:
+    """A text that is not empty."""
+
+    def read(key: Key, value: Any) -> str:
+        if not isinstance(value, str) or not value:
+            raise RecipeError(key, f"{key[-1]} must be a text, got {value!r}")
+        return value
+
+    return _field(told, read, type="string", minLength=1)
+
+
+def flag(told: str) -> Field:
+    """True or false."""
+
+    def read(key: Key, value: Any) -> bool:
+        if not isinstance(value, bool):
+            raise RecipeError(key, f"{key[-1]} must be true or false, got {value!r}")
+        return value
+
+    return _field(told, read, type="boolean")
+
+
+_SIDE = integer("", low=1, high=MAX_SIDE)
+
+
+def size(told: str) -> Field:
+    """The longer side of an image, or [height, width]."""
+    both = {"type": "array", "items": _SIDE.schema, "minItems": 2, "maxItems": 2}
+    return _field(told, read_size, anyOf=[_SIDE.schema, both])
+
+
+def read_size(key: Key, value: Any) -> int | list[int]:
+    """The longer side of an image, or [height, width], as plain data."""
     if isinstance(value, list | tuple):
         if len(value) != 2:
             raise RecipeError(key, f"{key_name(key)} must be an integer or [height, width], got {value!r}")
-        height, width = (integer(key, one, low=1, high=1 << 13) for one in value)
-        return height, width
-    return integer(key, value, low=1, high=1 << 13)
+        return [_SIDE.read(key, one) for one in value]
+    side: int = _SIDE.read(key, value)
+    return side
 
 
-def listed(size: int | tuple[int, int] | None) -> Any:
-    """A size as JSON has it."""
-    return list(size) if isinstance(size, tuple) else size
-
-
-def numbers(key: Key, value: Any, name: str = "seeds") -> Any:
+def numbers(told: str, name: str) -> Field:
     """A list of integers, or ``{first, count}``."""
-    if isinstance(value, dict):
-        known = mapping(key, value, ("first", "count"), needed=("count",))
-        first = integer((*key, "first"), known.get("first", 0), low=0, high=2**63)
-        return {"first": first, "count": integer((*key, "count"), known["count"], low=1, high=2**20)}
-    if not isinstance(value, list) or not value:
-        raise RecipeError(key, f"{name} must be a list of integers, or first and count, got {value!r}")
-    found = [integer((*key, k), one, low=0, high=2**64 - 1, name=name) for k, one in enumerate(value)]
-    if len(set(found)) < len(found):
-        raise RecipeError(key, f"{name} must differ from each other, got {found}")
-    return found
+    one = integer("", low=0, high=2**64 - 1, name=name)
+    run: Fields = {
+        "first": integer("The first one.", low=0, high=2**63).or_else(0),
+        "count": integer("How many.", low=1, high=2**20),
+    }
+
+    def read(key: Key, value: Any) -> Any:
+        if isinstance(value, dict):
+            return read_mapping(key, value, run, needed=("count",))
+        if not isinstance(value, list) or not value:
+            raise RecipeError(key, f"{name} must be a list of integers, or first and count, got {value!r}")
+        found = [one.read((*key, k), each) for k, each in enumerate(value)]
+        if len(set(found)) < len(found):
+            raise RecipeError(key, f"{name} must differ from each other, got {found}")
+        return found
+
+    listed = {"type": "array", "items": one.schema, "minItems": 1}
+    return _field(told, read, anyOf=[listed, schema_of(run, needed=("count",))])
 
 
 def listed_numbers(value: Any) -> list[int]:
@@ -63,6 +136,54 @@ def listed_numbers(value: Any) -> list[int]:
     if isinstance(value, dict):
         return list(range(value["first"], value["first"] + value["count"]))
     return list(value)
+
+
+def mapping(told: str, fields: Fields, needed: tuple[str, ...] = ()) -> Field:
+    """Keys of their own."""
+    return _field(told, lambda key, value: read_mapping(key, value, fields, needed), **schema_of(fields, needed))
+
+
+def several(one: Field) -> Field:
+    """One, or a list of them; read as a list."""
+
+    def read(key: Key, value: Any) -> list[Any]:
+        if not isinstance(value, list):
+            return [one.read(key, value)]
+        return [one.read((*key, k), each) for k, each in enumerate(value)]
+
+    alone = {name: value for name, value in one.schema.items() if name != "description"}
+    return _field(one.schema["description"], read, anyOf=[alone, {"type": "array", "items": alone, "minItems": 1}])
+
+
+def other(told: str, schema: dict[str, Any]) -> Field:
+    """A value that is read elsewhere."""
+    return _field(told, lambda key, value: value, **schema)
+
+
+def read_mapping(
+    key: Key, data: Any, fields: Fields, needed: tuple[str, ...] = (), name: str | None = None
+) -> dict[str, Any]:
+    """The values of a mapping of known keys, defaults among them; what is None is left out."""
+    name = name or key_name(key) or "the recipe"
+    given: dict[str, Any] = checked(key, checks.known_keys, name, data, tuple(fields))
+    for one in needed:
+        if given.get(one) is None:
+            raise RecipeError(key, f"{name} must give {one}")
+    told: dict[str, Any] = {}
+    for each, field in fields.items():
+        value = given.get(each)
+        if value is not None:
+            told[each] = field.read((*key, each), value)
+        elif field.default is not None:
+            told[each] = field.default
+    return told
+
+
+def schema_of(fields: Fields, needed: tuple[str, ...] = ()) -> dict[str, Any]:
+    """JSON Schema of a mapping."""
+    properties = {name: field.schema for name, field in fields.items()}
+    told: dict[str, Any] = {"type": "object", "properties": properties, "additionalProperties": False}
+    return told | {"required": [*needed]} if needed else told
 
 
 def key_name(key: Key) -> str:
@@ -77,28 +198,6 @@ def number(value: Any) -> Any:
             return float(value)
         except ValueError:
             return value
-    return value
-
-
-def real(key: Key, value: Any, **limits: Any) -> float:
-    """A number; `limits` as for `checks.real`."""
-    return float(checked(key, lambda: checks.real(key_name(key), number(value), **limits)))
-
-
-def integer(key: Key, value: Any, *, name: str | None = None, **limits: Any) -> int:
-    """An integer; `limits` as for `checks.integer`."""
-    return int(checked(key, lambda: checks.integer(name or key_name(key), value, **limits)))
-
-
-def choice(key: Key, value: Any, allowed: tuple[str, ...]) -> str:
-    """One of some words."""
-    return str(checked(key, checks.choice, key_name(key), value, allowed))
-
-
-def text(key: Key, value: Any) -> str:
-    """A text that is not empty."""
-    if not isinstance(value, str) or not value:
-        raise RecipeError(key, f"{key[-1]} must be a text, got {value!r}")
     return value
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import check_claim, reading
-from mars_lidar._base.yaml import opened
+from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.pulse import Pulse, pulse_from_dict
@@ -24,6 +24,7 @@ SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 _STARTS = ("armed", "stationary")
 _MAX_CYCLES = 100_000_000  # the sampler counts periods in 32 bits: ten seconds at 10 MHz
 _MAX_BINS = 2**20
+_LINED_BYTES = 2**16  # of JSON that is read as YAML, a hundred times slower, so that errors name the line
 _MAX_DEAD_PERIODS = 2**20
 
 
@@ -196,13 +197,16 @@ class System:
 
     @classmethod
     def load(cls, path: str | Path) -> System:
-        """Read what `save` wrote; an error names the file and the key."""
+        """Read what `save` wrote; an error names the file, the line and the key."""
         source = Path(path)
         if source.suffix not in (".json", ".yaml", ".yml"):
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
-        if source.suffix != ".json":
-            with opened(source) as (loader, node):
-                return cls.from_dict(None if node is None else loader.construct_document(node))
-        with reading(source, "a system"):
-            check_claim(source, 8 * source.stat().st_size, "its numbers")
-            return cls.from_dict(json.loads(source.read_text(encoding="utf-8-sig")))
+        lines: Lines = {}
+        if source.suffix != ".json" or (source.is_file() and source.stat().st_size <= _LINED_BYTES):
+            data, lines = read_yaml(source)  # JSON is YAML, and YAML has lines
+        else:
+            with reading(source, "a system"):
+                check_claim(source, 8 * source.stat().st_size, "its numbers")
+                data = json.loads(source.read_text(encoding="utf-8-sig"))
+        with located(source, lines):
+            return cls.from_dict(data)

@@ -21,12 +21,14 @@ FARTHEST = 5.5  # standard errors: of a hundred and more normal numbers none is 
     ("seed", "number"),
     [
         (17, 67),  # a bright pulse narrower than its jitter: the delay was off by 6 errors, the jitter by 5
+        (17, 97),  # few photons of a pulse that is all jitter: signal by 16, all light by 21, dead time by 8
         (17, 212),  # a pulse a period later taken for the edge: the dead time by 40 errors
         (17, 237),  # all light of a pulse in one unit of the clock: the signal by 7
         (17, 283),  # a clock that rounds as much as the pixel is lit: the signal by 17
         (17, 315),  # a jitter that hides, watched too early: all light by 15
         (17, 332),  # a pulse a period later: dead time 29, delay 10
         (17, 351),  # the same with a wide jitter: dead time 14
+        (17, 360),  # the same with many photons: all light by 6
         (17, 378),  # photons of one unit of the clock were told to be afterpulses
         (29, 100),  # a clock coarser than the pulse, hardly a background: the dead time by 117
         (29, 129),  # bright, every twelfth period one photon: the signal by 661

@@ -121,5 +121,12 @@ def test_light_that_cells_do_not_see():
     assert abs(histogram[: BINS // 2].sum() - known[:500].sum() - 0.5 * known[500]) < 1e-3 * known.sum()
     with pytest.raises(ConvergenceError, match=r"use fewer bins, .*engine 'exact'"):
         ml.joint_law(8.0, 0.2, system, delay_ns=33.3)
-    with pytest.raises(MemoryError, match="window"):
-        ml.joint_law(0.5, 0.2, view(0.45, 100, 0.01)).covariance()
+
+
+def test_covariances_of_all_bins_do_not_fit(monkeypatch: pytest.MonkeyPatch):
+    """They say what to use, whatever memory the machine has."""
+    monkeypatch.setattr("mars_lidar._base.memory.available_bytes", lambda: 2**36)
+    law = ml.joint_law(0.5, 0.2, view(0.45, 100, 0.01))
+    for ask in (law.covariance, law.lag, lambda: law.variance):
+        with pytest.raises(MemoryError, match="window"):
+            ask()

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch, fitted
+from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch
 from mars_lidar.calibrate.calibration_result import Calibration, nearest
 from mars_lidar.calibrate.departure import SIGNIFICANT, departure_of, too_coarse
-from mars_lidar.calibrate.hidden_dead_time import EDGE, excess, hidden
+from mars_lidar.calibrate.hidden_dead_time import EDGE
 from mars_lidar.calibrate.hidden_light import SHUT, with_hidden, without_pulse
-from mars_lidar.calibrate.intervals import Stream
-from mars_lidar.calibrate.light_behind import LightBehind
 from mars_lidar.calibrate.recovery_edge import ORDINARY, REACH, Edge, Law, edge_of
-from mars_lidar.calibrate.shortest_intervals import FEW, LEAST_REACH, Ages, Underlying, extrapolated, is_sharp, shortest
-from mars_lidar.calibrate.stream_summary import Summary
-from mars_lidar.calibrate.unknowns import is_seen
+from mars_lidar.calibrate.sharp_edge import ALL, WIDEST, SharpEdge, width_of
+from mars_lidar.calibrate.shortest_intervals import FEW, Ages, Underlying, extrapolated, is_sharp
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 
 SHARP = 0.01  # false-alarm probability of a blurred edge
@@ -28,31 +24,13 @@ _STARTS = (0.15, 0.06, 0.4, 1.0)  # widths tried, in parts of the reach over whi
 _SAME = 0.05  # standard errors by which a last round may move the edge
 _AGREE = 4.0  # standard errors between the jitter by the edge and that by the shape of the pulse
 _STEP = 0.2  # of the light behind an edge that falls before it, where the dead time keeps it away
-_BLURRED = 3.0  # jitters before the first photons of a bright pulse
-_ROUNDED = 0.1  # standard errors of the light that the dead time's rounding may move it by
-_COARSE = 2.0  # units of a clock that runs free, of a pulse below which its shape is not known
 _MOSTLY = 0.7  # of the recorded width of a bright pulse that is jitter: then pulse and signal hide in it
 _FOLLOWED = 0.5  # of a change of a bright pulse's jitter that the edge follows: then it is not the edge that tells it
-_ALL = 0.98  # of the pulse that may be jitter
-_WIDEST = 0.1  # periods that a jitter may be wide where no pulse limits it
-_OUT_OF_ORDER = 0.3  # of the intervals within the reach of a jitter that may hide
 
 
 @dataclass(frozen=True, eq=False)
-class Unknown:
+class Unknown(SharpEdge):
     """A calibration whose dead time is estimated too, and the jitter where `jitter_ns` is None."""
-
-    stream: Stream
-    counted: Summary
-    shape: Pulse | Literal["gaussian", "free"]
-    hold_off_ns: float | None
-    returns: int
-    jitter_ns: float | None
-    _seen: dict[float, Ages] = field(default_factory=dict)
-
-    @property
-    def _light(self) -> LightBehind:
-        return LightBehind(self.stream)
 
     def calibrated(self) -> Calibration:
         """By the smallest interval where the edge is sharp, else with edge and light fitted in turn."""
@@ -64,11 +42,11 @@ class Unknown:
         least = smallest + CERTAIN * told
         first = self._pass(Watch(smallest, max(least, hold or 0.0), told, by="smallest interval"))
         if smallest == 0.0 or self.jitter_ns == 0.0:
-            return self._sharp(first)
+            return self.by_smallest(first)
         sharp, blurred = self._blurred(first)
         if blurred is not None:
             return self._checked(blurred)
-        found = self._sharp(first)
+        found = self.by_smallest(first)
         return self._checked(found) if sharp else replace(found, edge_fits=False, dead_time_error_ns=math.nan)
 
     def _checked(self, found: Calibration) -> Calibration:
@@ -79,64 +57,6 @@ class Unknown:
         if np.abs(scores).max(initial=0.0) <= SIGNIFICANT:
             return found
         return replace(found, edge_fits=False, dead_time_error_ns=math.nan)
-
-    def _pass(self, watch: Watch, near: Calibration | None = None) -> Calibration:
-        return fitted(self.stream, self.counted, self.shape, watch, self.returns, near, divided=False)
-
-    def _sharp(self, first: Calibration) -> Calibration:
-        """The smallest of n intervals exceeds t_d by 1 / (sum of the rates at re-arming) in the mean.
-
-        What a dead time may be below it for want of light, or above it with a jitter that hides, is in the error.
-        """
-        stream, smallest = self.stream, first.dead_time_ns
-        first = self._certain(first)
-        told, law = self.jitter_ns is not None, self._light.any_width(first)
-        sigma = min(_width(first), _WIDEST * stream.period_ns)
-        mean, error = excess(law(0.0), stream.registrations, smallest)
-        dead = max(smallest - mean, 0.0)
-        left = hidden(self._ages(), law, stream.registrations, dead, 0.0 if told else _ALL * sigma)
-        # how the light begins is not known on the scale of a coarse clock, or of a jitter of a bright pulse
-        coarse = stream.units == 0 and not _width(first) > _COARSE * stream.unit_ns
-        guard = 2.0 * stream.unit_ns if coarse else 0.0
-        if not told and first.pulse is not None and first.signal > SHUT:
-            guard = max(guard, _BLURRED * left.jitter_ns)
-        if guard > 0.0:
-            error = max(error, excess(law(0.0), stream.registrations, smallest, guard)[1])
-        error = max(error, left.below_ns, 0.0 if told else left.above_ns)
-        limit = 0.0 if told else math.hypot(max(left.jitter_ns, 0.0), stream.unit_ns)
-        found = replace(
-            first,
-            dead_time_ns=dead,
-            dead_time_error_ns=math.hypot(error, stream.unit_ns, first.jitter_ns),
-            jitter_limit_ns=0.0 if smallest < limit else limit,
-        )
-        if not told and CERTAIN * left.jitter_ns > smallest:
-            # a jitter as large as the dead time puts records out of order: with many of them within its reach
-            near = sum(int((dt < CERTAIN * left.jitter_ns).sum()) for dt in stream.intervals())
-            if near > _OUT_OF_ORDER * stream.registrations:
-                return replace(found, edge_fits=False, dead_time_error_ns=math.nan)
-        return with_hidden(found, min(limit, _ALL * sigma), self._pass, known=isinstance(self.shape, Pulse))
-
-    def _certain(self, first: Calibration) -> Calibration:
-        """Watched from where the pixel is armed for certain, with two roundings of the clock, where that matters."""
-        unit, rate = self.stream.unit_ns, first.rate
-        peak = float(rate.max(initial=0.0)) * rate.size / self.stream.period_ns
-        if 2.0 * unit * peak < _ROUNDED / math.sqrt(max(self.stream.registrations, 1)):
-            return first
-        # whole units: to where one ends, as a record stands in the middle of its own; others are spread over theirs too
-        hold = max(first.hold_off_ns, first.dead_time_ns + (1.5 if self.stream.units else 3.0) * unit)
-        if not hold > first.hold_off_ns:
-            return first
-        later = self._pass(Watch(first.dead_time_ns, hold, first.jitter_ns, by=first.dead_time_by), first)
-        return later if later.armed.used >= FEW else first
-
-    def _ages(self, reach_ns: float = 0.0) -> Ages:
-        """The shortest intervals, up to at least `reach_ns` above the smallest."""
-        smallest = float(self.counted.smallest_ns[0])
-        reach_ns = max(reach_ns, LEAST_REACH * self.stream.period_ns)
-        if max(self._seen, default=0.0) < reach_ns:
-            self._seen[reach_ns] = shortest(self.stream, smallest, reach_ns)
-        return self._seen[max(self._seen)]
 
     def _blurred(self, first: Calibration) -> tuple[bool, Calibration | None]:
         """Whether the edge is sharp; and by the edge, None where that is sharp or no Gaussian jitter makes it."""
@@ -179,9 +99,9 @@ class Unknown:
         tried: list[tuple[float, float]] = []
         found, failed = first, 0
         for _ in range(_ROUNDS):
-            sigma = _width(found)
-            jitter = min(jitter, _ALL * sigma)
-            if not (dead > 0.0 and jitter < 1.5 * _WIDEST * period):
+            sigma = width_of(found)
+            jitter = min(jitter, ALL * sigma)
+            if not (dead > 0.0 and jitter < 1.5 * WIDEST * period):
                 return None
             hold = max(dead + CERTAIN * jitter, self.hold_off_ns or 0.0)
             found = self._pass(Watch(dead, hold, jitter), None if found is first else found)
@@ -227,7 +147,7 @@ class Unknown:
             moved = nearest(found, self._pass(watch, found).parameters - found.parameters)
             found = replace(found, covariance=found.covariance + np.outer(moved, moved))
         found = replace(found, dead_time_ns=edge.dead_time_ns, dead_time_error_ns=edge.dead_time_error_ns)
-        hides = found.jitter_ns > _MOSTLY * _width(found) or follows[1] > _FOLLOWED
+        hides = found.jitter_ns > _MOSTLY * width_of(found) or follows[1] > _FOLLOWED
         if self.jitter_ns is None and found.signal > SHUT and hides:
             return without_pulse(found)
         return found
@@ -240,7 +160,7 @@ class Unknown:
         """
         step = max(edge.jitter_error_ns, _SAME * edge.jitter_ns)
         jitter = found.jitter_ns + step
-        if not jitter < _ALL * _width(found):
+        if not jitter < ALL * width_of(found):
             jitter = found.jitter_ns - step
         if not jitter > 0.0:
             return 0.0, 0.0
@@ -268,7 +188,7 @@ class Unknown:
         )
         sigma = found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) else 0.0
         return with_hidden(
-            found, min(found.jitter_limit_ns, _ALL * sigma), self._pass, known=isinstance(self.shape, Pulse)
+            found, min(found.jitter_limit_ns, ALL * sigma), self._pass, known=isinstance(self.shape, Pulse)
         )
 
     def _edge(
@@ -309,9 +229,4 @@ def _is_clock(edge: Edge, ages: Ages) -> bool:
 
 def _within_pulse(edge: Edge, found: Calibration) -> bool:
     """Whether the edge is no wider than the pulse, which holds the jitter."""
-    return edge.jitter_ns - 3.0 * edge.jitter_error_ns < _width(found)
-
-
-def _width(found: Calibration) -> float:
-    """Sigma of a Gaussian pulse that is seen, else inf."""
-    return found.pulse.sigma_ns if isinstance(found.pulse, GaussianPulse) and is_seen(found) else math.inf
+    return edge.jitter_ns - 3.0 * edge.jitter_error_ns < width_of(found)

@@ -19,6 +19,7 @@ Again = Callable[[Watch, Calibration | None], Calibration]
 
 _BRIGHT = 0.02  # photons of signal from which on a jitter moves the light by more than its error
 SHUT = 4.0  # photons of signal of which the pixel sees the first alone
+_UNSEEN = 0.5  # passes below which the light of a bin is not known
 _PARTS = (0.6, 1.0)  # of a hidden jitter that are tried
 _HIDES = (
     "signal, delay and width are not known: the pulse is bright, only its first photons are seen, and how much of its "
@@ -36,8 +37,6 @@ def with_hidden(found: Calibration, jitter: float, again: Again, *, known: bool)
     `again` fits the light for another detector; `known`: the shape of the pulse was given. No error is stated of
     signal, delay and width of a pulse so bright that only its first photons are seen.
     """
-    if found.pulse is None:
-        return _with_later(found, jitter, again)
     if not isinstance(found.pulse, GaussianPulse) or jitter < MATTERS * found.pulse.sigma_ns:
         return found
     if found.signal < _BRIGHT or known:
@@ -53,16 +52,27 @@ def with_hidden(found: Calibration, jitter: float, again: Again, *, known: bool)
             return without_pulse(found)
         moved = nearest(found, other.parameters - found.parameters)
         covariance = covariance + np.outer(moved, moved)
-    return replace(found, covariance=covariance)
+    found = replace(found, covariance=covariance)
+    return without_pulse(found) if may_shut(found) else found
 
 
-def _with_later(found: Calibration, jitter: float, again: Again) -> Calibration:
-    """`with_hidden` for a free shape: watched only from where the pixel is armed for certain with such a jitter."""
+def may_shut(found: Calibration) -> bool:
+    """Whether the pulse may be so bright that the pixel sees its first photons alone: by three standard errors."""
+    lights = [k for k, name in enumerate(found.names) if name.startswith("signal")]
+    error = math.sqrt(max(float(found.covariance[np.ix_(lights, lights)].sum()), 0.0))
+    return not found.signal + 3.0 * error <= SHUT
+
+
+def with_later(found: Calibration, jitter: float, again: Again, *, bright: bool) -> Calibration:
+    """`with_hidden` for a free shape: watched only from where the pixel is armed for certain with such a jitter.
+
+    Of a `bright` pulse what is not watched then is light too.
+    """
     hold = found.dead_time_ns + CERTAIN * jitter
     if not hold > found.armed.hold_off_ns:
         return found
     other = again(Watch(hold, hold, by=found.dead_time_by), None)
-    if other.armed.used < FEW:
+    if other.armed.used < FEW or (bright and (other.armed.passes < _UNSEEN).any()):
         return replace(found, covariance=np.full_like(found.covariance, math.nan), unknown=(*found.unknown, _LATER))
     return replace(found, covariance=found.covariance + (other.total - found.total) ** 2)
 

@@ -24,6 +24,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import SampledPulse
 
 REACH = 8.5  # widths of a Gaussian that are taken along: less than 1e-16 lie outside
+_NOTHING = 1e-19  # of a kernel's largest bin
 _LUCY = 1000  # steps of Richardson and Lucy for a pulse, which was measured with many photons
 _BRIGHT = 20.0  # photons per period above which rounding of a Fourier transform would show behind the pulse
 
@@ -51,7 +52,9 @@ class Records:
         self._alive = np.exp(alive - alive.max())  # up to a factor, which falls out
         used = np.flatnonzero(kernel > 0.0)
         place = (used + self._n // 2) % self._n - self._n // 2
-        self._low, self._high = int(place.min()), int(place.max())
+        # a pixel is no more alive later: of what is recorded too early less than 1e-17 matters nowhere
+        seen = (place >= 0) | (kernel[used] > _NOTHING * float(kernel.max()))
+        self._low, self._high = int(place[seen].min()), int(place[seen].max())
         self._place = np.arange(self._low, self._high + 1)  # of the kernel's bins
         tilt = np.exp(np.clip(self._total * self._place / self._n, -700.0, 700.0))
         self._kernel = np.maximum(kernel[self._place % self._n], 0.0) * tilt

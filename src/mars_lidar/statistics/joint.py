@@ -238,7 +238,13 @@ class JointLaw:
         return np.concatenate([self._pixel.covariances(x, y) for x, y in parts]).reshape(shape)[()]
 
     def lag(self, lag: int = 1) -> FloatArray:
-        """(bins,) covariances of bin j with bin j + lag, round the period; lag 0 gives the variances."""
+        """(bins,) covariances of bin j with bin j + lag, round the period; lag 0 gives the variances.
+
+        Raises
+        ------
+        MemoryError
+            Where (bins, bins) numbers would not fit in memory.
+        """
         n = self.mean.size
         lag = checks.integer("lag", lag, low=-n, high=n)
         if self._pixel is None:
@@ -246,6 +252,7 @@ class JointLaw:
         if self._covariance is not None:
             j = np.arange(n)
             return np.asarray(self._covariance[j, (j + lag) % n])
+        check_memory(8 * n * n, f"lags of {n} bins", "use window() or covariance_of() for the bins of interest")
         found = np.empty(n)
         eye = np.eye(n)
         for start in range(0, n, _BLOCK):

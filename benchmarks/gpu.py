@@ -17,7 +17,7 @@ import mars_lidar as ml
 from benchmarks.gpu_resources import MEMORY_BYTES_PER_S
 from mars_lidar import cuda
 from mars_lidar.cuda.exact import exact_histogram
-from mars_lidar.cuda.machine import cupy_with_device
+from mars_lidar.cuda.machine import Cuda, cupy_with_device
 from mars_lidar.engines import Engine, find_engine
 from mars_lidar.engines.engine import Task
 from mars_lidar.simulate import _task
@@ -161,7 +161,7 @@ def _engine(case: Case) -> Engine:
 
 def _drawing(engine: Engine, task: Task, out: Any, in_block: bool | None) -> Callable[[], None]:
     if in_block is not None:
-        return lambda: exact_histogram(task, out, in_block=in_block)
+        return lambda: exact_histogram(task, out, Cuda(), in_block=in_block)
     return lambda: cuda.histogram(engine, task, out)
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from native_emulation import run_kernel
+from host_machine import Host
 from numpy.typing import NDArray
 
 import mars_lidar as ml
-from mars_lidar import _core
-from mars_lidar.cuda.exact import host_arrays
-from mars_lidar.cuda.kernels import Sink, Variant, block_bytes
+from mars_lidar.cuda import exact
+from mars_lidar.cuda.kernels import Sink, Variant
 from mars_lidar.engines.engine import Records, Task
 from mars_lidar.engines.exact import ExactEngine
 
@@ -58,16 +58,9 @@ def task(detector: dict[str, Any], pulse: str, start: str, returns: int, bins: i
     return Task(flux, system, 2, 3, index, 2**40 + 9, 1, None)
 
 
-def run_on_host(task: Task, sink: Sink, to: dict[str, NDArray[Any]], lanes: int = 32) -> None:
-    arrays = {**host_arrays(task), **to}
-    addresses = {name: array.ctypes.data for name, array in arrays.items() if array.size}
-    kernel = Variant.of(task, sink).expression
-    part = task.items // 2 + 1  # two launches
-    for first in range(0, task.items, part):
-        items = min(part, task.items - first)
-        argument = _core.device_task(task.job, task.pulse, addresses, first, items)
-        blocks, shared = -(-items // lanes), block_bytes(task.system.bins, lanes)
-        run_kernel("exact", kernel, argument, blocks, lanes, shared)
+@pytest.fixture(autouse=True)
+def _two_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exact, "_LAUNCH_ITEMS", 60)  # of 102 exposures
 
 
 def expected(task: Task, dtype: Any = np.uint16) -> NDArray[Any]:
@@ -89,8 +82,10 @@ STARTS = [
 @pytest.mark.parametrize(("mode", "start"), STARTS)
 def test_histograms_are_those_of_the_engine(mode: str, pulse: str, returns: int, start: str):
     asked = task(MODES[mode], pulse, start, returns, bins=64)
-    out = np.zeros((asked.items, 64), np.uint16)
-    run_on_host(asked, Sink.BLOCK16, {"out": out})
+    out = np.empty((asked.items, 64), np.uint16)
+    machine = Host()
+    exact.exact_histogram(asked, out, machine)
+    assert machine.launched == [Variant.of(asked, Sink.BLOCK16).expression] * 2
     wanted = expected(asked)
     assert wanted.sum() > 1000
     np.testing.assert_array_equal(out, wanted)
@@ -98,26 +93,37 @@ def test_histograms_are_those_of_the_engine(mode: str, pulse: str, returns: int,
 
 @pytest.mark.parametrize("sink", [Sink.BLOCK16, Sink.BLOCK32, Sink.ROWS16, Sink.ROWS32])
 @pytest.mark.parametrize("bins", [1, 5, 30, 64])
-def test_every_way_to_count(sink: Sink, bins: int):
+def test_every_way_to_count(sink: Sink, bins: int, monkeypatch: pytest.MonkeyPatch):
     """Bins of more than 255 counts, rows that end inside a word."""
+    monkeypatch.setattr(exact, "_ROW_THREADS", 7)
     dtype = np.uint16 if sink in (Sink.BLOCK16, Sink.ROWS16) else np.uint32
     asked = task({"dead_time_ns": 20.0}, "gaussian", "armed", 1, bins, cycles=3000)
-    out = np.zeros((asked.items, bins), dtype)
-    run_on_host(asked, sink, {"out": out}, lanes=32 if "BLOCK" in sink.name else 7)
+    out = np.empty((asked.items, bins), dtype)
+    machine = Host()
+    exact.exact_histogram(asked, out, machine, in_block="BLOCK" in sink.name)
+    assert set(machine.launched) == {Variant.of(asked, sink).expression}
     wanted = expected(asked, dtype)
     assert (wanted > 512).any()
     np.testing.assert_array_equal(out, wanted)
 
 
+def test_histograms_that_fit_no_block_are_counted_in_the_memory_of_the_device():
+    asked = task({}, "gaussian", "armed", 1, bins=64)
+    out = np.empty((asked.items, 64), np.uint16)
+    machine = Host(shared_bytes=1 << 10)
+    exact.exact_histogram(asked, out, machine)
+    assert set(machine.launched) == {Variant.of(asked, Sink.ROWS16).expression}
+    np.testing.assert_array_equal(out, expected(asked))
+
+
 @pytest.mark.parametrize(("mode", "start"), STARTS)
 def test_timestamps_are_those_of_the_engine(mode: str, start: str):
-    asked = task(MODES[mode], "gaussian", start, 2, bins=64)
-    engine, counts = ExactEngine(), np.empty(asked.items, np.int64)
-    run_on_host(asked, Sink.COUNTS, {"out": counts})
-    np.testing.assert_array_equal(counts, engine.counts(asked))
-    wanted, told = Records.allocate(counts), Records.allocate(counts)
-    engine.timestamps(asked, wanted)
-    to = {"offsets": told.offsets, "times": told.times, "cycles": told.cycle, "bins": told.bin}
-    run_on_host(asked, Sink.TIMESTAMPS, to)
-    for a, b in ((told.times, wanted.times), (told.cycle, wanted.cycle), (told.bin, wanted.bin)):
-        np.testing.assert_array_equal(a, b)
+    done: list[int] = []
+    asked = replace(task(MODES[mode], "gaussian", start, 2, bins=64), progress=lambda n, _: done.append(n))
+    engine = ExactEngine()
+    told = exact.exact_records(asked, Host())
+    wanted = Records.allocate(engine.counts(asked))
+    engine.timestamps(replace(asked, progress=None), wanted)
+    for name in ("offsets", "times", "cycle", "bin"):
+        np.testing.assert_array_equal(getattr(told, name), getattr(wanted, name))
+    assert done == [60, asked.items] * 2  # counted, then drawn

@@ -55,7 +55,7 @@ def histogram(engine: Engine, task: Task, out: Any) -> None:
     """
     match engine:
         case ExactEngine():  # one exposure a thread
-            exact_histogram(task, out)
+            exact_histogram(task, out, Cuda())
         case FeedbackEngine():  # one pixel a thread; what the sweeps refuse is drawn exactly
             machine = Cuda()
             feedback_histogram(task, out, machine, _exactly(engine, machine))
@@ -69,7 +69,7 @@ def records(engine: Engine, task: Task) -> Records:
     """Registrations of a task that `check` took, in the processor's memory; ValueError where an engine draws none."""
     if not isinstance(engine, ExactEngine):
         raise ValueError(f"engine {engine.name!r} draws histograms only, not timestamps; use 'exact'")
-    return exact_records(task)
+    return exact_records(task, Cuda())
 
 
 def _check_exact(engine: ExactEngine, flux: Flux, system: System) -> None:
@@ -85,7 +85,7 @@ def _exactly(engine: FeedbackEngine, machine: Cuda) -> Any:
 
     def draw(part: Task, rows: Any) -> None:
         if part.flux.waveform is None:
-            exact_histogram(part, rows)
+            exact_histogram(part, rows, machine)
             return
         here = np.empty((part.items, part.system.bins), rows.dtype)
         ExactEngine(engine.level).histogram(part, here)

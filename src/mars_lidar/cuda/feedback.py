@@ -43,15 +43,7 @@ def feedback_histogram(task: Task, out: Any, machine: Machine, draw_exactly: Dra
         if pixels.size == task.pixel_index.size and number == task.realizations:
             draw_exactly(task, out)
             continue
-        part = replace(
-            task,
-            flux=part_of(task.flux, pixels),
-            pixel_index=task.pixel_index[pixels],
-            progress=None,
-            report={},
-            realizations=number,
-            first_realization=task.first_realization + first,
-        )
+        part = part_of(task, pixels, first, number)
         rows = machine.empty((part.items, task.system.bins), out.dtype)
         draw_exactly(part, rows)
         cube[first : first + number, machine.array(pixels)] = rows.reshape(number, pixels.size, task.system.bins)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -263,15 +263,7 @@ def _on_host(engine: MarsEngine, task: Task, out: Any, machine: Machine, pixels:
     number = max(1, _HOST_BYTES // (pixels.size * bins * out.dtype.itemsize))
     for first in range(0, task.realizations, number):
         some = min(number, task.realizations - first)
-        part = replace(
-            task,
-            flux=part_of(task.flux, pixels),
-            realizations=some,
-            report={},
-            progress=None,
-            first_realization=task.first_realization + first,
-            pixel_index=task.pixel_index[pixels],
-        )
+        part = part_of(task, pixels, first, some)
         rows = np.empty((part.items, bins), out.dtype)
         alone.histogram(part, rows)
         cube[first : first + some, where] = machine.array(rows.reshape(some, pixels.size, bins))

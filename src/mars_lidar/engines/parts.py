@@ -27,7 +27,7 @@ def stage(progress: Progress | None, start: float, end: float) -> Progress | Non
     return told
 
 
-def part_of(flux: Flux, pixels: NDArray[np.int64]) -> Flux:
+def _pixels_of(flux: Flux, pixels: NDArray[np.int64]) -> Flux:
     """The flux of some pixels (n,), as an image of one row."""
     n = pixels.size
     background = flux.background.reshape(-1)[pixels].reshape(1, n)
@@ -41,6 +41,21 @@ def part_of(flux: Flux, pixels: NDArray[np.int64]) -> Flux:
     dark = np.zeros_like(background)
     every = enumerate(zip(signal, delay, strict=True))
     return Flux.multi(*(Flux(s[None], dark if k else background, tau[None]) for k, (s, tau) in every))
+
+
+def part_of(
+    task: Task, pixels: NDArray[np.int64], first: int, realizations: int, progress: Progress | None = None
+) -> Task:
+    """Some pixels (n,) of a task in some of its realizations, `first` the first: each has the bits of the whole."""
+    return replace(
+        task,
+        flux=_pixels_of(task.flux, pixels),
+        pixel_index=task.pixel_index[pixels],
+        first_realization=task.first_realization + first,
+        realizations=realizations,
+        report={},
+        progress=progress,
+    )
 
 
 def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[np.int64]) -> None:
@@ -59,15 +74,8 @@ def draw_pixels(engine: Engine, task: Task, out: NDArray[Any], pixels: NDArray[n
     for k, (first_pixel, first) in enumerate(steps):
         some = pixels[first_pixel : first_pixel + wide]
         number = min(deep, task.realizations - first)
-        part = replace(
-            task,
-            flux=part_of(task.flux, some),
-            realizations=number,
-            first_realization=task.first_realization + first,
-            pixel_index=task.pixel_index[some],
-            report={},
-            progress=stage(task.progress, k / len(steps), (k + 1) / len(steps)),
-        )
+        progress = stage(task.progress, k / len(steps), (k + 1) / len(steps))
+        part = part_of(task, some, first, number, progress)
         rows = np.empty((part.items, task.system.bins), out.dtype)
         engine.histogram(part, rows)
         cube[first : first + number, some] = rows.reshape(number, some.size, task.system.bins)

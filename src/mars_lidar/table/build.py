@@ -16,7 +16,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.table.axes import Grid, axis_values, describe
-from mars_lidar.table.entries import part_of
+from mars_lidar.table.entries import progress_of_part
 from mars_lidar.table.error import QuantisationError, long_error, quantisation_error
 from mars_lidar.table.law import law_error
 from mars_lidar.table.node_laws import NodeLaws, node_laws
@@ -93,7 +93,10 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
     settled = cells + max(1, cells // 10)  # the start phases take about so much of the time
     total = settled + max(1, cells // 20)  # and the laws of some entries so much
     entries = recipe.entries(
-        np.repeat(signal, background.size), np.tile(background, signal.size), system, part_of(progress, 0, cells, total)
+        np.repeat(signal, background.size),
+        np.tile(background, signal.size),
+        system,
+        progress_of_part(progress, 0, cells, total),
     )
     phases, laws = StartPhases.none(), NodeLaws.none()
     if recipe.method == "exposure":
@@ -104,7 +107,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
             entries.cumulants,
             entries.bins,
             threads=recipe.threads,
-            progress=part_of(progress, cells, settled, total),
+            progress=progress_of_part(progress, cells, settled, total),
         )
         laws = node_laws(
             system,
@@ -112,7 +115,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
             background,
             entries,
             threads=recipe.threads,
-            progress=part_of(progress, settled, total, total),
+            progress=progress_of_part(progress, settled, total, total),
         )
     if progress is not None:
         progress(total, total)

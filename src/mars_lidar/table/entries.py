@@ -116,7 +116,7 @@ def exposure_entries(
         some = slice(start, min(start + step, n))
         cells = Cells.of(signal[some], background[some], system)
         part = refined_moments(
-            cells, bins, tolerance=tolerance, threads=threads, progress=part_of(progress, start, some.stop, n)
+            cells, bins, tolerance=tolerance, threads=threads, progress=progress_of_part(progress, start, some.stop, n)
         )
         entries.cumulants[some], entries.rates[some] = part.cumulants, part.cumulant_rates
         entries.enough[some] = np.where(part.settled < 0, -1, np.maximum(part.settled - window, 1))
@@ -128,7 +128,7 @@ def exposure_entries(
     return entries
 
 
-def part_of(progress: Progress | None, first: int, last: int, total: int) -> Progress | None:
+def progress_of_part(progress: Progress | None, first: int, last: int, total: int) -> Progress | None:
     """Progress of one part of the work, from `first` to `last` of `total`; never backward."""
     if progress is None:
         return None

@@ -86,6 +86,10 @@ _STUDIES = {
     ),
     "transients": ("transients.run", "two returns in fog through the dead time of three detectors"),
     "downstream": ("downstream.run", "T5: networks trained on every simulator's data, tested on gold; --config"),
+    "downstream-baselines": (
+        "downstream.baselines",
+        "what no network needs, on the cubes of T5: estimators of depth, a polynomial for reflectivity, the bound",
+    ),
     "start-up": ("table.start_up", "what the shape of a table leaves out: the start-up at other delays"),
     "table": ("table.run", "lookup tables: what they hold, and their errors between entries and at any delay"),
 }

@@ -180,3 +180,15 @@ def test_measured_records(name: str):
 def test_only_the_abstract_pulse_is_abstract():
     with pytest.raises(TypeError):
         ml.Pulse()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 1.0])
+def test_wide_trains_by_frequency_are_those_by_pulses(share: float):
+    """The Fourier series of a wide Gaussian's train against the sum over its pulses, the same origin included."""
+    pulse, period = ml.GaussianPulse(sigma_ns=10.0 * share), 10.0
+    t = np.linspace(-25.0, 25.0, 1001)
+    by_pulses = ml.Pulse.wrapped_cumulative(pulse, t, period)
+    np.testing.assert_allclose(
+        pulse.wrapped_cumulative(t, period), by_pulses, atol=2e-14, rtol=0.0
+    )  # 19 pulses round more
+    assert pulse.wrapped_cumulative(t + period, period) - pulse.wrapped_cumulative(t, period) == pytest.approx(1.0)

@@ -238,13 +238,7 @@ class JointLaw:
         return np.concatenate([self._pixel.covariances(x, y) for x, y in parts]).reshape(shape)[()]
 
     def lag(self, lag: int = 1) -> FloatArray:
-        """(bins,) covariances of bin j with bin j + lag, round the period; lag 0 gives the variances.
-
-        Raises
-        ------
-        MemoryError
-            Where (bins, bins) numbers would not fit in memory.
-        """
+        """(bins,) covariances of bin j with bin j + lag, round the period; lag 0: variances. May raise MemoryError."""
         n = self.mean.size
         lag = checks.integer("lag", lag, low=-n, high=n)
         if self._pixel is None:

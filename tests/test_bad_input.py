@@ -309,6 +309,58 @@ def test_a_masked_pixel_is_not_taken_for_what_lies_under_the_mask():
     assert np.isnan(ml.Flux(np.where(mask, 0.0, 1.0), 0.5, light).delay_ns[0, 1])  # no light: no return
 
 
+def test_masks_are_honoured_or_refused_by_name():
+    def masked(values):
+        return np.ma.MaskedArray(values, mask=np.arange(np.size(values)).reshape(np.shape(values)) == 1)
+
+    cube = ml.simulate(FLUX, SYSTEM)
+    pixels = int(np.prod(FLUX.shape))
+    refused(lambda: ml.reconstruct(masked(cube), SYSTEM), ValueError, "cube must have no masked elements")
+    index = masked(np.arange(pixels))
+    refused(
+        lambda: ml.simulate(FLUX, SYSTEM, pixel_index=index), ValueError, "pixel_index must have no masked elements"
+    )
+    refused(lambda: ml.SampledPulse(masked([1.0, 5.0, 2.0]), 0.1), ValueError, "values must have no masked elements")
+    assert ml.SampledPulse(np.ma.MaskedArray([1.0, 5.0, 2.0]), 0.1) == ml.SampledPulse([1.0, 5.0, 2.0], 0.1)
+
+
+def test_counts_are_whole_numbers():
+    cube = ml.simulate(FLUX, SYSTEM)
+    refused(lambda: ml.reconstruct(cube > 0, SYSTEM), TypeError, "cube must hold counts", "got dtype bool")
+    refused(lambda: ml.reconstruct(cube - 7.0, SYSTEM), ValueError, "cube must hold finite counts >= 0, got -7")
+    refused(lambda: ml.reconstruct(cube.astype(int) - 7, SYSTEM), ValueError, "cube must hold counts >= 0, got -7")
+    refused(lambda: ml.reconstruct(cube + 0.25, SYSTEM), ValueError, "cube must hold whole counts, got")
+    assert np.array_equal(ml.reconstruct(cube + 0.0, SYSTEM).signal, ml.reconstruct(cube, SYSTEM).signal)
+
+
+def test_memory_for_timestamps_is_estimated_before_they_are_counted(monkeypatch):
+    monkeypatch.setattr(
+        "mars_lidar.engines.exact.ExactEngine.counts", lambda *_: pytest.fail("the exposure was counted")
+    )
+    bright = ml.Flux(np.full((100, 100), 20.0), 1.0, 20.0)
+    monkeypatch.setattr("mars_lidar._base.memory.available_bytes", lambda: 2**20)
+    with pytest.raises(MemoryError, match="timestamps of shape"):
+        ml.simulate_timestamps(bright, SYSTEM)
+
+
+def test_maps_that_do_not_fit_together_are_refused(tmp_path):
+    from mars_lidar.io.maps import load_maps, save_maps
+
+    save_maps(tmp_path / "maps.npz", {"peak": ml.reconstruct(ml.simulate(FLUX, SYSTEM), SYSTEM, "peak")})
+    with np.load(tmp_path / "maps.npz") as archive:
+        arrays = dict(archive)
+    system = arrays["attributes"].item().replace('"system"', '"sistem"')
+    for name, value, told in (
+        ("depth", arrays["depth"][..., :-1], "depth must be numbers"),
+        ("signal", arrays["signal"].astype(str), "signal must be numbers"),
+        ("flags", None, "has no variable 'flags'"),
+        ("attributes", np.asarray(system), "'system'"),
+    ):
+        changed = {key: each for key, each in {**arrays, name: value}.items() if each is not None}
+        np.savez(tmp_path / "bad.npz", **changed)
+        refused(lambda: load_maps(tmp_path / "bad.npz"), ValueError, "bad.npz", told)
+
+
 def test_what_is_no_array_of_counts_is_named_by_its_type(tmp_path):
     from mars_lidar import io
 

@@ -12,7 +12,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
-from mars_lidar._base.types import Progress
+from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import Records, Task
 from mars_lidar.instrument.system import System
@@ -23,6 +23,7 @@ from mars_lidar.light.timestamps import Timestamps
 if TYPE_CHECKING:
     pass
 
+_STAMP_BYTES = 16  # of a time, a cycle and a bin
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
 
@@ -141,8 +142,12 @@ def simulate_timestamps(
         cuda.check(drawn_by, task.flux, task.system)
         records = cuda.records(drawn_by, task)
     else:
+        detected = flux.detected(system)
+        share = np.exp(-detected.total * system.dead_time_periods) if system.detector.mode == "paralyzable" else 1.0
+        least = 0.5 * float((share * _expected_registrations(detected, system)).sum())
+        _check_memory((math.ceil(least),), _STAMP_BYTES, "timestamps")  # before they are counted: half of the work
         counts = drawn_by.counts(task)
-        _check_memory((int(counts.sum()),), 16, "timestamps")
+        _check_memory((int(counts.sum()),), _STAMP_BYTES, "timestamps")
         records = Records.allocate(counts)
         drawn_by.timestamps(task, records)
     times_ns = records.times
@@ -223,7 +228,7 @@ def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArr
     pixels = shape[0] * shape[1]
     if pixel_index is None:
         return np.arange(pixels, dtype=np.uint32)
-    index = np.asarray(pixel_index)
+    index = np.asarray(checks.unmasked("pixel_index", pixel_index))
     if index.dtype.kind not in "iu":
         raise TypeError(f"pixel_index must be integers, got dtype {index.dtype}")
     if index.shape not in ((pixels,), shape):
@@ -234,24 +239,30 @@ def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArr
 
 
 def _check_registrations(flux: Flux, system: System) -> None:
-    photons, dead = float(flux.total.max()), system.dead_time_periods
-    mode, what = system.detector.mode, "registrations"
-    if mode == "gated":  # what arrives outside of the gate costs one draw a period
-        shut = 1.0 - system.detector.gate_periods(system.period_ns)[2]
-        photons = float((flux.total - shut * flux.background).max())
-    most = photons * system.cycles / (1.0 + photons * dead)
-    if mode == "paralyzable":  # each arrival is drawn, seen or not
-        most, what = photons * (system.cycles + dead), "arrivals of mode 'paralyzable'"
-    elif mode == "synchronous":
-        most = min(most, float(system.cycles))
-    traps = system.detector.afterpulsing
-    if traps is not None:  # each avalanche is followed by up to p / (1 - p) others
-        most /= 1.0 - traps.probability
+    expected = _expected_registrations(flux, system)
+    most, what = float(expected.max()), "registrations"
+    if system.detector.mode == "paralyzable":  # each arrival is drawn, seen or not
+        what = "arrivals of mode 'paralyzable'"
     if most > 0.5 * _MAX_REGISTRATIONS:
+        photons = float(flux.total.flat[expected.argmax()])
         raise ValueError(
             f"a pixel must have at most {0.5 * _MAX_REGISTRATIONS:.3g} expected {what}, "
             f"got {most:.3g} ({photons:g} photons per period, {system.cycles} cycles)"
         )
+
+
+def _expected_registrations(flux: Flux, system: System) -> FloatArray:
+    """Registrations of each pixel (H, W) of detected photons, within a factor of two; if paralyzable, arrivals."""
+    photons, dead, mode = flux.total, system.dead_time_periods, system.detector.mode
+    if mode == "gated":  # what arrives outside of the gate costs one draw a period
+        photons = photons - (1.0 - system.detector.gate_periods(system.period_ns)[2]) * flux.background
+    most = photons * system.cycles / (1.0 + photons * dead)
+    if mode == "paralyzable":
+        most = photons * (system.cycles + dead)
+    elif mode == "synchronous":
+        most = np.minimum(most, float(system.cycles))
+    traps = system.detector.afterpulsing  # each avalanche is followed by up to p / (1 - p) others
+    return np.asarray(most if traps is None else most / (1.0 - traps.probability))
 
 
 def _check_out(out: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:

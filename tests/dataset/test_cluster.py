@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
+import time
 import warnings
 
 import distributed
@@ -62,4 +66,40 @@ def test_without_the_library(tmp_path, recipe, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(io.MissingLibraryError, match=r"pip install 'mars-lidar\[cluster\]'"):
         ml.generate(recipe, tmp_path / "set.zarr", workers=2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scheduler_that_is_lost_is_told_and_the_run_goes_on_afterwards(tmp_path, recipe):
+    place = tmp_path / "scheduler.json"
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--no-dashboard", "--scheduler-file", str(place)]
+    scheduler = subprocess.Popen([*dask, "--port", "0"], stderr=subprocess.DEVNULL)
+    dask[2] = "distributed.cli.dask_worker"
+    worker = None
+    try:
+        while not place.exists():
+            time.sleep(0.1)
+        worker = subprocess.Popen([*dask, "--nthreads", "1"], stderr=subprocess.DEVNULL)
+
+        def progress(done: int, total: int) -> None:
+            if done == 3:
+                scheduler.kill()
+
+        address = json.loads(place.read_text())["address"]
+        with pytest.raises(io.WriteError, match=r"were lost .* continue with --resume"):
+            ml.generate(recipe, tmp_path / "two.zarr", scheduler=address, progress=progress)
+    finally:
+        for process in (scheduler, worker):
+            if process is not None:
+                process.kill()
+                process.wait()
+    ml.generate(recipe, tmp_path / "one.zarr")
+    ml.generate(recipe, tmp_path / "two.zarr", resume=True)
+    assert files(tmp_path / "one.zarr") == files(tmp_path / "two.zarr")
+
+
+def test_a_wrong_address_is_noticed_before_the_scenes_are_read(tmp_path, recipe, monkeypatch):
+    monkeypatch.setattr("mars_lidar.dataset.cluster.TIMEOUT_S", 0.2)
+    monkeypatch.setattr("mars_lidar.dataset.ingest.create", lambda *_: pytest.fail("the scenes were read"))
+    with pytest.raises(ValueError, match="scheduler must be the address"):
+        ml.generate(recipe, tmp_path / "set.zarr", scheduler="tcp://127.0.0.1:9")
     assert not list(tmp_path.iterdir())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -119,3 +120,62 @@ def test_two_runs_do_not_write_one_store(tmp_path, recipe):
         with pytest.raises(ValueError, match="being written by another process"):
             ml.generate(recipe, tmp_path / "set.zarr")
     ml.generate(recipe, tmp_path / "set.zarr")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs flock")
+def test_a_lock_that_its_owner_took_away_is_not_held(tmp_path, recipe, monkeypatch):
+    """Opened while its owner was leaving, the lock has no name any more: nobody would see that it is held."""
+    import fcntl
+
+    lock, real, calls = tmp_path / "set.zarr.lock", fcntl.flock, []
+
+    def flock(held, how) -> None:
+        calls.append(how)
+        if len(calls) == 1:
+            lock.unlink()
+        real(held, how)
+
+    def progress(done: int, total: int) -> None:
+        with open(lock) as other, pytest.raises(BlockingIOError):
+            real(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    ml.generate(recipe, tmp_path / "set.zarr", progress=progress)
+    assert len(calls) == 2
+    assert not lock.exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs flock")
+def test_a_store_that_another_run_just_finished_is_not_replaced(tmp_path, recipe, monkeypatch):
+    import fcntl
+
+    real, out = fcntl.flock, tmp_path / "set.zarr"
+
+    def flock(held, how) -> None:
+        monkeypatch.setattr(fcntl, "flock", lambda *_: None)
+        ml.generate(recipe, out)  # between the first look and the lock
+        monkeypatch.setattr(fcntl, "flock", real)
+        open(tmp_path / "set.zarr.lock", "w").close()
+        real(held, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises(FileExistsError, match="exists already"):
+        ml.generate(recipe | {"seed": 99}, out)
+    assert open_dataset(out).recipe.seed == recipe["seed"]
+
+
+@pytest.mark.parametrize("what", ["", "histogram", "depth/zarr.json", "zarr.json", "sbr"])
+def test_what_is_taken_away_while_it_is_made_is_missed(tmp_path, recipe, what):
+    out = tmp_path / "set.zarr"
+
+    def progress(done: int, total: int) -> None:
+        if done == total - 2:
+            if (out / what).is_dir():
+                shutil.rmtree(out / what)
+            else:
+                (out / what).unlink(missing_ok=True)
+
+    with pytest.raises(OSError, match=r"taken away|has no zarr\.json|No such file|does not exist"):
+        ml.generate(recipe, out, progress=progress, threads=1)
+    with pytest.raises((ValueError, FileNotFoundError)):
+        open_dataset(out)

@@ -7,6 +7,8 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
+
 
 def real(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf, strict_low: bool = False) -> float:
     """A finite real number in [low, high] (or (low, high] with `strict_low`), as float."""
@@ -43,6 +45,13 @@ def choice(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     if not isinstance(value, str) or value not in allowed:
         told = f"{name} must be one of {', '.join(map(repr, allowed))}"
         raise ValueError(f"{told}, got {value!r}{_meant(value, allowed)}")
+    return value
+
+
+def unmasked(name: str, value: Any) -> Any:
+    """The value, unless elements of it are masked: an array made of it would take what the mask hides."""
+    if np.ma.is_masked(value):
+        raise ValueError(f"{name} must have no masked elements, got {np.ma.getmaskarray(value).sum()}: fill them first")
     return value
 
 

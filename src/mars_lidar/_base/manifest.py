@@ -30,6 +30,9 @@ def seal(store: Path, attrs: dict[str, Any]) -> None:
     document = json.loads((store / _ROOT).read_bytes())
     document["attributes"].update(attrs | {"manifest": NAME})
     root = json.dumps(document, indent=2).encode()
+    for name in document.get("consolidated_metadata", {}).get("metadata", {}):
+        if not (store / name / _ROOT).is_file():
+            raise FileNotFoundError(f"{store / name / _ROOT} was taken away while the store was written")
     names = sorted(_files(store) - {_ROOT, NAME})
     with ThreadPoolExecutor(_THREADS) as pool:
         told = dict(zip(names, pool.map(lambda name: _hash(store / name), names), strict=True))

@@ -7,6 +7,7 @@ rename, so half a part does not exist.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 import uuid
@@ -33,6 +34,13 @@ def needed() -> Any:
             f"workers and scheduler need dask.distributed: pip install 'mars-lidar[cluster]' ({error})"
         ) from error
     return distributed
+
+
+def reach(scheduler: str | None) -> None:
+    """Raise ValueError unless the library is there and a scheduler answers at this address, if one is given."""
+    distributed = needed()
+    if scheduler is not None:
+        _client(distributed, scheduler).close()
 
 
 def make_all(
@@ -98,6 +106,13 @@ def _share_out(
             add(made)
             for item in itertools.islice(waiting, 1):
                 running.add(given(item))
+    except (
+        distributed.client.FutureCancelledError,
+        distributed.scheduler.KilledWorker,
+        distributed.comm.CommClosedError,
+    ) as error:
+        raise ConnectionError(f"the scheduler or its workers were lost ({' '.join(str(error).split())})") from error
     except BaseException:
-        client.cancel(list(running.futures), force=True)
+        with contextlib.suppress(Exception):  # a scheduler that is gone has nothing to cancel
+            client.cancel(list(running.futures), force=True)
         raise

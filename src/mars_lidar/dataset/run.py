@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import shutil
 import threading
 import time
@@ -123,19 +124,19 @@ def generate(
         for name, value in (("threads", threads), ("workers", workers))
     )
     wanted, folder = read_recipe(recipe)
-    there = target.exists() and resume
-    if there:
-        dataset = open_dataset(target, allow_incomplete=True)
-        _check_same(target, dataset, wanted)
-    elif wanted is None:
-        raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
-    else:
-        check_target(target, folder=True, overwrite=overwrite)
+    check_target(target, folder=True, overwrite=overwrite or resume)
     if workers is not None or scheduler is not None:
         from mars_lidar.dataset import cluster
 
-        cluster.needed()
-    with _alone(target):
+        cluster.reach(scheduler)  # before the scenes are read
+    with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
+        there = target.exists() and resume
+        if there:
+            dataset = open_dataset(target, allow_incomplete=True)
+            _check_same(target, dataset, wanted)
+        elif wanted is None:
+            raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
+        check_target(target, folder=True, overwrite=overwrite or there)
         try:
             if not there or not dataset.planned:
                 if wanted is None:
@@ -281,19 +282,23 @@ def _left(target: Path) -> str:
 def _alone(target: Path) -> Iterator[None]:
     """Hold a lock beside the store while it is written; a lock of a process that was killed holds nobody up."""
     lock = target.with_name(target.name + ".lock")
-    with open(lock, "w") as held:
-        try:
-            import fcntl
-        except ImportError:  # Windows
-            yield
+    while True:
+        with open(lock, "w") as held:
+            try:
+                import fcntl
+            except ImportError:  # Windows
+                yield
+                return
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ValueError(f"{target} is being written by another process (its lock is {lock})") from None
+            except OSError:  # a file system without locks
+                pass
+            if not (lock.exists() and os.path.samestat(lock.stat(), os.fstat(held.fileno()))):
+                continue  # its owner left, and took the name away, between our opening and our locking
+            try:
+                yield
+            finally:
+                lock.unlink(missing_ok=True)
             return
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(f"{target} is being written by another process (its lock is {lock})") from None
-        except OSError:  # a file system without locks
-            pass
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)

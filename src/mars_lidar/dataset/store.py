@@ -161,8 +161,11 @@ class Dataset:
 
     def finish(self) -> None:
         """Mark the store complete, with one replacement of its root document, after its manifest."""
-        (self.path / manifest.NAME).unlink(missing_ok=True)  # of a run that was stopped in the next line but one
-        mark(self.group, {})
+        gone = [str(file) for item in self.items() for file in self.files(item) if not file.is_file()]
+        if gone:
+            raise FileNotFoundError(f"{gone[0]} was taken away while the others were made, the first of {len(gone)}")
+        if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
+            mark(self.group, {})
         manifest.seal(self.path, {"stage": "done", "complete": True})
         self.attrs = manifest.root_document(self.path)["attributes"]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import manifest
+from mars_lidar._base import checks, manifest
 from mars_lidar._base.files import WriteError as WriteError
 from mars_lidar._base.files import reason
 from mars_lidar._base.progress import shown
@@ -121,7 +121,7 @@ def simulate_to(
         seed=seed,
         realizations=realizations,
         first_realization=first_realization,
-        pixel_index=None if pixel_index is None else np.asarray(pixel_index),
+        pixel_index=None if pixel_index is None else np.asarray(checks.unmasked("pixel_index", pixel_index)),
         depth_m=system.depth_m(flux.delay_ns) if depth_m is None else np.asarray(depth_m),
         reflectivity=None if reflectivity is None else np.asarray(reflectivity),
         source=source,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import checks
 from mars_lidar._base.late import late
 
 if TYPE_CHECKING:
@@ -52,6 +53,38 @@ class Timestamps:
     period_ns: float = math.nan
     cycles: int = 0
     info: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raise ValueError or TypeError, with the name of the attribute, for what no detector registers."""
+        for name, kind in (("times_ns", "f"), ("cycle", "iu"), ("bin", "iu"), ("offsets", "iu")):
+            array = checks.unmasked(name, getattr(self, name))
+            if not isinstance(array, np.ndarray) or array.ndim != 1 or array.dtype.kind not in kind:
+                told = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+                numbers = "real numbers" if kind == "f" else "integers"
+                raise TypeError(f"{name} must be a NumPy array (n,) of {numbers}, got {told}")
+        height, width = self.shape
+        offsets, number = self.offsets, self.times_ns.size
+        if offsets.size != height * width + 1 or offsets[0] != 0 or (np.diff(offsets) < 0).any():
+            raise ValueError(
+                f"offsets must be {height * width + 1} numbers that rise from 0, for {height} x {width} pixels"
+            )
+        for name in ("times_ns", "cycle", "bin"):
+            if getattr(self, name).size != offsets[-1]:
+                raise ValueError(
+                    f"{name} must have {offsets[-1]} registrations as offsets tell, got {getattr(self, name).size}"
+                )
+        checks.integer("bins", self.bins, low=1, high=2**32)
+        cycles = checks.integer("cycles", self.cycles, low=0, high=2**31) or 2**31
+        for name, most in (("cycle", cycles), ("bin", self.bins)):
+            array = getattr(self, name)
+            if number and (array.min() < 0 or array.max() >= most):
+                raise ValueError(f"{name} must lie in [0, {most}), got {array.min()} to {array.max()}")
+        if not (np.isfinite(self.times_ns) & (self.times_ns >= 0)).all():
+            raise ValueError("times_ns must be finite and >= 0")
+        falls = np.diff(self.times_ns) < 0
+        falls[offsets[(offsets > 0) & (offsets < number)] - 1] = False
+        if falls.any():
+            raise ValueError(f"times_ns must be sorted within a pixel, got {falls.sum()} before the one before them")
 
     @property
     def system(self) -> System | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base import checks
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
@@ -41,7 +42,7 @@ def checked(
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     team = thread_count(threads)
     progress = shown(progress, "reconstructing")
-    counts = np.asarray(cube)
+    counts = np.asarray(checks.unmasked("cube", cube))
     if counts.dtype.kind in "OUS":
         raise TypeError(f"cube must be an array of counts (of a loaded cube its histogram), got {type(cube).__name__}")
     if counts.ndim == 0 or counts.shape[-1] != system.bins or counts.size == 0:
@@ -60,7 +61,7 @@ def _typed(counts: NDArray[Any]) -> NDArray[Any]:
         if bad.any():
             raise ValueError(f"cube must hold finite counts >= 0, got {counts[bad].flat[0]}")
         return counts.astype(np.float64, copy=False)
-    if kind not in "iub":
+    if kind not in "iu":
         raise TypeError(f"cube must hold counts, integers or means of them, got dtype {counts.dtype}")
     if counts.dtype in (np.uint16, np.uint32):
         return counts

@@ -102,7 +102,7 @@ def reconstruct(
     Parameters
     ----------
     cube
-        (..., bins) counts, e.g. (realizations, H, W, bins) of `simulate`. Float cubes are means of counts per exposure.
+        (..., bins) counts, whole numbers of any type, e.g. (realizations, H, W, bins) of `simulate`.
         Or a cube of `mars_lidar.io.load`, which carries its system.
     system
         How they were recorded. Flux is periodic, with the system's pulse. None: the system that the cube carries.
@@ -134,6 +134,11 @@ def reconstruct(
     if level is not None:
         level = checks.real("level", level, low=0.0, strict_low=True)
     given, shape = checked(cube, system, threads, progress)
+    if given.counts.dtype.kind == "f" and (given.counts != np.round(given.counts)).any():
+        part = given.counts[given.counts != np.round(given.counts)].flat[0]
+        raise ValueError(
+            f"cube must hold whole counts, got {part}: add exposures up, and tell it by cycles of the system"
+        )
     used.check(system)
     tell_effects(system)
     return assembled(used.name, system, used.estimate(given), shape, level, attenuation)

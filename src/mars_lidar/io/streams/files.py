@@ -143,4 +143,10 @@ def _read_npz(path: Path) -> Timestamps:
         raise ValueError(f"{path} is not a file of timestamps written by mars-lidar (no format = {FORMAT!r})")
     with open_npz(path) as archive:
         counts = np.diff(archive["offsets"])
-        return from_attributes(attrs, archive["times_ns"], archive["cycle"], archive["bin"], counts)
+        times = from_attributes(attrs, archive["times_ns"], archive["cycle"], archive["bin"], counts)
+    apart = np.abs(times.times_ns / times.period_ns - times.cycle - 0.5)
+    if apart.max(initial=0.0) > 0.5 + 1e-6:
+        raise ValueError(
+            f"times_ns must lie in the laser periods that cycle tells, got {apart.max() - 0.5:.3g} periods off"
+        )
+    return times

@@ -210,3 +210,54 @@ def test_mars_takes_a_table_over_the_range_of_an_image(tmp_path, monkeypatch):
     (next((tmp_path / "cache").iterdir())).unlink()
     with io.load(tmp_path / "a.zarr") as cube, pytest.raises(ValueError, match="table must be the one"):
         io.verify(cube)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"pulse": ml.GaussianPulse(sigma_ns=100.0)}, r"sigma_ns=100 .* in picoseconds, give 0\.1, in ns"),
+        ({"pulse": ml.GaussianPulse.from_fwhm(fwhm_ns=100.0)}, r"sigma_ns=42.* in picoseconds"),
+        ({"detector": ml.Detector(dead_time_ns=75_000.0)}, r"dead_time_ns=75000 .* in picoseconds, give 75, in ns"),
+        ({"detector": ml.Detector(dead_time_ns=75e-9)}, r"dead_time_ns=7\.5e-08 .* in seconds, give 75, in ns"),
+        (
+            {"detector": ml.Detector(dead_time_ns=75.0, electronics_dead_time_ns=80_000.0)},
+            r"electronics_dead_time_ns=80000 .* give 80",
+        ),
+        (
+            {"period_ns": 133e-9, "pulse": ml.GaussianPulse(sigma_ns=5e-10), "detector": ml.Detector(dead_time_ns=0.0)},
+            r"133 ns, if it was given in seconds",
+        ),
+    ],
+)
+def test_a_time_in_another_unit_is_told(change, told):
+    with pytest.warns(ml.UnitWarning, match=told):
+        SYSTEM.replace(**{"period_ns": 133.0, **change})
+
+
+def test_delays_in_another_unit_are_told():
+    with pytest.warns(ml.UnitWarning, match=r"delay_ns has a median of 20000, 200 laser periods.*divide it by 1000"):
+        ml.simulate(ml.Flux(0.5, 0.1, 20_000.0), SYSTEM)
+    ml.simulate(ml.Flux(0.5, 0.1, 1_900.0), SYSTEM)
+
+
+def test_a_period_in_seconds_is_blamed_and_not_the_pulse():
+    with pytest.raises(ValueError, match=r"^period_ns=1\.33e-07 .* 133 ns, if it was given in seconds; sigma_ns"):
+        SYSTEM.replace(period_ns=133e-9)
+
+
+def test_every_published_detector_and_extreme_system_of_use_is_quiet(recwarn):
+    from mars_lidar.instrument.presets import PRESETS
+
+    for name in PRESETS:
+        ml.System(period_ns=50.0, cycles=50, bins=64, pulse=SYSTEM.pulse, detector=ml.Detector.preset(name))
+    for dead_ns in (0.0, 0.02, 1e4, 19_999.0, 1e6, 1e8):
+        SYSTEM.replace(detector=ml.Detector(dead_time_ns=dead_ns))
+    SYSTEM.replace(pulse=ml.GaussianPulse(sigma_ns=30.0))
+    assert not recwarn.list
+
+
+def test_the_command_line_says_a_warning_once(tmp_path):
+    small = ["--size", "8", "--cycles", "50", "--bins", "64", "--no-picture"]
+    done = run("simulate", "--scene", "room", *small, "--dead-time-ns", "75000", "-o", tmp_path / "a.zarr")
+    assert done.exit_code == 0
+    assert done.stderr.count("in picoseconds, give 75, in ns") == 1

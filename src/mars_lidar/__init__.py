@@ -10,6 +10,7 @@ from mars_lidar.instrument.dark_counts import dark_count_map
 from mars_lidar.instrument.effects import Jitter, SampledJitter
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import Detector, System
+from mars_lidar.instrument.units import UnitWarning
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.timestamps import Timestamps
 from mars_lidar.reconstruct import Reconstruction, cramer_rao, reconstruct
@@ -46,6 +47,7 @@ __all__ = [
     "System",
     "Table",
     "Timestamps",
+    "UnitWarning",
     "Validation",
     "__version__",
     "calibrate",

@@ -16,6 +16,7 @@ from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
 from mars_lidar.engines.engine import Records, Task
 from mars_lidar.instrument.system import System
+from mars_lidar.instrument.units import check_delays
 from mars_lidar.light.flux import MAX_RETURNS, Flux
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.timestamps import Timestamps
@@ -213,6 +214,9 @@ def _task(
             f"flux must have at most {MAX_RETURNS} returns, got {len(flux.returns_signal)}; use a waveform"
         )
     _check_registrations(flux.detected(system), system)
+    lit = flux.returns_delay_ns[flux.returns_signal > 0.0]
+    if lit.size:
+        check_delays(float(np.median(lit)), system.period_ns)
     check_detector(drawn_by, system)
     drawn_by.check(flux, system)
     index = _pixel_index(pixel_index, flux.shape)

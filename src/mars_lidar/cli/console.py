@@ -7,6 +7,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +44,8 @@ def reported() -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
-            warnings.showwarning = _show_warning
+            told: set[str] = set()
+            warnings.showwarning = partial(_show_warning, told)
             yield
     except Interrupted as stop:
         say(str(stop))
@@ -130,6 +132,7 @@ def _of_file(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if issubclass(category, UserWarning):
+def _show_warning(told: set[str], message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if issubclass(category, UserWarning) and str(message) not in told:
+        told.add(str(message))
         say(f"warning: {message}")

@@ -35,6 +35,16 @@ TIMESTAMPS_EPILOG = "\n\n".join(
     )
 )
 
+_LARGE_IMAGE = 5e8
+_ClockPs = Annotated[
+    float | None,
+    typer.Option(
+        "--clock-ps",
+        help="Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for "
+        "each. [dim]Default: the finest, 32768 to a period.[/dim]",
+        show_default=False,
+    ),
+]
 _Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 
 
@@ -58,6 +68,7 @@ def convert(
         int | None,
         typer.Option("--bins", help="Histogram bins of a recorded stream. [dim]Default: its finest clock.[/dim]"),
     ] = None,
+    clock_ps: _ClockPs = None,
     overwrite: _Overwrite = False,
 ) -> None:
     """Write a cube or a photon stream in another format, and tell what the other format cannot hold."""
@@ -71,7 +82,13 @@ def convert(
             done = _imported(foreign, source, target, overwrite)
         else:
             done = converted(
-                source, target, realization=realization, period_ns=foreign.period_ns, bins=bins, overwrite=overwrite
+                source,
+                target,
+                realization=realization,
+                period_ns=foreign.period_ns,
+                bins=bins,
+                clock_ps=clock_ps,
+                overwrite=overwrite,
             )
         rows = [("wrote", str(done.path)), ("content", done.content)]
         table(rows + [("lost", text) for text in done.lost or ("nothing",)])
@@ -97,6 +114,7 @@ def timestamps(
     threads: Annotated[
         int | None, typer.Option("--threads", help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
     ] = None,
+    clock_ps: _ClockPs = None,
     overwrite: _Overwrite = False,
 ) -> None:
     """Write the photons of a stored cube, one by one, with their times: the cube is simulated again.
@@ -108,14 +126,17 @@ def timestamps(
         from mars_lidar.io.cube import load
         from mars_lidar.io.streams.files import check_output
 
-        check_output(out, overwrite=overwrite)
+        check_output(out, overwrite=overwrite, clock_ps=clock_ps)
         with load(cube) as stored, progress_bar("simulating") as progress:
             tell_time(stored.flux, stored.system, stored.engine, 1, threads, {})
             times = photons(stored, realization=realization, threads=threads, progress=progress)
-        times.save(out, overwrite=overwrite)
-        unit = resolution_ns(out, times)
+        times.save(out, overwrite=overwrite, clock_ps=clock_ps)
+        unit = resolution_ns(out, times, clock_ps)
         height, width = times.shape
         told = "as simulated" if unit == 0.0 else f"in units of {1e3 * unit:.4g} ps; cycles and bins are exact"
+        image = 2 * height * width * times.period_ns / unit if out.suffix == ".ptu" else 0.0
+        if image > _LARGE_IMAGE:
+            told += f"; other programs make an image of {image / 1e9:.2g} GB of it, --clock-ps a smaller one"
         table(
             [
                 ("wrote", str(out)),

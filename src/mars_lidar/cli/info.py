@@ -71,7 +71,7 @@ def view(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of others: also .npy, .tif, .csv.",
+            help="A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; or histograms of others: also .npy, .tif, .csv.",
             show_default=False,
         ),
     ],
@@ -88,6 +88,10 @@ def view(
         ),
     ] = None,
     realization: Annotated[int, typer.Option("--realization", help="Which exposure, counted from 0 in this file.")] = 0,
+    sample: Annotated[
+        int | None,
+        typer.Option("--sample", help="Of a dataset: which sample. [dim]Default: 0.[/dim]", show_default=False),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
 ) -> None:
     """Draw depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
@@ -98,12 +102,23 @@ def view(
     with reported():
         check_picture(out, overwrite)
         pixels = None if not pixel else [parsed_pixel(text) for text in pixel]
-        with foreign.opened(file) as cube:
+        with _opened(file, sample, foreign) as cube:
             from mars_lidar.plot import overview
 
             figure = overview(cube, realization=realization, pixels=pixels)
         save_picture(figure, out)
         table([("picture", str(out))])
+
+
+def _opened(file: Path, sample: int | None, foreign: ForeignOptions) -> Cube:
+    """A cube, histograms of others, or a sample of a dataset."""
+    from mars_lidar.dataset.store import is_dataset, open_dataset
+
+    if is_dataset(file):
+        return open_dataset(file).cube(0 if sample is None else sample)
+    if sample is not None:
+        raise ValueError(f"--sample is for datasets, and {file} is none")
+    return foreign.opened(file)
 
 
 def parsed_pixel(text: str) -> tuple[int, int]:

@@ -160,6 +160,10 @@ Overwrite = Annotated[
     bool,
     _option("--overwrite", panel=_OUTPUT, help="Replace an existing cube and picture."),
 ]
+Resume = Annotated[
+    bool,
+    _option("--resume", panel=_OUTPUT, help="Continue a .zarr that was interrupted: the same command, the same bits."),
+]
 Picture = Annotated[
     bool,
     _option("--picture/--no-picture", panel=_OUTPUT, help="A PNG overview beside the cube.", default="yes"),

@@ -58,6 +58,7 @@ def simulate(
     device: options.Device = "cpu",
     out: options.Out,
     overwrite: options.Overwrite = False,
+    resume: options.Resume = False,
     picture: options.Picture = True,
 ) -> None:
     """Simulate histograms of a scene under dead time, and write the cube with a picture of it.
@@ -68,9 +69,9 @@ def simulate(
     with reported():
         began = time.perf_counter()
         png = out.with_suffix(".png")
-        if picture and png.exists() and not overwrite:
+        if picture and png.exists() and not overwrite and not resume:
             raise FileExistsError(f"{png} exists already; give --overwrite, --no-picture or another --out")
-        if out.exists() and not overwrite:
+        if out.exists() and not overwrite and not resume:
             raise FileExistsError(f"{out} exists already; give --overwrite or another --out")
         system = instrument.build(effects)
         view = seen(scene, light, system, in_parts=True)
@@ -99,6 +100,7 @@ def simulate(
                 reflectivity=view.reflectivity,
                 source=view.source,
                 overwrite=overwrite,
+                resume=resume,
                 progress=progress,
                 **chosen,
             )

@@ -24,12 +24,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base import manifest
+from mars_lidar._base import checks, manifest
 from mars_lidar._base.files import FileError, IncompleteFileError, reading
 from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.sample_content import Rendered
+from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.scenes import SceneReader
+from mars_lidar.io.cube import Cube
+from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.scan import Problem
 from mars_lidar.io.store import OnDisk
 from mars_lidar.light.transient import Transient
@@ -112,6 +115,24 @@ class Dataset:
     def scenes(self) -> SceneReader:
         """All that samples show."""
         return SceneReader(self.group["scenes"], self.path)
+
+    def cube(self, sample: int) -> Cube:
+        """One sample as a cube (realizations, H, W, bins), with the light behind it."""
+        number = checks.integer("sample", sample, low=0, high=len(self.seeds) - 1)
+        scene, which, signal, sbr = sample_parts(self.recipe, number)
+        system, shown = self.recipe.systems[which], self.scenes.read(scene)
+        known = ~np.isnan(shown.reflectivity)
+        recipe = Recipe(
+            system=system,
+            flux=shown.flux(system, self.recipe.light, signal, sbr)[:],
+            engine=self.recipe.engine,
+            seed=int(self.seeds[number]),
+            realizations=self.recipe.realizations,
+            depth_m=shown.depth_m,
+            reflectivity=shown.reflectivity if known.any() else None,
+            source=self.scene_names()[scene],
+        )
+        return Cube(histogram=np.asarray(self.histogram[number]), recipe=recipe, version=self.attrs["version"])
 
     def scene_names(self) -> list[str]:
         """Names of all scenes."""

@@ -19,6 +19,7 @@ from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.pulse import Pulse, pulse_from_dict
+from mars_lidar.instrument.units import check_units, period_hint
 
 SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 _STARTS = ("armed", "stationary")
@@ -47,6 +48,11 @@ class System:
     start
         State of the pixel at the start of the exposure: ``"armed"`` (ready at t = 0) or ``"stationary"``
         (warmed up). The two differ by up to half a count in the mean.
+
+    Warns
+    -----
+    UnitWarning
+        A time that is possible, and likely meant in ps or s: a dead time of 75,000 ns, a pulse of 100 ns.
     """
 
     period_ns: float
@@ -68,7 +74,11 @@ class System:
         if not isinstance(self.detector, Detector):
             raise TypeError(f"detector must be a Detector, got {self.detector!r}")
         checks.choice("start", self.start, _STARTS)
-        self.pulse.check(self.period_ns)
+        try:
+            self.pulse.check(self.period_ns)
+        except ValueError as error:
+            hint = period_hint(self.period_ns)
+            raise ValueError(f"{hint}; {error}" if hint else str(error)) from error
         if self.dead_time_periods > _MAX_DEAD_PERIODS:
             raise ValueError(
                 f"dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
@@ -80,6 +90,7 @@ class System:
                 f"electronics_dead_time_ns must be at most {_MAX_DEAD_PERIODS} periods of {self.period_ns:g} ns, "
                 f"got {self.detector.electronics_dead_time_ns:g} ns"
             )
+        check_units(self.period_ns, self.pulse, self.detector)
 
     @property
     def bin_ns(self) -> float:

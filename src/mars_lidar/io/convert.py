@@ -40,6 +40,7 @@ def convert(
     realization: int | None = None,
     period_ns: float | None = None,
     bins: int | None = None,
+    clock_ps: float | None = None,
     overwrite: bool = False,
 ) -> Converted:
     """Write a cube or a photon stream in the format that the target's suffix names.
@@ -56,6 +57,8 @@ def convert(
         Of a cube: this exposure alone, counted from 0 in the file. A ``.mat`` holds no more than one.
     period_ns, bins
         Of a recorded stream: see `mars_lidar.Timestamps.load`.
+    clock_ps
+        Of a stream that becomes a ``.ptu``: see `mars_lidar.Timestamps.save`.
     overwrite
         Replace an existing target.
 
@@ -76,10 +79,10 @@ def convert(
     if old.is_file() and is_stream(old):
         if realization is not None:
             raise ValueError(f"realization is for cubes, and {old} holds photons of one exposure")
-        return _stream(Timestamps.load(old, period_ns=period_ns, bins=bins), old, new, overwrite)
-    for name, value in (("period_ns", period_ns), ("bins", bins)):
+        return _stream(Timestamps.load(old, period_ns=period_ns, bins=bins), old, new, overwrite, clock_ps)
+    for name, value in (("period_ns", period_ns), ("bins", bins), ("clock_ps", clock_ps)):
         if value is not None:
-            raise ValueError(f"{name} is for recorded photon streams, and {old} is none")
+            raise ValueError(f"{name} is for photon streams, and {old} is none")
     with load(old) as cube:
         return _cube(cube, old, new, realization, overwrite)
 
@@ -156,27 +159,30 @@ def _cube(cube: Cube, old: Path, new: Path, realization: int | None, overwrite: 
     return Converted(new, f"cube {n} × {height} × {width} × {bins} (realization, y, x, time)", tuple(lost))
 
 
-def _stream(times: Timestamps, old: Path, new: Path, overwrite: bool) -> Converted:
+def _stream(times: Timestamps, old: Path, new: Path, overwrite: bool, clock_ps: float | None) -> Converted:
     if new.suffix not in STREAM_SUFFIXES:
         raise ValueError(
             f"{old} is a photon stream, which goes into one of {', '.join(STREAM_SUFFIXES)}, not {str(new)!r}"
         )
     lost = []
     if new.suffix != ".npz":
-        unit_ns = resolution_ns(new, times)
+        unit_ns = resolution_ns(new, times, clock_ps)
         lost.append(f"times below {1e3 * unit_ns:.4g} ps (units of {new.suffix} here); cycles and bins are exact")
     if times.system is None:
         lost.append("header entries of the other program that wrote the source, beyond period, detectors and times")
-    times.save(new, overwrite=overwrite)
+    times.save(new, overwrite=overwrite, clock_ps=clock_ps)
     height, width = times.shape
     return Converted(new, f"{len(times):,} photons of {height} × {width} pixels", tuple(lost))
 
 
-def resolution_ns(path: Path, times: Timestamps) -> float:
+def resolution_ns(path: Path, times: Timestamps, clock_ps: float | None = None) -> float:
     """Unit of the times that the format of `path` stores, ns; 0 for .npz, which holds them as they are."""
     if path.suffix == ".npz":
         return 0.0
     from mars_lidar.io.streams import photon_hdf5, ptu_stream
 
-    module = ptu_stream if path.suffix == ".ptu" else photon_hdf5
-    return float(times.period_ns / (times.bins * module.units_per_bin(times.bins)))
+    if path.suffix == ".ptu":
+        units = ptu_stream.units_per_bin(times.bins, times.period_ns, clock_ps)
+    else:
+        units = photon_hdf5.units_per_bin(times.bins)
+    return float(times.period_ns / (times.bins * units))

@@ -20,8 +20,9 @@ from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
 from mars_lidar.engines.options import given
 from mars_lidar.instrument.system import System
-from mars_lidar.io.cube import Cube, check_output, create
+from mars_lidar.io.cube import Cube, check_output, create, load
 from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.zarr_store import ZarrWriter, continue_writer
 from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ def simulate_to(
     reflectivity: ArrayLike | None = None,
     source: str = "",
     overwrite: bool = False,
+    resume: bool = False,
     progress: Progress | bool | None = None,
     **options: Unpack[EngineOptions],
 ) -> Written:
@@ -98,6 +100,9 @@ def simulate_to(
         Free text: where the scene came from.
     overwrite
         Replace an existing file.
+    resume
+        Continue a ``.zarr`` that was left incomplete, to the same bits; of a complete one nothing is made. Everything
+        else must be as it was.
     progress
         Called with (pixel exposures done, in all); True: a bar, or a line every 30 s where there is no terminal.
 
@@ -129,19 +134,29 @@ def simulate_to(
         settings=_settings(engine, chosen),
     )
     target = Path(path)
-    check_output(target, recipe, overwrite=overwrite)
+    if resume and overwrite:
+        raise ValueError("resume and overwrite exclude each other")
+    going_on = resume and target.exists()
+    if not going_on:
+        check_output(target, recipe, overwrite=overwrite)
+    elif target.suffix != ".zarr":
+        raise ValueError(f"resume is for a .zarr, the only format that an interruption leaves, got {str(target)!r}")
     if isinstance(engine, str):  # every pixel, before the blocks one by one
         find_engine(engine, **options).check(flux, system)
     _try_brightest_pixel(recipe, threads, device)
     try:
-        writer = create(target, recipe, overwrite=overwrite)
+        writer = continue_writer(target, recipe) if going_on else create(target, recipe, overwrite=overwrite)
     except OSError as error:
         raise WriteError(error.errno, f"{reason(error)}; nothing was left at {target}") from error
-    registrations = 0
+    if writer is None:
+        return Written(target, int(load(target).registrations or 0), 0.0, 0.0, {})
+    blocks, begun, registrations = list(recipe.blocks(writer.chunks)), 0, 0
+    if isinstance(writer, ZarrWriter) and going_on:
+        begun, registrations = writer.begun(blocks)
     simulate_s = write_s = 0.0
     report: dict[str, float] = {}
     try:
-        for images, rows in recipe.blocks(writer.chunks):
+        for images, rows in blocks[begun:]:
             began = time.perf_counter()
             told: dict[str, float] = {}
             tell = _of_the_whole(progress, recipe, images, rows)

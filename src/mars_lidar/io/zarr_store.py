@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +27,23 @@ _CHUNK_BYTES = 4 * 2**20
 class ZarrWriter(Writer):
     """A store whose attribute ``complete`` is false from its first byte on and true after its last."""
 
-    def __init__(self, path: Path, recipe: Recipe) -> None:
+    def __init__(self, path: Path, recipe: Recipe, group: Any = None) -> None:
         self._path = path
+        self._group: Any = self._new(recipe) if group is None else group
+        self._histogram: Any = self._group["histogram"]
+        self.chunks = self._histogram.chunks
+
+    def _new(self, recipe: Recipe) -> Any:
+        path = self._path
         if path.exists():
             # without its root document the old store is no store: a removal cut short cannot pass for a cube
             (path / "zarr.json").unlink(missing_ok=True)
             shutil.rmtree(path)
         try:
-            self._group = self._create(recipe)
+            return self._create(recipe)
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)  # no counts are lost
             raise
-        self._histogram: Any = self._group["histogram"]
 
     def _create(self, recipe: Recipe) -> Any:
         import zarr
@@ -55,12 +62,11 @@ class ZarrWriter(Writer):
             )
             for rows in v.bands():
                 array[rows] = v.data[rows]
-        self.chunks = recipe.chunks(_CHUNK_BYTES)
         group.create_array(
             "histogram",
             shape=recipe.shape,
             dtype=recipe.dtype,
-            chunks=self.chunks,
+            chunks=recipe.chunks(_CHUNK_BYTES),
             compressors=_compressors(recipe.dtype, "bitshuffle"),
             dimension_names=layout.DIMS,
             attributes={**layout.HISTOGRAM_LABELS},
@@ -79,7 +85,49 @@ class ZarrWriter(Writer):
 
     def abandon(self) -> str:
         """Leave what is there, marked incomplete."""
-        return f"{self._path} is left behind, marked incomplete"
+        return f"{self._path} is left behind, marked incomplete: --resume (resume=True) continues it"
+
+    def begun(self, blocks: Sequence[tuple[slice, slice]]) -> tuple[int, int]:
+        """How many of `blocks` are written, in their order, and the registrations in them.
+
+        The last one with anything in it may be half there, and does not count; chunks without counts are no files.
+        """
+        folder = self._path / "histogram" / "c"
+        last = 0
+        for number, (images, rows) in enumerate(blocks):
+            first, row = images.start // self.chunks[0], rows.start // self.chunks[1]
+            ends = -(-images.stop // self.chunks[0]), -(-rows.stop // self.chunks[1])
+            if any((folder / str(k) / str(y)).exists() for k in range(first, ends[0]) for y in range(row, ends[1])):
+                last = number
+        counts = (int(self._histogram[images, rows].sum(dtype=np.uint64)) for images, rows in blocks[:last])
+        return last, sum(counts)
+
+
+def continue_writer(path: Path, recipe: Recipe) -> ZarrWriter | None:
+    """The writer of a store that was left incomplete; None for a complete one.
+
+    Raises
+    ------
+    ValueError
+        A store of another recipe or version.
+    """
+    import zarr
+
+    if not (path / "zarr.json").is_file():
+        raise ValueError(f"{path} is not a Zarr store: there is nothing to resume")
+    group = zarr.open_group(path, mode="r+")
+    stored, ours = dict(group.attrs), json.loads(json.dumps(layout.attributes(recipe)))
+    for name, value in ours.items():
+        if stored.get(name) != value:
+            raise ValueError(f"{path} was begun with another {name}: {stored.get(name)!r}, now {value!r}; start again")
+    for v in layout.variables(recipe):
+        array: Any = group.get(v.name)
+        same = array is not None and array.shape == v.data.shape
+        if not same or not all(np.array_equal(array[rows], v.data[rows], equal_nan=True) for rows in v.bands()):
+            raise ValueError(f"{path} was begun with another {v.name}; start again with --overwrite (overwrite=True)")
+    if "histogram" not in group:
+        raise ValueError(f"{path} was stopped before its first count; start again with --overwrite (overwrite=True)")
+    return None if stored.get("complete") is True else ZarrWriter(path, recipe, group)
 
 
 def open_writer(path: Path, recipe: Recipe) -> Writer:

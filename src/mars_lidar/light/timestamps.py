@@ -94,8 +94,16 @@ class Timestamps:
         told = self.info.get("system")
         return None if told is None else System.from_dict(told)
 
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+    def save(self, path: str | Path, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
         """Write to a ``.npz`` (exact), ``.ptu`` or ``.h5`` / ``.hdf5`` (Photon-HDF5); see docs/formats.md.
+
+        Parameters
+        ----------
+        path, overwrite
+            The file, and whether to replace one that exists.
+        clock_ps
+            Of a ``.ptu``: least unit of its times; None: as fine as its records can. Programs that make an image of
+            the file have a bin for each unit of the period.
 
         Raises
         ------
@@ -104,7 +112,7 @@ class Timestamps:
         OSError
             `path` exists and `overwrite` is false, or cannot be written.
         """
-        late("io.streams.files:save")(path, self, overwrite=overwrite)
+        late("io.streams.files:save")(path, self, overwrite=overwrite, clock_ps=clock_ps)
 
     @classmethod
     def load(

@@ -97,7 +97,9 @@ def _draw_maps(axes: list[Axes], found: Comparison, colours: dict[str, str]) -> 
         if expected.known.any():
             error = np.sqrt(np.where(expected.variance > 0, expected.variance, np.nan) / len(scene.seconds))
             values = (expected.on_grid(scene.mean_counts) - expected.mean) / error
-            label, limit = "deviation (standard errors)", (-_SCORES, _SCORES)
+            most = float(np.nanpercentile(np.abs(values), 99)) if np.isfinite(values).any() else 0.0
+            most = most if most > 2.0 * _SCORES else _SCORES  # an engine that is off everywhere has a scale of its own
+            label, limit = "standard errors", (-most, most)
         else:
             values = scene.mean_counts - found.scenes[found.against].mean_counts
             most = float(np.abs(values).max()) or 1.0

@@ -44,6 +44,7 @@ def draw_points(
     for column, (pixel, row) in enumerate(rows.items()):
         if known is not None and math.isfinite(known.get(pixel, math.nan)):
             ax.plot([column - 0.45, column + 0.45], [known[pixel]] * 2, color=INK, lw=0.9, ls=(0, (4, 1.5)))
+        placed = {True: 0, False: 0}  # off the scale, above and below
         for k, (engine, found) in enumerate(row.items()):
             at = column + (k - 0.5 * (len(engines) - 1)) * step
             colour = colours[engine]
@@ -58,7 +59,8 @@ def draw_points(
                 edge, within = (0.96, "top") if above else (0.04, "bottom")
                 frame = ax.get_xaxis_transform()
                 ax.plot(at, edge, "^" if above else "v", ms=4, color=colour, transform=frame)
-                away = 5 + 7 * (k % 2)  # neighbours side by side
+                away = 5 + 7 * placed[above]  # one below the other: neighbours are narrower than their numbers
+                placed[above] += 1
                 ax.annotate(
                     f"{found.value:.2g}",
                     (at, edge),

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from mars_lidar.io import Cube
 
 _Pixels = dict[str, tuple[int, int]]
-_GAP_INCHES = 0.3
+_GAP_INCHES, _BAR_INCHES = 0.3, 0.86  # below a map, for the title of the next, and beside it, for its colour bar
+_LANDSCAPE = 0.62  # height over width, below which the maps stand in a row
+_WIDEST_INCHES, _NARROW_INCHES = 2.45, 1.7  # of a map; a narrower one has a short title
 
 
 def overview(
@@ -60,16 +62,36 @@ def overview(
         from matplotlib.figure import Figure
 
         width, height = 13.0, max(6.0, 1.75 * len(chosen) + 0.75)
+        aspect = cube.shape[1] / cube.shape[2]
+        across = aspect < _LANDSCAPE
+        if across:  # the maps in a row above the histograms
+            each = width / 4 - _BAR_INCHES
+            image = each * aspect
+            height += image + _GAP_INCHES - 0.5
+            rows, columns, first = 1, 4, width
+        else:  # two rows of two beside them, as high as the figure, and no wider than they need
+            image = min(0.5 * (height - 0.62 - _GAP_INCHES - 0.12), _WIDEST_INCHES * aspect)
+            each = image / aspect
+            rows, columns, first = 2, 2, 2.0 * (each + _BAR_INCHES)
         figure = Figure(figsize=(width, height), dpi=DPI)
         below, above = 0.46 / height, 1.0 - 0.62 / height
-        left, right = 0.012, 0.446
-        # two rows of images right below each other, whatever their aspect
-        image = (right - left) * width / 2.3 * cube.shape[1] / cube.shape[2]
-        bottom = max(0.02, above - (2.0 * image + _GAP_INCHES) / height)
-        box = {"left": left, "right": right, "bottom": bottom, "top": above}
-        maps = figure.add_gridspec(2, 2, **box, wspace=0.3, hspace=_hspace(height * (above - bottom)))
-        _draw_maps(maps.subplots(), cube, totals, peaks_m, chosen)
-        _draw_pixels(figure, (0.535, 0.99, below, above), cube, realization, chosen)
+        left, right = 0.012, (first - _BAR_INCHES) / width + 0.012
+        bottom = above - (rows * image + (rows - 1) * _GAP_INCHES) / height
+        maps = figure.add_gridspec(
+            rows,
+            columns,
+            left=left,
+            right=min(right, 1.0 - _BAR_INCHES / width),
+            bottom=bottom,
+            top=above,
+            wspace=_BAR_INCHES / each,
+            hspace=_GAP_INCHES / image,
+        )
+        _draw_maps(maps.subplots(), cube, totals, peaks_m, chosen, each < _NARROW_INCHES)
+        if across:
+            _draw_pixels(figure, (0.055, 0.99, below, bottom - 0.5 / height), cube, realization, chosen)
+        else:
+            _draw_pixels(figure, ((first + 0.8) / width, 0.99, below, above), cube, realization, chosen)
         headline = _headline(cube, realization) if title is None else title
         figure.text(0.012, 1.0 - 0.2 / height, headline, fontsize=9.0, va="center")
     return figure
@@ -103,31 +125,29 @@ def map_image(values: NDArray[Any], label: str, *, cmap: str = "viridis") -> Fig
     return figure
 
 
-def _hspace(inches: float) -> float:
-    """The gap between two rows of images of `inches` in all, in heights of a row."""
-    return _GAP_INCHES / max(0.5 * (inches - _GAP_INCHES), 0.1)
-
-
-def _draw_maps(axes: Any, cube: Cube, totals: NDArray[np.int64], peaks_m: NDArray[np.float64], pixels: _Pixels) -> None:
-    depth = cube.depth_m
+def _draw_maps(
+    axes: Any, cube: Cube, totals: NDArray[np.int64], peaks_m: NDArray[np.float64], pixels: _Pixels, short: bool
+) -> None:
+    depth, axes = cube.depth_m, np.asarray(axes).ravel()
     known, fit = bool(np.isfinite(depth).any()), ", fitted" if cube.engine == MEASURED else ""
     limits = _limits(depth if known else peaks_m)
     if known:
-        _draw_map(axes[0, 0], depth, "depth (m)", "viridis", limits, f"Depth{fit}")
+        _draw_map(axes[0], depth, "depth (m)", "viridis", limits, f"Depth{fit}")
     else:  # a waveform has no depth: its background stands here
-        _draw_map(axes[0, 0], cube.flux.background, "photons per period", "viridis", None, "Background")
+        _draw_map(axes[0], cube.flux.background, "photons per period", "viridis", None, "Background")
     if cube.reflectivity is not None:
-        _draw_map(axes[0, 1], cube.reflectivity, "reflectivity", "gray", None, "Reflectivity")
+        _draw_map(axes[1], cube.reflectivity, "reflectivity", "gray", None, "Reflectivity")
     else:
         shown = cube.flux.signal
-        _draw_map(axes[0, 1], shown, "photons per period", "gray", _limits(shown) if fit else None, f"Signal{fit}")
-    _draw_map(axes[1, 0], totals, "registrations", "magma", _limits(totals), "Total counts")
+        _draw_map(axes[1], shown, "photons per period", "gray", _limits(shown) if fit else None, f"Signal{fit}")
+    _draw_map(axes[2], totals, "registrations", "magma", _limits(totals), "Total counts")
     note = "Peak-bin depth"
     error = np.abs(depth_error_m(cube, peaks_m))
     if np.isfinite(error).any():
-        note += f" (median {'distance' if fit else 'error'} {_metres(float(np.nanmedian(error)))})"
-    _draw_map(axes[1, 1], peaks_m, "depth (m)", "viridis", limits, note)
-    for ax in axes.flat:
+        median = _metres(float(np.nanmedian(error)))
+        note = f"Peak bin, off {median}" if short else f"{note} (median {'distance' if fit else 'error'} {median})"
+    _draw_map(axes[3], peaks_m, "depth (m)", "viridis", limits, note)
+    for ax in axes:
         for (y, x), colour in zip(pixels.values(), COLOURS, strict=False):
             ax.plot(x, y, "o", ms=6, mfc="none", mec="white", mew=2.2)
             ax.plot(x, y, "o", ms=6, mfc="none", mec=colour, mew=1.1)
@@ -183,7 +203,7 @@ def _draw_pixels(
         draw_pixel(axes[row, 0], axes[row, 1], cube, realization, pixel, colour, name)
     for ax in axes[:, 0]:
         ax.set_ylabel("counts per bin")
-        ax.yaxis.set_label_coords(-0.075, 0.5)
+        ax.yaxis.set_label_coords(-0.45 / (ax.get_position().width * figure.get_figwidth()), 0.5)
     axes[-1, 0].set_xlabel("time in the laser period (ns)")
     axes[-1, 1].set_xlabel("around the return (ns)")
     spacing = {"handlelength": 1.6, "borderaxespad": 0.1, "labelspacing": 0.25}

@@ -76,8 +76,16 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
                     rmse = _metres(float(np.sqrt(np.nanmean(error**2))))
                     note = f"error: RMSE {rmse}, median {_metres(float(np.nanmedian(np.abs(error))))}"
                 _draw_map(row[1], 1e3 * error, "depth error (mm)", "RdBu_r", (-1e3 * scale, 1e3 * scale), note)
-            _draw_map(row[-1], each["share"], unit, "gray", share_limits, what)
+            own = known and _elsewhere(each["share"], truth)
+            limits = _limits(each["share"]) if own else share_limits
+            _draw_map(row[-1], each["share"], unit, "gray", limits, f"{what}, a scale of its own" if own else what)
     return figure
+
+
+def _elsewhere(share: Any, truth: Any) -> bool:
+    """Whether a map would be black or white on the scale of the truth, as of methods that know no dead time."""
+    lit = (share > 0) & (truth > 0)
+    return bool(lit.any()) and not 0.5 <= float(np.median(share[lit] / truth[lit])) <= 2.0
 
 
 def _maps(found: Reconstruction, what: str, realization: int) -> dict[str, Any]:

@@ -27,7 +27,7 @@ STREAM_SUFFIXES = (".npz", ".ptu", ".h5", ".hdf5")
 READ_SUFFIXES = (*STREAM_SUFFIXES, ".mat")
 
 
-def save(path: str | Path, times: Timestamps, *, overwrite: bool = False) -> None:
+def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
     """Write timestamps; see `Timestamps.save`."""
     if not isinstance(times, Timestamps):
         raise TypeError(f"times must be Timestamps, got {type(times).__name__}")
@@ -39,13 +39,18 @@ def save(path: str | Path, times: Timestamps, *, overwrite: bool = False) -> Non
             f"times must tell the laser period and the cycles of the exposure to be written, "
             f"got period_ns {times.period_ns} and cycles {times.cycles}"
         )
-    check_output(target, overwrite=overwrite)
+    check_output(target, overwrite=overwrite, clock_ps=clock_ps)
+    more = {} if clock_ps is None else {"clock_ps": clock_ps}
     with TemporarySibling(target).writing() as unfinished:
-        write(unfinished, times)
+        write(unfinished, times, **more)
 
 
-def check_output(path: str | Path, *, overwrite: bool = False) -> None:
+def check_output(path: str | Path, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
     """Raise what `save` would raise because of the place or the suffix, without touching anything."""
+    if clock_ps is not None:
+        checks.real("clock_ps", clock_ps, low=0.0, strict_low=True)
+        if Path(path).suffix != ".ptu":
+            raise ValueError(f"clock_ps belongs to a .ptu, got {str(path)!r}")
     module = _module(Path(path))
     if module is not None:
         module.check()

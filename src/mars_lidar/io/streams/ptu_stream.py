@@ -33,8 +33,12 @@ def check() -> None:
     needed("ptufile", "a .ptu")
 
 
-def write(path: Path, times: Timestamps) -> None:
-    """Write a stream; the caller renames the file when it is whole."""
+def write(path: Path, times: Timestamps, clock_ps: float | None = None) -> None:
+    """Write a stream; the caller renames the file when it is whole.
+
+    `clock_ps`: least unit of the fine time. Programs that make images of the file have a bin for each of its codes:
+    at the finest one, 32768 a period, an image of 128 x 128 pixels takes 1 GB there.
+    """
     from mars_lidar.io.streams.attributes import attributes
 
     ptufile = needed("ptufile", "a .ptu")
@@ -43,7 +47,7 @@ def write(path: Path, times: Timestamps) -> None:
     height, width = times.shape
     if not times.cycles < 2**31:
         raise ValueError(f"cycles must be below 2^31 in a .ptu, got {times.cycles}")
-    fine = units_per_bin(times.bins)
+    fine = units_per_bin(times.bins, times.period_ns, clock_ps)
     period_s = 1e-9 * times.period_ns
     exposure_s = period_s * times.cycles
     attrs = {"kind": KIND, **attributes(times)}
@@ -111,16 +115,17 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     pixel, cycle = np.divmod(photons["time"].astype(np.int64), cycles)
     if pixel.size and pixel.max() >= height * width:
         raise ValueError(f"{path} is damaged: it has photons after the last of {height} x {width} pixels")
-    fine = units_per_bin(number)
+    fine = max(1, round(float(attrs["period_ns"]) / (number * unit_ns)))
     dtime = photons["dtime"].astype(np.int64)
     times_ns = (cycle + (dtime + 0.5) / (number * fine)) * float(attrs["period_ns"])
     counts = np.bincount(pixel, minlength=height * width)
     return from_attributes(attrs, times_ns, cycle, dtime // fine, counts)
 
 
-def units_per_bin(bins: int) -> int:
-    """Units of the fine time in a histogram bin."""
-    return ptu_header.MAX_BINS // bins
+def units_per_bin(bins: int, period_ns: float = 0.0, clock_ps: float | None = None) -> int:
+    """Units of the fine time in a histogram bin: as many as a record has room for, or of at least `clock_ps` each."""
+    most = ptu_header.MAX_BINS // bins
+    return most if clock_ps is None else min(most, max(1, int(1e3 * period_ns / bins / clock_ps * (1 + 1e-9))))
 
 
 def is_stream(path: Path) -> bool:

@@ -1,0 +1,67 @@
+"""A look at the units of a system: times in ps or s where ns are meant, which no other check can know."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, GaussianPulse, Pulse
+
+
+class UnitWarning(UserWarning):
+    """A value that is possible, and likely meant in another unit."""
+
+
+# from what on a time is odd in ns, and in laser periods, and from what on nobody types it: such values are meant
+_PULSE, _DEAD = (41.0, 0.31, 2e4), (25_000.0, 25.0, 1e6)
+_LONGEST_NS = 1e-6  # of a time in seconds that was taken for ns: a second is the longest anybody has
+_ODD_DELAY = 100.0  # periods
+_DIGITS = 3  # what people type; a computed value has more
+
+
+def period_hint(period_ns: float) -> str:
+    """What a period was likely meant to be, or nothing."""
+    if period_ns < 1e-3:  # 1 ps
+        return f"period_ns={period_ns:g} is {period_ns:g} ns: {1e9 * period_ns:.4g} ns, if it was given in seconds"
+    return ""
+
+
+def check_units(period: float, pulse: Pulse, detector: Detector) -> None:
+    """Warn of times that are 1000 or 1e9 times what is usual."""
+    if hint := period_hint(period):
+        _warn(hint)
+    told = [
+        ("dead_time_ns", detector.dead_time_ns, _DEAD),
+        ("electronics_dead_time_ns", detector.electronics_dead_time_ns, _DEAD),
+    ]
+    if isinstance(pulse, GaussianPulse):
+        told.append(("sigma_ns", pulse.sigma_ns, _PULSE))
+    if any(value >= meant for _, value, (_, _, meant) in told):
+        return  # nobody's laboratory: the far end of the domain, in units of its own
+    for name, value, (odd_ns, odd_periods, _) in told:
+        if 0.0 < value < _LONGEST_NS and value < 1e-6 * period and not math.log10(value).is_integer():  # a limit, then
+            likely, unit = 1e9 * value, "seconds"
+        elif odd_ns <= value and odd_periods * period <= value != period and _typed(name, value):
+            likely, unit = 1e-3 * value, "picoseconds"
+        else:
+            continue
+        what = f"{name}={value:g} is {value / period:.3g} laser periods of {period:.4g} ns"
+        _warn(f"{what}: if it was meant in {unit}, give {likely:g}, in ns")
+
+
+def check_delays(median_ns: float, period_ns: float) -> None:
+    """Warn of returns that come many periods after their pulse."""
+    if _ODD_DELAY * period_ns <= abs(median_ns) < 1e7:
+        what = f"delay_ns has a median of {median_ns:g}, {median_ns / period_ns:.3g} laser periods, and wraps into one"
+        _warn(f"{what}: if it was meant in picoseconds, divide it by 1000")
+
+
+def _typed(name: str, value: float) -> bool:
+    """Whether somebody may have typed it, perhaps as the width at half maximum."""
+    values = [value, FWHM_PER_SIGMA * value] if name == "sigma_ns" else [value]
+    return any(abs(float(f"{one:.{_DIGITS}g}") - one) < 1e-9 * one for one in values)
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, UnitWarning, stacklevel=5)  # who made the system, or called simulate

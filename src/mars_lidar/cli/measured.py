@@ -7,11 +7,13 @@ from typing import Annotated
 
 import typer
 
+from mars_lidar._base import checks
 from mars_lidar.cli.console import FAILED, check_picture, reported, save_picture, table
 from mars_lidar.cli.effect_options import StreamEffects
 from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
 from mars_lidar.cli.options import _OUTPUT, _option
 from mars_lidar.cli.stream_options import STREAM, DeadTimeNs, FitOptions, StreamOptions
+from mars_lidar.instrument.system import MAX_CYCLES
 
 _RECIPE = "docs/calibration.md has the whole recipe."
 INSPECT_EPILOG = "\n\n".join(
@@ -109,11 +111,22 @@ def calibrate(
     light: FitOptions,
     effects: StreamEffects,
     out: SystemOut = None,
+    cycles: Annotated[
+        int | None,
+        _option(
+            "--cycles",
+            panel=_OUTPUT,
+            help="Laser periods of an exposure of the calibrated system.",
+            default="those of the stream, at most 1e8",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Signal, background and delay of a photon stream, by maximum likelihood, with standard errors."""
     with reported():
         _check_system_out(out, light.free, overwrite)
+        if cycles is not None:
+            checks.integer("--cycles", cycles, low=1, high=MAX_CYCLES)
         times, rows = source.load(stream)
         found, detector = light.calibrate(times, effects)
         table(rows + clock_rows(found) + light_rows(found, detector))
@@ -121,8 +134,9 @@ def calibrate(
             from mars_lidar.calibrate.prediction import system_of
 
             bins = times.bins if times.bins <= 2**20 else 1024
-            system_of(found, detector, max(times.cycles, 1), bins).replace(start="armed").save(out)
-            table([("wrote", str(out))])
+            exposure = min(max(times.cycles, 1), MAX_CYCLES) if cycles is None else cycles
+            system_of(found, detector, exposure, bins).replace(start="armed").save(out)
+            table([("wrote", f"{out}, exposures of {exposure:,} laser periods")])
 
 
 def validate(

@@ -137,6 +137,7 @@ class FitOptions:
         from mars_lidar.cli.system_options import with_given
         from mars_lidar.instrument.detector import Detector
         from mars_lidar.instrument.pulse import GaussianPulse
+        from mars_lidar.instrument.system import MAX_CYCLES
         from mars_lidar.instrument.system import System as SystemOf
 
         known = times.system if self.system is None else SystemOf.load(self.system)
@@ -157,7 +158,7 @@ class FitOptions:
             return known.replace(detector=detector, pulse=pulse)
         return SystemOf(
             period_ns=times.period_ns,
-            cycles=max(times.cycles, 1),
+            cycles=min(max(times.cycles, 1), MAX_CYCLES),
             bins=times.bins,
             pulse=pulse,
             detector=detector,

@@ -27,6 +27,7 @@ NAMES = {  # of every command that a committed report prints
     "detectors",
     "domain",
     "downstream",
+    "downstream-baselines",
     "effects",
     "hardware",
     "joint",

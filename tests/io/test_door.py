@@ -209,3 +209,24 @@ def test_damaged_files_in_a_folder_are_left_out_with_their_reason(tmp_path, fold
     done = ml.generate(recipe, tmp_path / "s.zarr")
     assert done.shape[0] == 1
     assert sorted({one.path.name for one in done.problems}) == names
+
+
+def test_heaps_and_markers_over_which_libraries_do_not_end_are_refused(tmp_path):
+    """Found by tests/fuzz: HDF5 loops over a heap of texts whose free space has size 0, ptufile raises 2 to a marker."""
+    flux = ml.Flux(np.full((3, 4), 0.5), 0.1, 40.0)
+    io.simulate_to(tmp_path / "cube.h5", flux, SYSTEM)
+    content = bytearray((tmp_path / "cube.h5").read_bytes())
+    heap = content.find(b"GCOL")
+    content[heap + 16 : heap + 64] = bytes(48)
+    (tmp_path / "cube.h5").write_bytes(content)
+    for read in (io.load, ml.Timestamps.load, io.read_transient):
+        with pytest.raises(FileError, match=r"cube\.h5: is damaged: the heap of its texts"):
+            read(tmp_path / "cube.h5")
+    pytest.importorskip("ptufile")
+    io.simulate_to(tmp_path / "cube.ptu", flux, SYSTEM)
+    content = bytearray((tmp_path / "cube.ptu").read_bytes())
+    place = content.find(b"ImgHdr_LineStart") + 40
+    content[place : place + 8] = (2**32).to_bytes(8, "little")
+    (tmp_path / "cube.ptu").write_bytes(content)
+    with pytest.raises(FileError, match=r"cube\.ptu is damaged: ImgHdr_LineStart"):
+        io.load(tmp_path / "cube.ptu")

@@ -149,8 +149,13 @@ def _together(values: dict[str, Any], names: str) -> dict[str, Any] | None:
 
 def read_array(option: str, file: Path) -> Any:
     """The array of a .npy file that `option` names."""
+    import numpy as np
+
     from mars_lidar._base.files import read_npy
 
     if file.suffix != ".npy":
         raise ValueError(f"{option} must be a 1-D .npy array, got {str(file)!r}")
-    return read_npy(file)
+    values = read_npy(file)
+    if values.ndim != 1 or values.dtype.kind not in "fiu" or not (np.isfinite(values) & (values >= 0)).all():
+        raise ValueError(f"{file}: {option} must be finite numbers >= 0, (n,), got {values.dtype} {values.shape}")
+    return values

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import reading
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import blosc, create_list, create_maps, create_texts
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
@@ -144,11 +145,16 @@ class SceneReader:
     """Scenes by their number; several threads may read."""
 
     def __init__(self, group: Any, path: Path) -> None:
+        self._path = path
         self._group = {name: OnDisk(array, path) for name, array in group.arrays()}
         self._block: tuple[int, tuple[NDArray[np.float64], ...] | None] = (0, None)
 
     def read(self, number: int) -> Shown:
         """A scene as it was read from its source; rendered light stays on disk."""
+        with reading(self._path, "scenes of a dataset"):
+            return self._shown(number)
+
+    def _shown(self, number: int) -> Shown:
         depth, reflectivity, background = self._first_layer(number)
         told = self.kind(number)
         if "transient" in told:

@@ -89,17 +89,17 @@ class Dataset:
     @cached_property
     def histogram(self) -> Any:
         """The counts, read when indexed."""
-        return OnDisk(with_zeros(self.group["histogram"]), self.path)
+        return self._array("histogram")
 
     @cached_property
     def maps(self) -> dict[str, Any]:
         """The arrays (sample, y, x)."""
-        return {name: OnDisk(with_zeros(self.group[name]), self.path) for name in MAPS}
+        return {name: self._array(name) for name in MAPS}
 
     @cached_property
     def seeds(self) -> NDArray[np.uint64]:
         """Seed of each sample."""
-        return np.asarray(OnDisk(self.group["seed"], self.path))
+        return np.asarray(self._array("seed"))
 
     @cached_property
     def problems(self) -> list[Problem]:
@@ -114,7 +114,12 @@ class Dataset:
     @cached_property
     def scenes(self) -> SceneReader:
         """All that samples show."""
-        return SceneReader(self.group["scenes"], self.path)
+        with reading(self.path, "scenes of a dataset"):
+            return SceneReader(self.group["scenes"], self.path)
+
+    def _array(self, name: str) -> OnDisk:
+        with reading(self.path, "a dataset of mars-lidar"):
+            return OnDisk(with_zeros(self.group[name]), self.path)
 
     def cube(self, sample: int) -> Cube:
         """One sample as a cube (realizations, H, W, bins), with the light behind it."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import TemporarySibling, whole
+from mars_lidar._base.files import TemporarySibling, check_heaps, whole
 from mars_lidar._base.hdf5 import ForgivingFile
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
@@ -101,6 +101,7 @@ def open_store(path: Path) -> OpenedStore:
     """Open a file for reading; chunks are read when the histogram is indexed."""
     import h5py
 
+    check_heaps(path)
     file = h5py.File(path, "r", rdcc_nbytes=32 * _CHUNK_BYTES)
     try:
         attrs = {name: _plain(value) for name, value in file.attrs.items()}

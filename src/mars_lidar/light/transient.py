@@ -173,7 +173,7 @@ class Transient:
         number = checks.integer("parts", fitting if parts is None else parts, low=1, high=_MAX_PARTS)
         lit = self.totals[self.totals > 0]
         if lit.size == 0:
-            raise ValueError("values must have light in some pixel, got none")
+            raise ValueError(f"{self._named}values must have light in some pixel, got none")
         mean = float(lit.mean())
         scale = signal / mean if signal is not None else float(photons_per_unit or 0.0)
         dark = dark_counts_per_s * 1e-9 * system.period_ns / system.detector.detection_efficiency
@@ -236,17 +236,24 @@ class Transient:
         background = np.full(self.shape, first.info["mean_background"])
         return StoredFlux(scale * self.totals, background, first.waveform.shape[-1], make, first.info)
 
+    @property
+    def _named(self) -> str:
+        """Begins errors of values, which are read long after their file was opened."""
+        return f"{self.source}: " if self.source else ""
+
     def rows(self, rows: slice) -> FloatArray:
         """Light of some rows (rows, W, T), checked."""
         values = np.asarray(self.values[rows])
         if values.dtype.kind not in "fiu":
-            raise TypeError(f"values must be real numbers, got dtype {values.dtype}")
+            raise TypeError(f"{self._named}values must be real numbers, got dtype {values.dtype}")
         light = values.astype(np.float64)
         wrong = ~((light >= 0.0) & (light < np.inf))
         if wrong.any():
             y, x, k = (int(n) for n in np.argwhere(wrong)[0])
             place = (y + rows.start, x, k)
-            raise ValueError(f"values must be finite and >= 0, got {light[y, x, k]} at (y, x, bin) {place}")
+            raise ValueError(
+                f"{self._named}values must be finite and >= 0, got {light[y, x, k]} at (y, x, bin) {place}"
+            )
         return light
 
     def _on_period(self, light: FloatArray, period_ns: float, number: int) -> FloatArray:

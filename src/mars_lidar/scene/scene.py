@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.files import reading
 from mars_lidar._base.late import late
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
 from mars_lidar._base.types import FloatArray
@@ -255,7 +256,8 @@ class Scene:
         read = late("io.rgbd:read_rgbd")(
             depth_path, image_path, depth_unit_m=depth_unit_m, focal_px=focal_px, index=index
         )
-        scene = cls(*read)
+        with reading(depth_path, "a scene"):
+            scene = cls(*read)
         return scene if size is None else scene.resize(size)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import check_claim, reading
+from mars_lidar._base.files import check_claim, open_hdf5
 from mars_lidar.io.rgbd.pixels import describe
 
 
@@ -40,7 +40,7 @@ def read_frame(path: Path, index: Any) -> tuple[NDArray[Any], NDArray[Any]]:
 def _opened(path: Path) -> Iterator[Any]:
     import h5py
 
-    with reading(path, "NYUv2's labelled .mat, of MATLAB v7.3"), h5py.File(path, "r") as file:
+    with open_hdf5(path, "NYUv2's labelled .mat, of MATLAB v7.3") as file:
         for name in ("depths", "images"):
             if not isinstance(file.get(name), h5py.Dataset):
                 raise ValueError(f"{path}: must hold 'depths' and 'images' as NYUv2 does, got {', '.join(file)}")

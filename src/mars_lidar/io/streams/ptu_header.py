@@ -80,6 +80,11 @@ def opened(path: Path) -> Any:
         raise ValueError(f"{path} is not a PTU file: it starts with {magic!r}, not {_MAGIC!r}")
     with reading(path, "a PTU file"):
         ptu = ptufile.PtuFile(path, trimdims="")
+    for name in ("ImgHdr_LineStart", "ImgHdr_LineStop", "ImgHdr_Frame"):
+        marker = ptu.tags.get(name)
+        if marker is not None and not (isinstance(marker, int) and 0 <= marker <= 32):  # ptufile takes 2 to its power
+            ptu.close()
+            raise ValueError(f"{path} is damaged: {name} must be a marker of at most 32, got {marker!r}")
     stored, told = (path.stat().st_size - ptu.record_offset) // 4, ptu.tags.get("TTResult_NumberOfRecords", 0)
     if told > stored:
         ptu.close()

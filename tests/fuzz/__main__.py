@@ -1,0 +1,52 @@
+"""Hours of it: ``python -m tests.fuzz --examples 2000``; a table of counts, and every bad input kept beside it."""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+from tests.fuzz.formats import make
+from tests.fuzz.run import BAD, fuzz
+from tests.fuzz.server import Server
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--examples", type=int, default=500, help="of each format")
+parser.add_argument("--seed", type=int, default=1)
+parser.add_argument("--only", default="", help="names that contain this")
+parser.add_argument("--keep", type=Path, default=Path("fuzz_bad"), help="folder for the inputs that fared badly")
+given = parser.parse_args()
+kinds = ("read", "refused", *BAD)
+total: collections.Counter[str] = collections.Counter()
+began = time.monotonic()
+with tempfile.TemporaryDirectory() as folder:
+    good = Path(folder) / "good"
+    good.mkdir()
+    names = [name for name in make(good) if given.only in name]
+    server = Server()
+    print(f"{'':22}" + "".join(f"{kind:>9}" for kind in kinds), flush=True)
+    for name in names:
+        counts: collections.Counter[str] = collections.Counter()
+        seen: collections.Counter[str] = collections.Counter()
+
+        def tell(found: dict, path: Path, name=name, counts=counts, seen=seen) -> None:
+            counts[found["kind"]] += 1
+            if found["kind"] in BAD:
+                label = found["told"][:60]
+                seen[label] += 1
+                if seen[label] <= 2:
+                    kept = given.keep / f"{given.seed}_{sum(counts.values())}_{name.replace('/', '_')}"
+                    given.keep.mkdir(parents=True, exist_ok=True)
+                    (shutil.copytree if path.is_dir() else shutil.copy)(path, kept)
+                    print(f"  {found['kind']}: {kept}: {found['told'][:300]}", flush=True)
+
+        fuzz(name, good, Path(folder), server, given.examples, given.seed, tell)
+        print(f"{name:22}" + "".join(f"{counts[kind]:9}" for kind in kinds), flush=True)
+        total += counts
+    print(f"{'all ' + str(sum(total.values())):22}" + "".join(f"{total[kind]:9}" for kind in kinds))
+    print(f"{time.monotonic() - began:.0f} s")
+    server.close()
+raise SystemExit(1 if any(total[kind] for kind in BAD) else 0)

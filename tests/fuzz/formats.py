@@ -1,0 +1,171 @@
+"""A small good file of every format, and what reads all of it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.cli.pulse_options import _measured
+from mars_lidar.dataset import DatasetRecipe, open_dataset, read_sparse
+from mars_lidar.dataset.view import read_view
+from mars_lidar.io.foreign import foreign_cube
+from mars_lidar.io.maps import load_maps, save_maps
+from mars_lidar.io.rgbd.layered import read_layers
+from mars_lidar.io.transient_truth import read_truth
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
+)
+
+
+def _cube(path: Path) -> None:
+    with io.load(path) as cube:
+        np.asarray(cube.histogram)
+
+
+def _dataset(path: Path) -> None:
+    stored = open_dataset(path)
+    for array in (stored.histogram, *stored.maps.values()):
+        np.asarray(array)
+    read_sparse(stored, 0)
+    for number in range(len(stored.scene_names())):
+        stored.scene(number)
+    _ = stored.seeds
+
+
+def _light(path: Path) -> None:
+    light = io.read_transient(path, bin_ns=1.0 if path.suffix == ".npy" else None)
+    read_truth(path, light.shape)
+    light.flux(SYSTEM, signal=0.5, sbr=2.0)
+
+
+def _stream(path: Path) -> None:
+    given = {"period_ns": 100.0, "unit_ns": 1.0} if path.name.startswith("bare") else {}
+    ml.Timestamps.load(path, **given).histogram()
+
+
+def _folder(path: Path) -> None:
+    """Nothing in a folder may stop its scan; a manifest that is damaged is an argument."""
+    io.scan(path.parent)
+
+
+READERS: dict[str, Callable[[Path], Any]] = {
+    **dict.fromkeys(["cube.zarr", "cube.h5", "cube.npz", "cube.mat", "cube.ptu"], _cube),
+    "set.zarr": _dataset,
+    "read.mat": io.read_mat,
+    **dict.fromkeys(["photons.npz", "photons.h5", "photons.ptu", "bare.mat", "bare73.mat", "bare.npz"], _stream),
+    **dict.fromkeys(["light.npy", "light.npz", "light.h5", "light.mat", "light73.mat", "tal.hdf5"], _light),
+    **dict.fromkeys(["maps.zarr", "maps.h5", "maps.npz"], load_maps),
+    "table.h5": ml.Table.load,
+    **dict.fromkeys(["depth.png", "depth.tif", "depth.npy", "depth.npz", "depth.pfm", "depth.exr"], ml.Scene.from_rgbd),
+    "layers.npz": read_layers,
+    "nyu.mat": lambda path: ml.Scene.from_rgbd(path, index=1),
+    "art/dmin.txt": lambda path: ml.Scene.from_rgbd(path.parent),
+    "art/disp1.png": lambda path: ml.Scene.from_rgbd(path.parent),
+    "bike/calib.txt": lambda path: ml.Scene.from_rgbd(path.parent),
+    "folder/a.npz": _folder,
+    "folder/nyu.mat": _folder,
+    "listed/manifest.csv": _folder,
+    "system.yaml": ml.System.load,
+    "system.json": ml.System.load,
+    "recipe.yaml": DatasetRecipe.load,
+    "scene.yaml": lambda path: read_view(path, SYSTEM),
+    **dict.fromkeys(["counts.csv", "counts.npy", "counts.h5", "counts.mat"], lambda path: foreign_cube(path, SYSTEM)),
+    "pulse.npy": lambda path: _measured(path, 0.1, "peak"),
+}
+LEAVES_OUT = ("folder/a.npz", "folder/nyu.mat")  # never an error: what is damaged is left out
+
+
+def make(folder: Path) -> list[str]:
+    """Write them all; the names of those whose libraries are here."""
+    import h5py
+    from PIL import Image
+    from scipy.io import savemat
+
+    flux = ml.Flux(np.linspace(0.1, 2.0, 12).reshape(3, 4), 0.1, 40.0)
+    for suffix in (".zarr", ".h5", ".npz", ".mat", ".ptu"):
+        io.simulate_to(folder / f"cube{suffix}", flux, SYSTEM)
+    shutil.copy(folder / "cube.mat", folder / "read.mat")
+    recipe = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": [0.5, 1.0]}}
+    ml.generate(recipe | {"store": {"layout": "sparse"}}, folder / "set.zarr")
+    times = ml.simulate_timestamps(flux, SYSTEM)
+    for suffix in (".npz", ".h5", ".ptu"):
+        times.save(folder / f"photons{suffix}")
+    one = np.sort(np.random.default_rng(1).random(300) * 5e4)
+    savemat(folder / "bare.mat", {"t_ns": one})
+    np.savez_compressed(folder / "bare.npz", t_ns=one)
+    with h5py.File(folder / "bare73.mat", "w") as file:
+        file["a"], file["b"] = one[:100], one[100:]
+        cells = file.create_dataset("t_ns", (2, 1), h5py.ref_dtype)
+        cells[0, 0], cells[1, 0] = file["a"].ref, file["b"].ref
+    light = np.random.default_rng(2).random((3, 4, 50))
+    truth = {"depth": np.full((3, 4), 2.0), "reflectivity": np.full((3, 4), 0.5)}
+    np.save(folder / "light.npy", light)
+    np.savez_compressed(folder / "light.npz", transient=light, bin_ns=1.0, start_ns=3.0, **truth)
+    savemat(folder / "light.mat", {"transient": light, "bin_ns": 1.0, "start_ns": 3.0, **truth}, do_compression=True)
+    with h5py.File(folder / "light.h5", "w") as file:
+        data = file.create_dataset("transient", data=light, chunks=(1, 4, 50), compression="gzip", shuffle=True)
+        data.attrs.update({"bin_ns": 1.0, "start_ns": 3.0})
+        file["depth"] = truth["depth"]
+    with h5py.File(folder / "light73.mat", "w") as file:
+        file["transient"], file["bin_ns"] = light.transpose(2, 1, 0), [[1.0]]
+    with h5py.File(folder / "tal.hdf5", "w") as file:
+        file["H"], file["H_format"] = light.transpose(2, 1, 0), 1
+        file["delta_t"], file["t_start"] = 0.01, 0.5
+    maps = {"peak": ml.reconstruct(np.asarray(io.load(folder / "cube.npz").histogram), SYSTEM, "peak")}
+    for suffix in (".zarr", ".h5", ".npz"):
+        save_maps(folder / f"maps{suffix}", maps)
+    ml.Table.build(SYSTEM, signal=(0.1, 1, 2), background=(0.1, 1, 2)).save(folder / "table.h5")
+    depth = np.random.default_rng(3).random((6, 7)) + 1.0
+    Image.fromarray((1000 * depth).astype(np.uint16)).save(folder / "depth.png")
+    Image.fromarray((1000 * depth).astype(np.uint16)).save(folder / "depth.tif")
+    np.save(folder / "depth.npy", depth)
+    np.savez_compressed(folder / "depth.npz", depth=depth, reflectivity=depth / 2, background=depth)
+    np.savez_compressed(folder / "layers.npz", depth=np.stack([depth, depth + 1]), reflectivity=np.full((2, 6, 7), 0.3))
+    pfm = b"Pf\n7 6\n-1.0\n" + depth[::-1].astype("<f4").tobytes()
+    (folder / "depth.pfm").write_bytes(pfm)
+    with h5py.File(folder / "nyu.mat", "w") as file:
+        file.create_dataset("depths", data=np.ones((3, 7, 6)) + 1, chunks=(1, 7, 6), compression="gzip")
+        file["images"] = np.full((3, 3, 7, 6), 99, np.uint8)
+    for name in ("art", "bike", "folder", "listed"):
+        (folder / name).mkdir()
+    Image.fromarray(np.full((6, 7), 90, np.uint8)).save(folder / "art/disp1.png")
+    Image.fromarray(np.full((6, 7, 3), 90, np.uint8)).save(folder / "art/view1.png")
+    (folder / "art/dmin.txt").write_text("200\n")
+    (folder / "bike/disp0.pfm").write_bytes(pfm)
+    shutil.copy(folder / "art/view1.png", folder / "bike/im0.png")
+    (folder / "bike/calib.txt").write_text("cam0=[3000 0 4; 0 3000 3; 0 0 1]\ndoffs=100.5\nbaseline=193.0\n")
+    shutil.copy(folder / "depth.npz", folder / "folder/a.npz")
+    shutil.copy(folder / "nyu.mat", folder / "folder/nyu.mat")
+    shutil.copy(folder / "depth.npz", folder / "listed/a.npz")
+    (folder / "listed/manifest.csv").write_text("depth,depth_unit_m,focal_px\na.npz,1.0,500\na.npz,,\n")
+    SYSTEM.save(folder / "system.yaml")
+    SYSTEM.save(folder / "system.json")
+    (folder / "recipe.yaml").write_text(
+        "seed: 7\nscenes:\n  - example: room\n    size: 8\n    seeds: {first: 0, count: 3}\n  - path: folder\n"
+        "crop: {size: [4, 4], count: 2}\nsystems: {file: system.yaml}\nlight: {signal: [0.5, 1.0], sbr: 5}\n"
+        "store: {layout: sparse, chunk_mib: 1}\n"
+    )
+    (folder / "scene.yaml").write_text("depth: depth.png\nfocal_px: 500\nlight: {signal: 1, sbr: 2}\n")
+    counts = np.random.default_rng(4).poisson(2.0, (3, 4, 32))
+    np.save(folder / "counts.npy", counts)
+    savemat(folder / "counts.mat", {"counts": counts})
+    np.savetxt(folder / "counts.csv", counts[0, 0], fmt="%d")
+    with h5py.File(folder / "counts.h5", "w") as file:
+        file["counts"] = counts
+    np.save(folder / "pulse.npy", np.exp(-(np.linspace(-3, 3, 40) ** 2)))
+    try:
+        import OpenEXR
+    except ImportError:
+        return [name for name in READERS if not name.endswith(".exr")]
+    pixels = {"Z": np.ascontiguousarray(depth, np.float32)}
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, pixels).write(
+        str(folder / "depth.exr")
+    )
+    return list(READERS)

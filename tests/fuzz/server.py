@@ -1,0 +1,114 @@
+"""Reads files, each in a process of its own with limits of memory and time; tells what became of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import select
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+LIMIT_S, LIMIT_BYTES, ADDRESS_BYTES = 10.0, 2**30, 6 * 2**30
+
+
+class Server:
+    """A process that has imported everything, and is copied for every file."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.fuzz.server"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=Path(__file__).parents[2],
+        )
+
+    def read(self, name: str, path: Path) -> dict[str, Any]:
+        """``kind``: read, refused, unnamed, foreign, crash, hang, memory; ``told``: the error."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps([name, str(path)]) + "\n")
+        self._process.stdin.flush()
+        return dict(json.loads(self._process.stdout.readline()))
+
+    def close(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def _outcome(name: str, path: Path) -> dict[str, Any]:
+    from tests.fuzz.formats import READERS
+
+    try:
+        if name == "<run>":  # for the test of this file
+            exec(path.read_text(), {"path": path})
+        else:
+            READERS[name](path)
+        return {"kind": "read", "told": ""}
+    except (ValueError, OSError, MemoryError) as error:
+        told = str(error)
+        kind = "refused" if str(path) in told or str(path.parent) in told else "unnamed"
+        return {"kind": kind, "told": f"{type(error).__name__}: {told}"}
+    except Exception as error:
+        kind = "refused" if isinstance(error, TypeError) and str(path) in str(error) else "foreign"
+        return {"kind": kind, "told": f"{type(error).__name__}: {error}"}
+
+
+def _in_child(name: str, path: Path) -> dict[str, Any]:
+    reading, writing = os.pipe()
+    began = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_BYTES, ADDRESS_BYTES))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        warnings.simplefilter("ignore")
+        try:
+            os.write(writing, json.dumps(_outcome(name, path))[:4000].encode())
+        finally:
+            os._exit(0)
+    os.close(writing)
+    hung = not select.select([reading], [], [], LIMIT_S)[0]
+    if hung:
+        os.kill(child, signal.SIGKILL)
+    content = b""
+    while part := os.read(reading, 2**16):
+        content += part
+    os.close(reading)
+    _, status, used = os.wait4(child, 0)
+    found: dict[str, Any]
+    if hung:
+        found = {"kind": "hang", "told": f"more than {LIMIT_S} s"}
+    elif not content:
+        found = {"kind": "crash", "told": f"status {status}"}
+    else:
+        try:
+            found = json.loads(content)
+        except ValueError:  # a long text that was cut
+            found = {"kind": "refused", "told": content.decode(errors="replace")}
+    if found["kind"] in ("read", "refused", "unnamed") and 1024 * used.ru_maxrss > LIMIT_BYTES:
+        found = {"kind": "memory", "told": f"{1024 * used.ru_maxrss / 2**20:.0f} MiB; {found['told']}"}
+    return found | {"seconds": time.monotonic() - began}
+
+
+if __name__ == "__main__":
+    import h5py  # noqa: F401
+    import scipy.io
+    import scipy.sparse  # noqa: F401
+    import xarray  # noqa: F401
+    import zarr  # noqa: F401
+
+    import tests.fuzz.formats  # noqa: F401
+
+    for _line in sys.stdin:
+        _name, _path = json.loads(_line)
+        print(json.dumps(_in_child(_name, Path(_path))), flush=True)

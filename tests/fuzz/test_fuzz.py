@@ -1,0 +1,59 @@
+"""A minute of `python -m tests.fuzz`, of a fixed seed: all that a damaged file may do is to be refused by its name."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hypothesis")
+if os.name != "posix":
+    pytest.skip("needs fork", allow_module_level=True)
+
+from tests.fuzz.formats import READERS, make
+from tests.fuzz.run import BAD, fuzz
+from tests.fuzz.server import Server
+
+EXAMPLES = 8
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> tuple[Path, list[str]]:
+    pytest.importorskip("ptufile")
+    pytest.importorskip("phconvert")
+    folder = tmp_path_factory.mktemp("good")
+    return folder, make(folder)
+
+
+@pytest.fixture(scope="module")
+def server():
+    started = Server()
+    yield started
+    started.close()
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_mutated_files_are_refused_by_name(tmp_path, good, server, name):
+    folder, names = good
+    if name not in names:
+        pytest.skip("its library is missing")
+    assert server.read(name, folder / name)["kind"] == "read"
+    outcomes = []
+    fuzz(name, folder, tmp_path, server, EXAMPLES, 20261122, lambda found, _: outcomes.append(found))
+    assert len(outcomes) >= EXAMPLES // 2
+    assert not [one for one in outcomes if one["kind"] in BAD]
+
+
+def test_the_server_tells_what_is_bad(tmp_path, server, good):
+    """The tests above can fail: an unnamed error, a foreign one, a crash, a hang and too much memory are told apart."""
+    told = {
+        "unnamed": "raise ValueError('no name')",
+        "foreign": "raise KeyError('x')",
+        "crash": "import os; os.abort()",
+        "hang": "import time; time.sleep(30)",
+        "memory": "x = bytearray(1100 * 2**20); x[::4096] = x[::4096]; raise ValueError(str(path))",
+    }
+    for kind, code in told.items():
+        (tmp_path / "a.py").write_text(code)
+        assert server.read("<run>", tmp_path / "a.py")["kind"] == kind

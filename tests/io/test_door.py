@@ -212,7 +212,7 @@ def test_damaged_files_in_a_folder_are_left_out_with_their_reason(tmp_path, fold
 
 
 def test_heaps_and_markers_over_which_libraries_do_not_end_are_refused(tmp_path):
-    """Found by tests/fuzz: HDF5 loops over a heap of texts whose free space has size 0, ptufile raises 2 to a marker."""
+    """Found by tests/fuzz: HDF5 loops over a heap of texts with free space of size 0, ptufile raises 2 to a marker."""
     flux = ml.Flux(np.full((3, 4), 0.5), 0.1, 40.0)
     io.simulate_to(tmp_path / "cube.h5", flux, SYSTEM)
     content = bytearray((tmp_path / "cube.h5").read_bytes())

@@ -177,11 +177,9 @@ def generate(
                 raise ValueError("--dry-run needs a source")
             tell_estimate(dataset.estimate(recipe, out, threads=threads))
             return
-        if recipe is not None and not (resume and out.exists()) and workers is None and scheduler is None:
-            from mars_lidar.dataset.estimate import quick_advice
-
-            if told := str(quick_advice(recipe, threads)):
-                say(told)
+        here = workers is None and scheduler is None and not (resume and out.exists())
+        if here and recipe is not None and (told := str(dataset.quick_advice(recipe, threads))):
+            say(told)
         with progress_bar("generating") as progress:
             done = dataset.generate(
                 recipe,

@@ -71,7 +71,7 @@ def view(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of others: .npy, .tif, .csv too.",
+            help="A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of others: also .npy, .tif, .csv.",
             show_default=False,
         ),
     ],

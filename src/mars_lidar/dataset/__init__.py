@@ -8,6 +8,7 @@ from mars_lidar.dataset.run import Generated, generate
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.estimate import Estimate, estimate
+    from mars_lidar.dataset.estimate import quick_advice as quick_advice
     from mars_lidar.dataset.export import Exported, export
     from mars_lidar.dataset.light import Light
     from mars_lidar.dataset.read import read_sparse
@@ -29,6 +30,7 @@ _MODULES = {
     "export": "export",
     "json_schema": "schema",
     "open_dataset": "store",
+    "quick_advice": "estimate",
     "read_sparse": "read",
     "read_view": "view",
     "verify": "verify",
@@ -39,9 +41,11 @@ def __getattr__(name: str) -> Any:  # `import mars_lidar` loads no Zarr
     if name in _MODULES:
         from importlib import import_module
 
-        value = getattr(import_module(f"mars_lidar.dataset.{_MODULES[name]}"), name)
-        globals()[name] = value  # not the module of the same name
-        return value
+        module = import_module(f"mars_lidar.dataset.{_MODULES[name]}")
+        for each, home in _MODULES.items():  # all of them: `verify` is the function, not the module of the same name
+            if home == _MODULES[name]:
+                globals()[each] = getattr(module, each)
+        return globals()[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -1,0 +1,44 @@
+"""Without any of the optional libraries: one line that names the extra, never a traceback."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+HIDDEN = Path(__file__).with_name("hidden_library.py")
+# library, extra, and whether public names and commands are to miss it
+LIBRARIES = [
+    ("torch", "learn", True, False),
+    ("skimage", "estimate", False, True),
+    ("ptufile", "io", False, True),
+    ("phconvert", "io", False, True),
+    ("OpenEXR", "io", False, False),
+    ("distributed", "cluster", False, True),
+    ("cupy", "cuda", False, True),
+    ("torch,skimage,ptufile,phconvert,OpenEXR,distributed,cupy", "learn,estimate,io,cluster,cuda", True, True),
+]
+
+
+@pytest.mark.parametrize(("library", "extra", "names", "commands"), LIBRARIES)
+def test_what_misses_a_library_names_its_extra(tmp_path, library, extra, names, commands):
+    done = subprocess.run(
+        [sys.executable, HIDDEN, library, extra, tmp_path], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = re.search(r"(\d+) names and (\d+) commands", done.stdout)
+    assert told, done.stdout
+    assert (int(told[1]) > 0, int(told[2]) > 0) == (names, commands), done.stdout
+
+
+def test_an_exr_names_its_extra(tmp_path):
+    (tmp_path / "depth.exr").write_bytes(b"")
+    code = (
+        "import sys; sys.modules['OpenEXR'] = None\nimport mars_lidar as ml\n"
+        f"ml.Scene.from_rgbd({str(tmp_path / 'depth.exr')!r})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "pip install 'mars-lidar[io]'" in done.stderr.splitlines()[-1]

@@ -138,7 +138,17 @@ class ExposureEnds {
             for (double i = 0.0; i < h; i += 1.0) product *= std::max(passes - i, 1e-3);
             return std::log(product);
         }
-        return std::lgamma(passes + 1.0) - std::lgamma(std::max(passes - h, 0.0) + 1.0);
+        return log_gamma(passes + 1.0) - log_gamma(std::max(passes - h, 0.0) + 1.0);
+    }
+
+    // std::lgamma writes the sign into a global of the C library, which threads share
+    static double log_gamma(double x) {
+#ifdef _WIN32
+        return std::lgamma(x);
+#else
+        int sign = 0;
+        return ::lgamma_r(x, &sign);
+#endif
     }
 
     int64_t first = 0, length = 0;

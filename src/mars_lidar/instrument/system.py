@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import check_claim, reading
+from mars_lidar._base.notebook import as_html
 from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
@@ -91,6 +92,11 @@ class System:
                 f"got {self.detector.electronics_dead_time_ns:g} ns"
             )
         check_units(self.period_ns, self.pulse, self.detector)
+
+    def _repr_html_(self) -> str:
+        t = self.time_ns
+        pulse = self.pulse.bin_energy(0.5 * self.period_ns, self.period_ns, self.bins)
+        return as_html(self, {"pulse, share per bin, over the period (ns)": (t, pulse)})
 
     @property
     def bin_ns(self) -> float:

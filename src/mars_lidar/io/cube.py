@@ -22,6 +22,7 @@ from mars_lidar._base.files import (
     reason,
 )
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
@@ -73,6 +74,11 @@ class Cube:
                 f"histogram must have the shape {self.recipe.shape} of its recipe "
                 f"(realizations, H, W, bins), got {tuple(self.histogram.shape)}"
             )
+
+    def _repr_html_(self) -> str:
+        y, x = self.shape[1] // 2, self.shape[2] // 2
+        counts = self.system.time_ns, np.asarray(self.histogram[0, y, x])
+        return as_html(self, {"depth (m)": self.depth_m, f"counts of pixel ({y}, {x}), over time (ns)": counts})
 
     @property
     def system(self) -> System:

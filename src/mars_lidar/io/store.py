@@ -71,6 +71,9 @@ class OnDisk:
             raise AttributeError(name)
         return getattr(self._array, name)
 
+    def __repr__(self) -> str:
+        return f"<{self.dtype} {tuple(self.shape)} on disk>"
+
     def __getitem__(self, key: Any) -> Any:
         return self._read(lambda: self._array[key])
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base.late import late
+from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray
 from mars_lidar.light.photon_maps import MAX_PHOTONS as MAX_PHOTONS
 from mars_lidar.light.photon_maps import broadcast, check_photons, common_shape, frozen, light_map, waveform_maps
@@ -244,6 +245,9 @@ class Flux:
         if 0 in part.shape:
             raise IndexError(f"flux{list(keys)} selects no pixel of {self.shape}")
         return part
+
+    def _repr_html_(self) -> str:
+        return as_html(self, {"signal (photons per period)": self.signal, "background": self.background})
 
     def __repr__(self) -> str:
         h, w = self.shape

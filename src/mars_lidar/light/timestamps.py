@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.late import late
+from mars_lidar._base.notebook import as_html
 
 if TYPE_CHECKING:
     from mars_lidar.instrument.system import System
@@ -93,6 +94,9 @@ class Timestamps:
 
         told = self.info.get("system")
         return None if told is None else System.from_dict(told)
+
+    def _repr_html_(self) -> str:
+        return as_html(self, {"photons": np.diff(self.offsets).reshape(self.shape)})
 
     def save(self, path: str | Path, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
         """Write to a ``.npz`` (exact), ``.ptu`` or ``.h5`` / ``.hdf5`` (Photon-HDF5); see docs/formats.md.

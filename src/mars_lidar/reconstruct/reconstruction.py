@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histograms import checked
@@ -62,6 +63,11 @@ class Reconstruction:
     flags: NDArray[np.uint8]
 
     __repr__ = brief
+
+    def _repr_html_(self) -> str:
+        image = self.depth_m.ndim > 1 and (slice(0, 1),) * (self.depth_m.ndim - 2)
+        first = {"depth (m)": self.depth_m, "reflectivity": self.reflectivity}
+        return as_html(self, {} if image is False else {k: v[image].reshape(v.shape[-2:]) for k, v in first.items()})
 
     @property
     def seen(self) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.files import reading
 from mars_lidar._base.late import late
+from mars_lidar._base.notebook import as_html
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
@@ -91,6 +92,9 @@ class Scene:
         ambient = "" if self.background is None else ", background map"
         share = self.reflectivity
         return f"Scene({h} x {w} pixels, {span}{lost}, reflectivity {share.min():.3g} to {share.max():.3g}{ambient})"
+
+    def _repr_html_(self) -> str:
+        return as_html(self, {"depth (m)": self.depth_m, "reflectivity": self.reflectivity})
 
     def __getitem__(self, key: Any) -> Scene:
         """A crop: ``scene[rows, columns]`` with slices."""

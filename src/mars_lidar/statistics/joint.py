@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
@@ -176,6 +177,9 @@ class JointLaw:
     _pixel: Pixel | FinePixel | TimedPixel | None = field(repr=False)
 
     __repr__ = brief
+
+    def _repr_html_(self) -> str:
+        return as_html(self, {"expected counts per bin, over time (ns)": (self.system.time_ns, self.mean)})
 
     @property
     def sweeps(self) -> int:

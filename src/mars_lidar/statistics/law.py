@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.notebook import as_html
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import MODES, Mode
@@ -117,6 +118,11 @@ class CountLaw:
         """The law with its probabilities: what evaluates them when first asked for does not go to other processes."""
         windows = self._windows
         return {name: value for name, value in self.__dict__.items() if name != "_evaluate"} | {"_windows": windows}
+
+    def _repr_html_(self) -> str:
+        if self.cumulants.ndim == 1:
+            return as_html(self, {"probability of N registrations": (self.support, self.pmf)})
+        return as_html(self, {"mean count": self.mean} if self.cumulants.ndim == 3 else {})
 
     def __repr__(self) -> str:
         if self._shape:

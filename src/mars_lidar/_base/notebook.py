@@ -1,0 +1,43 @@
+"""What a notebook shows of an object: its line of text, and small pictures of its maps and curves."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+_LARGEST = 160  # pixels of a map on its longer side: more cannot be seen
+_INCHES, _DPI = 1.7, 75
+
+
+def as_html(shown: object, panels: Mapping[str, Any]) -> str:
+    """The ``repr`` of `shown` above `panels`: maps (H, W) by their title and unit, or curves (x, y)."""
+    text = f"<code>{html.escape(repr(shown))}</code>"
+    drawn = {name: values for name, values in panels.items() if _has_values(values)}
+    if not drawn:
+        return text
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2.0 * _INCHES * len(drawn), _INCHES), dpi=_DPI, layout="constrained")
+    for ax, (name, values) in zip(figure.subplots(1, len(drawn), squeeze=False).flat, drawn.items(), strict=True):
+        ax.set_title(name, fontsize=7)
+        ax.tick_params(labelsize=6)
+        if isinstance(values, tuple):
+            ax.plot(*values, lw=0.8, drawstyle="steps-mid")
+            continue
+        step = max(1, max(values.shape) // _LARGEST)
+        figure.colorbar(ax.imshow(values[::step, ::step]), ax=ax).ax.tick_params(labelsize=6)
+        ax.set_xticks([])
+        ax.set_yticks([])
+    file = io.BytesIO()
+    figure.savefig(file, format="png")
+    return f'{text}<br><img src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}">'
+
+
+def _has_values(values: Any) -> bool:
+    parts = values if isinstance(values, tuple) else (values,)
+    return all(part is not None and np.size(part) and np.isfinite(part).any() for part in parts)

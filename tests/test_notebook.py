@@ -1,0 +1,67 @@
+"""What a notebook shows of objects, and the tutorial."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from mars_lidar import io
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=50, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
+)
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory) -> dict[str, object]:
+    scene = ml.Scene.example("room", size=(8, 12))
+    flux = scene.flux(SYSTEM, signal=1.0, sbr=1.0)
+    path = tmp_path_factory.mktemp("cubes") / "a.zarr"
+    io.simulate_to(path, flux, SYSTEM)
+    cube = io.load(path)
+    return {
+        "scene": scene,
+        "flux": flux,
+        "dark flux": ml.Flux(0.0, 0.5),
+        "waveform": ml.Flux(waveform=np.ones((2, 3, 5)) * 0.01),
+        "system": SYSTEM,
+        "cube": cube,
+        "timestamps": ml.simulate_timestamps(flux, SYSTEM),
+        "law": ml.count_law(0.5, 0.1, SYSTEM),
+        "laws": ml.count_law(flux.signal, flux.background, SYSTEM),
+        "several laws": ml.count_law([0.5, 0.6], 0.1, SYSTEM),
+        "joint law": ml.joint_law(0.5, 0.1, SYSTEM),
+        "reconstruction": ml.reconstruct(cube),
+        "one pixel": ml.reconstruct(cube.histogram[0, 4, 5], SYSTEM),
+    }
+
+
+def test_a_notebook_shows_text_and_a_small_picture(objects):
+    without = {"several laws", "one pixel"}  # no map, no curve
+    for name, shown in objects.items():
+        text = shown._repr_html_()
+        assert text.startswith("<code>"), name
+        assert type(shown).__name__ in re.sub("<.*?>", "", text)[:40], name
+        assert ("data:image/png;base64," in text) == (name not in without), name
+        assert len(text) < 60_000, name
+
+
+def test_the_tutorial_runs_and_is_the_notebook(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    import make_notebook
+
+    try:
+        made, kept = make_notebook.notebook(), json.loads((EXAMPLES / "tutorial.ipynb").read_text())
+    finally:
+        sys.modules.pop("make_notebook")
+    assert [one["source"] for one in made["cells"]] == [one["source"] for one in kept["cells"]]
+    shown = [output for one in made["cells"] for output in one.get("outputs", ())]
+    assert sum("text/html" in one.get("data", {}) for one in shown) >= 6
+    assert sum("image/png" in one.get("data", {}) for one in shown) == 1

@@ -1,6 +1,5 @@
 // The exact engine's inner loop for waveforms, as the host calls it: for each vector level a kernel that records
-// every registration as it is, one with a recorder, and one with traps (waveform/kernel.cpp and its two neighbours
-// are compiled once for each level).
+// every registration as it is, one with a recorder, and one with traps (waveform/kernel.cpp is compiled once for each).
 #pragma once
 #include <atomic>
 #include <cstdint>

@@ -5,16 +5,15 @@
 // them. A processor with vectors has no level `scalar`, one number at a time, which is never faster there; a build for
 // checks may add it (CMake's MARS_SCALAR), and compilers without vector extensions have nothing else.
 #pragma once
+#include "lanes/processor.h"
 
 #if defined(MARS_HAS_avx512)
-#define MARS_LEVEL_OF_512(each)                                                              \
-    each(avx512, (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && \
-                  __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl")))
+#define MARS_LEVEL_OF_512(each) each(avx512, has_avx512())
 #else
 #define MARS_LEVEL_OF_512(each)
 #endif
 #if defined(MARS_HAS_avx2)
-#define MARS_LEVEL_OF_256(each) each(avx2, __builtin_cpu_supports("avx2"))
+#define MARS_LEVEL_OF_256(each) each(avx2, has_avx2())
 #else
 #define MARS_LEVEL_OF_256(each)
 #endif

@@ -28,18 +28,10 @@ struct ShapeBlock {
 
 using ShapeKernel = void (*)(ShapeBlock&);
 
-#ifdef MARS_HAS_scalar
 void shape_kernel_scalar(ShapeBlock& block);
-#endif
-#ifdef MARS_HAS_vector128
 void shape_kernel_vector128(ShapeBlock& block);
-#endif
-#ifdef MARS_HAS_avx2
 void shape_kernel_avx2(ShapeBlock& block);
-#endif
-#ifdef MARS_HAS_avx512
 void shape_kernel_avx512(ShapeBlock& block);
-#endif
 
 // Work area of one thread: six arrays of the bins, the classes, the frame, and photons on their way.
 int64_t shape_memory(const ShapeJob& job);

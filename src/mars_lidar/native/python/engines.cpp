@@ -97,7 +97,7 @@ void bind_engines(nb::module_& module) {
     bind_registrations(module, "exact", &exact<std::string>);
     bind_registrations(module, "sequential", &sequential);
     bind_histograms(module, "poisson", &poisson);
-#if defined(__GNUC__)
+#if defined(__GNUC__) || defined(__clang__)
     module.def("addition_chain", &addition_chain, nb::arg("rounds"),
                "16 dependent additions a round, a cycle each: the processor's clock, for the benchmarks.");
 #endif

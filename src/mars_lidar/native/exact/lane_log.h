@@ -115,8 +115,7 @@ class LaneLog {
             case Sink::kHistogram32:
                 return count_bins<n, uint32_t>(lane, from, to);
             case Sink::kTimestamps:
-                for (int i = lane; i < lane + n; ++i) tell_times(i, from, to);
-                return;
+                return tell_times<n>(lane, from, to);
         }
     }
     template <int n>
@@ -137,15 +136,21 @@ class LaneLog {
                 if (bin >= 0) ++rows[i][bin];
             }
     }
+    template <int n>
     void tell_times(int lane, int from, int to) {
-        for (int k = from; k < to; ++k) {
-            if (bin_[k][lane] < 0) continue;
-            const int64_t record = next_[lane]++;
-            const int32_t cycle = round_exposure(cycle_[k][lane], cycles_);
-            output_.times[record] = registration_time(cycle, phase_[k][lane]);
-            output_.cycles[record] = cycle;
-            output_.bins[record] = bin_[k][lane];
-        }
+        int64_t next[n];
+        for (int i = 0; i < n; ++i) next[i] = next_[lane + i];
+        for (int k = from; k < to; ++k)
+            for (int i = 0; i < n; ++i) {
+                const int32_t bin = bin_[k][lane + i];
+                if (bin < 0) continue;
+                const int64_t record = next[i]++;
+                const int32_t cycle = round_exposure(cycle_[k][lane + i], cycles_);
+                output_.times[record] = registration_time(cycle, phase_[k][lane + i]);
+                output_.cycles[record] = cycle;
+                output_.bins[record] = bin;
+            }
+        for (int i = 0; i < n; ++i) next_[lane + i] = next[i];
     }
 
     const Output output_;

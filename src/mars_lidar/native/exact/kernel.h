@@ -7,6 +7,7 @@
 
 #include "instrument/job.h"
 #include "instrument/output.h"
+#include "lanes/levels.h"
 
 namespace mars {
 
@@ -25,17 +26,9 @@ struct ExactBlock {
     const std::atomic<bool>* stop;
 };
 
-using ExactKernel = void (*)(const ExactBlock&);
-
-#define MARS_DECLARE_EXACT(level)                                 \
-    void exact_kernel_##level(const ExactBlock& block);           \
-    void exact_modes_kernel_##level(const ExactBlock& block);     \
-    void exact_recording_kernel_##level(const ExactBlock& block); \
-    void exact_avalanche_kernel_##level(const ExactBlock& block);
-
-MARS_DECLARE_EXACT(scalar)
-MARS_DECLARE_EXACT(vector128)
-MARS_DECLARE_EXACT(avx2)
-MARS_DECLARE_EXACT(avx512)
+MARS_DECLARE_KERNEL(void, exact_kernel_, const ExactBlock& block)
+MARS_DECLARE_KERNEL(void, exact_modes_kernel_, const ExactBlock& block)
+MARS_DECLARE_KERNEL(void, exact_recording_kernel_, const ExactBlock& block)
+MARS_DECLARE_KERNEL(void, exact_avalanche_kernel_, const ExactBlock& block)
 
 }  // namespace mars

@@ -1,6 +1,8 @@
 // What the bindings share: nanobind's arrays by short names, and objects of Python together with the arrays into which they
 // point. Bindings check shapes and convert; algorithms are in the other folders and know no Python.
 #pragma once
+#include <string>
+
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
@@ -28,6 +30,13 @@ template <class Count>
 void check_histogram(const Job& job, const Matrix<Count>& out) {
     if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
         throw nb::value_error("out must be (realizations * pixels, bins)");
+}
+
+// Checks an array's shape; `name` is in the message.
+template <class T>
+void expect(const char* name, const Matrix<T>& array, int64_t rows, int64_t columns) {
+    if (static_cast<int64_t>(array.shape(0)) != rows || static_cast<int64_t>(array.shape(1)) != columns)
+        throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
 }
 
 // A job together with the arrays that it points into.

@@ -25,16 +25,8 @@ struct WaveformBlock {
     const std::atomic<bool>* stop;
 };
 
-using WaveformKernel = void (*)(const WaveformBlock&);
-
-#define MARS_DECLARE_WAVEFORM(level)                                    \
-    void waveform_kernel_##level(const WaveformBlock& block);           \
-    void waveform_recording_kernel_##level(const WaveformBlock& block); \
-    void waveform_avalanche_kernel_##level(const WaveformBlock& block);
-
-MARS_DECLARE_WAVEFORM(scalar)
-MARS_DECLARE_WAVEFORM(vector128)
-MARS_DECLARE_WAVEFORM(avx2)
-MARS_DECLARE_WAVEFORM(avx512)
+MARS_DECLARE_KERNEL(void, waveform_kernel_, const WaveformBlock& block)
+MARS_DECLARE_KERNEL(void, waveform_recording_kernel_, const WaveformBlock& block)
+MARS_DECLARE_KERNEL(void, waveform_avalanche_kernel_, const WaveformBlock& block)
 
 }  // namespace mars

@@ -19,7 +19,7 @@
 #endif
 
 // Pastes two names after expanding them: MARS_JOIN(exact_kernel_, MARS_LEVEL) is exact_kernel_avx2 at that level. The
-// entry points of kernels carry the name of their level, by which lanes/levels.h finds them at run time.
+// entry points of kernels carry the name of their level, by which lanes/kernels.h finds them at run time.
 #define MARS_JOIN2(a, b) a##b
 #define MARS_JOIN(a, b) MARS_JOIN2(a, b)
 

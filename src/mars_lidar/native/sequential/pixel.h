@@ -47,38 +47,45 @@ class Pixel {
     // registration at T the pixel is blind on (T, T + dead time).
     template <class Registered>
     void pass(const std::vector<uint64_t>& times, int64_t start, Registered&& registered) {
-        uint64_t earliest = mode_ == DetectorMode::kParalyzable ? 0 : ready.after(start);
-        for (const uint64_t time : times) {
-            if (time < earliest) continue;
-            const Time now{start + static_cast<int64_t>(time >> kPhaseBits), time & kPhaseMask};
-            if (!sees(now)) continue;
-            registered(now.cycle, phase_of(time));
-            earliest = mode_ == DetectorMode::kParalyzable ? 0 : ready.after(start);
+        switch (mode_) {
+            case DetectorMode::kNonparalyzable:
+                return pass_as<DetectorMode::kNonparalyzable>(times, start, registered);
+            case DetectorMode::kParalyzable:
+                return pass_as<DetectorMode::kParalyzable>(times, start, registered);
+            case DetectorMode::kSynchronous:
+                return pass_as<DetectorMode::kSynchronous>(times, start, registered);
+            case DetectorMode::kGated:
+                return pass_as<DetectorMode::kGated>(times, start, registered);
         }
     }
 
  private:
-    // Whether an arrival is registered by a pixel that is ready; `ready` moves on.
-    bool sees(Time now) {
-        switch (mode_) {
-            case DetectorMode::kNonparalyzable:
-                break;
-            case DetectorMode::kParalyzable: {  // every arrival begins the dead time anew, seen or not
+    template <DetectorMode mode, class Registered>
+    void pass_as(const std::vector<uint64_t>& times, int64_t start, Registered&& registered) {
+        constexpr bool paralyzable = mode == DetectorMode::kParalyzable;
+        uint64_t earliest = paralyzable ? 0 : ready.after(start);
+        for (const uint64_t time : times) {
+            if (time < earliest) continue;
+            const Time now{start + static_cast<int64_t>(time >> kPhaseBits), time & kPhaseMask};
+            const double phase = phase_of(time);
+            if constexpr (paralyzable) {  // every arrival begins the dead time anew, seen or not
                 const bool blind = fired_ && now < ready;
                 ready = now.plus(dead_time_);
                 fired_ = true;
-                return !blind;
+                if (!blind) registered(now.cycle, phase);
+                continue;
             }
-            case DetectorMode::kSynchronous: {  // one a period; a dead time that is not over at its start costs it
-                const Time next_period{now.cycle + 1, 0}, over = armed(now.plus(dead_time_));
+            if (mode == DetectorMode::kGated && !open(now.cycle, phase))
+                continue;  // outside of the gate: does not exist
+            registered(now.cycle, phase);
+            ready = now.plus(dead_time_);
+            if constexpr (mode == DetectorMode::kSynchronous) {
+                // armed for one registration; a dead time that is not over at the start of a period costs that period
+                const Time next_period{now.cycle + 1, 0}, over = armed(ready);
                 ready = over < next_period ? next_period : over;
-                return true;
             }
-            case DetectorMode::kGated:  // arrivals outside of the gate do not exist
-                if (!open(now.cycle, phase_of(now.phase))) return false;
+            earliest = ready.after(start);
         }
-        ready = now.plus(dead_time_);
-        return true;
     }
 
     // The gate of a period stays within it: where it wraps, its end is at the beginning of that same period.

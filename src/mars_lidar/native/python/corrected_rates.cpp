@@ -27,16 +27,12 @@ void rates(const HistogramRecord& recording, Matrix<const Count> histogram, int 
     if (histogram.shape(1) != bins || out.shape(0) != pixels || out.shape(1) != bins || flags.shape(0) != pixels)
         throw nb::value_error("histogram and out must be (pixels, bins), flags (pixels)");
     const CorrectionSettings settings = settings_of(correction, steps, tolerance, total, pixels);
-    const int64_t count = static_cast<int64_t>(pixels);
-    run_watched_chunks((count + kChunk - 1) / kChunk, threads, nb::none(),
-                       [&](int64_t chunk, const std::atomic<bool>& stop) {
-                           Corrector correct(recording, settings);
-                           for (int64_t p = chunk * kChunk; p < std::min(count, (chunk + 1) * kChunk); ++p) {
-                               if (stop) return;
-                               flags.data()[p] = correct(histogram.data() + p * recording.bins, p, false);
-                               std::copy(correct.rate.begin(), correct.rate.end(), out.data() + p * recording.bins);
-                           }
-                       });
+    run_watched_items(static_cast<int64_t>(pixels), kChunk, threads, nb::none(), [&] {
+        return [&, correct = Corrector(recording, settings)](int64_t p) mutable {
+            flags.data()[p] = correct(histogram.data() + p * recording.bins, p, false);
+            std::copy(correct.rate.begin(), correct.rate.end(), out.data() + p * recording.bins);
+        };
+    });
 }
 
 template <class Count>
@@ -48,18 +44,14 @@ void windows(const HistogramRecord& recording, Matrix<const Count> histogram, in
         out.shape(1) != kWindowColumns || flags.shape(0) != pixels)
         throw nb::value_error("histogram must be (pixels, bins), out (pixels, 5), flags (pixels)");
     const CorrectionSettings settings = settings_of(correction, steps, tolerance, total, pixels);
-    const int64_t count = static_cast<int64_t>(pixels);
-    run_watched_chunks(
-        (count + kChunk - 1) / kChunk, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-            Corrector correct(recording, settings);
-            WindowEstimate estimate(recording, static_cast<Locator>(locator));
-            for (int64_t p = chunk * kChunk; p < std::min(count, (chunk + 1) * kChunk); ++p) {
-                if (stop) return;
-                flags.data()[p] =
-                    estimate_window(correct, estimate, settings.correction == Correction::kPasses,
-                                    histogram.data() + p * recording.bins, p, out.data() + p * kWindowColumns);
-            }
-        });
+    run_watched_items(static_cast<int64_t>(pixels), kChunk, threads, progress, [&] {
+        return [&, correct = Corrector(recording, settings),
+                estimate = WindowEstimate(recording, static_cast<Locator>(locator))](int64_t p) mutable {
+            flags.data()[p] =
+                estimate_window(correct, estimate, settings.correction == Correction::kPasses,
+                                histogram.data() + p * recording.bins, p, out.data() + p * kWindowColumns);
+        };
+    });
 }
 
 std::vector<double> values_of(const Vector<const double>& values) {

@@ -8,6 +8,7 @@ namespace mars {
 namespace {
 
 constexpr int64_t kChunk = 64;  // pixels
+
 template <class Count>
 void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> histogram, int starts, double least_gain,
                         bool less_bias, Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
@@ -17,14 +18,11 @@ void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> hi
     if (out.shape(0) != histogram.shape(0) || out.shape(1) != kMaximumColumns || flags.shape(0) != histogram.shape(0))
         throw nb::value_error("out must be (pixels, 8), flags (pixels)");
     const ReconstructionJob job{starts, least_gain, less_bias};
-    run_watched_chunks(
-        (pixels + kChunk - 1) / kChunk, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-            Maximizer<Count> maximizer(recording, job);
-            for (int64_t p = chunk * kChunk; p < std::min(pixels, (chunk + 1) * kChunk); ++p) {
-                if (stop) return;
-                maximizer(histogram.data() + p * recording.bins, out.data() + p * kMaximumColumns, flags.data() + p);
-            }
-        });
+    run_watched_items(pixels, kChunk, threads, progress, [&] {
+        return [&, maximizer = Maximizer<Count>(recording, job)](int64_t p) mutable {
+            maximizer(histogram.data() + p * recording.bins, out.data() + p * kMaximumColumns, flags.data() + p);
+        };
+    });
 }
 
 void log_likelihood(const HistogramRecord& recording, Vector<const double> histogram, Matrix<const double> at,

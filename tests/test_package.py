@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import yaml
 
 import mars_lidar as ml
 from mars_lidar.engines import EngineOptions
@@ -141,3 +142,16 @@ def test_nothing_native_is_left_when_the_interpreter_ends():
     )
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert (ran.stdout, ran.stderr) == ("", "")  # nanobind tells of instances that were never freed
+
+
+def test_wheels_and_recipe_follow_the_project():
+    """Every wheel has to give the golden bits; conda-forge's recipe has the project's version and dependencies."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    for file in re.findall(r"\{project\}/(\S+)", settings["tool"]["cibuildwheel"]["test-command"]):
+        assert "def test_golden_bits" in (ROOT / file).read_text()
+    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text())
+    assert recipe["context"]["version"] == settings["project"]["version"]
+    run = {line.replace(" ", "").replace("matplotlib-base", "matplotlib") for line in recipe["requirements"]["run"]}
+    assert run == {*settings["project"]["dependencies"], "python" + settings["project"]["requires-python"]}
+    host = {line.replace(" ", "") for line in recipe["requirements"]["host"]}
+    assert set(settings["build-system"]["requires"]) <= host

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
-from mars_lidar._base.types import Progress
 from mars_lidar.engines.engine import Engine, Records, Task
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
@@ -32,24 +31,17 @@ class ExactEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Every registration, binned as it is drawn."""
-        self._draw("histogram", task, out, progress=task.progress)
+        _core.exact_histogram(task.job, task.pulse, out, task.threads, task.progress, self.level)
 
     def counts(self, task: Task) -> NDArray[np.int64]:
         """The first of the two passes for timestamps."""
         out = np.empty(task.items, np.int64)
-        self._draw("counts", task, out)
+        _core.exact_counts(task.job, task.pulse, out, task.threads, None, self.level)
         return out
 
     def timestamps(self, task: Task, records: Records) -> None:
         """The second pass: the same draws again, now with a place to go."""
         where = (records.offsets, records.times, records.cycle, records.bin)
-        self._draw("timestamps", task, *where, progress=task.progress)
+        _core.exact_timestamps(task.job, task.pulse, *where, task.threads, task.progress, self.level)
         if task.system.detector.jitter is not None:
             records.sort()
-
-    def _draw(self, what: str, task: Task, *out: NDArray[Any], progress: Progress | None = None) -> None:
-        """Let the native core draw: light of any waveform, or returns of the system's pulse."""
-        if task.flux.waveform is not None:
-            getattr(_core, f"waveform_{what}")(task.job, *out, task.threads, self.level, progress)
-        else:
-            getattr(_core, f"exact_{what}")(task.job, task.pulse, *out, task.threads, self.level, progress)

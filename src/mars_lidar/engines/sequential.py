@@ -38,6 +38,6 @@ class SequentialEngine(Engine):
     def timestamps(self, task: Task, records: Records) -> None:
         """The second pass: the same draws again."""
         where = (records.offsets, records.times, records.cycle, records.bin)
-        _core.sequential_timestamps(task.job, task.pulse, *where, 1.0, task.threads, task.progress)
+        _core.sequential_timestamps(task.job, task.pulse, *where, task.threads, task.progress)
         if task.system.detector.jitter is not None:
             records.sort()

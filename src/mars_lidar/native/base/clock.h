@@ -4,7 +4,7 @@
 
 namespace mars {
 
-#if defined(__GNUC__)
+#if defined(__GNUC__) || defined(__clang__)
 // `rounds` times 16 additions, each of which waits for the one before it: a cycle each. The number that is added comes
 // from a register, because some processors do additions of constants beside the others.
 inline uint64_t addition_chain(int64_t rounds) {

@@ -189,6 +189,7 @@ MARS_INLINE Rate device_rate(double photons) {
 template <int32_t mode_number, bool gaussian, bool whole, bool single, int32_t sink_number, int32_t ahead>
 MARS_KERNEL exact_items(const DeviceTask task) {
     constexpr DetectorMode mode = static_cast<DetectorMode>(mode_number);
+    constexpr PulseKind kind = gaussian ? PulseKind::kGaussian : PulseKind::kSampled;
     const DevicePlace place = device_place();
     if (place.thread >= task.items) return;
     SystemView system = task.system;
@@ -221,8 +222,8 @@ MARS_KERNEL exact_items(const DeviceTask task) {
         MARS_UNROLL
         for (int k = 0; k < ahead; ++k) {
             const Registration next =
-                register_next<mode, gaussian, whole>(system, returns, delay, drawn[k], key.first, key.second,
-                                                     event + static_cast<uint32_t>(k), armed, memory);
+                register_next<mode, kind, whole>(system, returns, delay, drawn[k], key.first, key.second,
+                                                 event + static_cast<uint32_t>(k), armed, memory);
             writer.take(next, bin_of(next.phase, system.bins));
         }
     }

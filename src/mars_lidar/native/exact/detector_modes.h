@@ -7,12 +7,14 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
+// A part of the period, in [0, 1), in units of 2^-64 period.
+inline uint64_t fixed_point(double periods) {
+    const double upper = static_cast<double>(static_cast<uint32_t>(periods * 0x1p32));
+    const double lower = (periods * 0x1p32 - upper) * 0x1p32;
+    return static_cast<uint64_t>(static_cast<uint32_t>(upper)) << 32 | static_cast<uint32_t>(lower);
+}
+
 inline GateView gate_view(const Gate& gate) {
-    const auto fixed_point = [](double periods) {  // in [0, 1)
-        const double upper = static_cast<double>(static_cast<uint32_t>(periods * 0x1p32));
-        const double lower = (periods * 0x1p32 - upper) * 0x1p32;
-        return static_cast<uint64_t>(static_cast<uint32_t>(upper)) << 32 | static_cast<uint32_t>(lower);
-    };
     // Phases are multiples of 2^-24 or finer. As many of them are inside as the gate is wide: an edge between two.
     // A gate that is always open: 1 would not do, because a distance round the period may be rounded up to 1.
     const double places = static_cast<double>(static_cast<int32_t>(gate.width * 0x1p24 + 0.5));

@@ -3,56 +3,36 @@
 #include "exact/engine.h"
 
 #include <algorithm>
-#include <stdexcept>
 
 #include "exact/start.h"
 #include "exact/trap_law.h"
 #include "instrument/pulse_table.h"
-#include "lanes/levels.h"
+#include "lanes/kernels.h"
 
 namespace mars {
 namespace {
 
-// The kernels of one vector level.
-struct Level {
-    const char* name;
-    ExactKernel kernel, modes, recording, avalanches;  // free running, all other modes, any with more to it
-};
-
-// Widest first.
-std::vector<Level> levels() {
-    std::vector<Level> found;
-#define MARS_ADD_LEVEL(level, runs)                                                                                \
-    if (runs)                                                                                                      \
-        found.push_back({#level, exact_kernel_##level, exact_modes_kernel_##level, exact_recording_kernel_##level, \
-                         exact_avalanche_kernel_##level});
-    MARS_EACH_LEVEL(MARS_ADD_LEVEL)
-#undef MARS_ADD_LEVEL
-    return found;
-}
-
-// The kernel for a job at the level of this name, or the widest; std::invalid_argument where the processor has none.
-ExactKernel kernel_of(const std::string& name, const Job& job) {
-    for (const Level& level : levels())
-        if (name.empty() || name == level.name)
-            return job.avalanches_matter()                     ? level.avalanches
-                   : job.recording                             ? level.recording
-                   : job.mode == DetectorMode::kNonparalyzable ? level.kernel
-                                                               : level.modes;
-    throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
+// The kernel for a job at the level of this name, or the widest.
+auto kernel_of(const std::string& level, const Job& job) {
+    using Block = const ExactBlock&;
+    if (job.avalanches_matter()) return kernel_at<Block>(level, MARS_KERNELS(exact_avalanche_kernel_));
+    if (job.recording) return kernel_at<Block>(level, MARS_KERNELS(exact_recording_kernel_));
+    if (job.mode != DetectorMode::kNonparalyzable) return kernel_at<Block>(level, MARS_KERNELS(exact_modes_kernel_));
+    return kernel_at<Block>(level, MARS_KERNELS(exact_kernel_));
 }
 
 }  // namespace
 
 std::vector<std::string> exact_levels() {
     std::vector<std::string> names;
-    for (const Level& level : levels()) names.emplace_back(level.name);
+    for (const auto& kernel : std::initializer_list<LevelKernel<const ExactBlock&>> MARS_KERNELS(exact_kernel_))
+        if (kernel.runs) names.emplace_back(kernel.level);
     return names;
 }
 
 void run_exact(const Job& job, const PulseTable& pulse, const Output& output, int threads, const std::string& level,
                const Watch& watch) {
-    const ExactKernel kernel = kernel_of(level, job);
+    const auto kernel = kernel_of(level, job);
     ExactBlock proto{};
     proto.output = output;
     proto.job = &job;
@@ -66,20 +46,12 @@ void run_exact(const Job& job, const PulseTable& pulse, const Output& output, in
         block.first_item = chunk * items;
         block.items = std::min(items, job.items() - block.first_item);
         block.stop = &stop;
-        std::vector<int32_t> cycle;
-        std::vector<float> phase;
-        block.start_cycle = nullptr;
-        block.start_phase = nullptr;
-        const bool avalanches = job.avalanches_matter();
-        if (job.stationary && (job.dead_time > 0.0 || avalanches)) {
-            if (job.dead_time > 0.0) draw_starts(job, pulse, block, cycle, phase);
-            if (avalanches) {  // from the state without afterpulses
-                cycle.resize(static_cast<size_t>(block.items), 0);
-                phase.resize(static_cast<size_t>(block.items), 0.0f);
-                for (int32_t& start : cycle) start -= settling_periods(job);
-            }
-            block.start_cycle = cycle.data();
-            block.start_phase = phase.data();
+        WarmStarts<float> starts;
+        if (starts.wanted(job)) {
+            if (job.dead_time > 0.0) draw_starts(job, pulse, block, starts.cycle, starts.phase);
+            starts.settle(job, block.items);
+            block.start_cycle = starts.cycle.data();
+            block.start_phase = starts.phase.data();
         }
         if (!stop.load(std::memory_order_relaxed)) kernel(block);
     });

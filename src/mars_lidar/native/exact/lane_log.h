@@ -13,18 +13,21 @@ inline namespace MARS_LEVEL {
 
 constexpr int kLog = 128;  // rows
 
-// `Phase` is the precision that times are told in; `timed` logs can keep them. Which output is asked for matters only
-// when the log is written, so one kernel serves them all.
-template <class Phase, bool timed>
+// `Phase` is the precision that times are told in. Which output is asked for matters only when the log is written, and
+// for whether times are kept, so one kernel serves them all.
+template <class Phase>
 class LaneLog {
  public:
     LaneLog(const Output& output, const Job& job)
-        : output_(output), bins_(static_cast<size_t>(job.bins)), cycles_(job.cycles) {
+        : output_(output),
+          timed_(output.sink == Sink::kTimestamps),
+          bins_(static_cast<size_t>(job.bins)),
+          cycles_(job.cycles) {
         for (int lane = 0; lane < kLanes; ++lane) items_[lane] = -1;
     }
 
     // Whether times are asked for.
-    bool wants_times() const { return timed && output_.sink == Sink::kTimestamps; }
+    bool timed() const { return timed_; }
     bool busy(int lane) const { return items_[lane] >= 0; }
 
     // An item of the job without any registration yet.
@@ -46,18 +49,21 @@ class LaneLog {
         if (busy(lane)) write<1>(lane, first_row_[lane], rows_);
         first_row_[lane] = rows_;
         items_[lane] = item;
-        if (item >= 0 && output_.sink == Sink::kTimestamps) next_[lane] = output_.offsets[item];
+        if (item >= 0 && timed_) next_[lane] = output_.offsets[item];
     }
 
     // Row k after those that are complete: the registrations of all lanes, some of them outside of the exposure.
     MARS_INLINE void put(int k, Mask lost, Int bin) { store(bin_[rows_ + k], select(lost, splat(-1), bin)); }
-    MARS_INLINE void put_cycle(int k, Int cycle) { store(cycle_[rows_ + k], cycle); }
-    MARS_INLINE Phase (&phase(int k)) [kLanes] { return phase_[rows_ + k]; }
+    // Their times, kept if timed(): `phase` as a vector or in memory.
+    template <class Phases>
+    MARS_INLINE void put_time(int k, Int cycle, const Phases& phase) {
+        static_assert(sizeof phase == sizeof phase_[0], "a phase per lane");
+        store(cycle_[rows_ + k], cycle);
+        memcpy(phase_[rows_ + k], &phase, sizeof phase);
+    }
 
     // `n` rows, a divisor of kLog, are complete.
-    void advance(int n) {
-        rows_ += n;
-    }
+    void advance(int n) { rows_ += n; }
     bool full() const { return rows_ == kLog; }
 
     // Several lanes at once, where all have work: the processor is busy while a bin that was just counted is still on
@@ -109,9 +115,7 @@ class LaneLog {
             case Sink::kHistogram32:
                 return count_bins<n, uint32_t>(lane, from, to);
             case Sink::kTimestamps:
-                if constexpr (timed)
-                    for (int i = lane; i < lane + n; ++i) tell_times(i, from, to);
-                return;
+                return tell_times<n>(lane, from, to);
         }
     }
     template <int n>
@@ -132,27 +136,32 @@ class LaneLog {
                 if (bin >= 0) ++rows[i][bin];
             }
     }
+    template <int n>
     void tell_times(int lane, int from, int to) {
-        for (int k = from; k < to; ++k) {
-            if (bin_[k][lane] < 0) continue;
-            const int64_t record = next_[lane]++;
-            const int32_t cycle = round_exposure(cycle_[k][lane], cycles_);
-            output_.times[record] = registration_time(cycle, phase_[k][lane]);
-            output_.cycles[record] = cycle;
-            output_.bins[record] = bin_[k][lane];
-        }
+        int64_t next[n];
+        for (int i = 0; i < n; ++i) next[i] = next_[lane + i];
+        for (int k = from; k < to; ++k)
+            for (int i = 0; i < n; ++i) {
+                const int32_t bin = bin_[k][lane + i];
+                if (bin < 0) continue;
+                const int64_t record = next[i]++;
+                const int32_t cycle = round_exposure(cycle_[k][lane + i], cycles_);
+                output_.times[record] = registration_time(cycle, phase_[k][lane + i]);
+                output_.cycles[record] = cycle;
+                output_.bins[record] = bin;
+            }
+        for (int i = 0; i < n; ++i) next_[lane + i] = next[i];
     }
 
-    static constexpr int kTimes = timed ? kLog : 1;
-
     const Output output_;
+    const bool timed_;
     const size_t bins_;
     const int32_t cycles_;
     int64_t items_[kLanes], next_[kLanes];  // of the job, or -1; the lane's next record
     int first_row_[kLanes] = {}, rows_ = 0;
     alignas(64) int32_t bin_[kLog][kLanes];  // -1: not registered
-    alignas(64) int32_t cycle_[kTimes][kLanes];
-    alignas(64) Phase phase_[kTimes][kLanes];
+    alignas(64) int32_t cycle_[kLog][kLanes];
+    alignas(64) Phase phase_[kLog][kLanes];
 };
 
 }  // namespace MARS_LEVEL

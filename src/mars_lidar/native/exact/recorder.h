@@ -125,10 +125,10 @@ class Recorder {
 // In place of a recorder where every registration is recorded as it is.
 struct NoRecorder {
     explicit NoRecorder(const Job&) {}
+    void begin(int) {}
+    void save_lanes() {}
+    void load_lanes() {}
 };
-
-// What lies between a registration and the log.
-enum class Stage { kPlain, kRecording, kAvalanches };  // the last: what avalanches leave behind, and recording
 
 }  // namespace MARS_LEVEL
 }  // namespace mars

@@ -30,11 +30,14 @@ struct Time {
 
 MARS_INLINE Float magnitude(Float x) { return from_bits(bits(x) & 0x7fffffffu); }
 
+// What is known of the pulse when a loop is compiled; kAny asks its tables: only a sampled pulse has guides.
+enum class PulseKind { kGaussian, kSampled, kAny };
+
 // Position in the frame of the energy p, signed as in pulse_table.h; `size` is its magnitude.
-template <bool gaussian>
+template <PulseKind kind>
 MARS_INLINE Float quantile(const PulseView& pulse, Float p, Float size) {
     const Int cell = as_int(bits(size) >> kEnergyShift);
-    if constexpr (gaussian) {  // the early half, mirrored
+    if (kind == PulseKind::kAny ? pulse.guides == 0 : kind == PulseKind::kGaussian) {  // the early half, mirrored
         const UInt late = bits(p) & 0x80000000u;
         Float intercept, slope;
         gather_pair(pulse.inverse, cell, intercept, slope);
@@ -77,7 +80,7 @@ MARS_INLINE Float resolve_tail(Float p, Float here, Int turns, const Rate& flux,
 // `whole` (a dead time of whole periods) `energy` holds the signed energy of the lanes in `known` at `from` on
 // entry: a registration of this return that re-arms at the same phase takes no detour over the tables. On return
 // it holds the arrival's.
-template <bool gaussian, bool whole>
+template <PulseKind kind, bool whole>
 MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask known, const Rate& flux,
                              const Source& source, Float& energy) {
     const Float x = minimum(maximum(from.phase * pulse.cells_per_period + pulse.cell_of_centre, splat(0.0f)),
@@ -103,7 +106,7 @@ MARS_INLINE Time next_return(const PulseView& pulse, Time from, Wait wait, Mask 
     energy = p;
     // from the late half of a frame to an early half: one frame further
     const Int frames = minus_if(plus_if(turns, late), p < 0.0f);
-    const Float arrival = quantile<gaussian>(pulse, p, size);
+    const Float arrival = quantile<kind>(pulse, p, size);
     // the tables' rounding must not turn time back
     return {from.frame + frames, select(frames == 0, maximum(arrival, from.phase), arrival)};
 }
@@ -162,14 +165,13 @@ MARS_INLINE Draw draw(const Rate& background, const Rate& signal, UInt key0, UIn
 }
 
 // The next registration of a pixel that re-armed at `from`.
-template <bool gaussian, bool whole>
+template <PulseKind kind, bool whole>
 MARS_INLINE Time next_registration(const SystemView& system, const Return* returns, Time from, const Draw& drawn,
                                    UInt key0, UInt key1, UInt event, Memory& memory) {
     Time first = finely_later(from, drawn.background.whole, drawn.background.fraction);
     Float energy = memory.energy;
-    const Time echo =
-        next_return<gaussian, whole>(system.pulse, from, drawn.signal, memory.known & (memory.source == 0),
-                                     returns[0].flux, {key0, key1, event, kStageTails}, energy);
+    const Time echo = next_return<kind, whole>(system.pulse, from, drawn.signal, memory.known & (memory.source == 0),
+                                               returns[0].flux, {key0, key1, event, kStageTails}, energy);
     const Mask wins = before(echo, first);
     first = earlier(wins, echo, first);
     Memory next = {wins, splat(0), energy};
@@ -183,8 +185,8 @@ MARS_INLINE Time next_registration(const SystemView& system, const Return* retur
             energy = memory.energy;
             const Source source = {key0, key1, event, kStageTails + static_cast<uint32_t>(i)};
             const Time frames =
-                next_return<gaussian, whole>(system.pulse, shifted(from, returns[i].offset), waits[i - k],
-                                             memory.known & (memory.source == i), returns[i].flux, source, energy);
+                next_return<kind, whole>(system.pulse, shifted(from, returns[i].offset), waits[i - k],
+                                         memory.known & (memory.source == i), returns[i].flux, source, energy);
             const Time other = shifted(frames, negative(returns[i].offset));
             const Mask sooner = before(other, first);
             first = earlier(sooner, other, first);

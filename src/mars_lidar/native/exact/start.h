@@ -61,7 +61,7 @@ inline double photons_between(const Job& job, const PulseShape& shape, int64_t p
 class Photons {
  public:
     Photons(const Job& job, const PulseTable& pulse, int64_t pixel)
-        : gaussian_(pulse.shape.gaussian()), view_(pulse_view(pulse)), background_(job.background[pixel]) {
+        : view_(pulse_view(pulse)), background_(job.background[pixel]) {
         total_ = background_;
         for (int64_t k = 0; k < job.returns; ++k) {
             total_ += job.signal[k * job.pixels + pixel];
@@ -88,14 +88,12 @@ class Photons {
         while (k + 1 < returns_ && photon >= until_[k]) ++k;
         const float energy = static_cast<float>(u < view_.split ? u : u - 1.0);
         const float size = magnitude(energy);
-        const double time =
-            centre_[k] + (gaussian_ ? quantile<true>(view_, energy, size) : quantile<false>(view_, energy, size));
+        const double time = centre_[k] + quantile<PulseKind::kAny>(view_, energy, size);
         const double phase = time - std::floor(time);
         return phase < 1.0 ? phase : 0.0;
     }
 
  private:
-    bool gaussian_;
     PulseView view_;
     double background_, total_;
     int64_t returns_;

@@ -38,10 +38,10 @@ MARS_INLINE Registration register_arrival(const SystemView& system, const Time& 
 }
 
 // The next registration of pixels that re-armed at `armed`.
-template <DetectorMode mode, bool gaussian, bool whole>
+template <DetectorMode mode, PulseKind kind, bool whole>
 MARS_INLINE Registration register_next(const SystemView& system, const Return* returns, Float delay, const Draw& drawn,
                                        UInt key0, UInt key1, UInt event, Time& armed, Memory& memory) {
-    const Time hit = next_registration<gaussian, whole>(system, returns, armed, drawn, key0, key1, event, memory);
+    const Time hit = next_registration<kind, whole>(system, returns, armed, drawn, key0, key1, event, memory);
     Mask unseen = splat(0) > 0;
     return register_arrival<mode>(system, hit, delay, event, armed, memory, unseen);
 }

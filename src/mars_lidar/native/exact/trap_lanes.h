@@ -87,7 +87,7 @@ class TrapLanes {
 
     // Removes the next release of some lanes; whether others were behind them.
     MARS_INLINE bool drop(Mask lanes) {
-        next_ = earlier(lanes, clock_.all_never(), next_);
+        next_ = earlier(lanes, Clock::all(Clock::never()), next_);
         const Mask more = lanes & (behind_ > 0);
         if (!any(more)) return false;
         promote(more);
@@ -247,6 +247,10 @@ class TrapLanes {
 // In place of them where avalanches leave nothing.
 struct NoTraps {
     explicit NoTraps(const Job&) {}
+    void close(int) {}
+    void open(int, uint32_t, uint32_t) {}
+    void save_lanes() {}
+    void load_lanes() {}
 };
 
 }  // namespace MARS_LEVEL

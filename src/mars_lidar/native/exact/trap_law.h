@@ -9,6 +9,7 @@
 #pragma once
 #include <cmath>
 #include <cstdint>
+#include <vector>
 
 #include "instrument/job.h"
 
@@ -47,10 +48,23 @@ class TrapLaw {
     double least_, hidden_;      // shortest delay that matters; P(delay < least)
 };
 
-// Periods before a stationary exposure that a pixel lives through, from the stationary state without afterpulses and
-// twilight pulses on, until its traps are as full as they will be.
-inline int32_t settling_periods(const Job& job) {
-    return static_cast<int32_t>(std::ceil(64.0 * (job.dead_time + 1.0) + 32.0 * job.traps.mean_delay));
-}
+// Where the items of a block begin that are warmed up at the start of the exposure.
+template <class Phase>
+struct WarmStarts {
+    std::vector<int32_t> cycle;
+    std::vector<Phase> phase;
+
+    static bool wanted(const Job& job) { return job.stationary && (job.dead_time > 0.0 || job.avalanches_matter()); }
+
+    // Pixels whose avalanches matter live on from the stationary state without afterpulses and twilight pulses, for as
+    // many periods before the exposure as it takes until their traps are as full as they will be.
+    void settle(const Job& job, int64_t items) {
+        if (!job.avalanches_matter()) return;
+        cycle.resize(static_cast<size_t>(items), 0);
+        phase.resize(static_cast<size_t>(items), Phase{0});
+        const double periods = std::ceil(64.0 * (job.dead_time + 1.0) + 32.0 * job.traps.mean_delay);
+        for (int32_t& start : cycle) start -= static_cast<int32_t>(periods);
+    }
+};
 
 }  // namespace mars

@@ -4,37 +4,21 @@
 
 #include <algorithm>
 #include <cmath>
-#include <stdexcept>
 #include <vector>
 
 #include "base/full.h"
 #include "feedback/grid.h"
 #include "feedback/pulse_energy.h"
 #include "instrument/pulse_table.h"
-#include "lanes/levels.h"
+#include "lanes/kernels.h"
 
 namespace mars {
-namespace {
-
-using Kernel = bool (*)(const FeedbackBatch&);
-
-// The kernel at the level of this name, or the widest; std::invalid_argument where the processor has none.
-Kernel kernel_of(const std::string& asked) {
-#define MARS_TRY_LEVEL(level, runs) \
-    if ((asked.empty() || asked == #level) && (runs)) return feedback_kernel_##level;
-    MARS_EACH_LEVEL(MARS_TRY_LEVEL)
-#undef MARS_TRY_LEVEL
-    throw std::invalid_argument("level must be one that this processor runs, got '" + asked + "'");
-}
-
-}  // namespace
-
 template <class Count>
 void feedback_histogram(const Job& job, const PulseTable& pulse, Count* out, const FeedbackCall& call, int threads,
                         const std::string& level, const Watch& watch) {
     const int64_t number = call.number;
     if (number == 0) return;
-    const Kernel kernel = kernel_of(level);
+    const auto kernel = kernel_at<const FeedbackBatch&, bool>(level, MARS_KERNELS(feedback_kernel_));
     const CellGrid cells(job, call.merge, call.parts, call.narrow, call.laps);
     const PulseEnergyTables energy(pulse.shape);
 

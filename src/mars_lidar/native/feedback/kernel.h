@@ -2,6 +2,7 @@
 // Symbols and steps are those of docs/feedback.md.
 #pragma once
 #include "base/integers.h"
+#include "lanes/levels.h"
 #if !defined(__CUDACC_RTC__)
 #include <atomic>
 #endif
@@ -105,11 +106,7 @@ inline int64_t feedback_bytes(int64_t cells, int64_t laps, int64_t lit) {
 
 #if !defined(__CUDACC_RTC__)
 // Returns false where a count does not fit into its histogram bin.
-#define MARS_DECLARE_FEEDBACK(level) bool feedback_kernel_##level(const FeedbackBatch& batch);
-MARS_DECLARE_FEEDBACK(scalar)
-MARS_DECLARE_FEEDBACK(vector128)
-MARS_DECLARE_FEEDBACK(avx2)
-MARS_DECLARE_FEEDBACK(avx512)
+MARS_DECLARE_KERNEL(bool, feedback_kernel_, const FeedbackBatch& batch)
 #endif
 
 }  // namespace mars

@@ -6,7 +6,7 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
-#if defined(__GNUC__)
+#if defined(__GNUC__) || defined(__clang__)
 // How many bits are set.
 MARS_INLINE int popcount(uint64_t x) { return __builtin_popcountll(x); }
 // The place of the lowest and of the highest bit that is set, of a word that is not 0.

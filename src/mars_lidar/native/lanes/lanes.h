@@ -19,7 +19,7 @@
 #endif
 
 // Pastes two names after expanding them: MARS_JOIN(exact_kernel_, MARS_LEVEL) is exact_kernel_avx2 at that level. The
-// entry points of kernels carry the name of their level, by which lanes/levels.h finds them at run time.
+// entry points of kernels carry the name of their level, by which lanes/kernels.h finds them at run time.
 #define MARS_JOIN2(a, b) a##b
 #define MARS_JOIN(a, b) MARS_JOIN2(a, b)
 
@@ -37,7 +37,7 @@
 #if defined(__CUDACC__)
 #define MARS_INLINE __device__ __forceinline__
 #define MARS_NOINLINE
-#elif defined(_MSC_VER)
+#elif defined(_MSC_VER) && !defined(__clang__)
 #define MARS_INLINE __forceinline
 #define MARS_NOINLINE __declspec(noinline)
 #else
@@ -52,14 +52,14 @@ inline namespace MARS_LEVEL {
 // caches.
 template <int write = 0, int locality = 3>
 MARS_INLINE void prefetch([[maybe_unused]] const void* at) {
-#if defined(__GNUC__) && !defined(__CUDACC__)
+#if (defined(__GNUC__) || defined(__clang__)) && !defined(__CUDACC__)
     __builtin_prefetch(at, write, locality);
 #endif
 }
 
 // A condition that is seldom true: compilers put what it guards out of the way.
 MARS_INLINE bool seldom(bool condition) {
-#if defined(__GNUC__) && !defined(__CUDACC__)
+#if (defined(__GNUC__) || defined(__clang__)) && !defined(__CUDACC__)
     return __builtin_expect(condition, false);
 #else
     return condition;

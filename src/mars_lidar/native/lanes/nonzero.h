@@ -8,10 +8,12 @@
 #if defined(__SSE2__)
 #include <emmintrin.h>
 #endif
-#if defined(__GNUC__) && defined(__x86_64__)
+#if defined(__x86_64__)
 #define MARS_AVX512 __attribute__((target("avx512f,avx512bw,avx512vl")))
 #include <immintrin.h>
 #endif
+
+#include "lanes/processor.h"
 
 namespace mars {
 
@@ -84,7 +86,7 @@ MARS_AVX512 size_t find_nonzero_wide(const Count* values, size_t size, uint32_t*
 template <class Count>
 auto finder() -> size_t (*)(const Count*, size_t, uint32_t*) {
 #if defined(MARS_AVX512)
-    if (__builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl")) return &find_nonzero_wide<Count>;
+    if (has_avx512()) return &find_nonzero_wide<Count>;
 #endif
     return &find_nonzero<Count>;
 }

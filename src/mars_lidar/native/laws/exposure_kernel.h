@@ -4,6 +4,8 @@
 #include <atomic>
 #include <cstdint>
 
+#include "lanes/levels.h"
+
 namespace mars {
 
 constexpr int kExposureParts = 4;   // photon energies are given per quarter of a grid bin
@@ -118,15 +120,9 @@ struct CharacteristicBlock {
 };
 
 // Cumulants and mean histogram; what start and end phases change; the stationary state; the generating function.
-#define MARS_DECLARE_EXPOSURE(level)                                \
-    void exposure_moments_##level(const MomentsBlock& block);       \
-    void exposure_phases_##level(const PhasesBlock& block);         \
-    void exposure_stationary_##level(const StationaryBlock& block); \
-    void exposure_characteristic_##level(const CharacteristicBlock& block);
-
-MARS_DECLARE_EXPOSURE(scalar)
-MARS_DECLARE_EXPOSURE(vector128)
-MARS_DECLARE_EXPOSURE(avx2)
-MARS_DECLARE_EXPOSURE(avx512)
+MARS_DECLARE_KERNEL(void, exposure_moments_, const MomentsBlock& block)
+MARS_DECLARE_KERNEL(void, exposure_phases_, const PhasesBlock& block)
+MARS_DECLARE_KERNEL(void, exposure_stationary_, const StationaryBlock& block)
+MARS_DECLARE_KERNEL(void, exposure_characteristic_, const CharacteristicBlock& block)
 
 }  // namespace mars

@@ -23,7 +23,7 @@ MARS_INLINE void set_lane(Real& x, int k, double value) { x[k] = value; }
 #endif
 
 // Loops over coefficients must vanish before the compiler decides what lives in registers.
-#if defined(_MSC_VER)
+#if defined(_MSC_VER) && !defined(__clang__)
 #define MARS_UNROLL
 #else
 #define MARS_UNROLL _Pragma("GCC unroll 8")

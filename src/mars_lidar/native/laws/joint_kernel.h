@@ -4,6 +4,8 @@
 #include <atomic>
 #include <cstdint>
 
+#include "lanes/levels.h"
+
 namespace mars {
 
 // Windows [first, first + count), count at most the level's lanes. Arrays are (windows, n).
@@ -24,11 +26,6 @@ struct AdjointBlock {
 };
 
 // Solves the windows of a block: `done` and `error` tell how each ended.
-#define MARS_DECLARE_JOINT(level) void joint_adjoint_##level(const AdjointBlock& block);
-
-MARS_DECLARE_JOINT(scalar)
-MARS_DECLARE_JOINT(vector128)
-MARS_DECLARE_JOINT(avx2)
-MARS_DECLARE_JOINT(avx512)
+MARS_DECLARE_KERNEL(void, joint_adjoint_, const AdjointBlock& block)
 
 }  // namespace mars

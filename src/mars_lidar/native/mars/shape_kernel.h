@@ -6,6 +6,7 @@
 #include <atomic>
 #include <cstdint>
 
+#include "lanes/levels.h"
 #include "mars/shape_job.h"
 
 namespace mars {
@@ -26,20 +27,7 @@ struct ShapeBlock {
 
 // Functions of this header have internal linkage: one compiled for AVX-512 must not be linked in place of another.
 
-using ShapeKernel = void (*)(ShapeBlock&);
-
-#ifdef MARS_HAS_scalar
-void shape_kernel_scalar(ShapeBlock& block);
-#endif
-#ifdef MARS_HAS_vector128
-void shape_kernel_vector128(ShapeBlock& block);
-#endif
-#ifdef MARS_HAS_avx2
-void shape_kernel_avx2(ShapeBlock& block);
-#endif
-#ifdef MARS_HAS_avx512
-void shape_kernel_avx512(ShapeBlock& block);
-#endif
+MARS_DECLARE_KERNEL(void, shape_kernel_, ShapeBlock& block)
 
 // Work area of one thread: six arrays of the bins, the classes, the frame, and photons on their way.
 int64_t shape_memory(const ShapeJob& job);

@@ -5,11 +5,10 @@
 #include <algorithm>
 #include <cmath>
 #include <new>
-#include <stdexcept>
 #include <vector>
 
 #include "base/full.h"
-#include "lanes/levels.h"
+#include "lanes/kernels.h"
 #include "mars/shape_kernel.h"
 #include "numbers/poisson_sampler.h"
 
@@ -26,15 +25,6 @@ int64_t shape_memory(const ShapeJob& job) {
 namespace {
 
 constexpr int64_t kChunkBins = 1 << 19;  // a millisecond of work
-
-// The kernel at the level of this name, or the widest; std::invalid_argument where the processor has none.
-ShapeKernel kernel_of(const std::string& asked) {
-#define MARS_TRY_LEVEL(level, runs) \
-    if ((asked.empty() || asked == #level) && (runs)) return shape_kernel_##level;
-    MARS_EACH_LEVEL(MARS_TRY_LEVEL)
-#undef MARS_TRY_LEVEL
-    throw std::invalid_argument("level must be one that this processor runs, got '" + asked + "'");
-}
 
 // A Poisson number of a mean beyond those that the lanes draw, from a stream of its own.
 int64_t large_poisson(uint64_t key, uint32_t event, uint32_t step, double mean) {
@@ -60,7 +50,7 @@ class WorkArea {
 template <class Count>
 void shape_histogram(const ShapeJob& job, const int64_t* counts, Count* out, int threads, const std::string& level,
                      const Watch& watch) {
-    const ShapeKernel kernel = kernel_of(level);
+    const auto kernel = kernel_at<ShapeBlock&>(level, MARS_KERNELS(shape_kernel_));
     ShapeJob full = job;
     full.counts = counts;
     const int64_t memory = shape_memory(job);
@@ -99,7 +89,7 @@ void shape_aligned(const ShapeJob& job, double* out, const std::string& level) {
     block.memory = area.get();
     block.aligned = out;
     block.stop = &stop;
-    kernel_of(level)(block);
+    kernel_at<ShapeBlock&>(level, MARS_KERNELS(shape_kernel_))(block);
 }
 
 void look_at_row(const ShapeJob& job, int64_t row, RowGuide& guide) {

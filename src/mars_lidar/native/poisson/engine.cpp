@@ -206,10 +206,8 @@ void fill(const EventStream& stream, const Means& means, const PoissonTable* tab
     }
 }
 
-}  // namespace
-
 template <class Count>
-void poisson_histogram(const Job& job, const PulseShape& pulse, Count* out, int threads, const Watch& watch) {
+void histograms(const Job& job, const PulseShape& pulse, Count* out, int threads, const Watch& watch) {
     // Chunks are runs of pixels, all realizations of each, so that a pixel's means are worked out once; with
     // few pixels, runs of realizations.
     const int64_t size = std::max<int64_t>(1, kChunkBins / job.bins);
@@ -235,7 +233,13 @@ void poisson_histogram(const Job& job, const PulseShape& pulse, Count* out, int 
         }
     });
 }
-template void poisson_histogram(const Job&, const PulseShape&, uint16_t*, int, const Watch&);
-template void poisson_histogram(const Job&, const PulseShape&, uint32_t*, int, const Watch&);
+
+}  // namespace
+
+void run_poisson(const Job& job, const PulseShape& pulse, const Output& output, int threads, const Watch& watch) {
+    if (output.sink == Sink::kHistogram16)
+        return histograms(job, pulse, static_cast<uint16_t*>(output.out), threads, watch);
+    histograms(job, pulse, static_cast<uint32_t*>(output.out), threads, watch);
+}
 
 }  // namespace mars

@@ -5,14 +5,14 @@
 
 #include "base/parallel.h"
 #include "instrument/job.h"
+#include "instrument/output.h"
 #include "instrument/pulse.h"
 
 namespace mars {
 
 constexpr uint64_t kPoissonDomain = 0x506f6973736f6e00u;  // "Poisson": not the exact engine's numbers at one seed
 
-// Histograms out (items, bins); std::overflow_error where a count does not fit. For uint16_t and uint32_t.
-template <class Count>
-void poisson_histogram(const Job& job, const PulseShape& pulse, Count* out, int threads, const Watch& watch);
+// Draws the histograms of a job's items into `output`; std::overflow_error where a count does not fit.
+void run_poisson(const Job& job, const PulseShape& pulse, const Output& output, int threads, const Watch& watch);
 
 }  // namespace mars

@@ -1,6 +1,8 @@
 // What the bindings share: nanobind's arrays by short names, and objects of Python together with the arrays into which they
 // point. Bindings check shapes and convert; algorithms are in the other folders and know no Python.
 #pragma once
+#include <string>
+
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
@@ -23,6 +25,20 @@ int64_t size_of(const Vector<T>& vector) {
     return static_cast<int64_t>(vector.shape(0));
 }
 
+// Checks the histograms that an engine is to fill.
+template <class Count>
+void check_histogram(const Job& job, const Matrix<Count>& out) {
+    if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
+        throw nb::value_error("out must be (realizations * pixels, bins)");
+}
+
+// Checks an array's shape; `name` is in the message.
+template <class T>
+void expect(const char* name, const Matrix<T>& array, int64_t rows, int64_t columns) {
+    if (static_cast<int64_t>(array.shape(0)) != rows || static_cast<int64_t>(array.shape(1)) != columns)
+        throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
+}
+
 // A job together with the arrays that it points into.
 struct BoundJob : Job {
     nb::object arrays;
@@ -36,13 +52,10 @@ struct BoundRecording : Recording {
 void bind_pulse(nb::module_& module);
 void bind_recording(nb::module_& module);
 void bind_job(nb::module_& module);
-void bind_exact(nb::module_& module);
+void bind_engines(nb::module_& module);
 void bind_exact_device(nb::module_& module);
 void bind_mars_device(nb::module_& module);
 void bind_feedback_device(nb::module_& module);
-void bind_waveform(nb::module_& module);
-void bind_sequential(nb::module_& module);
-void bind_poisson(nb::module_& module);
 void bind_chain(nb::module_& module);
 void bind_exposure(nb::module_& module);
 void bind_joint(nb::module_& module);

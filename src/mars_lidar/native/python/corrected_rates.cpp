@@ -7,6 +7,7 @@
 #include <nanobind/stl/optional.h>
 
 #include "python/bindings.h"
+#include "python/count_rows.h"
 #include "python/watched.h"
 
 namespace mars {
@@ -20,27 +21,22 @@ CorrectionSettings settings_of(int correction, int steps, double tolerance,
     return {static_cast<Correction>(correction), steps, tolerance, total ? total->data() : nullptr};
 }
 
-template <class Count>
-void rates(const HistogramRecord& recording, Matrix<const Count> histogram, int correction, int steps, double tolerance,
+void rates(const HistogramRecord& recording, Histograms histogram, int correction, int steps, double tolerance,
            std::optional<Vector<const double>> total, Matrix<double> out, Vector<uint8_t> flags, int threads) {
     const size_t pixels = histogram.shape(0), bins = static_cast<size_t>(recording.bins);
     if (histogram.shape(1) != bins || out.shape(0) != pixels || out.shape(1) != bins || flags.shape(0) != pixels)
         throw nb::value_error("histogram and out must be (pixels, bins), flags (pixels)");
     const CorrectionSettings settings = settings_of(correction, steps, tolerance, total, pixels);
-    const int64_t count = static_cast<int64_t>(pixels);
-    run_watched_chunks((count + kChunk - 1) / kChunk, threads, nb::none(),
-                       [&](int64_t chunk, const std::atomic<bool>& stop) {
-                           Corrector correct(recording, settings);
-                           for (int64_t p = chunk * kChunk; p < std::min(count, (chunk + 1) * kChunk); ++p) {
-                               if (stop) return;
-                               flags.data()[p] = correct(histogram.data() + p * recording.bins, p, false);
-                               std::copy(correct.rate.begin(), correct.rate.end(), out.data() + p * recording.bins);
-                           }
-                       });
+    const CountRows counts = rows_of(histogram);
+    run_watched_items(static_cast<int64_t>(pixels), kChunk, threads, nb::none(), [&] {
+        return [&, correct = Corrector(recording, settings)](int64_t p) mutable {
+            flags.data()[p] = correct(counts, p, false);
+            std::copy(correct.rate.begin(), correct.rate.end(), out.data() + p * recording.bins);
+        };
+    });
 }
 
-template <class Count>
-void windows(const HistogramRecord& recording, Matrix<const Count> histogram, int correction, int locator, int steps,
+void windows(const HistogramRecord& recording, Histograms histogram, int correction, int locator, int steps,
              double tolerance, std::optional<Vector<const double>> total, Matrix<double> out, Vector<uint8_t> flags,
              int threads, nb::object progress) {
     const size_t pixels = histogram.shape(0);
@@ -48,18 +44,14 @@ void windows(const HistogramRecord& recording, Matrix<const Count> histogram, in
         out.shape(1) != kWindowColumns || flags.shape(0) != pixels)
         throw nb::value_error("histogram must be (pixels, bins), out (pixels, 5), flags (pixels)");
     const CorrectionSettings settings = settings_of(correction, steps, tolerance, total, pixels);
-    const int64_t count = static_cast<int64_t>(pixels);
-    run_watched_chunks(
-        (count + kChunk - 1) / kChunk, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-            Corrector correct(recording, settings);
-            WindowEstimate estimate(recording, static_cast<Locator>(locator));
-            for (int64_t p = chunk * kChunk; p < std::min(count, (chunk + 1) * kChunk); ++p) {
-                if (stop) return;
-                flags.data()[p] =
-                    estimate_window(correct, estimate, settings.correction == Correction::kPasses,
-                                    histogram.data() + p * recording.bins, p, out.data() + p * kWindowColumns);
-            }
-        });
+    const CountRows counts = rows_of(histogram);
+    run_watched_items(static_cast<int64_t>(pixels), kChunk, threads, progress, [&] {
+        return [&, correct = Corrector(recording, settings),
+                estimate = WindowEstimate(recording, static_cast<Locator>(locator))](int64_t p) mutable {
+            flags.data()[p] = estimate_window(correct, estimate, settings.correction == Correction::kPasses, counts, p,
+                                              out.data() + p * kWindowColumns);
+        };
+    });
 }
 
 std::vector<double> values_of(const Vector<const double>& values) {
@@ -105,20 +97,14 @@ void bind_corrected_rates(nb::module_& module) {
             nb::arg("stationary"), nb::arg("synchronous"), nb::arg("pulse_low"), nb::arg("pulse_cell"),
             nb::arg("energy"), nb::arg("slope"), nb::arg("peak"), nb::arg("width"), nb::arg("core_low"),
             nb::arg("core_high"), nb::arg("open_low"), nb::arg("open_high"));
-    auto add = [&](auto* rate_function, auto* window_function) {
-        module.def("corrected_rates", rate_function, nb::arg("recording"), nb::arg("histogram").noconvert(),
-                   nb::kw_only(), nb::arg("correction"), nb::arg("steps"), nb::arg("tolerance"),
-                   nb::arg("total").none(), nb::arg("out").noconvert(), nb::arg("flags").noconvert(),
-                   nb::arg("threads"), "Photons per period of each bin: out (pixels, bins).");
-        module.def("window_estimates", window_function, nb::arg("recording"), nb::arg("histogram").noconvert(),
-                   nb::kw_only(), nb::arg("correction"), nb::arg("locator"), nb::arg("steps"), nb::arg("tolerance"),
-                   nb::arg("total").none(), nb::arg("out").noconvert(), nb::arg("flags").noconvert(),
-                   nb::arg("threads"), nb::arg("progress").none(),
-                   "Signal, background, delay and errors of the first two: out (pixels, 5).");
-    };
-    add(&rates<uint16_t>, &windows<uint16_t>);
-    add(&rates<uint32_t>, &windows<uint32_t>);
-    add(&rates<double>, &windows<double>);
+    module.def("corrected_rates", &rates, nb::arg("recording"), nb::arg("histogram").noconvert(), nb::kw_only(),
+               nb::arg("correction"), nb::arg("steps"), nb::arg("tolerance"), nb::arg("total").none(),
+               nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"),
+               "Photons per period of each bin: out (pixels, bins).");
+    module.def("window_estimates", &windows, nb::arg("recording"), nb::arg("histogram").noconvert(), nb::kw_only(),
+               nb::arg("correction"), nb::arg("locator"), nb::arg("steps"), nb::arg("tolerance"),
+               nb::arg("total").none(), nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"),
+               nb::arg("progress").none(), "Signal, background, delay and errors of the first two: out (pixels, 5).");
 }
 
 }  // namespace mars

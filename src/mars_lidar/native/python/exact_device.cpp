@@ -11,40 +11,34 @@
 namespace mars {
 namespace {
 
-template <class T>
-T* at(uint64_t address) {
-    return reinterpret_cast<T*>(static_cast<uintptr_t>(address));
-}
-
 // Addresses of the task's arrays, by name; 0 where there is none.
 DeviceTask task_of(const BoundJob& job, const PulseTable& pulse, const nb::dict& addresses, int64_t first,
                    int64_t items) {
-    const auto address = [&](const char* name) {
-        return addresses.contains(name) ? nb::cast<uint64_t>(addresses[name]) : uint64_t{0};
-    };
+    const nb::dict none;
+    const DeviceFields f(addresses, none);
     DeviceTask task{};
     task.system = view(job, pulse);
     PulseView& tables = task.system.pulse;
-    tables.forward = at<const float>(address("forward"));
-    tables.inverse = at<const float>(address("inverse"));
-    tables.guide = at<const int32_t>(address("guide"));
-    tables.upper = at<const float>(address("upper"));
-    tables.end = at<const float>(address("end"));
-    tables.periods_per_energy = at<const float>(address("periods_per_energy"));
+    tables.forward = f.at<const float>("forward");
+    tables.inverse = f.at<const float>("inverse");
+    tables.guide = f.at<const int32_t>("guide");
+    tables.upper = f.at<const float>("upper");
+    tables.end = f.at<const float>("end");
+    tables.periods_per_energy = f.at<const float>("periods_per_energy");
     task.centre = pulse.centre;
     task.seed = job.seed;
-    task.signal = at<const double>(address("signal"));
-    task.delay = at<const double>(address("delay"));
-    task.background = at<const double>(address("background"));
-    task.pixel_index = at<const uint32_t>(address("pixel_index"));
-    task.order = at<const int32_t>(address("order"));
-    task.start_cycle = at<const int32_t>(address("start_cycle"));
-    task.start_phase = at<const float>(address("start_phase"));
-    task.out = at<void>(address("out"));
-    task.offsets = at<const int64_t>(address("offsets"));
-    task.times = at<double>(address("times"));
-    task.cycles = at<int32_t>(address("cycles"));
-    task.bins = at<int32_t>(address("bins"));
+    task.signal = f.at<const double>("signal");
+    task.delay = f.at<const double>("delay");
+    task.background = f.at<const double>("background");
+    task.pixel_index = f.at<const uint32_t>("pixel_index");
+    task.order = f.at<const int32_t>("order");
+    task.start_cycle = f.at<const int32_t>("start_cycle");
+    task.start_phase = f.at<const float>("start_phase");
+    task.out = f.at<void>("out");
+    task.offsets = f.at<const int64_t>("offsets");
+    task.times = f.at<double>("times");
+    task.cycles = f.at<int32_t>("cycles");
+    task.bins = f.at<int32_t>("bins");
     task.pixels = job.pixels;
     task.first = first;
     task.items = items;
@@ -63,8 +57,7 @@ void bind_exact_device(nb::module_& module) {
     module.def(
         "device_task",
         [](const BoundJob& job, const PulseTable& pulse, const nb::dict& addresses, int64_t first, int64_t items) {
-            const DeviceTask task = task_of(job, pulse, addresses, first, items);
-            return nb::bytes(reinterpret_cast<const char*>(&task), sizeof task);
+            return as_bytes(task_of(job, pulse, addresses, first, items));
         },
         nb::arg("job"), nb::arg("pulse"), nb::arg("addresses"), nb::arg("first"), nb::arg("items"),
         "The argument of the GPU's kernel: `addresses` of device arrays by name.");

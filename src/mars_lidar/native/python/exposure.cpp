@@ -1,58 +1,30 @@
 // Bindings of the exposure recursion: batches of entries on threads, through the widest kernel that runs here.
 #include <optional>
-#include <stdexcept>
 #include <string>
 #include <vector>
 
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
-#include "lanes/levels.h"
+#include "lanes/kernels.h"
 #include "laws/exposure_kernel.h"
 #include "python/bindings.h"
 #include "python/watched.h"
 
 namespace mars {
 
-void bind_exposure(nb::module_& module);
-
 namespace {
 
 constexpr int64_t kBatchBytes = int64_t{256} << 20;  // what one batch of lanes may remember
 
-struct Level {
-    const char* name;
-    int lanes;
-    void (*moments)(const MomentsBlock&);
-    void (*phases)(const PhasesBlock&);
-    void (*stationary)(const StationaryBlock&);
-    void (*characteristic)(const CharacteristicBlock&);
-};
-
-// Widest first.
-std::vector<Level> levels() {
-    std::vector<Level> found;
-#define MARS_ADD_LEVEL(level, runs)                                                                   \
-    if (runs)                                                                                         \
-        found.push_back({#level, kDoubles_##level, exposure_moments_##level, exposure_phases_##level, \
-                         exposure_stationary_##level, exposure_characteristic_##level});
-    MARS_EACH_LEVEL(MARS_ADD_LEVEL)
-#undef MARS_ADD_LEVEL
-    return found;
-}
-
 // The widest level, or the one named, whose batches do not remember more than kBatchBytes and whose lanes are filled by
-// `jobs`: a lane without work costs as much as another. The narrowest if
-// none.
-Level level_for(const std::string& name, int64_t bytes_per_lane, int64_t jobs) {
-    Level chosen{};
-    for (const Level& level : levels()) {
-        if (!name.empty() && name != level.name) continue;
-        chosen = level;
-        if (!name.empty() || (level.lanes * bytes_per_lane <= kBatchBytes && level.lanes < 2 * jobs)) break;
-    }
-    if (!chosen.moments) throw std::invalid_argument("level must be one that this processor runs, got '" + name + "'");
-    return chosen;
+// `jobs`: a lane without work costs as much as another. The narrowest if none.
+template <class Block>
+LevelKernel<const Block&> level_for(const std::string& name, int64_t bytes_per_lane, int64_t jobs,
+                                    std::initializer_list<LevelKernel<const Block&>> kernels) {
+    return fitting_kernel<const Block&, void>(name, kernels, [&](const auto& level) {
+        return level.doubles * bytes_per_lane <= kBatchBytes && level.doubles < 2 * jobs;
+    });
 }
 
 int64_t bytes_per_lane(const ExposureGrid& grid, int64_t numbers) {
@@ -88,12 +60,6 @@ void add_history(ExposureFlux& flux, const History& history) {
     flux.history = history->data();
 }
 
-template <class T>
-void expect(const char* name, const T& array, int64_t rows, int64_t columns) {
-    if (static_cast<int64_t>(array.shape(0)) != rows || static_cast<int64_t>(array.shape(1)) != columns)
-        throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
-}
-
 ExposureRate make_rate(const ExposureGrid& grid, const Vector<const double>& photons,
                        const Matrix<const double>& rates) {
     ExposureRate rate;
@@ -115,14 +81,15 @@ void run_moments(const ExposureGrid& grid, const ExposureFlux* flux, const Expos
     expect("histogram", histogram, entries, grid.out_bins);
     expect("histogram_rate", histogram_rate, entries, grid.out_bins);
     if (static_cast<int64_t>(settled.shape(0)) != entries) throw nb::value_error("settled has the wrong shape");
-    const Level level = level_for(level_name, bytes_per_lane(grid, kExposureOrders + 1), entries);
-    const int64_t batches = (entries + level.lanes - 1) / level.lanes;
+    const auto level = level_for<MomentsBlock>(level_name, bytes_per_lane(grid, kExposureOrders + 1), entries,
+                                               MARS_KERNELS(exposure_moments_));
+    const int64_t batches = (entries + level.doubles - 1) / level.doubles;
     run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
-        const int64_t first = batch * level.lanes;
+        const int64_t first = batch * level.doubles;
         MomentsBlock block{&grid,
                            flux,
                            first,
-                           std::min<int64_t>(level.lanes, entries - first),
+                           std::min<int64_t>(level.doubles, entries - first),
                            cumulants.data(),
                            cumulant_rates.data(),
                            histogram.data(),
@@ -130,7 +97,7 @@ void run_moments(const ExposureGrid& grid, const ExposureFlux* flux, const Expos
                            settled.data(),
                            &stop};
         block.rate = rate;
-        level.moments(block);
+        level.call(block);
     });
 }
 
@@ -170,14 +137,15 @@ void phases(const ExposureGrid& grid, Vector<const double> signal, Vector<const 
             throw nb::value_error("phase must be ascending edges of the grid");
     const std::vector<double>::size_type cells = static_cast<size_t>(flux.entries);
     std::vector<double> rates(cells * kExposureOrders), histogram(cells * grid.out_bins), rate(cells * grid.out_bins);
-    const Level level = level_for(level_name, 2 * bytes_per_lane(grid, kExposureOrders + 1), flux.entries);
-    const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
+    const auto level = level_for<PhasesBlock>(level_name, 2 * bytes_per_lane(grid, kExposureOrders + 1), flux.entries,
+                                              MARS_KERNELS(exposure_phases_));
+    const int64_t batches = (flux.entries + level.doubles - 1) / level.doubles;
     run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
-        const int64_t first = batch * level.lanes;
+        const int64_t first = batch * level.doubles;
         const MomentsBlock forward{&grid,
                                    &flux,
                                    first,
-                                   std::min<int64_t>(level.lanes, flux.entries - first),
+                                   std::min<int64_t>(level.doubles, flux.entries - first),
                                    cumulants.data(),
                                    rates.data(),
                                    histogram.data(),
@@ -187,7 +155,7 @@ void phases(const ExposureGrid& grid, Vector<const double> signal, Vector<const 
                                    phase.data(),
                                    edges,
                                    correction.data()};
-        level.phases({forward, edges, correction.data()});
+        level.call({forward, edges, correction.data()});
     });
 }
 
@@ -197,12 +165,12 @@ void stationary(const ExposureGrid& grid, Vector<const double> signal, Vector<co
     const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
     expect("histogram", histogram, flux.entries, grid.out_bins);
     if (static_cast<int64_t>(settled.shape(0)) != flux.entries) throw nb::value_error("settled has the wrong shape");
-    const Level level = level_for(level_name, 0, flux.entries);
-    const int64_t batches = (flux.entries + level.lanes - 1) / level.lanes;
+    const auto level = level_for<StationaryBlock>(level_name, 0, flux.entries, MARS_KERNELS(exposure_stationary_));
+    const int64_t batches = (flux.entries + level.doubles - 1) / level.doubles;
     run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
-        const int64_t first = batch * level.lanes;
-        level.stationary({&grid, &flux, first, std::min<int64_t>(level.lanes, flux.entries - first), histogram.data(),
-                          settled.data(), &stop});
+        const int64_t first = batch * level.doubles;
+        level.call({&grid, &flux, first, std::min<int64_t>(level.doubles, flux.entries - first), histogram.data(),
+                    settled.data(), &stop});
     });
 }
 
@@ -216,13 +184,13 @@ void run_characteristic(const ExposureGrid& grid, const ExposureFlux* flux, cons
     expect("re", re, entries, points);
     expect("im", im, entries, points);
     expect("settled", settled, entries, points);
-    const Level level = level_for(level_name, bytes_per_lane(grid, 2), points);
-    const int64_t batches = (points + level.lanes - 1) / level.lanes;
+    const auto level = level_for<CharacteristicBlock>(level_name, bytes_per_lane(grid, 2), points,
+                                                      MARS_KERNELS(exposure_characteristic_));
+    const int64_t batches = (points + level.doubles - 1) / level.doubles;
     run_watched_chunks(entries * batches, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-        const int64_t entry = chunk / batches, first = chunk % batches * level.lanes, at = entry * points + first;
-        level.characteristic({&grid, flux, entry, std::min<int64_t>(level.lanes, points - first), tilted,
-                              z_re.data() + at, z_im.data() + at, re.data() + at, im.data() + at, settled.data() + at,
-                              &stop, rate});
+        const int64_t entry = chunk / batches, first = chunk % batches * level.doubles, at = entry * points + first;
+        level.call({&grid, flux, entry, std::min<int64_t>(level.doubles, points - first), tilted, z_re.data() + at,
+                    z_im.data() + at, re.data() + at, im.data() + at, settled.data() + at, &stop, rate});
     });
 }
 

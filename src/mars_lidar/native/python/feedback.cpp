@@ -5,7 +5,6 @@
 
 #include "instrument/pulse_table.h"
 #include "python/bindings.h"
-#include "python/histogram_output.h"
 #include "python/watched.h"
 
 namespace mars {

@@ -1,16 +1,14 @@
 // Bindings of the joint law (statistics/joint.py): bin responses, the feedback equations of the folded exposure
 // (laws/joint_folded.h) and their transpose (laws/joint_kernel.h), and the exact recursion for exposures that do not settle
 // (laws/joint_exposure.h). Python validates and composes.
-#include <stdexcept>
 #include <string>
 #include <utility>
-#include <vector>
 
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 
+#include "lanes/kernels.h"
 #include "lanes/lanes.h"
-#include "lanes/levels.h"
 #include "laws/joint_exposure.h"
 #include "laws/joint_folded.h"
 #include "laws/joint_kernel.h"
@@ -19,29 +17,7 @@
 
 namespace mars {
 
-void bind_joint(nb::module_& module);
-
 namespace {
-
-struct Level {
-    int lanes;
-    void (*adjoint)(const AdjointBlock&);
-};
-
-// The widest level that runs here and of which `windows` fill more than half; the narrowest for a single one.
-Level level_for(int64_t windows) {
-#define MARS_TRY_LEVEL(level, runs) \
-    if (windows > kDoubles_##level / 2 && (runs)) return {kDoubles_##level, joint_adjoint_##level};
-    MARS_EACH_LEVEL(MARS_TRY_LEVEL)
-#undef MARS_TRY_LEVEL
-    return {MARS_JOIN(kDoubles_, MARS_BASE_LEVEL), MARS_JOIN(joint_adjoint_, MARS_BASE_LEVEL)};
-}
-
-template <class T>
-void expect(const char* name, const Matrix<T>& array, size_t rows, size_t columns) {
-    if (array.shape(0) != rows || array.shape(1) != columns)
-        throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
-}
 
 FeedbackGrid make_grid(const Matrix<const double>& response, int64_t whole, int32_t shift, double fraction) {
     const int32_t n = static_cast<int32_t>(response.shape(1));
@@ -63,21 +39,23 @@ void adjoint(Matrix<const double> response, int32_t shift, double fraction, Matr
              std::optional<Matrix<const double>> moment_in, Matrix<double> mass, Matrix<double> moment, int64_t sweeps,
              double tolerance, Vector<int64_t> done, Vector<double> error) {
     const FeedbackGrid grid = make_grid(response, 0, shift, fraction);
-    const size_t windows = mass_in.shape(0), n = response.shape(1);
+    const int64_t windows = static_cast<int64_t>(mass_in.shape(0)), n = grid.bins;
     expect("mass_in", mass_in, windows, n);
     if (moment_in) expect("moment_in", *moment_in, windows, n);
     expect("mass", mass, windows, n);
     expect("moment", moment, windows, n);
-    if (done.shape(0) != windows || error.shape(0) != windows) throw nb::value_error("done and error: one per window");
-    const Level level = level_for(static_cast<int64_t>(windows));
-    const int64_t count = static_cast<int64_t>(windows), batches = (count + level.lanes - 1) / level.lanes;
+    if (size_of(done) != windows || size_of(error) != windows) throw nb::value_error("done and error: one per window");
+    const auto kernel =  // of which the windows fill more than half
+        fitting_kernel<const AdjointBlock&, void>("", MARS_KERNELS(joint_adjoint_),
+                                                  [&](const auto& level) { return windows > level.doubles / 2; });
+    const int64_t lanes = kernel.doubles, batches = (windows + lanes - 1) / lanes;
     auto work = [&](int64_t batch, const std::atomic<bool>& stop) {
-        const int64_t first = batch * level.lanes;
-        level.adjoint({grid.response, grid.bins, shift, fraction, first, std::min<int64_t>(level.lanes, count - first),
-                       mass_in.data(), moment_in ? moment_in->data() : nullptr, mass.data(), moment.data(), sweeps,
-                       tolerance, done.data(), error.data(), &stop});
+        const int64_t first = batch * lanes;
+        kernel.call({grid.response, grid.bins, shift, fraction, first, std::min(lanes, windows - first), mass_in.data(),
+                     moment_in ? moment_in->data() : nullptr, mass.data(), moment.data(), sweeps, tolerance,
+                     done.data(), error.data(), &stop});
     };
-    if (count * static_cast<int64_t>(n) < 1 << 16) {  // a window takes less time than to start a thread
+    if (windows * n < 1 << 16) {  // a window takes less time than to start a thread
         const std::atomic<bool> stop{false};
         for (int64_t batch = 0; batch < batches; ++batch) work(batch, stop);
     } else {

@@ -22,11 +22,7 @@ int64_t check_cells(const Matrix<const double>& cumulants) {
 // Calls work(cell) for each cell, on threads.
 template <class Work>
 void for_cells(int64_t cells, int threads, const Work& work) {
-    run_watched_chunks((cells + kChunkCells - 1) / kChunkCells, threads, nb::none(),
-                       [&](int64_t chunk, const std::atomic<bool>& stop) {
-                           const int64_t end = std::min(cells, (chunk + 1) * kChunkCells);
-                           for (int64_t cell = chunk * kChunkCells; cell < end && !stop; ++cell) work(cell);
-                       });
+    run_watched_items(cells, kChunkCells, threads, nb::none(), [&] { return work; });
 }
 
 void support(Matrix<const double> cumulants, Vector<int64_t> first, Vector<int64_t> last, Vector<bool> trusted,

@@ -2,14 +2,15 @@
 #include "reconstruct/maximizer.h"
 
 #include "python/bindings.h"
+#include "python/count_rows.h"
 #include "python/watched.h"
 
 namespace mars {
 namespace {
 
 constexpr int64_t kChunk = 64;  // pixels
-template <class Count>
-void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> histogram, int starts, double least_gain,
+
+void maximum_likelihood(const HistogramRecord& recording, Histograms histogram, int starts, double least_gain,
                         bool less_bias, Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
     const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
     if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
@@ -17,14 +18,12 @@ void maximum_likelihood(const HistogramRecord& recording, Matrix<const Count> hi
     if (out.shape(0) != histogram.shape(0) || out.shape(1) != kMaximumColumns || flags.shape(0) != histogram.shape(0))
         throw nb::value_error("out must be (pixels, 8), flags (pixels)");
     const ReconstructionJob job{starts, least_gain, less_bias};
-    run_watched_chunks(
-        (pixels + kChunk - 1) / kChunk, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
-            Maximizer<Count> maximizer(recording, job);
-            for (int64_t p = chunk * kChunk; p < std::min(pixels, (chunk + 1) * kChunk); ++p) {
-                if (stop) return;
-                maximizer(histogram.data() + p * recording.bins, out.data() + p * kMaximumColumns, flags.data() + p);
-            }
-        });
+    const CountRows counts = rows_of(histogram);
+    run_watched_items(pixels, kChunk, threads, progress, [&] {
+        return [&, maximizer = Maximizer(recording, job)](int64_t p) mutable {
+            maximizer(counts, p, out.data() + p * kMaximumColumns, flags.data() + p);
+        };
+    });
 }
 
 void log_likelihood(const HistogramRecord& recording, Vector<const double> histogram, Matrix<const double> at,
@@ -33,7 +32,7 @@ void log_likelihood(const HistogramRecord& recording, Vector<const double> histo
         out.shape(0) != at.shape(0))
         throw nb::value_error("histogram must be (bins), at (points, 3), out (points, 13)");
     ArmedPasses passes(recording.bins);
-    passes.set(recording, histogram.data());
+    passes.set(recording, {histogram.data(), CountRows::Type::kDouble, recording.bins}, 0);
     PixelLikelihood pixel(recording, passes);
     ExposureEnds ends;
     BackgroundSeries series;
@@ -53,16 +52,10 @@ void log_likelihood(const HistogramRecord& recording, Vector<const double> histo
 }  // namespace
 
 void bind_maximum_likelihood(nb::module_& module) {
-    constexpr const char* kText = "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).";
-    auto add = [&](auto* function) {
-        module.def("maximum_likelihood", function, nb::arg("recording"), nb::arg("histogram").noconvert(),
-                   nb::kw_only(), nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"),
-                   nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"),
-                   nb::arg("progress").none(), kText);
-    };
-    add(&maximum_likelihood<uint16_t>);
-    add(&maximum_likelihood<uint32_t>);
-    add(&maximum_likelihood<double>);
+    module.def("maximum_likelihood", &maximum_likelihood, nb::arg("recording"), nb::arg("histogram").noconvert(),
+               nb::kw_only(), nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"),
+               nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"), nb::arg("progress").none(),
+               "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).");
     module.def("histogram_log_likelihood", &log_likelihood, nb::arg("recording"), nb::arg("histogram"), nb::arg("at"),
                nb::arg("out").noconvert(), nb::arg("whole") = true,
                "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");

@@ -7,13 +7,10 @@ NB_MODULE(_core, module) {
     mars::bind_pulse(module);
     mars::bind_recording(module);
     mars::bind_job(module);
-    mars::bind_exact(module);
+    mars::bind_engines(module);
     mars::bind_exact_device(module);
     mars::bind_mars_device(module);
     mars::bind_feedback_device(module);
-    mars::bind_waveform(module);
-    mars::bind_sequential(module);
-    mars::bind_poisson(module);
     mars::bind_chain(module);
     mars::bind_exposure(module);
     mars::bind_joint(module);

@@ -43,13 +43,12 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
         cumulants.shape(0) != signal.shape(0) || rows.shape(1) != 4 || weights.shape(1) != 4 ||
         cumulants.shape(1) != kCumulants)
         throw nb::value_error("rows, weights and cumulants must be (pixels, 4)");
-    run_watched_chunks((pixels + kBlock - 1) / kBlock, threads, nb::none(),
-                       [&](int64_t block, const std::atomic<bool>&) {
-                           const int64_t last = std::min(pixels, (block + 1) * kBlock);
-                           for (int64_t p = block * kBlock; p < last; ++p)
-                               table.pixel(signal.data()[p], background.data()[p], at.data()[p], rows.data() + 4 * p,
-                                           weights.data() + 4 * p, cumulants.data() + kCumulants * p);
-                       });
+    run_watched_items(pixels, kBlock, threads, nb::none(), [&] {
+        return [&](int64_t p) {
+            table.pixel(signal.data()[p], background.data()[p], at.data()[p], rows.data() + 4 * p,
+                        weights.data() + 4 * p, cumulants.data() + kCumulants * p);
+        };
+    });
 }
 
 }  // namespace

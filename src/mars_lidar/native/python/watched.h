@@ -1,5 +1,7 @@
 // Long work called from Python: without the interpreter's lock, stopped by Ctrl-C, and with calls of `progress`.
 #pragma once
+#include <algorithm>
+
 #include <nanobind/nanobind.h>
 
 #include "base/parallel.h"
@@ -32,6 +34,19 @@ void watched(const nanobind::object& progress, const Run& run) {
         if (!raised) throw;
     }
     if (raised) throw nb::python_error();
+}
+
+// Items in chunks: `begin()` gives what works on those of one chunk, called with each.
+template <class Begin>
+void run_watched_items(int64_t items, int64_t chunk, int threads, const nanobind::object& progress,
+                       const Begin& begin) {
+    watched(progress, [&](const Watch& watch) {
+        run_chunks((items + chunk - 1) / chunk, threads, watch, [&](int64_t number, const std::atomic<bool>& stop) {
+            auto work = begin();
+            const int64_t end = std::min(items, (number + 1) * chunk);
+            for (int64_t item = number * chunk; item < end && !stop; ++item) work(item);
+        });
+    });
 }
 
 // run_chunks for a caller that holds the interpreter's lock.

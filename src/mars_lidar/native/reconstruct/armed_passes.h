@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "reconstruct/count_rows.h"
 #include "reconstruct/histogram_record.h"
 
 namespace mars {
@@ -24,14 +25,11 @@ struct ArmedPasses {
         return std::max(armed[j] + 0.5 * rearmed[j] - 0.5 * count[j], 0.0);
     }
 
-    template <class Count>
-    void set(const HistogramRecord& r, const Count* histogram) {
+    void set(const HistogramRecord& r, const CountRows& histograms, int64_t pixel) {
         const int64_t n = r.bins;
+        histograms.copy(pixel, count.data());
         before[0] = 0.0;
-        for (int64_t j = 0; j < n; ++j) {
-            count[j] = static_cast<double>(histogram[j]);
-            before[j + 1] = before[j] + count[j];
-        }
+        for (int64_t j = 0; j < n; ++j) before[j + 1] = before[j] + count[j];
         total = before[n];
         if (r.synchronous)
             set_synchronous(r);

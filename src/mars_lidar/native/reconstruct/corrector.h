@@ -34,9 +34,8 @@ class Corrector {
     std::vector<double> rate, variance;
 
     // `finite`: no rate is infinite.
-    template <class Count>
-    uint8_t operator()(const Count* histogram, int64_t pixel, bool finite) {
-        passes_.set(r_, histogram);
+    uint8_t operator()(const CountRows& histograms, int64_t pixel, bool finite) {
+        passes_.set(r_, histograms, pixel);
         rate.resize(r_.bins);
         variance.assign(r_.bins, 0.0);
         std::fill(rate.begin(), rate.end(), 0.0);
@@ -80,10 +79,9 @@ class Corrector {
 // Signal, background, delay of one pixel, and the standard errors of the first two, from its corrected rates.
 constexpr int kWindowColumns = 5;
 
-template <class Count>
-uint8_t estimate_window(Corrector& correct, WindowEstimate& estimate, bool known, const Count* histogram, int64_t pixel,
-                        double* out) {
-    const uint8_t flag = correct(histogram, pixel, true);
+inline uint8_t estimate_window(Corrector& correct, WindowEstimate& estimate, bool known, const CountRows& histograms,
+                               int64_t pixel, double* out) {
+    const uint8_t flag = correct(histograms, pixel, true);
     WindowResult found;
     if (flag & kEmpty)
         found.signal = found.background = 0.0;

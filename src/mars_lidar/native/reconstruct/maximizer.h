@@ -135,7 +135,6 @@ inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_si
 }
 
 // One histogram after another, with the memory that they share.
-template <class Count>
 class Maximizer {
  public:
     Maximizer(const HistogramRecord& recording, const ReconstructionJob& job)
@@ -143,8 +142,8 @@ class Maximizer {
 
     // Signal, background, delay, their standard errors, twice the gain of the log likelihood by the signal, and its
     // value.
-    void operator()(const Count* histogram, double* out, uint8_t* flag) {
-        passes_.set(r_, histogram);
+    void operator()(const CountRows& histograms, int64_t row, double* out, uint8_t* flag) {
+        passes_.set(r_, histograms, row);
         PixelLikelihood pixel(r_, passes_);
         for (int k = 0; k < kMaximumColumns; ++k) out[k] = NAN;
         *flag = 0;

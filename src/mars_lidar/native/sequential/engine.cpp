@@ -20,7 +20,6 @@ constexpr double kWarmUpBlockPhotons = 256.0;
 constexpr double kChunkPhotons = 1 << 20;  // some 20 ms of work
 
 // One item (a pixel in a realization) after the other; one of these per thread and chunk.
-template <class Pixel>
 class Simulator {
  public:
     Simulator(const Job& job, const PulseShape& pulse, const std::atomic<bool>& stop)
@@ -29,7 +28,7 @@ class Simulator {
     // Calls recorded(cycle, phase) for the records of an item, in the order of their registrations. Returns early
     // on stop.
     template <class Recorded>
-    void run(int64_t item, const Recorded& recorded) {
+    void run(int64_t item, Recorded& recorded) {
         if (!job_.recording) return walk(item, recorded);
         SequentialRecorder recorder(job_, item);
         walk(item, [&](int64_t cycle, double phase) { recorder.take(cycle, phase, recorded); });
@@ -37,7 +36,7 @@ class Simulator {
 
  private:
     template <class Registered>
-    void walk(int64_t item, const Registered& registered) {
+    void walk(int64_t item, Registered&& registered) {
         const int64_t index = job_.pixel(item);
         Arrivals arrivals(job_, pulse_, index);
         if (arrivals.photons_per_period() == 0.0) return;
@@ -61,7 +60,7 @@ class Simulator {
     // registrations settles while it runs, and the random beginning averages over whatever does not
     // (warm_up.h).
     void warm_up(Arrivals& arrivals, Xoshiro256& random, Pixel& pixel) {
-        if constexpr (Pixel::kForgets) {  // nothing before the last dead time matters
+        if (pixel.forgets()) {
             const int64_t enough = static_cast<int64_t>(job_.dead_time) + 2;
             const int64_t block = arrivals.block_cycles(kBlockPhotons);
             for (int64_t start = -enough; start < 0 && !stop_.load(std::memory_order_relaxed); start += block) {
@@ -101,9 +100,65 @@ class Simulator {
     ArrivalSorter sorter_;
 };
 
-// Calls work(simulator, item, stop) for all items, in chunks of about equal work.
-template <template <class> class Simulation, class Pixel, class Work>
-void for_pixels(const Job& job, const PulseShape& pulse, int threads, const Watch& watch, const Work& work) {
+// The bin of a phase in [0, 1); rounding may not lead beyond the last.
+inline int32_t bin_of(double phase, int32_t bins) { return std::min(static_cast<int32_t>(phase * bins), bins - 1); }
+
+// Where the records of an item go.
+class ItemOutput {
+ public:
+    ItemOutput(const Output& to, const Job& job, int64_t item) : to_(to), bins_(job.bins), item_(item) {
+        if (to.sink == Sink::kHistogram16) std::fill_n(row<uint16_t>(), bins_, uint16_t{0});
+        if (to.sink == Sink::kHistogram32) std::fill_n(row<uint32_t>(), bins_, uint32_t{0});
+    }
+
+    void operator()(int64_t cycle, double phase) {
+        switch (to_.sink) {
+            case Sink::kCounts:
+                break;
+            case Sink::kHistogram16:
+                return count<uint16_t>(phase);
+            case Sink::kHistogram32:
+                return count<uint32_t>(phase);
+            case Sink::kTimestamps: {
+                const int64_t record = to_.offsets[item_] + number_;
+                if (record == to_.offsets[item_ + 1]) throw_other_counts();
+                to_.times[record] = static_cast<double>(cycle) + phase;
+                to_.cycles[record] = static_cast<int32_t>(cycle);
+                to_.bins[record] = bin_of(phase, bins_);
+            }
+        }
+        ++number_;
+    }
+
+    // After the last one; not if the run was stopped.
+    void end() const {
+        if (to_.sink == Sink::kCounts) static_cast<int64_t*>(to_.out)[item_] = number_;
+        if (to_.sink == Sink::kTimestamps && to_.offsets[item_] + number_ != to_.offsets[item_ + 1])
+            throw_other_counts();
+    }
+
+ private:
+    template <class Count>
+    Count* row() const {
+        return static_cast<Count*>(to_.out) + item_ * bins_;
+    }
+    template <class Count>
+    void count(double phase) const {
+        if (++row<Count>()[bin_of(phase, bins_)] == 0) throw_full<Count>();
+    }
+    [[noreturn]] static void throw_other_counts() {
+        throw std::invalid_argument("offsets are not those of this job's counts");
+    }
+
+    const Output& to_;
+    const int32_t bins_;
+    const int64_t item_;
+    int64_t number_ = 0;
+};
+
+// All items, in chunks of about equal work.
+template <class Simulation>
+void run_items(const Job& job, const PulseShape& pulse, const Output& output, int threads, const Watch& watch) {
     double photons = 0.0;
     const int64_t looks = std::min<int64_t>(job.pixels, 64);  // a sample of the image will do
     for (int64_t k = 0; k < looks; ++k) photons += Arrivals(job, pulse, k * job.pixels / looks).photons_per_period();
@@ -113,75 +168,21 @@ void for_pixels(const Job& job, const PulseShape& pulse, int threads, const Watc
                              : std::max<int64_t>(1, static_cast<int64_t>(std::min(kChunkPhotons / per_item, 4096.0)));
     const int64_t items = job.items();
     run_chunks((items + size - 1) / size, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {
-        Simulation<Pixel> simulator(job, pulse, stop);
-        for (int64_t item = chunk * size; item < std::min(items, (chunk + 1) * size) && !stop; ++item)
-            work(simulator, item, stop);
+        Simulation simulator(job, pulse, stop);
+        for (int64_t item = chunk * size; item < std::min(items, (chunk + 1) * size) && !stop; ++item) {
+            ItemOutput to(output, job, item);
+            simulator.run(item, to);
+            if (!stop) to.end();
+        }
     });
 }
-
-// The loop for a job's mode: each has pixels of its own type.
-template <template <class> class Simulation, class Work>
-void for_modes(const Job& job, const PulseShape& pulse, int threads, const Watch& watch, const Work& work) {
-    switch (job.mode) {
-        case DetectorMode::kNonparalyzable:
-            return for_pixels<Simulation, FreePixel>(job, pulse, threads, watch, work);
-        case DetectorMode::kParalyzable:
-            return for_pixels<Simulation, ParalyzablePixel>(job, pulse, threads, watch, work);
-        case DetectorMode::kSynchronous:
-            return for_pixels<Simulation, SynchronousPixel>(job, pulse, threads, watch, work);
-        case DetectorMode::kGated:
-            return for_pixels<Simulation, GatedPixel>(job, pulse, threads, watch, work);
-    }
-}
-
-// Pixels whose avalanches have consequences share one queue of events; others are simulated each alone.
-template <class Work>
-void for_items(const Job& job, const PulseShape& pulse, int threads, const Watch& watch, const Work& work) {
-    job.avalanches_matter() ? for_modes<EventSimulator>(job, pulse, threads, watch, work)
-                            : for_modes<Simulator>(job, pulse, threads, watch, work);
-}
-
-// The bin of a phase in [0, 1); rounding may not lead beyond the last.
-inline int32_t bin_of(double phase, int32_t bins) { return std::min(static_cast<int32_t>(phase * bins), bins - 1); }
 
 }  // namespace
 
-template <class Count>
-void sequential_histogram(const Job& job, const PulseShape& pulse, Count* out, int threads, const Watch& watch) {
-    for_items(job, pulse, threads, watch, [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
-        Count* const row = out + item * job.bins;
-        std::fill_n(row, job.bins, Count{0});
-        simulator.run(item, [&](int64_t, double phase) {
-            Count& count = row[bin_of(phase, job.bins)];
-            if (++count == 0) throw_full<Count>();
-        });
-    });
-}
-template void sequential_histogram(const Job&, const PulseShape&, uint16_t*, int, const Watch&);
-template void sequential_histogram(const Job&, const PulseShape&, uint32_t*, int, const Watch&);
-
-void sequential_counts(const Job& job, const PulseShape& pulse, int64_t* out, int threads, const Watch& watch) {
-    for_items(job, pulse, threads, watch, [&](auto& simulator, int64_t item, const std::atomic<bool>&) {
-        int64_t count = 0;
-        simulator.run(item, [&](int64_t, double) { ++count; });
-        out[item] = count;
-    });
-}
-
-void sequential_timestamps(const Job& job, const PulseShape& pulse, const SequentialTimes& to, int threads,
-                           const Watch& watch) {
-    for_items(job, pulse, threads, watch, [&](auto& simulator, int64_t item, const std::atomic<bool>& stop) {
-        int64_t k = to.offsets[item];
-        const int64_t end = to.offsets[item + 1];
-        simulator.run(item, [&](int64_t c, double phase) {
-            if (k == end) throw std::invalid_argument("offsets are not those of this job's counts");
-            to.times_ns[k] = (static_cast<double>(c) + phase) * to.period_ns;
-            to.cycle[k] = static_cast<int32_t>(c);
-            to.bin[k] = bin_of(phase, job.bins);
-            ++k;
-        });
-        if (k != end && !stop) throw std::invalid_argument("offsets are not those of this job's counts");
-    });
+void run_sequential(const Job& job, const PulseShape& pulse, const Output& output, int threads, const Watch& watch) {
+    // pixels whose avalanches have consequences share one queue of events; others are simulated each alone
+    job.avalanches_matter() ? run_items<EventSimulator>(job, pulse, output, threads, watch)
+                            : run_items<Simulator>(job, pulse, output, threads, watch);
 }
 
 }  // namespace mars

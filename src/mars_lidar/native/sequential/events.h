@@ -29,7 +29,6 @@ struct Arrival {
     bool operator<(const Arrival& other) const { return other.time < time; }  // a queue's first is the earliest
 };
 
-template <class Pixel>
 class EventSimulator {
  public:
     EventSimulator(const Job& job, const PulseShape& pulse, const std::atomic<bool>& stop)
@@ -38,7 +37,7 @@ class EventSimulator {
     // Calls recorded(cycle, phase) for the records of an item, in the order of their registrations. Returns early on
     // stop. With crosstalk, where all pixels of a realization are simulated at once: item after item from the first on.
     template <class Recorded>
-    void run(int64_t item, const Recorded& recorded) {
+    void run(int64_t item, Recorded& recorded) {
         SequentialRecorder recorder(job_, item);
         walk(item, [&](int64_t cycle, double phase) { recorder.take(cycle, phase, recorded); });
     }

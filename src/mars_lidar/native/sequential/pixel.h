@@ -28,93 +28,66 @@ struct Time {
     }
 };
 
-// Free running, non-paralyzable; what the other modes have in common with it.
-class FreePixel {
+// The rule of a detector's mode (docs/detectors.md), photon by photon.
+class Pixel {
  public:
-    static constexpr bool kForgets = false;  // what was before the last dead time has no effect
-
-    explicit FreePixel(const Job& job) : dead_time_(Time{0, 0}.plus(job.dead_time)) {}
+    explicit Pixel(const Job& job) : mode_(job.mode), dead_time_(Time{0, 0}.plus(job.dead_time)), gate_(job.gate) {}
 
     Time ready{0, 0};  // armed from here on
 
-    // When a pixel that could be armed at `time` is.
-    Time armed(Time time) const { return time; }
+    // Whether nothing before the last dead time has an effect.
+    bool forgets() const { return mode_ == DetectorMode::kParalyzable; }
+
+    // When a pixel that could be armed at `time` is: a synchronous one at the start of a period.
+    Time armed(Time time) const {
+        return mode_ != DetectorMode::kSynchronous || time.phase == 0 ? time : Time{time.cycle + 1, 0};
+    }
 
     // Passes the sorted arrivals of a block; calls registered(cycle, phase) for each that is seen. After a
     // registration at T the pixel is blind on (T, T + dead time).
     template <class Registered>
-    void pass(const std::vector<uint64_t>& times, int64_t start, const Registered& registered) {
-        uint64_t earliest = ready.after(start);
+    void pass(const std::vector<uint64_t>& times, int64_t start, Registered&& registered) {
+        switch (mode_) {
+            case DetectorMode::kNonparalyzable:
+                return pass_as<DetectorMode::kNonparalyzable>(times, start, registered);
+            case DetectorMode::kParalyzable:
+                return pass_as<DetectorMode::kParalyzable>(times, start, registered);
+            case DetectorMode::kSynchronous:
+                return pass_as<DetectorMode::kSynchronous>(times, start, registered);
+            case DetectorMode::kGated:
+                return pass_as<DetectorMode::kGated>(times, start, registered);
+        }
+    }
+
+ private:
+    template <DetectorMode mode, class Registered>
+    void pass_as(const std::vector<uint64_t>& times, int64_t start, Registered&& registered) {
+        constexpr bool paralyzable = mode == DetectorMode::kParalyzable;
+        uint64_t earliest = paralyzable ? 0 : ready.after(start);
         for (const uint64_t time : times) {
             if (time < earliest) continue;
             const Time now{start + static_cast<int64_t>(time >> kPhaseBits), time & kPhaseMask};
-            registered(now.cycle, phase_of(time));
+            const double phase = phase_of(time);
+            if constexpr (paralyzable) {  // every arrival begins the dead time anew, seen or not
+                const bool blind = fired_ && now < ready;
+                ready = now.plus(dead_time_);
+                fired_ = true;
+                if (!blind) registered(now.cycle, phase);
+                continue;
+            }
+            if (mode == DetectorMode::kGated && !open(now.cycle, phase))
+                continue;  // outside of the gate: does not exist
+            registered(now.cycle, phase);
             ready = now.plus(dead_time_);
+            if constexpr (mode == DetectorMode::kSynchronous) {
+                // armed for one registration; a dead time that is not over at the start of a period costs that period
+                const Time next_period{now.cycle + 1, 0}, over = armed(ready);
+                ready = over < next_period ? next_period : over;
+            }
             earliest = ready.after(start);
         }
     }
 
- protected:
-    Time dead_time_;
-};
-
-// Every arrival begins the dead time anew, seen or not.
-class ParalyzablePixel : public FreePixel {
- public:
-    static constexpr bool kForgets = true;
-
-    using FreePixel::FreePixel;
-
-    template <class Registered>
-    void pass(const std::vector<uint64_t>& times, int64_t start, const Registered& registered) {
-        for (const uint64_t time : times) {
-            const Time now{start + static_cast<int64_t>(time >> kPhaseBits), time & kPhaseMask};
-            const bool blind = fired_ && now < ready;
-            ready = now.plus(dead_time_);
-            fired_ = true;
-            if (!blind) registered(now.cycle, phase_of(time));
-        }
-    }
-
- private:
-    bool fired_ = false;
-};
-
-// Armed at the start of a period, for one registration; a dead time that is not over by then costs that period.
-class SynchronousPixel : public FreePixel {
- public:
-    using FreePixel::FreePixel;
-
-    Time armed(Time time) const { return time.phase == 0 ? time : Time{time.cycle + 1, 0}; }
-
-    template <class Registered>
-    void pass(const std::vector<uint64_t>& times, int64_t start, const Registered& registered) {
-        for (const uint64_t time : times) {
-            const Time now{start + static_cast<int64_t>(time >> kPhaseBits), time & kPhaseMask};
-            if (now < ready) continue;
-            registered(now.cycle, phase_of(time));
-            const Time next_period{now.cycle + 1, 0}, over = armed(now.plus(dead_time_));
-            ready = over < next_period ? next_period : over;
-        }
-    }
-};
-
-// Free running, but arrivals outside of the gate do not exist.
-class GatedPixel : public FreePixel {
- public:
-    explicit GatedPixel(const Job& job) : FreePixel(job), gate_(job.gate) {}
-
-    template <class Registered>
-    void pass(const std::vector<uint64_t>& times, int64_t start, const Registered& registered) {
-        for (const uint64_t time : times) {
-            const Time now{start + static_cast<int64_t>(time >> kPhaseBits), time & kPhaseMask};
-            if (now < ready || !open(now.cycle, phase_of(time))) continue;
-            registered(now.cycle, phase_of(time));
-            ready = now.plus(dead_time_);
-        }
-    }
-
- private:
     // The gate of a period stays within it: where it wraps, its end is at the beginning of that same period.
     bool open(int64_t cycle, double phase) const {
         const double turns = std::floor(static_cast<double>(cycle) / gate_.cycles);
@@ -123,7 +96,10 @@ class GatedPixel : public FreePixel {
         return (phase >= opens && phase < closes) || phase < closes - 1.0;
     }
 
-    const Gate gate_;
+    DetectorMode mode_;
+    Time dead_time_;
+    Gate gate_;
+    bool fired_ = false;
 };
 
 }  // namespace

@@ -25,7 +25,7 @@ class SequentialRecorder {
 
     // Calls recorded(cycle, phase) if the registration is recorded.
     template <class Recorded>
-    void take(int64_t cycle, double phase, const Recorded& recorded) {
+    void take(int64_t cycle, double phase, Recorded& recorded) {
         // electronics: ready again t_e after the last event that they took
         const double since = static_cast<double>(cycle - last_cycle_) + (phase - last_phase_);
         if (taken_ > 0 && since < rule_.electronics_dead_time) return;

@@ -5,27 +5,22 @@
 #include <algorithm>
 #include <memory>
 #include <new>
-#include <stdexcept>
 #include <vector>
 
 #include "exact/trap_law.h"
-#include "lanes/levels.h"
+#include "lanes/kernels.h"
 #include "waveform/start.h"
 #include "waveform/table.h"
 
 namespace mars {
 namespace {
 
-// The kernel for a job at the level of this name, or the widest; std::invalid_argument where the processor has none.
-WaveformKernel kernel_of(const std::string& asked, const Job& job) {
-#define MARS_TRY_LEVEL(level, runs)                                        \
-    if ((asked.empty() || asked == #level) && (runs))                      \
-        return job.avalanches_matter() ? waveform_avalanche_kernel_##level \
-               : job.recording         ? waveform_recording_kernel_##level \
-                                       : waveform_kernel_##level;
-    MARS_EACH_LEVEL(MARS_TRY_LEVEL)
-#undef MARS_TRY_LEVEL
-    throw std::invalid_argument("level must be one that this processor runs, got '" + asked + "'");
+// The kernel for a job at the level of this name, or the widest.
+auto kernel_of(const std::string& level, const Job& job) {
+    using Block = const WaveformBlock&;
+    if (job.avalanches_matter()) return kernel_at<Block>(level, MARS_KERNELS(waveform_avalanche_kernel_));
+    if (job.recording) return kernel_at<Block>(level, MARS_KERNELS(waveform_recording_kernel_));
+    return kernel_at<Block>(level, MARS_KERNELS(waveform_kernel_));
 }
 
 // Where the items of a block begin that are warmed up at the start of the exposure.
@@ -48,7 +43,7 @@ void draw_starts(const Job& job, const WaveformBlock& block, std::vector<int32_t
 void run_waveform(const Job& job, const Output& output, int threads, const std::string& level, const Watch& watch) {
     // memory of one thread's tables: fewer lanes have one of their own where waveforms are long
     constexpr int64_t kTableBytes = int64_t{64} << 20;
-    const WaveformKernel kernel = kernel_of(level, job);
+    const auto kernel = kernel_of(level, job);
     const TableLayout layout(job.samples);
     const int64_t table_bytes = 4 * layout.edges + 2 * layout.cells;
     WaveformBlock proto{};
@@ -67,20 +62,12 @@ void run_waveform(const Job& job, const Output& output, int threads, const std::
         block.first_realization = (chunk / across) * realizations;
         block.realizations = std::min(realizations, job.realizations - block.first_realization);
         block.stop = &stop;
-        std::vector<int32_t> cycle;
-        std::vector<double> phase;
-        block.start_cycle = nullptr;
-        block.start_phase = nullptr;
-        const bool avalanches = job.avalanches_matter();
-        if (job.stationary && (job.dead_time > 0.0 || avalanches)) {
-            if (job.dead_time > 0.0) draw_starts(job, block, cycle, phase);
-            if (avalanches) {  // from the state without afterpulses
-                cycle.resize(block.pixels * block.realizations, 0);
-                phase.resize(block.pixels * block.realizations, 0.0);
-                for (int32_t& start : cycle) start -= settling_periods(job);
-            }
-            block.start_cycle = cycle.data();
-            block.start_phase = phase.data();
+        WarmStarts<double> starts;
+        if (starts.wanted(job)) {
+            if (job.dead_time > 0.0) draw_starts(job, block, starts.cycle, starts.phase);
+            starts.settle(job, block.pixels * block.realizations);
+            block.start_cycle = starts.cycle.data();
+            block.start_phase = starts.phase.data();
         }
         struct alignas(64) Line {
             int32_t edges[16];

@@ -1,6 +1,5 @@
 // The exact engine's inner loop for waveforms, as the host calls it: for each vector level a kernel that records
-// every registration as it is, one with a recorder, and one with traps (waveform/kernel.cpp and its two neighbours
-// are compiled once for each level).
+// every registration as it is, one with a recorder, and one with traps (waveform/kernel.cpp is compiled once for each).
 #pragma once
 #include <atomic>
 #include <cstdint>
@@ -26,16 +25,8 @@ struct WaveformBlock {
     const std::atomic<bool>* stop;
 };
 
-using WaveformKernel = void (*)(const WaveformBlock&);
-
-#define MARS_DECLARE_WAVEFORM(level)                                    \
-    void waveform_kernel_##level(const WaveformBlock& block);           \
-    void waveform_recording_kernel_##level(const WaveformBlock& block); \
-    void waveform_avalanche_kernel_##level(const WaveformBlock& block);
-
-MARS_DECLARE_WAVEFORM(scalar)
-MARS_DECLARE_WAVEFORM(vector128)
-MARS_DECLARE_WAVEFORM(avx2)
-MARS_DECLARE_WAVEFORM(avx512)
+MARS_DECLARE_KERNEL(void, waveform_kernel_, const WaveformBlock& block)
+MARS_DECLARE_KERNEL(void, waveform_recording_kernel_, const WaveformBlock& block)
+MARS_DECLARE_KERNEL(void, waveform_avalanche_kernel_, const WaveformBlock& block)
 
 }  // namespace mars

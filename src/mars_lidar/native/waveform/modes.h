@@ -1,7 +1,7 @@
 // The modes of a detector for waveforms: which arrivals are registered, and from when on the next one matters. The
 // rules are those of exact/detector_modes.h (docs/detectors.md), the times those of waveform/arrival.h.
 #pragma once
-#include "instrument/job.h"
+#include "exact/detector_modes.h"
 #include "waveform/arrival.h"
 
 namespace mars {
@@ -16,11 +16,6 @@ struct WaveSystem {
 };
 
 inline WaveSystem wave_system(const Job& job) {
-    const auto fixed_point = [](double periods) {  // in [0, 1)
-        const double upper = static_cast<double>(static_cast<uint32_t>(periods * 0x1p32));
-        const double lower = (periods * 0x1p32 - upper) * 0x1p32;
-        return static_cast<uint64_t>(static_cast<uint32_t>(upper)) << 32 | static_cast<uint32_t>(lower);
-    };
     const int32_t parts = static_cast<int32_t>(job.samples);
     return {job.cycles,
             job.bins,
@@ -61,45 +56,41 @@ MARS_INLINE Mask shut(const WaveSystem& system, const WaveTime& at, const WaveTi
     return (round > system.gate_width.parts) | ((round == system.gate_width.parts) & (rest >= system.gate_width.rest));
 }
 
-// The last arrival's dead time of a paralyzable pixel.
-struct WaveMemory {
-    WaveTime ready;
-};
-
 // Takes the arrival `hit`, moves `from` to where the search for the next one begins, and returns where it is *not*
-// registered.
-template <DetectorMode mode>
-MARS_INLINE Mask advance(const WaveSystem& system, const WaveTime& hit, WaveTime& from, WaveMemory& memory) {
+// registered. `last` is the end of the last arrival's dead time of a paralyzable pixel.
+MARS_INLINE Mask advance(DetectorMode mode, const WaveSystem& system, const WaveTime& hit, WaveTime& from,
+                         WaveTime& last) {
     const WaveTime ready = later(hit, system.dead, system.parts);
-    if constexpr (mode == DetectorMode::kNonparalyzable) {
+    if (mode == DetectorMode::kNonparalyzable) {
         from = ready;
         return splat(0) > 0;
-    } else if constexpr (mode == DetectorMode::kParalyzable) {
-        const Mask blind = before(hit, memory.ready);
-        memory.ready = ready;
+    }
+    if (mode == DetectorMode::kParalyzable) {
+        const Mask blind = before(hit, last);
+        last = ready;
         from = hit;
         return blind;
-    } else if constexpr (mode == DetectorMode::kSynchronous) {
+    }
+    if (mode == DetectorMode::kSynchronous) {
         // the first period start at or after the end of the dead time, and not in this period
         const Mask at_start = (ready.part == 0) & (ready.inside == 0.0f) & (ready.cycle > hit.cycle);
         from = {minus_if(ready.cycle + 1, at_start), splat(0), splat(0.0f)};
         return splat(0) > 0;
-    } else {
-        const Mask unseen = shut(system, hit, gate_openings(system, hit.cycle));
-        const WaveTime next = earlier(unseen, hit, ready);
-        // where the gate is shut at that time: to its next opening
-        const WaveTime opening = gate_openings(system, next.cycle);
-        const Mask wait = shut(system, next, opening), past = wait & before(opening, next);
-        WaveTime open = gate_openings(system, plus_if(next.cycle, past));
-        // a gate that wraps is open from the beginning of the period
-        const WaveTime end = later({splat(0), open.part, open.inside},
-                                   {0, system.gate_width.parts, system.gate_width.rest}, system.parts);
-        const Mask wraps = (end.cycle > 0) & ((end.part > 0) | (end.inside > 0.0f));
-        const Mask at_once = past & wraps;
-        open = {open.cycle, select(at_once, splat(0), open.part), select(at_once, splat(0.0f), open.inside)};
-        from = earlier(wait, open, next);
-        return unseen;
     }
+    const Mask unseen = shut(system, hit, gate_openings(system, hit.cycle));
+    const WaveTime next = earlier(unseen, hit, ready);
+    // where the gate is shut at that time: to its next opening
+    const WaveTime opening = gate_openings(system, next.cycle);
+    const Mask wait = shut(system, next, opening), past = wait & before(opening, next);
+    WaveTime open = gate_openings(system, plus_if(next.cycle, past));
+    // a gate that wraps is open from the beginning of the period
+    const WaveTime end =
+        later({splat(0), open.part, open.inside}, {0, system.gate_width.parts, system.gate_width.rest}, system.parts);
+    const Mask wraps = (end.cycle > 0) & ((end.part > 0) | (end.inside > 0.0f));
+    const Mask at_once = past & wraps;
+    open = {open.cycle, select(at_once, splat(0), open.part), select(at_once, splat(0.0f), open.inside)};
+    from = earlier(wait, open, next);
+    return unseen;
 }
 
 }  // namespace MARS_LEVEL

@@ -5,6 +5,7 @@
 #include <algorithm>
 
 #include "exact/recorder.h"
+#include "exact/step.h"
 #include "waveform/arrival.h"
 
 namespace mars {
@@ -51,6 +52,7 @@ struct WavePlaces {
 // Parts of the waveform; what is recorded in double precision, lane by lane.
 struct PartClock {
     using Time = WaveTime;
+    using Phase = double;
 
     // One registration of each lane.
     struct Registration {
@@ -77,6 +79,7 @@ struct PartClock {
         int32_t cycle[kLanes], part[kLanes];
         float inside[kLanes];
 
+        int32_t period(int lane) const { return cycle[lane]; }
         Moment get(int lane) const { return {cycle[lane], part[lane], inside[lane]}; }
         void set(int lane, const Moment& time) {
             cycle[lane] = time.cycle;
@@ -96,9 +99,11 @@ struct PartClock {
         : places(job),
           bins(job.bins),
           parts(static_cast<int32_t>(job.samples)),
-          dead(wave_span(job.recording->electronics_dead_time, parts)) {}
+          dead(wave_span(job.recording ? job.recording->electronics_dead_time : 0.0, parts)),
+          twilight_span(wave_span(job.twilight, parts)) {}
 
     MARS_INLINE Time recovered(const Time& hit) const { return later(hit, dead, parts); }
+    MARS_INLINE Time twilight(const Time& armed) const { return sooner(armed, twilight_span, parts); }
 
     MARS_INLINE void find_phase(Registration& r) const { places.find_phase(r.hit, r.phase); }
 
@@ -136,10 +141,14 @@ struct PartClock {
         r.bin = load<Int>(bin);
     }
 
+    static Moment idle() { return {kIdleFrame, 0, 0.0f}; }
+    MARS_INLINE static Time all(const Moment& time) {
+        return {splat(time.cycle), splat(time.part), splat(time.inside)};
+    }
+
     // For releases of carriers (trap_lanes.h).
     static constexpr int32_t kNever = INT32_MAX;
     static Moment never() { return {kNever, 0, 0.0f}; }
-    static Time all_never() { return {splat(kNever), splat(0), splat(0.0f)}; }
     MARS_INLINE static Int period(const Time& time) { return time.cycle; }
     MARS_INLINE Time after(const Time& time, const Wait& wait) const {
         UInt part, inside;  // of the fraction, in units of 2^-24 period, times T
@@ -155,7 +164,7 @@ struct PartClock {
 
     WavePlaces places;
     int32_t bins, parts;
-    WaveSpan dead;
+    WaveSpan dead, twilight_span;
 
  private:
     double converted(const CodeTable& codes, double phase, int32_t& bin) const {

@@ -1,0 +1,106 @@
+// Bindings of the engines that draw a job's registrations one by one, or their histograms at once: exact/engine.h and
+// waveform/engine.h (one engine to Python), sequential/engine.h, poisson/engine.h.
+#include <string>
+
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "base/clock.h"
+#include "exact/engine.h"
+#include "instrument/pulse_table.h"
+#include "poisson/engine.h"
+#include "python/bindings.h"
+#include "python/watched.h"
+#include "sequential/engine.h"
+#include "waveform/engine.h"
+
+namespace mars {
+namespace {
+
+// An engine, and the name of the vector level to force, if it has any.
+template <class... Level>
+using Run = void (*)(const Job&, const PulseTable&, const Output&, int threads, const Watch&, const Level&... level);
+
+template <class... Level>
+void exact(const Job& job, const PulseTable& pulse, const Output& output, int threads, const Watch& watch,
+           const Level&... level) {
+    job.waveform ? run_waveform(job, output, threads, level..., watch)
+                 : run_exact(job, pulse, output, threads, level..., watch);
+}
+void sequential(const Job& job, const PulseTable& pulse, const Output& output, int threads, const Watch& watch) {
+    run_sequential(job, shape_of(pulse), output, threads, watch);
+}
+void poisson(const Job& job, const PulseTable& pulse, const Output& output, int threads, const Watch& watch) {
+    run_poisson(job, shape_of(pulse), output, threads, watch);
+}
+
+template <class Count, class... Level>
+void bind_histogram(nb::module_& module, const std::string& name, Run<Level...> run) {
+    module.def((name + "_histogram").c_str(),
+               [run](const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, int threads,
+                     const nb::object& progress, const Level&... level) {
+                   check_histogram(job, out);
+                   Output output{};
+                   output.sink = sizeof(Count) == 2 ? Sink::kHistogram16 : Sink::kHistogram32;
+                   output.out = out.data();
+                   watched(progress, [&](const Watch& watch) { run(job, pulse, output, threads, watch, level...); });
+               },
+               nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(), nb::arg("threads"),
+               nb::arg("progress").none(), nb::arg(sizeof(Level) ? "level" : "")...,
+               "Histograms out (realizations * pixels, bins).");
+}
+
+template <class... Level>
+void bind_histograms(nb::module_& module, const std::string& name, Run<Level...> run) {
+    bind_histogram<uint16_t>(module, name, run);
+    bind_histogram<uint32_t>(module, name, run);
+}
+
+template <class... Level>
+void bind_registrations(nb::module_& module, const std::string& name, Run<Level...> run) {
+    bind_histograms(module, name, run);
+    module.def((name + "_counts").c_str(),
+               [run](const BoundJob& job, const PulseTable& pulse, Vector<int64_t> out, int threads,
+                     const nb::object& progress, const Level&... level) {
+                   if (size_of(out) != job.items()) throw nb::value_error("out must have one count per item");
+                   Output output{};
+                   output.sink = Sink::kCounts;
+                   output.out = out.data();
+                   watched(progress, [&](const Watch& watch) { run(job, pulse, output, threads, watch, level...); });
+               },
+               nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(), nb::arg("threads"),
+               nb::arg("progress").none(), nb::arg(sizeof(Level) ? "level" : "")...,
+               "Registrations out (items): the draws of the histogram.");
+    module.def(
+        (name + "_timestamps").c_str(),
+        [run](const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> offsets, Vector<double> times,
+              Vector<int32_t> cycle, Vector<int32_t> bin, int threads, const nb::object& progress,
+              const Level&... level) {
+            const int64_t items = size_of(offsets) - 1, total = items < 0 ? 0 : offsets.data()[items];
+            if (items != job.items() || size_of(times) != total || size_of(cycle) != total || size_of(bin) != total)
+                throw nb::value_error("offsets must have items + 1 values, and the other arrays offsets[-1]");
+            const Output output{Sink::kTimestamps, nullptr, offsets.data(), times.data(), cycle.data(), bin.data()};
+            watched(progress, [&](const Watch& watch) { run(job, pulse, output, threads, watch, level...); });
+        },
+        nb::arg("job"), nb::arg("pulse"), nb::arg("offsets").noconvert(), nb::arg("times").noconvert(),
+        nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("progress").none(),
+        nb::arg(sizeof(Level) ? "level" : "")...,
+        "Registrations item after item, item i in [offsets[i], offsets[i + 1]), times in periods: the draws of the "
+        "histogram.");
+}
+
+}  // namespace
+
+void bind_engines(nb::module_& module) {
+    module.def("levels", &exact_levels,
+               "Vector levels that this processor runs, widest first; all give the same bits.");
+    bind_registrations(module, "exact", &exact<std::string>);
+    bind_registrations(module, "sequential", &sequential);
+    bind_histograms(module, "poisson", &poisson);
+#if defined(__GNUC__) || defined(__clang__)
+    module.def("addition_chain", &addition_chain, nb::arg("rounds"),
+               "16 dependent additions a round, a cycle each: the processor's clock, for the benchmarks.");
+#endif
+}
+
+}  // namespace mars

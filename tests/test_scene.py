@@ -335,7 +335,7 @@ def test_example_names_and_the_error_that_lists_them():
         Scene.example("kitchen")
 
 
-@pytest.mark.parametrize(("seed", "error"), [(-1, ValueError), (1.0, TypeError), (None, TypeError)])
+@pytest.mark.parametrize(("seed", "error"), [(-1, ValueError), (1.5, TypeError), (None, TypeError)])
 def test_bad_example_seeds_are_refused(seed, error):
     with pytest.raises(error, match="seed must be"):
         Scene.example(seed=seed)

@@ -186,7 +186,7 @@ def test_the_command_takes_a_frame(tmp_path):
         assert cube.depth_m[0, 0] == 9.0
         assert "frame 1" in cube.recipe.source
     done = CliRunner().invoke(app, [str(a) for a in (*arguments, "-o", tmp_path / "b.npz")])
-    assert (done.exit_code, "needs index" in done.output) == (2, True)
+    assert (done.exit_code, "index tells which" in " ".join(done.output.split())) == (2, True)
 
 
 # --- Middlebury 2014 ---------------------------------------------------------------------------------------

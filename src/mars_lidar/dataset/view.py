@@ -98,8 +98,11 @@ def _view(data: Any, folder: Path, system: System, whole: bool) -> View:
         raise RecipeError(key, f"light must be one level of one scene, got {len(light.levels)}; generate takes several")
     found, problems = candidates([entry], folder)
     if problems or len(found) != 1:
-        told = "; ".join(map(str, problems)) or f"got {len(found)}; generate takes several"
-        raise RecipeError((), f"a scene file must mean one scene: {told}")
+        told = (
+            "; ".join(map(str, problems))
+            or f"{len(found)} are named (of a file with frames, index tells which); generate takes several"
+        )
+        raise RecipeError((), f"there must be one scene: {told}")
     content = found[0].load()
     (signal, sbr), maps = light.levels[0], (content.depth_m, content.reflectivity)
     flux = content.flux(system, light, signal, sbr, tell=True)

@@ -155,7 +155,7 @@ def test_rules_hold_for_every_registration(mode: str, kind: str):
         (GATE | {"gate_start_ns": np.nan}, ValueError, ["gate_start_ns", "finite", "got nan"]),
         (GATE | {"gate_step_ns": np.inf}, ValueError, ["gate_step_ns", "finite", "got inf"]),
         (MOVING | {"gate_cycles": 0}, ValueError, ["gate_cycles", "[1, ", "got 0"]),
-        (MOVING | {"gate_cycles": 2.0}, TypeError, ["gate_cycles", "integer", "got 2.0"]),
+        (MOVING | {"gate_cycles": 2.5}, TypeError, ["gate_cycles", "integer", "got 2.5"]),
         (GATE | {"gate_cycles": 5}, ValueError, ["gate_cycles", "gate_step_ns", "gate_cycles=5"]),
     ],
 )
@@ -275,4 +275,4 @@ def test_command_line(tmp_path):
             assert cube.system.detector == expected
     done = run(*small, "--gate-start-ns", 3, "-o", tmp_path / "c.zarr")
     assert done.exit_code == 2
-    assert "gate_start_ns belongs to mode 'gated'" in done.output
+    assert "--gate-start-ns belongs to mode 'gated'" in done.output

@@ -69,7 +69,7 @@ def test_keys_of_one_scene_stand_for_those_of_many():
     assert DatasetRecipe.from_dict(one).scenes == ({"example": "room", "size": 128, "seeds": [3]},)
     with pytest.raises(ValueError, match="seed stands for seeds of one"):
         read_view({"example": "room", "seed": 3, "seeds": [3]}, SYSTEM)
-    with pytest.raises(ValueError, match="must mean one scene: got 2; generate takes several"):
+    with pytest.raises(ValueError, match="there must be one scene: 2 are named"):
         read_view({"example": "room", "size": 8, "seeds": [3, 4]}, SYSTEM)
     with pytest.raises(ValueError, match="one level of one scene, got 2"):
         read_view({"example": "room", "size": 8, "light": {"signal": [1, 2]}}, SYSTEM)

@@ -100,7 +100,7 @@ def _view(data: Any, folder: Path, system: System, whole: bool) -> View:
     if problems or len(found) != 1:
         told = (
             "; ".join(map(str, problems))
-            or f"{len(found)} are named (of a file with frames, index tells which); generate takes several"
+            or f"{len(found)} are named (of frames, index tells which); generate takes several"
         )
         raise RecipeError((), f"there must be one scene: {told}")
     content = found[0].load()

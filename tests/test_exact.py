@@ -23,11 +23,11 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
-from mars_lidar.instrument.system import _MAX_CYCLES
+from mars_lidar.instrument.system import MAX_CYCLES
 
 GAUSSIAN = ml.GaussianPulse(sigma_ns=1.0)
 EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
-LONGEST = _MAX_CYCLES
+LONGEST = MAX_CYCLES
 
 
 def system(**changes: object) -> ml.System:

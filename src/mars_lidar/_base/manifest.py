@@ -57,7 +57,7 @@ def root_document(store: Path) -> dict[str, Any]:
 
 
 def is_sealed(store: Path) -> bool:
-    """Whether a store has a manifest, or says so; those of mars-lidar 0.2.0 and before have none."""
+    """Whether a store has a manifest, or says so; those of mars-lidar 0.1 have none."""
     return (store / NAME).exists() or "manifest" in root_document(store).get("attributes", {})
 
 

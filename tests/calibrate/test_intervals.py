@@ -135,4 +135,4 @@ def test_bad_input():
     with pytest.raises(ValueError, match="laser period"):
         stream_of(dataclasses.replace(two, period_ns=np.nan))
     with pytest.raises(ValueError, match="share period and bins"):
-        stream_of([two.pixel(0, 0), dataclasses.replace(two.pixel(0, 1), bins=8)])
+        stream_of([two.pixel(0, 0), dataclasses.replace(two.pixel(0, 1), bins=32)])

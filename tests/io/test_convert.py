@@ -96,7 +96,7 @@ def test_what_cannot_be_converted_is_refused(tmp_path):
             io.convert(tmp_path / source, tmp_path / target)
     with pytest.raises(ValueError, match="realization is for cubes"):
         io.convert(tmp_path / "photons.npz", tmp_path / "a.npz", realization=0)
-    with pytest.raises(ValueError, match="bins is for recorded photon streams"):
+    with pytest.raises(ValueError, match="bins is for photon streams"):
         io.convert(tmp_path / "cube.npz", tmp_path / "a.h5", bins=4)
     io.convert(tmp_path / "cube.npz", tmp_path / "a.h5")
     with pytest.raises(FileExistsError):

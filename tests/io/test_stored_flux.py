@@ -117,11 +117,12 @@ def test_the_command_goes_from_a_file_to_a_cube_and_a_picture(transient, tmp_pat
     told = CliRunner().invoke(app, ["info", str(out)]).output
     for word in ("waveform of 200 parts", "t.npy", "pulse_convolved False"):
         assert word in told
+    twice = "light must give one of signal and photons_per_unit, got both"
     for more, error in (
         (["--overwrite"], "give bin_ns"),
         (["--overwrite", "--scene", "room"], "got --scene and --transient"),
         (["--overwrite", "--transient-bin-ns", 1, "--attenuation", "inverse_square"], "attenuation is for surfaces"),
-        (["--overwrite", "--transient-bin-ns", 1, "--signal", 1, "--photons-per-unit", 1], "light must give one of signal and photons_per_unit, got both"),
+        (["--overwrite", "--transient-bin-ns", 1, "--signal", 1, "--photons-per-unit", 1], twice),
         (["--overwrite", "--transient-bin-ns", 1, "--size", 9], "--size belongs to --scene"),
     ):
         failed = run(*more)

@@ -31,6 +31,7 @@ LAW_STEPS = 40_000_000  # of the laws, which are to take 2 s at most
 _WARM_PERIODS = 400  # sweeps for a warm state; beyond, an equation is solved (_warm.py)
 _CHUNK_BYTES = 64 << 20
 _MAX_HISTORY_BYTES = 1 << 30  # for each thread
+_NEAR_BYTES, _MIDDLE_BYTES = 1 << 19, 1 << 25  # 15 to 60 ns a step; up to 100 ns; beyond, 100 to 350 ns were measured
 _SIMULATE = "simulate it with engine 'exact'"
 _SETTLED = 1e-12  # relative change of the state per period (20)
 
@@ -250,6 +251,11 @@ class Cells:
         step = max(least, _CHUNK_BYTES // per_cell)
         for start in range(0, self.size, step):
             yield slice(start, min(start + step, self.size))
+
+    def step_cost(self, bins: int) -> float:
+        """What a step of a bin costs beside one whose dead time is remembered in the processor's own memory."""
+        remembered = self.grid(bins, 1).bytes
+        return 1.0 if remembered <= _NEAR_BYTES else 2.0 if remembered <= _MIDDLE_BYTES else 6.0
 
     def check_history(self, bins: int) -> None:
         """Refuse, before any work, dead times whose history would not fit in memory."""

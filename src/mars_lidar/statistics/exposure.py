@@ -136,11 +136,11 @@ def refined_moments(
             return shaped(result, cells.shape)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _run(cells.part(pending), bins // 2, shared, team, progress, steps)
-    last = spent = _spent(coarse, cells.system)
+    last = spent = _spent(coarse, cells)
     while True:
         _affordable(cells, pending, spent + 2.0 * last, steps)
         fine = _run(cells.part(pending), bins, out_bins, team, progress, steps)
-        last = _spent(fine, cells.system)
+        last = _spent(fine, cells)
         spent = spent + last
         moved = movement(coarse, fine)
         good = moved <= tolerance
@@ -166,10 +166,11 @@ def refined_moments(
     return shaped(result, cells.shape)
 
 
-def _spent(done: Exposure, system: System) -> FloatArray:
-    """Bins x periods (cells,) of one pass, and as many as what comes before it costs."""
-    periods = np.where(done.settled >= 0, done.settled, system.cycles)
-    return (periods + _before(system)) * done.bins.astype(np.float64)
+def _spent(done: Exposure, cells: Cells) -> FloatArray:
+    """Bins x periods (cells,) of one pass, weighed by what each costs, and as many as what comes before it costs."""
+    periods = np.where(done.settled >= 0, done.settled, cells.system.cycles)
+    bins = int(done.bins.max(initial=1))
+    return (periods + _before(cells.system)) * done.bins.astype(np.float64) * cells.step_cost(bins)
 
 
 def _before(system: System) -> float:
@@ -200,6 +201,8 @@ def _run(
     from mars_lidar._base.native import _core
 
     cells.check_history(bins)
+    if steps is not None:
+        steps = int(steps / cells.step_cost(bins))
     periods = min(3.0 * (cells.system.dead_time_periods + 1.0), cells.system.cycles) + _before(cells.system)
     if steps is not None and periods * bins > steps:
         raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, steps)}")

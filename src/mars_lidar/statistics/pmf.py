@@ -178,8 +178,7 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
         value = re[0] - 1j * im[0]
     # numpy's transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
     folded = np.fft.irfft(value, size)
-    pmf = np.take(folded, np.arange(first, first + counts), mode="wrap")
-    return Pmf(first, pmf, outside)
+    return Pmf(first, np.roll(folded, -(first % size))[:counts], outside)
 
 
 def _narrow(

@@ -212,6 +212,11 @@ def test_mars_takes_a_table_over_the_range_of_an_image(tmp_path, monkeypatch):
         io.verify(cube)
 
 
+def gated(**times: float) -> ml.Detector:
+    """A gate of 5 ns."""
+    return ml.Detector(dead_time_ns=75.0, mode="gated", **{"gate_start_ns": 10.0, "gate_width_ns": 5.0, **times})
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -223,6 +228,8 @@ def test_mars_takes_a_table_over_the_range_of_an_image(tmp_path, monkeypatch):
             {"detector": ml.Detector(dead_time_ns=75.0, electronics_dead_time_ns=80_000.0)},
             r"electronics_dead_time_ns=80000 .* give 80",
         ),
+        ({"detector": gated(gate_start_ns=20_000.0)}, r"gate_start_ns=20000 .* in picoseconds, give 20, in ns"),
+        ({"detector": gated(gate_step_ns=18e-12)}, r"gate_step_ns=1\.8e-11 .* in seconds, give 0\.018, in ns"),
         (
             {"period_ns": 133e-9, "pulse": ml.GaussianPulse(sigma_ns=5e-10), "detector": ml.Detector(dead_time_ns=0.0)},
             r"133 ns, if it was given in seconds",

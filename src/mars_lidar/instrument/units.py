@@ -14,7 +14,7 @@ class UnitWarning(UserWarning):
 
 
 # from what on a time is odd in ns, and in laser periods, and from what on nobody types it: such values are meant
-_PULSE, _DEAD = (41.0, 0.31, 2e4), (25_000.0, 25.0, 1e6)
+_PULSE, _DEAD, _GATE = (41.0, 0.31, 2e4), (25_000.0, 25.0, 1e6), (0.0, 25.0, 1e6)
 _LONGEST_NS = 1e-6  # of a time in seconds that was taken for ns: a second is the longest anybody has
 _ODD_DELAY = 100.0  # periods
 _DIGITS = 3  # what people type; a computed value has more
@@ -37,6 +37,7 @@ def check_units(period: float, pulse: Pulse, detector: Detector) -> None:
     ]
     if isinstance(pulse, GaussianPulse):
         told.append(("sigma_ns", pulse.sigma_ns, _PULSE))
+    told += [(name, abs(getattr(detector, name) or 0.0), _GATE) for name in ("gate_start_ns", "gate_step_ns")]
     if any(value >= meant for _, value, (_, _, meant) in told):
         return  # nobody's laboratory: the far end of the domain, in units of its own
     for name, value, (odd_ns, odd_periods, _) in told:

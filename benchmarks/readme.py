@@ -1,4 +1,4 @@
-"""Tables of README and docs/engines.md from the saved run: ``python -m benchmarks.readme``; a test compares them."""
+"""Tables of README and of pages in docs/ from the saved run: ``python -m benchmarks.readme``; a test compares them."""
 
 from __future__ import annotations
 
@@ -67,15 +67,31 @@ def _rows(saved: Saved) -> dict[str, str]:
     }
 
 
-def speed(saved: Saved) -> str:
-    """README's table, with a line on where it was measured."""
+def _where(saved: Saved) -> str:
     machine = saved.machine
-    where = (
+    return (
         f"{machine['processors of this process']} cores of an {machine['processor']} "
         f"({machine['vector levels'].split(',')[0]}), {machine['date'].split()[0]}, from `python -m benchmarks` "
         "([all figures](benchmarks/results/default.md)):"
     )
-    return f"{where}\n\n{table([{'': what, 'time': time} for what, time in _rows(saved).items()])}\n"
+
+
+def speed(saved: Saved) -> str:
+    """The whole table, with a line on where it was measured."""
+    return f"{_where(saved)}\n\n{table([{'': what, 'time': time} for what, time in _rows(saved).items()])}\n"
+
+
+def figures(saved: Saved) -> str:
+    """README's few figures."""
+    rows, million = _rows(saved), "N_r = 1,000,000"
+    shown = (
+        "`exact`, one core / two",
+        "the paper's pipeline in NumPy, one core",
+        "exact law of the count of one (S, B)",
+    )
+    chosen = {what: rows[what] for what in shown}
+    chosen["`auto`, two cores, at a million cycles"] = saved.ms(_LONG, million, engine="auto")
+    return f"{_where(saved)}\n\n{table([{'': what, 'time': time} for what, time in chosen.items()])}\n"
 
 
 def exposures(saved: Saved) -> str:
@@ -93,18 +109,24 @@ def _exposure(saved: Saved, cycles: int) -> dict[str, str]:
     return row
 
 
-TABLES = {"README.md": ("speed", speed), "docs/engines.md": ("exposures", exposures)}
+BLOCKS = {"speed": speed, "figures": figures, "exposures": exposures}
+TABLES = ("README.md", "docs/engines.md", "docs/speed.md")
 
 
 def filled(name: str) -> tuple[str, str]:
-    """A document as it is, and with its table made anew."""
-    what, make = TABLES[name]
-    text = ROOT.joinpath(name).read_text(encoding="utf-8")
-    block = re.compile(rf"(<!-- {what}: [^>]*-->\n).*?(<!-- end of {what} -->)", re.DOTALL)
-    if not block.search(text):
-        raise SystemExit(f"{name} has no block <!-- {what}: ... -->")
-    new = make(Saved(json.loads(SAVED.read_text(encoding="utf-8"))))
-    return text, block.sub(lambda m: m[1] + new + m[2], text)
+    """A document as it is, and with its tables made anew."""
+    text = new = ROOT.joinpath(name).read_text(encoding="utf-8")
+    saved, found = Saved(json.loads(SAVED.read_text(encoding="utf-8"))), 0
+    for what, make in BLOCKS.items():
+        made = make(saved)
+        if name.startswith("docs/"):
+            made = made.replace("](benchmarks/", "](../benchmarks/").replace("](#start)", "](start.md)")
+        block = re.compile(rf"(<!-- {what}: [^>]*-->\n).*?(<!-- end of {what} -->)", re.DOTALL)
+        new, count = block.subn(lambda m, made=made: m[1] + made + m[2], new)
+        found += count
+    if not found:
+        raise SystemExit(f"{name} has no block <!-- {', '.join(BLOCKS)}: ... -->")
+    return text, new
 
 
 def main() -> None:

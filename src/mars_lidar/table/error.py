@@ -46,7 +46,7 @@ class QuantisationError:
     delayed_mean_max, delayed_variance_max, delayed_shape_max
         The same at random delays. The shape is shifted by whole bins, so that nothing but the table errs.
     law_max
-        Largest of 0.399 |error of the mean| + 0.242 |error of the variance|: the total variation between two
+        Largest of 0.399 ``|error of the mean|`` + 0.242 ``|error of the variance|``: the total variation between two
         normal laws, to first order; delays included.
     worst_signal, worst_background
         The pixel of `law_max` or `shape_max`, whichever is larger.

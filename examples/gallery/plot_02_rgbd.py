@@ -1,0 +1,33 @@
+"""
+An RGB-D image to a cube and a point cloud
+==========================================
+
+Depth and colour, as an RGB-D camera gives them (here written from a built-in scene: put your own files in their place),
+become photon rates, photon rates become a cube of histograms, and the cube a depth map and a cloud of points that any
+viewer opens.
+"""
+
+import imageio.v3 as imageio
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mars_lidar as ml
+
+room = ml.Scene.example("room", size=(96, 128))
+imageio.imwrite("depth.png", (1000 * room.depth_m).astype(np.uint16))  # mm
+imageio.imwrite("colors.png", (255 * np.repeat(room.reflectivity[..., None], 3, axis=-1)).astype(np.uint8))
+
+scene = ml.Scene.from_rgbd("depth.png", "colors.png")
+pulse, detector = ml.GaussianPulse(sigma_ns=0.5), ml.Detector(dead_time_ns=75.0)
+system = ml.System(period_ns=100.0, cycles=1000, bins=1024, pulse=pulse, detector=detector)
+cube = ml.simulate(scene.flux(system, signal=0.5, sbr=1.0), system)
+found = ml.reconstruct(cube[0], system)
+ml.io.save_cloud("room.ply", found.depth_m, focal_px=110.0, intensity=found.signal, overwrite=True)
+
+x, y, z = np.moveaxis(ml.io.points(found.depth_m, focal_px=110.0), -1, 0)
+fig = plt.figure(figsize=(8.2, 3.3))
+fig.add_subplot(121, title=f"{cube.sum():,} counts in {cube.shape[1:]}").imshow(cube[0].sum(-1), cmap="gray")
+cloud = fig.add_subplot(122, projection="3d", xlim=(-3, 3), ylim=(1, 8), zlim=(-2, 2), elev=15, azim=-75)
+cloud.scatter(x, z, -y, c=found.signal, s=1.5, vmax=1.5, axlim_clip=True)
+cloud.set_box_aspect((6, 7, 4), zoom=1.3)
+plt.show()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -49,9 +50,16 @@ class Page:
         self.tab.goto(address)
         self.drawn()
 
+    def until(self, condition: str) -> None:
+        """Wait for a condition; not by `wait_for_function`, which pages with a content policy forbid."""
+        end = time.monotonic() + WAIT_MS / 1000.0
+        while not self.tab.evaluate(f"Boolean({condition})"):
+            assert time.monotonic() < end, f"{condition} never came; the page said {self.said}"
+            self.tab.wait_for_timeout(20)
+
     def drawn(self) -> dict[str, Any]:
         """The figure's results when all of its stages are there; arrays as lists."""
-        self.tab.wait_for_function("window.explorer?.figure.results.whole && !explorer.figure.busy")
+        self.until("window.explorer?.figure.results.whole && !explorer.figure.busy")
         return self.tab.evaluate(
             """() => JSON.parse(JSON.stringify(explorer.figure.results, (_, value) =>
                 ArrayBuffer.isView(value) ? Array.from(value) : value))"""
@@ -64,7 +72,7 @@ class Page:
 
     def picture(self) -> NDArray[np.uint32]:
         """The cube (pixels, bins) behind the pictures, when they are drawn."""
-        self.tab.wait_for_function("explorer.picture.whole")
+        self.until("explorer.picture.whole")
         cube = self.tab.evaluate("explorer.pictureCube().then((cube) => Array.from(cube))")
         return np.array(cube, np.uint32).reshape(-1, self.tab.evaluate("explorer.state.bins"))
 

@@ -90,7 +90,7 @@ def test_the_same_bits_in_the_browser(page: Page):
     found = {each["name"]: each["found"] for each in page.tab.evaluate("explorer.golden()")}
     assert found == golden_of_page()
     page.tab.click("#check")
-    page.tab.wait_for_function("document.getElementById('golden').textContent.includes('All 8 golden cubes')")
+    page.until("document.getElementById('golden').textContent.includes('All 8 golden cubes')")
 
 
 @pytest.mark.parametrize("name", STATES)
@@ -169,7 +169,7 @@ def test_the_picture_by_maximum_likelihood(page: Page, cube: tuple[dict[str, Any
     _, drawn = cube
     page.set(method="likelihood")
     page.tab.wait_for_timeout(600)
-    page.tab.wait_for_function("explorer.picture.whole")
+    page.until("explorer.picture.whole")
     delay = np.array(page.tab.evaluate("Array.from(explorer.picture.delay, (x) => Number.isNaN(x) ? null : x)"), float)
     found = reconstruct(drawn, scene(page.tab.evaluate("explorer.state"))[1])
     seen = np.isfinite(delay)
@@ -204,7 +204,7 @@ def test_keys_move_over_the_picture(page: Page, cube: tuple[dict[str, Any], NDAr
     page.tab.evaluate("explorer.figure.results = {}")
     page.tab.keyboard.press("ArrowRight")
     page.tab.keyboard.press("ArrowDown")
-    page.tab.wait_for_function("explorer.state.pixel === 64 * 21 + 31")
+    page.until("explorer.state.pixel === 64 * 21 + 31")
     assert np.array_equal(page.drawn()["draw"]["counts"], drawn[64 * 21 + 31])
 
 

@@ -14,6 +14,7 @@ import typer
 
 from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
+from mars_lidar.cli.explore import EXPLORE_EPILOG, explore
 from mars_lidar.cli.export import EXPORT_EPILOG, export
 from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
 from mars_lidar.cli.groups import grouped
@@ -57,6 +58,7 @@ for _command, _epilog in (
     (reconstruct, RECONSTRUCT_EPILOG),
 ):
     _add(_command, _epilog, no_args_is_help=True)
+_add(explore, EXPLORE_EPILOG)
 _add(init)
 _add(schema)
 app.add_typer(table_app, name="table")

@@ -102,7 +102,7 @@ def view(
     with reported():
         check_picture(out, overwrite)
         pixels = None if not pixel else [parsed_pixel(text) for text in pixel]
-        with _opened(file, sample, foreign) as cube:
+        with opened(file, sample, foreign) as cube:
             from mars_lidar.plot import overview
 
             figure = overview(cube, realization=realization, pixels=pixels)
@@ -110,7 +110,7 @@ def view(
         table([("picture", str(out))])
 
 
-def _opened(file: Path, sample: int | None, foreign: ForeignOptions) -> Cube:
+def opened(file: Path, sample: int | None, foreign: ForeignOptions) -> Cube:
     """A cube, histograms of others, or a sample of a dataset."""
     from mars_lidar.dataset.store import is_dataset, open_dataset
 

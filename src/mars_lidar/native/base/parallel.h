@@ -1,15 +1,17 @@
 // Runs numbered chunks of work on threads, while the calling thread looks after them: progress, and Ctrl-C
-// (python/watched.h).
+// (python/watched.h). Where there are no threads (MARS_NO_THREADS: in a browser), one chunk after the other.
 #pragma once
 #include <atomic>
-#include <chrono>
-#include <condition_variable>
 #include <cstdint>
 #include <exception>
 #include <functional>
+#if !defined(MARS_NO_THREADS)
+#include <chrono>
+#include <condition_variable>
 #include <mutex>
 #include <thread>
 #include <vector>
+#endif
 
 #if defined(__linux__)
 #include <sched.h>
@@ -48,6 +50,13 @@ struct Stopped : std::exception {
 // Calls work(chunk, stop) for chunk = 0 .. chunks-1 on `threads` threads, in any order. Where the watch asks for it, or
 // `work` throws, `stop` turns true, the threads are joined, and Stopped or the exception is thrown: long chunks must
 // poll `stop`.
+#if defined(MARS_NO_THREADS)
+template <class Work>
+void run_chunks(int64_t chunks, int, const Watch&, const Work& work) {
+    const std::atomic<bool> stop{false};
+    for (int64_t chunk = 0; chunk < chunks; ++chunk) work(chunk, stop);
+}
+#else
 template <class Work>
 void run_chunks(int64_t chunks, int threads, const Watch& watch, const Work& work) {
     std::atomic<int64_t> next{0}, done{0};
@@ -103,5 +112,6 @@ void run_chunks(int64_t chunks, int threads, const Watch& watch, const Work& wor
     if (failure) std::rethrow_exception(failure);
     if (watch && watch(chunks, chunks)) throw Stopped();
 }
+#endif
 
 }  // namespace mars

@@ -1,0 +1,160 @@
+// The page: state, link, controls, figure and pictures together.
+import { Controls } from "./controls.js";
+import { Engine, Refusal, unpacked } from "./engine.js";
+import { Figure } from "./figure.js";
+import { INITIAL, SPEED_OF_LIGHT, fromHash, problem, toHash } from "./model.js";
+import { Picture } from "./pictures.js";
+import { snippet } from "./snippet.js";
+import { CubeSource, SceneSource } from "./sources.js";
+import colours from "./colours.json";
+
+const at = (id) => document.getElementById(id);
+const PICTURE_KEYS = ["signal", "background", "dead", "sigma", "mode", "start", "cycles", "bins", "period", "gateStart", "gateWidth", "efficiency",
+  "dark", "jitter", "afterpulses", "trapDelay", "twilight", "electronics", "seed", "method"];
+const PAUSE_MS = 250; // after the last change, before all pixels are drawn again
+
+async function begin() {
+  const told = JSON.parse(at("cube").textContent);
+  const source = told ? new CubeSource(told) : new SceneSource();
+  const module = await unpacked(at("native").textContent), worker = at("worker").textContent;
+  const page = { histogram: at("histogram"), law: at("law"), facts: at("facts"), notes: at("notes") };
+  const figure = new Figure(page, new Engine(module, worker)), painter = new Engine(module, worker);
+  const pixels = source.height * source.width;
+  let state = told ? { ...INITIAL, ...source.settings } : fromHash(location.hash, pixels);
+  let painted = "", timer = 0, lastPicture = {};
+
+  const set = (changes) => {
+    const next = { ...state, ...changes };
+    if (next.delay > next.period) next.delay = next.period;
+    state = next;
+    return refresh();
+  };
+
+  const pick = async (row, column) => {
+    const pixel = row * source.width + column;
+    if (!told) return set({ pixel });
+    try {
+      const { light } = await source.read(pixel);
+      return set({ pixel, ...(light ?? {}) });
+    } catch (error) {
+      at("problem").textContent = `The pixel could not be read: ${error.message}`;
+    }
+  };
+  const pictures = [new Picture(at("depth"), colours.depth, pick), new Picture(at("counts"), colours.counts, pick)];
+  const controls = new Controls(at("controls"), set);
+
+  function refresh() {
+    const hash = toHash(state);
+    if (!told) history.replaceState(null, "", hash ? `#${hash}` : location.pathname + location.search);
+    const wrong = problem(state), pixel = source.pixel(state);
+    controls.show(state, [...source.fixed, ...(state.pixel >= 0 && !told ? ["delay"] : [])]);
+    at("method").value = state.method;
+    at("log").checked = state.log === 1;
+    at("again").textContent = `Draw again (seed ${state.seed})`;
+    at("python").textContent = snippet(state, pixel, pixel.stored);
+    at("which").textContent = whichPixel(pixel);
+    at("free").hidden = told || state.pixel < 0;
+    for (const picture of pictures) picture.select(state.pixel < 0 ? null : [Math.floor(state.pixel / source.width), state.pixel % source.width]);
+    at("problem").textContent = wrong;
+    if (wrong) return Promise.resolve();
+    const key = told ? state.method + source.image : PICTURE_KEYS.map((name) => state[name]).join();
+    if (key !== painted) {
+      painted = key;
+      clearTimeout(timer);
+      painter.stop();
+      timer = setTimeout(paint, PAUSE_MS);
+    }
+    return figure.want(state, pixel, told ? source.reason : "");
+  }
+
+  function whichPixel(pixel) {
+    if (state.pixel < 0) return told ? "Click a pixel of the pictures." : "A pixel with the light of the sliders. Click the pictures for one of theirs.";
+    const row = Math.floor(state.pixel / source.width), column = state.pixel % source.width;
+    const number = (x) => Number(x.toPrecision(4));
+    return `Pixel (${row}, ${column}) of the picture: S = ${number(pixel.signal)}, delay ${number(pixel.delayNs)} ns, depth ${number((pixel.delayNs * SPEED_OF_LIGHT) / 2)} m.`;
+  }
+
+  async function paint() {
+    const mine = painted, current = state, range = (SPEED_OF_LIGHT / 2) * current.period;
+    const found = lastPicture = {};
+    const tell = (share) => { if (mine === painted) at("progress").textContent = share < 1 ? `${Math.round(100 * share)} %` : ""; };
+    try {
+      await source.picture(current, painter, tell, (some) => {
+        if (mine !== painted) return;
+        Object.assign(found, some);
+        showPictures(found, current, range);
+      });
+      found.whole = true;
+      at("progress").textContent = "";
+    } catch (error) {
+      if (mine !== painted) return;
+      at("progress").textContent = error instanceof Refusal ? `No depth by this method here: ${error.message}. The picture is that of the peak.` : error.message;
+      if (error instanceof Refusal) found.whole = true;
+    }
+  }
+
+  function showPictures({ totals, delay }, current, range) {
+    const depth = delay.map((periods) => range * (periods - Math.floor(periods)));
+    const scale = (values, low, high) => {
+      const sorted = Float64Array.from(values).filter((x) => !Number.isNaN(x)).sort();
+      return sorted.length ? [sorted[Math.floor(low * (sorted.length - 1))], sorted[Math.ceil(high * (sorted.length - 1))]] : [0, 1];
+    };
+    const metres = (x) => `${Number(x.toPrecision(3))} m`, whole = (x) => Math.round(x).toLocaleString("en");
+    pictures[0].show(depth, source.height, source.width, scale(source.truth ? source.truth.map((z) => z % range) : depth, 0.01, 0.99), metres);
+    pictures[1].show(totals, source.height, source.width, scale(totals, 0, 1), whole);
+    if (!source.truth) return;
+    const off = depth.map((z, p) => Math.abs(z - (source.truth[p] % range))).filter((x) => !Number.isNaN(x)).sort();
+    const lost = depth.length - off.length;
+    at("error").textContent = current.method === "truth" ? "" :
+      `Median error of the depth ${Number((100 * off[Math.floor(off.length / 2)]).toPrecision(3))} cm${lost ? `, ${lost} pixels without` : ""}.`;
+  }
+
+  at("method").onchange = (event) => set({ method: event.target.value });
+  at("log").onchange = (event) => set({ log: event.target.checked ? 1 : 0 });
+  at("again").onclick = () => set({ seed: (state.seed + 1) % 2 ** 32 });
+  at("again").hidden = Boolean(told);
+  at("free").onclick = () => set({ pixel: -1 });
+  at("reset").onclick = () => { state = told ? { ...INITIAL, ...source.settings } : { ...INITIAL }; refresh(); };
+  const copied = (button, text) => async () => {
+    await navigator.clipboard.writeText(text());
+    const label = button.textContent;
+    button.textContent = "Copied";
+    setTimeout(() => { button.textContent = label; }, 1200);
+  };
+  at("copy").onclick = copied(at("copy"), () => at("python").textContent);
+  at("link").onclick = copied(at("link"), () => location.href);
+  at("link").hidden = Boolean(told);
+  at("image-number").hidden = source.images < 2;
+  at("image").max = source.images - 1;
+  at("image").onchange = async (event) => {
+    source.image = Math.min(Math.max(Math.round(Number(event.target.value)), 0), source.images - 1);
+    if (state.pixel >= 0) await source.read(state.pixel);
+    refresh();
+  };
+  at("check").onclick = async () => {
+    const { cubes } = await figure.engine.ask("golden"), same = cubes.filter(({ found, expected }) => found === expected);
+    at("golden").textContent = same.length === cubes.length
+      ? `All ${cubes.length} golden cubes have the bits that the package's tests hold (${cubes[0].name}: SHA-256 ${cubes[0].found}).`
+      : `${cubes.length - same.length} of ${cubes.length} golden cubes differ: please report this with your browser's name.`;
+    return cubes;
+  };
+  addEventListener("hashchange", () => { state = fromHash(location.hash, pixels); refresh(); });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => figure.restyle());
+  at("title-cube").textContent = told ? `${told.path}: ${told.height} x ${told.width} pixels` : "";
+
+  // For tests, and for those who look behind the page.
+  window.explorer = {
+    set, pick, figure, painter, source, get state() { return state; }, get picture() { return lastPicture; },
+    golden: async () => (await figure.engine.ask("golden")).cubes, pictureCube: async () => (await painter.ask("cube")).cube,
+  };
+  at("loading").hidden = true;
+  if (!told) return refresh();
+  at("dots-name").textContent = "the stored exposure";
+  if (!source.known) at("method").querySelector("[value=truth]").remove();
+  await pick(source.height >> 1, source.width >> 1);
+}
+
+begin().catch((error) => {
+  at("loading").textContent = `This browser cannot run the page: ${error.message}. It needs WebAssembly with SIMD and DecompressionStream (browsers of 2023 and later).`;
+  console.error(error);
+});

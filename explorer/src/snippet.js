@@ -1,0 +1,54 @@
+// The Python that makes the page's figure: same light, same system, same seed, and so the same dots.
+import { lawless } from "./model.js";
+
+const num = (x) => (Number.isInteger(x) && Math.abs(x) < 1e15 ? `${x}.0` : String(x).replace("e+", "e"));
+
+function detector(state) {
+  const told = [`dead_time_ns=${num(state.dead)}`];
+  if (state.mode !== "nonparalyzable") told.push(`mode="${state.mode}"`);
+  if (state.mode === "gated") told.push(`gate_start_ns=${num(state.gateStart)}`, `gate_width_ns=${num(state.gateWidth)}`);
+  if (state.efficiency !== 1) told.push(`detection_efficiency=${num(state.efficiency)}`);
+  if (state.dark > 0) told.push(`dark_count_hz=${num(state.dark)}`);
+  if (state.afterpulses > 0) told.push(`afterpulsing=ml.Afterpulsing(probability=${num(state.afterpulses)}, delay_ns=${num(state.trapDelay)})`);
+  if (state.twilight > 0 && state.mode === "nonparalyzable") told.push(`twilight_ns=${num(state.twilight)}`);
+  if (state.electronics > 0) told.push(`electronics_dead_time_ns=${num(state.electronics)}`);
+  if (state.jitter > 0) told.push(`jitter=ml.Jitter(sigma_ns=${num(state.jitter)})`);
+  return told.join(",\n        ");
+}
+
+/** Python for a state and its pixel (signal, background, delayNs, index), with the dots of a stored cube if `stored`. */
+export function snippet(state, pixel, stored) {
+  const exact = lawless(state).length === 0, joint = exact && state.mode === "nonparalyzable";
+  const names = ["photons_per_bin", ...(exact ? ["count_law", "mean_histogram"] : []), ...(joint ? ["joint_law"] : [])].sort();
+  const light = "signal, background, system, delay_ns=delay_ns";
+  const lines = [
+    "import matplotlib.pyplot as plt", "import numpy as np", "", "import mars_lidar as ml",
+    `from mars_lidar.statistics import ${names.join(", ")}`, "",
+    "system = ml.System(", `    period_ns=${num(state.period)},`, `    cycles=${state.cycles},`, `    bins=${state.bins},`,
+    `    pulse=ml.GaussianPulse(sigma_ns=${num(state.sigma)}),`, `    detector=ml.Detector(\n        ${detector(state)}\n    ),`,
+    ...(state.start === "armed" ? [] : [`    start="${state.start}",`]), ")",
+    `signal, background, delay_ns = ${num(pixel.signal)}, ${num(pixel.background)}, ${num(pixel.delayNs)}`,
+  ];
+  if (stored) {
+    lines.push(`drawn = np.asarray(ml.io.load(${JSON.stringify(stored.path)}).histogram[${stored.image}, ${stored.row}, ${stored.column}])`);
+  } else {
+    lines.push("flux = ml.Flux([[signal]], [[background]], [[delay_ns]])",
+      `drawn = ml.simulate(flux, system, seed=${state.seed}, pixel_index=[[${pixel.index}]])[0, 0, 0]`);
+  }
+  lines.push("incident = photons_per_bin(signal, background, system, bins=system.bins, delay_ns=delay_ns)");
+  if (exact) lines.push(`mean = mean_histogram(${light})`, `law = count_law(${light})`);
+  if (joint) lines.push(`spread = np.sqrt(joint_law(${light}).variance)`);
+  else if (exact) lines.push("spread = np.sqrt(mean)  # Poisson: for this mode there is no exact variance of a bin");
+  lines.push("", 'figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4), layout="constrained", width_ratios=(2, 1))',
+    "behind = left.twinx()", 'behind.fill_between(system.time_ns, incident, step="mid", color="0.85")',
+    'behind.set_ylabel("photons per bin and period")', "behind.set_zorder(-1)", "left.patch.set_visible(False)",
+    'left.plot(system.time_ns, drawn, ".", label="one exposure")');
+  if (exact) {
+    lines.push('left.plot(system.time_ns, mean, label="exact mean")',
+      'left.fill_between(system.time_ns, mean - 2 * spread, mean + 2 * spread, alpha=0.3, label="two standard deviations")',
+      "right.bar(law.support, law.pmf, width=1.0)");
+  }
+  lines.push('left.set(xlabel="time (ns)", ylabel="counts")', "left.legend()",
+    'right.axvline(drawn.sum(), color="k")', 'right.set(xlabel="registrations N", ylabel="probability")', "plt.show()");
+  return lines.join("\n") + "\n";
+}

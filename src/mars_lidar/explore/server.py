@@ -1,0 +1,192 @@
+"""The explorer's page with a cube of the user's own, served to this machine only.
+
+It listens on the loopback address; every path begins with a random word, and a request for another host's name, as a
+page elsewhere would send it after naming this machine its own, is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import threading
+import warnings
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from mars_lidar.explore.settings import light_of, settings_of, truth_of
+from mars_lidar.io import Cube
+from mars_lidar.reconstruct import reconstruct
+
+_PLACE = '<script type="application/json" id="cube">null</script>'
+_MOST_PIXELS = 2**16  # of one answer, or one row
+_METHODS = {"peak": "peak", "likelihood": "maximum_likelihood"}
+_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self'"
+)
+
+
+def page_text() -> str:
+    """The page; FileNotFoundError, in one line, where this installation came without it."""
+    page = files("mars_lidar.explore").joinpath("page.html")
+    if not page.is_file():
+        raise FileNotFoundError("this installation has no page for the explorer: explorer/build in a checkout makes it")
+    return page.read_text(encoding="utf-8")
+
+
+class CubeServer:
+    """Serves the page, and the pixels of `cube` (None: the page's own picture) as they are clicked.
+
+    Parameters
+    ----------
+    cube
+        An open cube; its counts are read in the parts that are asked for.
+    name
+        The file's name, which the page shows and its Python reads.
+    port
+        0: one that is free.
+    """
+
+    def __init__(self, cube: Cube | None = None, name: str = "", *, port: int = 0) -> None:
+        self.cube = cube
+        self._lock = threading.Lock()  # of the file
+        self._word = f"/{secrets.token_urlsafe(16)}"
+        text = page_text()
+        if cube is not None:
+            told = json.dumps(self._told(cube, name), allow_nan=False).replace("<", "\\u003c")
+            text = text.replace(_PLACE, _PLACE.replace("null", told, 1))
+        self._page = text.encode()
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
+        self._server.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self._server.server_port}{self._word}/"
+
+    def serve(self) -> None:
+        """Answer until the process is interrupted, or `stop` is called by another thread."""
+        self._server.serve_forever()
+
+    def stop(self) -> None:
+        """End `serve`."""
+        self._server.shutdown()
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._server.server_close()
+
+    @property
+    def hosts(self) -> tuple[str, str]:
+        """Names by which this machine may ask."""
+        port = self._server.server_port
+        return f"127.0.0.1:{port}", f"localhost:{port}"
+
+    def answer(self, target: str) -> tuple[str, bytes]:
+        """Type and content of what `target`, path and query, asks for; KeyError where that is nothing."""
+        asked = urlsplit(target)
+        if not secrets.compare_digest(asked.path[: len(self._word)].encode(), self._word.encode()):
+            raise KeyError(target)
+        what = asked.path[len(self._word) :]
+        if what == "/":
+            return "text/html; charset=utf-8", self._page
+        given = {name: values[-1] for name, values in parse_qs(asked.query).items()}
+        answers: dict[str, Callable[[Cube, dict[str, str]], tuple[str, bytes]]] = {
+            "/pixel": self._pixel,
+            "/rows": self._rows,
+        }
+        if self.cube is None:
+            raise KeyError(target)
+        with self._lock, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return answers[what](self.cube, given)
+
+    def _told(self, cube: Cube, name: str) -> dict[str, Any]:
+        settings, reason = settings_of(cube.system)
+        images, height, width, _ = cube.shape
+        return {
+            "path": name,
+            "api": self._word,
+            "images": images,
+            "height": height,
+            "width": width,
+            "settings": settings,
+            "reason": reason or truth_of(cube),
+            "known": not cube.measured and cube.flux.waveform is None,
+        }
+
+    def _pixel(self, cube: Cube, given: dict[str, str]) -> tuple[str, bytes]:
+        image, row, column = (
+            _whole(name, given, size) for name, size in zip(("image", "row", "column"), cube.shape, strict=False)
+        )
+        counts = np.asarray(cube.histogram[image, row, column])
+        told = {"counts": counts.tolist(), "light": light_of(cube, image, row, column, counts)}
+        return "application/json", json.dumps(told, allow_nan=False).encode()
+
+    def _rows(self, cube: Cube, given: dict[str, str]) -> tuple[str, bytes]:
+        """Counts of the pixels of some rows, and their delays in ns, NaN for none: float64."""
+        images, height, width, _ = cube.shape
+        image, first = _whole("image", given, images), _whole("first", given, height)
+        rows = 1 + _whole(
+            "rows", {"rows": str(int(given["rows"]) - 1)}, min(height - first, max(1, _MOST_PIXELS // width))
+        )
+        counts = np.asarray(cube.histogram[image, first : first + rows])
+        totals = counts.sum(-1, dtype=np.float64)
+        if given["method"] == "truth":
+            if cube.measured or cube.flux.waveform is not None:
+                raise ValueError("the file does not tell the true depth")
+            delay = cube.flux.returns_delay_ns.reshape(-1, height, width)[0, first : first + rows]
+        else:
+            delay = reconstruct(counts, cube.system, _METHODS[given["method"]]).delay_ns
+        return "application/octet-stream", np.stack([totals, delay]).astype("<f8").tobytes()
+
+
+def _whole(name: str, given: dict[str, str], size: int) -> int:
+    """A whole number in [0, size)."""
+    value = int(given[name])
+    if not 0 <= value < size:
+        raise ValueError(f"{name} must lie in [0, {size}), got {value}")
+    return value
+
+
+def _handler(server: CubeServer) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        server_version = "mars-lidar"
+        sys_version = ""
+
+        def do_GET(self) -> None:
+            if self.headers.get("Host", "") not in server.hosts:
+                self._send(HTTPStatus.FORBIDDEN, "text/plain", b"this page is for the machine that serves it")
+                return
+            try:
+                kind, content = server.answer(self.path)
+            except KeyError:
+                self._send(HTTPStatus.NOT_FOUND, "text/plain", b"there is nothing here")
+            except (ValueError, OSError) as error:
+                self._send(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(error).encode())
+            else:
+                self._send(HTTPStatus.OK, kind, content)
+
+        def _send(self, status: HTTPStatus, kind: str, content: bytes) -> None:
+            try:
+                self.send_response(status)
+                for name, value in (
+                    ("Content-Type", kind),
+                    ("Content-Length", str(len(content))),
+                    ("Cache-Control", "no-store"),
+                    ("X-Content-Type-Options", "nosniff"),
+                    ("Referrer-Policy", "no-referrer"),
+                    ("Content-Security-Policy", _POLICY),
+                ):
+                    self.send_header(name, value)
+                self.end_headers()
+                self.wfile.write(content)
+            except (BrokenPipeError, ConnectionResetError):  # the reader has gone to another page
+                pass
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Nothing: a line for each click would be noise."""
+
+    return Handler

@@ -1,5 +1,6 @@
 """Calibration: what a stream of photons says about its instrument, and whether the model describes the stream."""
 
+from mars_lidar.calibrate.arrivals import ArrivalInspection, inspect_arrivals
 from mars_lidar.calibrate.calibration import Calibration, calibrate
 from mars_lidar.calibrate.calibration_bound import Bound, calibration_bound
 from mars_lidar.calibrate.calibration_rapp import RappEstimate, rapp_total
@@ -10,6 +11,7 @@ from mars_lidar.calibrate.stream_summary import Summary, summary
 from mars_lidar.calibrate.validation import Validation, validate
 
 __all__ = [
+    "ArrivalInspection",
     "Bound",
     "Calibration",
     "Check",
@@ -21,6 +23,7 @@ __all__ = [
     "calibrate",
     "calibration_bound",
     "inspect",
+    "inspect_arrivals",
     "rapp_total",
     "recovery",
     "summary",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +13,7 @@ from mars_lidar.cli.pulse_options import PulseOptions
 if TYPE_CHECKING:
     from mars_lidar.instrument.system import System
     from mars_lidar.io import Cube
+    from mars_lidar.io.recorder import Recorded
 
 _PANEL = "A file of another program"
 _BINS = 1e-6  # relative difference by which a period may miss a whole number of bins
@@ -69,11 +70,10 @@ class ForeignOptions:
 
     def of_histograms(self, path: Path) -> bool:
         """Whether `path` is taken for histograms: by its suffix, or by options that neither cubes nor streams have."""
-        if path.suffix.lower() in (".npy", ".csv", ".txt", ".tif", ".tiff"):
+        if path.suffix.lower() in (".npy", ".csv", ".txt", ".tif", ".tiff", ".sdt"):
             return True
-        return any(
-            getattr(self, name) is not None for name in ("system", "cycles", "bin_ns", "bin_ps", "axes", "image")
-        )
+        names = ("system", "cycles", "bin_ns", "bin_ps", "dead_time_ns", "axes", "image")
+        return any(getattr(self, name) is not None for name in names)
 
     def opened(self, path: Path) -> Cube:
         """The cube in a file of mars-lidar, or of another program."""
@@ -98,7 +98,17 @@ class ForeignOptions:
             bins=None if base is None else base.bins,
         )
         length = None if found.counts is None else found.counts.shape[-1]
-        return found.cube(base or self._system(path, length), start_ns=self.start_ns, unit_ns=self.unit_ns)
+        whole = self if found.recorder is None or base is not None else self._completed(found.recorder, length)
+        return found.cube(base or whole._system(path, length), start_ns=self.start_ns, unit_ns=self.unit_ns)
+
+    def _completed(self, told: Recorded, length: int | None) -> ForeignOptions:
+        """With what the recorder tells, where no option does: the period is as many of its bins as fill it best."""
+        width = told.bin_ns if self.bin_ns is None and self.bin_ps is None else None
+        if width is None:
+            return self if self.cycles is not None else replace(self, cycles=told.cycles)
+        period = self.period_ns or told.period_ns or (width * length if length else None)
+        whole = None if period is None else max(round(period / width), length or 1) * width
+        return replace(self, bin_ns=width, period_ns=whole, cycles=told.cycles if self.cycles is None else self.cycles)
 
     def _file(self) -> System | None:
         if self.system is None:
@@ -167,13 +177,53 @@ def is_foreign(path: Path, error: ValueError) -> bool:
 def foreign_rows(path: Path) -> list[tuple[str, str]]:
     """What `mars-lidar info` tells of a file of another program."""
     from mars_lidar.io.foreign import arrays
+    from mars_lidar.io.recorder import RECORDER_SUFFIXES
 
+    if path.suffix.lower() in RECORDER_SUFFIXES:
+        return _recorder_rows(path)
     rows = [("file", f"{path} (not written by mars-lidar)")]
     for name, array in arrays(path).items():
         size = " × ".join(map(str, array.shape))
         told = f"photon times of {size} pixels" if array.dtype == object else f"{size} {array.dtype}"
         rows.append(("array", f"{name} {told}".strip()))
     return [*rows, ("reconstruct with", _NEEDED)]
+
+
+def _recorder_rows(path: Path) -> list[tuple[str, str]]:
+    """What a photon counter recorded: its clocks, the photons of each channel, and the images of a scan."""
+    import numpy as np
+
+    from mars_lidar.io.recorder import recorded
+    from mars_lidar.io.streams.files import recorded as photons_of
+
+    rows = [("file", f"{path} (not written by mars-lidar)")]
+    scan, found = None, None
+    if path.suffix == ".sdt":
+        scan = recorded(path)
+    else:
+        found = photons_of(path)
+        clock = f"{1e3 * found.clock_ns:.7g} ps"
+        if found.fine is None:
+            rows.append(("clock", f"absolute times in units of {clock} (T2)"))
+        else:
+            laser = "laser periods" if found.period_ns else "its own, not the laser's"
+            rows.append(
+                ("clock", f"{laser}, {clock}; photons in units of {1e3 * found.fine_ns:.5g} ps after the pulse")
+            )
+            scan = recorded(path)
+        for channel, number in zip(*np.unique(found.detector, return_counts=True), strict=True):
+            told = f"{channel}: {number:,} photons" if channel >= 0 else f"sync: {number:,} pulses"
+            rows.append(("channel", told))
+    for name, array in () if scan is None else scan.arrays.items():
+        rows.append(("histograms", f"{name}: {' × '.join(map(str, array.shape))}, {int(array.sum()):,} photons"))
+    rows += [("left out", text) for text in (() if scan is None else scan.told)]
+    if scan is not None:
+        rows.append(("reconstruct with", _NEEDED + "; bins and cycles as far as the file tells them"))
+    return (
+        rows
+        if found is None
+        else [*rows, ("a channel's stream", "mars-lidar inspect, calibrate, validate --pixel 0,C")]
+    )
 
 
 def _pair(text: str) -> tuple[int, int]:

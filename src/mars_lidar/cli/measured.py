@@ -47,7 +47,9 @@ VALIDATE_EPILOG = "\n\n".join(
 
 Stream = Annotated[
     Path,
-    typer.Argument(help="Photon stream: .ptu (T2, T3), Photon-HDF5, .mat or .npz.", show_default=False),
+    typer.Argument(
+        help="Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat or .npz.", show_default=False
+    ),
 ]
 Cycles = Annotated[
     int,
@@ -76,13 +78,20 @@ def inspect(
     """Look at a photon stream: rates, intervals, dead time, recovery after a photon, and what does not fit.
 
     Nothing is assumed of the light but that it repeats with the laser; of a simulated stream only the photons are
-    looked at, not the system in its header.
+    looked at, not the system in its header. Without a laser: dead time and afterpulses in constant light.
     """
     with reported():
         check_picture(out, overwrite)
         from mars_lidar.calibrate import inspect as look
+        from mars_lidar.io.streams.photons import NoLaserError
 
-        times, rows = source.load(stream)
+        try:
+            times, rows = source.load(stream)
+        except NoLaserError as error:
+            if out is not None:
+                raise ValueError(f"{error}; a picture (-o) needs a laser period") from error
+            table(source.arrivals(stream, dead_time_ns))
+            return
         found = look(times, dead_time_ns=dead_time_ns)
         rows += clock_rows(found.calibration) + interval_rows(found.calibration, dead_time_ns is None)
         light = found.calibration
@@ -124,10 +133,18 @@ def calibrate(
 ) -> None:
     """Signal, background and delay of a photon stream, by maximum likelihood, with standard errors."""
     with reported():
+        from mars_lidar.io.streams.photons import NoLaserError
+
         _check_system_out(out, light.free, overwrite)
         if cycles is not None:
             checks.integer("--cycles", cycles, low=1, high=MAX_CYCLES)
-        times, rows = source.load(stream)
+        try:
+            times, rows = source.load(stream)
+        except NoLaserError as error:
+            if out is not None or light.system is not None:
+                raise ValueError(f"{error}; a system (-o, --system) needs a laser period") from error
+            table(source.arrivals(stream, light.dead_time_ns))
+            return
         found, detector = light.calibrate(times, effects)
         table(rows + clock_rows(found) + light_rows(found, detector))
         if out is not None:

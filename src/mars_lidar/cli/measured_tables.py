@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mars_lidar.calibrate import Calibration
+    from mars_lidar.calibrate import ArrivalInspection, Calibration
     from mars_lidar.instrument.detector import Detector
 
 
@@ -104,3 +104,24 @@ def light_rows(found: Calibration, detector: Detector | None = None) -> list[tup
             )
         )
     return rows
+
+
+def arrival_rows(found: ArrivalInspection) -> list[tuple[str, str]]:
+    """A detector in constant light, of a recording without a laser."""
+    low, middle, high = found.quantiles_ns
+    unit = f", clock unit {1e3 * found.unit_ns:.5g} ps" if found.unit_ns else ""
+    known = found.dead_time_ns == found.dead_time_ns
+    dead = f"{found.dead_time_ns:.6g} ± {found.dead_time_error_ns:.2g} ns" if known else "not known"
+    seen = f"{found.afterpulse_probability:.4g} ± {found.afterpulse_error:.2g} a registration"
+    if found.afterpulse_probability == 0.0:
+        seen = f"none seen: 0 ± {found.afterpulse_error:.2g} a registration"
+    return [
+        ("laser", f"none told: arrivals over {1e-9 * found.duration_ns:.4g} s{unit}"),
+        ("rate", f"{found.rate_per_s:,.6g} ± {found.rate_error_per_s:.2g} per second of an armed detector"),
+        ("intervals", f"smallest {found.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),
+        ("dead time", dead),
+        *([("jitter", f"sigma {found.jitter_ns:.4g} ns, by the edge of the intervals")] if found.jitter_ns else []),
+        ("afterpulses", f"{seen}, within {found.afterpulse_until_ns:.4g} ns" if known else "not known"),
+        *[("not known", text) for text in found.unknown],
+        *[("does not fit", text) for text in found.problems or ("nothing",)],
+    ]

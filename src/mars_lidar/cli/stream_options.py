@@ -90,6 +90,25 @@ class StreamOptions:
     unit_ns: UnitNs = None
     variable: Variable = None
 
+    def arrivals(self, stream: Path, dead_time_ns: float | None) -> list[tuple[str, str]]:
+        """The rows of a recording without a laser."""
+        import numpy as np
+
+        from mars_lidar.calibrate import inspect_arrivals
+        from mars_lidar.cli.measured_tables import arrival_rows
+        from mars_lidar.io.streams.files import recorded
+
+        found = recorded(stream, unit_ns=self.unit_ns, variable=self.variable)
+        channels, counts = np.unique(found.detector[found.detector >= 0], return_counts=True)
+        if not channels.size:
+            raise ValueError(f"{stream} holds no photons")
+        y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else parsed_pixel(self.pixel)
+        if y != 0 or x not in channels:
+            raise ValueError(f"--pixel must be 0,C with a channel C of {', '.join(map(str, channels))}, got ({y}, {x})")
+        times = found.clock[found.detector == x].astype(np.float64) * found.clock_ns
+        rows = [("file", f"{stream}: {int(counts.sum()):,} photons"), ("channel", f"{x}: {times.size:,} photons")]
+        return rows + arrival_rows(inspect_arrivals(times, unit_ns=found.clock_ns, dead_time_ns=dead_time_ns))
+
     def load(self, stream: Path) -> tuple[Timestamps, list[tuple[str, str]]]:
         """The pixel, and the rows that say what was read."""
         import numpy as np

@@ -1,4 +1,4 @@
-"""Histograms and photon times in the files of others: arrays of NumPy, MATLAB and HDF5, TIFF stacks, tables of text."""
+"""Histograms and photon times in the files of others: NumPy, MATLAB, HDF5, TIFF, text, photon counters."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from mars_lidar._base.files import check_claim, open_hdf5, open_npz, read_mat5, 
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
+from mars_lidar.io.recorder import RECORDER_SUFFIXES, Recorded, recorded
 from mars_lidar.io.streams.bare_stream import mat_cells
 
-FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".csv", ".txt")
+FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".csv", ".txt", *RECORDER_SUFFIXES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,8 @@ class ForeignCounts:
         (H, W) of arrays of photon times, or None.
     axes
         What the array's dimensions were taken for.
+    recorder
+        What a photon counter's file tells of its histograms, else None.
     """
 
     path: Path
@@ -40,6 +43,7 @@ class ForeignCounts:
     counts: NDArray[Any] | None
     cells: NDArray[Any] | None
     axes: str
+    recorder: Recorded | None = None
 
     def cube(self, system: System, *, start_ns: float = 0.0, unit_ns: float | None = None) -> Cube:
         """The cube, see `foreign_cube`."""
@@ -71,9 +75,10 @@ def foreign_cube(
     Parameters
     ----------
     path
-        ``.npy``, ``.npz`` (SciPy's sparse matrices as well), ``.mat`` (v5, v7.3; dense, sparse, or cells of photon
-        times), ``.h5``, ``.hdf5``, ``.tif`` (a page for each time bin), ``.csv`` or ``.txt`` (one histogram: a column
-        of counts, or times and counts).
+        ``.ptu``, ``.pt3``, ``.ht3``, ``.t3r``, ``.spc`` and ``.sdt`` of photon counters (scanned images, or a histogram
+        for each channel), ``.npy``, ``.npz`` (SciPy's sparse matrices as well), ``.mat`` (v5, v7.3; dense, sparse, or
+        cells of photon times), ``.h5``, ``.hdf5``, ``.tif`` (a page for each time bin), ``.csv`` or ``.txt`` (one
+        histogram: a column of counts, or times and counts).
     system, axes, image, start_ns
         As for `mars_lidar.io.from_histograms`. Default of `axes`: time is the dimension that is as long as the system
         has bins where there is one such, else the last; of a TIFF the pages. A dimension of pixels goes through columns
@@ -102,12 +107,13 @@ def read_counts(
 ) -> ForeignCounts:
     """The array of a file, in order; `bins` is the length by which time is told from the image, if that is known."""
     source = Path(path)
-    name, array = _chosen(source, arrays(source), variable)
+    told_by = recorded(source) if source.suffix.lower() in RECORDER_SUFFIXES else None
+    name, array = _chosen(source, arrays(source) if told_by is None else told_by.arrays, variable)
     if isinstance(array, np.ndarray) and array.dtype == object:
         return ForeignCounts(source, name, None, array, "")
     told = axes or _guessed(source, array.shape, bins)
     try:
-        return ForeignCounts(source, name, in_order(array, told, image), None, told)
+        return ForeignCounts(source, name, in_order(array, told, image), None, told, told_by)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{source}: {name or 'the array'}: {error}") from error
 
@@ -117,6 +123,8 @@ def arrays(path: Path) -> dict[str, Any]:
     if path.suffix.lower() not in FOREIGN_SUFFIXES:
         raise ValueError(f"{path}: histograms of others are read from {', '.join(FOREIGN_SUFFIXES)}")
     with reading(path, "arrays of histograms"):
+        if path.suffix.lower() in RECORDER_SUFFIXES:
+            return dict(recorded(path).arrays)
         found: dict[str, Any] = _READERS[path.suffix.lower()](path)
     return {name: array for name, array in found.items() if len(array.shape)}
 

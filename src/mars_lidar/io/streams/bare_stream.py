@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import open_hdf5, open_npz, read_mat5, whole
+from mars_lidar.io.streams.photons import NoLaserError, Photons
 from mars_lidar.light.timestamps import Timestamps
 
 _BINS = 1024  # of times that are no whole numbers of a unit, where none are asked for
 _MOST_BINS = 2**20
+_FINEST_NS = 1e-6  # unit that times are counted in that are no whole numbers of one
 _PERIODS = ("syncPeriod", "sync_period", "period")  # names under which files give the laser period, in their unit
 _SUFFIX_NS = {"_ps": 1e-3, "_ns": 1.0, "_us": 1e3, "_s": 1e9}
 
@@ -27,6 +29,30 @@ def read(
     path: Path, period_ns: float | None, bins: int | None, unit_ns: float | None, variable: str | None
 ) -> Timestamps:
     """Read a stream; see `Timestamps.load`."""
+    found, name, cells, unit = _times(path, unit_ns, variable)
+    if period_ns is None:
+        period_ns = _period(found, unit)
+    if period_ns is None:
+        raise NoLaserError(f"{path} does not tell the laser period: give period_ns")
+    return _timestamps(path, name, cells, unit, period_ns, bins)
+
+
+def photons(path: Path, unit_ns: float | None, variable: str | None) -> Photons:
+    """The absolute times alone, each cell a channel; of a clock where they are whole numbers."""
+    _, name, cells, unit = _times(path, unit_ns, variable)
+    raw = np.concatenate([np.empty(0), *(np.asarray(cell, np.float64).ravel() for cell in cells.ravel())])
+    if not (np.isfinite(raw) & (raw >= 0)).all():
+        raise ValueError(f"{path}: times of {name!r} must be finite and >= 0")
+    channel = np.repeat(np.arange(cells.size), [cell.size for cell in cells.ravel()])
+    clocked = bool((raw == np.floor(raw)).all())
+    tick = unit if clocked else _FINEST_NS
+    if raw.size and raw.max() * unit / tick >= 2**62:
+        raise ValueError(f"{path}: times of {name!r} span more than {2**62:.2g} units of {tick:g} ns")
+    return Photons((raw * (unit / tick)).astype(np.int64), tick, channel, str(path))
+
+
+def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dict[str, _Cells], str, _Cells, float]:
+    """All variables, the name and the cells of the one that holds the times, and their unit, ns."""
     found = mat_cells(path) if path.suffix == ".mat" else _npz(path)
     name, cells = _chosen(path, found, variable)
     unit = unit_ns
@@ -34,11 +60,7 @@ def read(
         unit = next((ns for ending, ns in _SUFFIX_NS.items() if name.endswith(ending)), None)
     if unit is None:
         raise ValueError(f"{path}: nothing tells the unit of {name!r}: give unit_ns (1 if its times are in ns)")
-    if period_ns is None:
-        period_ns = _period(found, unit)
-    if period_ns is None:
-        raise ValueError(f"{path} does not tell the laser period: give period_ns")
-    return _timestamps(path, name, cells, unit, period_ns, bins)
+    return found, name, cells, unit
 
 
 def _timestamps(path: Path, name: str, cells: _Cells, unit: float, period_ns: float, bins: int | None) -> Timestamps:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import zipfile
@@ -20,11 +21,18 @@ from mars_lidar._base.files import (
     open_npz,
     reading,
 )
+from mars_lidar.io.streams import picoquant
 from mars_lidar.io.streams.attributes import FORMAT, attributes, from_attributes
+from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
 
 STREAM_SUFFIXES = (".npz", ".ptu", ".h5", ".hdf5")
-READ_SUFFIXES = (*STREAM_SUFFIXES, ".mat")
+_OTHERS = {  # formats that are only read, and the module that does
+    **dict.fromkeys(picoquant.SUFFIXES, "ptu_stream"),
+    ".t3r": "timeharp",
+    ".spc": "becker_hickl",
+}
+READ_SUFFIXES = (*STREAM_SUFFIXES, ".mat", *_OTHERS)
 
 
 def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
@@ -79,7 +87,7 @@ def load(
     bare = plain.suffix in (".mat", ".npz")
     if not bare and (unit_ns is not None or variable is not None):
         raise ValueError(f"unit_ns and variable are for .mat and .npz: a {plain.suffix} tells both, got {str(path)!r}")
-    module = None if bare else _module(plain)
+    module = None if bare else _reader(plain)
     if not source.exists():
         if source.with_name(source.name + INCOMPLETE_SUFFIX).exists():
             raise IncompleteFileError(f"{source} was never finished: a stopped run left a {INCOMPLETE_SUFFIX} file")
@@ -89,8 +97,24 @@ def load(
     with reading(source, "a photon stream"):
         if module is None:
             return _read_bare(source, period_ns, bins, unit_ns, variable)
+        if plain.suffix in _OTHERS:
+            found: Photons = module.photons(source)
+            return found.timestamps(period_ns, bins)
         times: Timestamps = module.read(source, period_ns, bins)
         return times
+
+
+def recorded(path: Path, *, unit_ns: float | None = None, variable: str | None = None) -> Photons:
+    """The photons of another program's file as its recorder counted them; `Timestamps.load` has the arguments."""
+    if path.suffix not in READ_SUFFIXES:
+        raise ValueError(f"path of photons must end in one of {', '.join(READ_SUFFIXES)}, got {str(path)!r}")
+    with reading(path, "a photon stream"):
+        if path.suffix in (".mat", ".npz"):
+            from mars_lidar.io.streams import bare_stream
+
+            return bare_stream.photons(path, unit_ns, variable)
+        found: Photons = _reader(path).photons(path)
+        return found
 
 
 def _read_bare(
@@ -112,6 +136,12 @@ def is_stream(path: Path) -> bool:
         if path.suffix == ".npz":
             return _npz_attributes(path).get("format") == FORMAT
         return path.suffix in STREAM_SUFFIXES and bool(_module(path).is_stream(path))
+
+
+def _reader(path: Path) -> Any:
+    if path.suffix in _OTHERS:
+        return importlib.import_module(f"mars_lidar.io.streams.{_OTHERS[path.suffix]}")
+    return _module(path)
 
 
 def _module(path: Path) -> Any:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, open_hdf5, whole
 from mars_lidar._base.optional import needed
+from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
 
 _GROUP, _ATTRIBUTES = "mars_lidar", "attributes"  # below /user, which the format leaves to its writers
@@ -106,7 +107,7 @@ def write(path: Path, times: Timestamps) -> None:
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     """Read a stream; `period_ns` and `bins` are for files of others."""
-    from mars_lidar.io.streams.attributes import from_attributes, measured
+    from mars_lidar.io.streams.attributes import from_attributes
 
     with open_hdf5(path) as file:
         if _PHOTONS not in file:
@@ -114,30 +115,11 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
         data = file[_PHOTONS]
         timestamps = whole(data["timestamps"])
         detectors = whole(data["detectors"]) if "detectors" in data else np.zeros(timestamps.shape, np.uint8)
-        unit_s = float(data["timestamps_specs/timestamps_unit"][()])
         own = file.get(f"user/{_GROUP}/{_ATTRIBUTES}")
         attrs = {} if own is None else json.loads(_text(own[()]))
-        if "nanotimes" not in data:
-            if period_ns is None:
-                raise ValueError("it has no nanotimes: give period_ns, and the timestamps are folded with it")
-            periods = (timestamps.astype(np.float64) + 0.5) * (1e9 * unit_s) / period_ns
-            cycle = np.floor(periods).astype(np.int64)
-            tick = 1e9 * unit_s if bins is None else period_ns / bins
-            rest = (periods - cycle) * (period_ns / tick) - 0.5
-            return measured(cycle, rest, tick, detectors, period_ns, bins, str(path), 1e9 * unit_s)
+        if not attrs:
+            return _photons(path, file).timestamps(period_ns, bins)
         nanotimes = whole(data["nanotimes"])
-        tcspc_s = _tcspc_unit(file)
-        rates: Any = whole(file["setup/laser_repetition_rates"]) if "setup/laser_repetition_rates" in file else []
-    if not attrs:
-        known = period_ns
-        if known is None:
-            known = 1e9 / float(rates[0]) if len(rates) else 1e9 * unit_s
-        if abs(1e9 * unit_s / known - 1.0) > 1e-3:
-            raise ValueError(
-                f"{path}: timestamps must count laser periods of {known:g} ns where there are nanotimes, "
-                f"their unit is {1e9 * unit_s:g} ns"
-            )
-        return measured(timestamps, nanotimes, 1e9 * tcspc_s, detectors, known, bins, str(path))
     if period_ns is not None or bins is not None:
         raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
     fine, number = units_per_bin(int(attrs["bins"])), int(attrs["bins"])
@@ -147,6 +129,28 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     height, width = attrs["shape"]
     counts = np.bincount(detectors, minlength=height * width)
     return from_attributes(attrs, times_ns, cycle, nano // fine, counts)
+
+
+def photons(path: Path) -> Photons:
+    """The photons of a file of others, of one spot."""
+    with open_hdf5(path) as file:
+        if _PHOTONS not in file:
+            raise ValueError(f"{path} is not Photon-HDF5 of one spot: it has no group 'photon_data'")
+        return _photons(path, file)
+
+
+def _photons(path: Path, file: Any) -> Photons:
+    data = file[_PHOTONS]
+    timestamps = whole(data["timestamps"])
+    detectors = whole(data["detectors"]) if "detectors" in data else np.zeros(timestamps.shape, np.uint8)
+    clock_ns = 1e9 * float(data["timestamps_specs/timestamps_unit"][()])
+    if "nanotimes" not in data:
+        return Photons(timestamps, clock_ns, detectors, str(path))
+    rates: Any = whole(file["setup/laser_repetition_rates"]) if "setup/laser_repetition_rates" in file else []
+    period = 1e9 / float(rates[0]) if len(rates) else clock_ns
+    return Photons(
+        timestamps, clock_ns, detectors, str(path), whole(data["nanotimes"]), 1e9 * _tcspc_unit(file), period
+    )
 
 
 def is_stream(path: Path) -> bool:

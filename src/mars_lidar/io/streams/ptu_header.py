@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import open_npz, reading
 from mars_lidar._base.optional import needed
+from mars_lidar.io.streams import picoquant
 
 MAX_BINS = 2**15  # 15 bits of delay in a generic T3 record
 _ATTRIBUTES, _VARIABLES = "MarsLidar_Attributes", "MarsLidar_Variables"
@@ -71,15 +72,18 @@ def variables(path: Path, found: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         return {name: archive[name] for name in archive.files}
 
 
-def opened(path: Path) -> Any:
-    """A `ptufile.PtuFile`; ValueError where it is none, is damaged, or was never finished."""
-    ptufile = needed("ptufile", "a .ptu")
+def opened(path: Path, trimdims: str = "") -> Any:
+    """A `ptufile.PtuFile`, also of the formats before PTU; ValueError where it is none, damaged, or never finished."""
+    ptufile = needed("ptufile", f"a {path.suffix}")
+    if path.suffix in picoquant.SUFFIXES:
+        with reading(path, f"a {path.suffix}"):
+            return ptufile.PtuFile(picoquant.as_ptu(path), trimdims=trimdims)
     with open(path, "rb") as file:
         magic = file.read(8)
     if magic != _MAGIC:
         raise ValueError(f"{path} is not a PTU file: it starts with {magic!r}, not {_MAGIC!r}")
     with reading(path, "a PTU file"):
-        ptu = ptufile.PtuFile(path, trimdims="")
+        ptu = ptufile.PtuFile(path, trimdims=trimdims)
     for name in ("ImgHdr_LineStart", "ImgHdr_LineStop", "ImgHdr_Frame"):
         marker = ptu.tags.get(name)
         if marker is not None and not (isinstance(marker, int) and 0 <= marker <= 32):  # ptufile takes 2 to its power

@@ -6,7 +6,7 @@ reader that makes images (`ptufile.imread`) gets the cube; one that makes stream
 time is in units of ``bin width / m``, m as large as the 15 bits of a record allow: the bin is kept exactly,
 the time to half a unit.
 
-Read: these files, and T3 and T2 streams of others, where a pixel is a detector.
+Read: these files, and T3 and T2 streams of others, also of the formats before PTU, where a pixel is a detector.
 """
 
 from __future__ import annotations
@@ -20,11 +20,14 @@ from numpy.typing import NDArray
 from mars_lidar._base.files import IncompleteFileError
 from mars_lidar._base.optional import needed
 from mars_lidar.io.streams import ptu_header
+from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
 
 KIND = "timestamps"
 _WRAP = 1024  # laser periods that the 10 bits of a generic T3 record count
 _SPECIAL, _OVERFLOW = np.uint32(1 << 31), np.uint32(63 << 25)
+_SYNC = 64  # special bit and channel 0 of a T2 record
+_PICOHARP = (0x00010203, 0x00010303)  # whose records have no special bit
 _LINE_START, _LINE_STOP, _FRAME = 1, 2, 4  # marker bits, as the header of ptufile's writer declares them
 
 
@@ -82,7 +85,7 @@ def write(path: Path, times: Timestamps, clock_ps: float | None = None) -> None:
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     """Read a stream; `period_ns` and `bins` are for files of others."""
-    from mars_lidar.io.streams.attributes import from_attributes, measured
+    from mars_lidar.io.streams.attributes import from_attributes
 
     ptu = ptu_header.opened(path)
     try:
@@ -91,23 +94,17 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
             raise ValueError(f"{path} is a cube, not a stream: mars_lidar.io.load reads it")
         if not attrs and ptu.is_image:
             raise ValueError(
-                f"{path} is an image of another program; ptufile.imread reads it (pixels of a scan need its markers)"
+                f"{path} is an image of another program: mars_lidar.io.foreign_cube and mars-lidar reconstruct read it"
             )
         if attrs and (period_ns is not None or bins is not None):
             raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
+        if not attrs:
+            return _photons(ptu, path).timestamps(period_ns, bins)
         decoded = ptu.decode_records()
-        is_t3, unit_ns = ptu.is_t3, 1e9 * ptu.tcspc_resolution
-        clock_ns = 1e9 * ptu.global_resolution
+        unit_ns = 1e9 * ptu.tcspc_resolution
     finally:
         ptu.close()
     photons = decoded[decoded["channel"] >= 0]
-    if not attrs:
-        if is_t3:
-            known = clock_ns if period_ns is None else period_ns
-            return measured(photons["time"], photons["dtime"], unit_ns, photons["channel"], known, bins, str(path))
-        if period_ns is None:
-            raise ValueError(f"{path} holds T2 records, absolute times without laser pulses: give period_ns")
-        return _absolute(photons, clock_ns, period_ns, bins, str(path))
     height, width = (int(n) for n in attrs["shape"])
     cycles, number = int(attrs["cycles"]), int(attrs["bins"])
     if not ((decoded["marker"] == _FRAME) & (decoded["channel"] < 0)).any():
@@ -120,6 +117,30 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     times_ns = (cycle + (dtime + 0.5) / (number * fine)) * float(attrs["period_ns"])
     counts = np.bincount(pixel, minlength=height * width)
     return from_attributes(attrs, times_ns, cycle, dtime // fine, counts)
+
+
+def photons(path: Path) -> Photons:
+    """The photons of a file: T3, or T2, absolute times; markers are passed over."""
+    ptu = ptu_header.opened(path)
+    try:
+        return _photons(ptu, path)
+    finally:
+        ptu.close()
+
+
+def _photons(ptu: Any, path: Path) -> Photons:
+    clock_ns, fine_ns = 1e9 * ptu.global_resolution, 1e9 * ptu.tcspc_resolution
+    found = ptu.decode_records()
+    kept = found["channel"] >= 0
+    if not ptu.is_t3:
+        channel = found["channel"].astype(np.int64)
+        if ptu.record_type not in _PICOHARP:  # ptufile has the sync input as channel 0, like the first other one
+            channel[ptu.read_records() >> 25 == _SYNC] = -1
+        return Photons(found["time"][kept], clock_ns, channel[kept], str(path))
+    found = found[kept]
+    if not clock_ns > 0.0:
+        raise ValueError(f"{path} tells no sync rate, so that its laser period is not known")
+    return Photons(found["time"], clock_ns, found["channel"], str(path), found["dtime"], fine_ns, clock_ns)
 
 
 def units_per_bin(bins: int, period_ns: float = 0.0, clock_ps: float | None = None) -> int:
@@ -174,14 +195,3 @@ def _with_overflows(
     order = np.arange(at.size) - np.repeat(np.cumsum(extra) - extra, extra)
     size = np.minimum(steps[at] - order * (_WRAP - 1), _WRAP - 1)
     return np.insert(records, at, _SPECIAL | _OVERFLOW | size.astype(np.uint32)), wraps[-1]
-
-
-def _absolute(photons: Any, clock_ns: float, period_ns: float, bins: int | None, source: str) -> Timestamps:
-    """Timestamps of T2 records: absolute times in units of `clock_ns`, folded with the laser period."""
-    from mars_lidar.io.streams.attributes import measured
-
-    periods = (photons["time"].astype(np.float64) + 0.5) * clock_ns / period_ns
-    cycle = np.floor(periods).astype(np.int64)
-    unit = clock_ns if bins is None else period_ns / bins
-    fine = (periods - cycle) * (period_ns / unit) - 0.5  # `measured` adds half a unit
-    return measured(cycle, fine, unit, photons["channel"], period_ns, bins, source, clock_ns)

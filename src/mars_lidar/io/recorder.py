@@ -1,0 +1,91 @@
+"""Histograms in the files of photon counters: scanned images and points of .ptu and the like, .t3r, .spc, .sdt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.files import check_claim, reading
+from mars_lidar._base.optional import needed
+from mars_lidar.io.streams import files, picoquant, ptu_header
+
+RECORDER_SUFFIXES = (".ptu", *picoquant.SUFFIXES, ".t3r", ".spc", ".sdt")
+_PICOQUANT = (".ptu", *picoquant.SUFFIXES)
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Histograms of a recorder, and what it tells of them.
+
+    Attributes
+    ----------
+    arrays
+        By name: (frames, y, x, t), (y, x, t) or (t,) counts.
+    bin_ns, period_ns, cycles
+        Width of a bin and laser period, ns, and laser periods of a pixel and frame, where the file tells them. The
+        period is that of the file, which a whole number of bins need not fill.
+    told
+        What else is worth a line.
+    """
+
+    arrays: dict[str, NDArray[Any]]
+    bin_ns: float | None = None
+    period_ns: float | None = None
+    cycles: int | None = None
+    told: tuple[str, ...] = field(default=())
+
+
+def recorded(path: Path) -> Recorded:
+    """Read the histograms of a file."""
+    with reading(path, f"a {path.suffix}"):
+        if path.suffix == ".sdt":
+            return _sdt(path)
+        if path.suffix in _PICOQUANT:
+            with ptu_header.opened(path, trimdims="T") as ptu:
+                if ptu.is_image:
+                    return _image(path, ptu)
+        found = files.recorded(path)
+        period = found.period_ns
+        cycles = int(found.clock.max()) + 1 if found.clock.size and period is not None else None
+        return Recorded(found.histograms(), found.fine_ns, period, cycles)
+
+
+def _image(path: Path, ptu: Any) -> Recorded:
+    """A scanned image: ptufile puts the photons between the markers of lines and frames into pixels."""
+    if not ptu.is_t3:
+        raise ValueError(f"{path} is a scan of absolute times (T2): without laser pulses it has no histograms")
+    period, width = 1e9 * ptu.global_resolution, 1e9 * ptu.tcspc_resolution
+    bins = max(1, round(period / width))
+    frames, height, columns, channels, _ = ptu.shape
+    check_claim(path, 4.0 * frames * height * columns * bins * channels, "its image")
+    image = ptu.decode_image(dtime=bins, dtype=np.uint32, keepdims=True)
+    used, seen = int(image.sum(dtype=np.uint64)), int(ptu.number_photons)
+    told = (f"{seen - used:,} of {seen:,} photons lie between lines and frames or beyond the last whole bin",)
+    first = next(iter(ptu.active_channels), 0)
+    arrays = {}
+    for k in range(image.shape[3]):
+        counts = image[:, :, :, k]
+        if counts.any() or image.shape[3] == 1:
+            name = f"channel {k if image.shape[3] > 1 else first}"
+            arrays[name] = counts[0] if frames == 1 else counts
+    cycles = round(ptu.global_pixel_time)
+    return Recorded(arrays, width, period, cycles if cycles > 0 else None, told if seen > used else ())
+
+
+def _sdt(path: Path) -> Recorded:
+    """Becker & Hickl's histograms and images; sdtfile reads them."""
+    library = needed("sdtfile", "a .sdt")
+    with open(path, "rb") as file, library.SdtFile(file) as sdt:
+        blocks = {f"block {k}": np.asarray(data) for k, data in enumerate(sdt.data)}
+        times = [np.asarray(axis, np.float64) for axis in sdt.times]
+    blocks = {name: data for name, data in blocks.items() if data.dtype.kind in "iu" and data.ndim and data.size > 1}
+    widths = {float(axis[1] - axis[0]) * 1e9 for axis in times if axis.size > 1}
+    if not blocks:
+        raise ValueError(f"{path} holds no histograms: photon by photon is in .spc")
+    one = widths.pop() if len(widths) == 1 else math.nan
+    return Recorded(blocks, one if one > 0.0 else None)

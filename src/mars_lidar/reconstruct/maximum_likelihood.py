@@ -35,7 +35,7 @@ class MaximumLikelihood(Method):
     returns
         Of each pixel up to so many are looked for, in [1, 8]: one more is taken for as long as twice the gain in log
         likelihood by it is more than what the others and the background reach anywhere in the period with probability
-        `false_alarm` (R24; docs/reconstruction.md, section 4). Signal, delay and background are those of the strongest
+        `false_alarm` (R23; docs/reconstruction.md, section 9). Signal, delay and background are those of the strongest
         then, beside the others.
     """
 

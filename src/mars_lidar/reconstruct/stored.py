@@ -81,9 +81,7 @@ def reconstruct_stored(
                 values = getattr(found, field.name)
                 if values is None:
                     continue
-                whole = buffers[method.name].setdefault(
-                    field.name, np.empty((*shape, *values.shape[1:]), values.dtype)
-                )
+                whole = buffers[method.name].setdefault(field.name, np.empty((*shape, *values.shape[1:]), values.dtype))
                 whole[images, rows] = values.reshape(*block, *values.shape[1:])
             done += len(counts.counts)
             if progress is not None:

@@ -1,4 +1,4 @@
-// Where a further return may be, and how far the likelihood gains by one when there is none: docs/reconstruction.md, section 4.
+// Where a further return may be, and how far the likelihood gains by one when there is none: docs/reconstruction.md, section 9.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -15,8 +15,8 @@ struct Hint {
     double signal, delay, gain;
 };
 
-// The score of a weak further return at every delay of a grid, free of what is known of the returns that there are (R22),
-// and the length of the curve that its direction follows (R23).
+// The score of a weak further return at every delay of a grid, free of what is known of the returns that there are (R21),
+// and the length of the curve that its direction follows (R22).
 class ReturnSearch {
  public:
     explicit ReturnSearch(const HistogramRecord& recording) : r_(recording) {

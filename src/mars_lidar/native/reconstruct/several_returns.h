@@ -1,4 +1,4 @@
-// How many returns a pixel has, each with its errors: docs/reconstruction.md, section 4. One more is taken for as long as
+// How many returns a pixel has, each with its errors: docs/reconstruction.md, section 9. One more is taken for as long as
 // the likelihood gains by it what background or the returns that there are would reach with a given probability.
 #pragma once
 #include <algorithm>

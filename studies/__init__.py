@@ -84,6 +84,10 @@ _STUDIES = {
         "reconstruction.run",
         "bias and error of depth and signal over flux, every method, beside the bound",
     ),
+    "returns": (
+        "reconstruction.returns",
+        "several returns of a pixel: false alarms, how near two may be, how well their errors hold",
+    ),
     "transients": ("transients.run", "two returns in fog through the dead time of three detectors"),
     "downstream": ("downstream.run", "T5: networks trained on every simulator's data, tested on gold; --config"),
     "downstream-baselines": (

@@ -73,6 +73,47 @@ def test_maps_read_back(cube, tmp_path, suffix):
         assert opened.depth.attrs["units"] == "m"
 
 
+@pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
+def test_several_returns_read_back(tmp_path, suffix):
+    """A pane before a wall: table, maps with an axis of returns, and every return a point of the cloud."""
+    system = ml.System(
+        period_ns=50.0,
+        cycles=2000,
+        bins=256,
+        pulse=ml.GaussianPulse(sigma_ns=0.4),
+        detector=ml.Detector(dead_time_ns=30.0),
+    )
+    pane = np.zeros((6, 8))
+    pane[:, 4:] = 0.3
+    io.simulate_to(
+        tmp_path / "g.zarr", ml.Flux.multi(ml.Flux(0.5 + 0 * pane, 0.2, 30.0), ml.Flux(pane, 0.0, 12.0)), system
+    )
+    out, cloud = tmp_path / f"maps{suffix}", tmp_path / "g.ply"
+    words = ("--returns", 3, "--method", "maximum_likelihood", "--cloud", cloud, "--focal-px", 9)
+    done = run("reconstruct", tmp_path / "g.zarr", *words, "-o", out)
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "maps.png").stat().st_size > 10_000
+    head, line = done.stdout.splitlines()[1:3]
+    assert "2 returns %" in head
+    found, _ = load_maps(out)
+    count = found["returns"][0, 0]
+    assert found["return_depth"].shape == (1, 1, 6, 8, 3)
+    assert (count[:, 4:] >= 2).all()
+    assert (count[:, :4] >= 1).all()
+    assert f"{100.0 * (count == 2).mean():.4g}" in line
+    assert np.array_equal(np.isfinite(found["return_depth"]).sum(-1)[0, 0], count)
+    near = found["return_depth"][0, 0, :, 4:, 0]
+    assert near == pytest.approx(np.full((6, 4), system.depth_m(12.0)), abs=0.05)
+    points = int(next(row for row in cloud.read_bytes().split(b"\n") if row.startswith(b"element vertex")).split()[2])
+    assert points == count.sum()
+    if suffix == ".zarr":
+        opened = xarray.open_zarr(out)
+        assert opened.return_depth.dims == ("method", "realization", "y", "x", "return")
+    refused = run("reconstruct", tmp_path / "g.zarr", "--returns", 2, "--method", "peak", "-o", tmp_path / "x.npz")
+    assert refused.exit_code == 2
+    assert "returns=2 needs the likelihood" in refused.stderr
+
+
 def test_all_methods_and_errors_in_the_table(cube, tmp_path):
     done = run("reconstruct", cube, "--method", "all", "--no-picture", "-o", tmp_path / "m.npz")
     assert done.exit_code == 0, done.output

@@ -29,6 +29,7 @@ RECONSTRUCT_EPILOG = "\n\n".join(
         "mars-lidar reconstruct room.zarr --method all -o maps.h5",
         "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
         "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
+        "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",
         "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
         f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
     )
@@ -69,6 +70,15 @@ def reconstruct(
             show_default=False,
         ),
     ] = None,
+    returns: Annotated[
+        int,
+        typer.Option(
+            "--returns",
+            min=1,
+            max=8,
+            help="Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood.",
+        ),
+    ] = 1,
     threads: Annotated[
         int | None, typer.Option("--threads", min=1, help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
     ] = None,
@@ -76,7 +86,8 @@ def reconstruct(
         Path | None,
         typer.Option(
             "--cloud",
-            help="Points of the first method and exposure, .ply, with reflectivity and standard error of depth.",
+            help="Points of the first method and exposure, .ply, with reflectivity (of --returns: signal, every "
+            "return a point) and standard error of depth.",
             show_default=False,
         ),
     ] = None,
@@ -115,7 +126,13 @@ def reconstruct(
             names = _methods(method, stored)
             with progress_bar("reconstructing") as progress:
                 found = reconstruct_stored(
-                    stored, names, level=level, attenuation=attenuation, threads=threads, progress=progress
+                    stored,
+                    names,
+                    level=level,
+                    attenuation=attenuation,
+                    returns=returns,
+                    threads=threads,
+                    progress=progress,
                 )
             results = {name: each.found for name, each in found.items()}
             _show(stored, found)  # first: a disk that is full takes nothing from what is known
@@ -165,6 +182,9 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
         errors = {name: errors_against(cube, each.found) for name, each in found.items()}
     except MissingLibraryError as error:
         say(f"no errors against the truth: {error}")
+    several = any(each.found.returns is not None for each in found.values())
+    if several:
+        head += ["2 returns %", "3 or more %"]
     kinds = list(next(iter(errors.values()), {}))
     for kind in kinds:
         unit, wide = ("mm", "depth") if kind == "depth" else ("", kind)
@@ -177,6 +197,9 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
             f"{100.0 * each.found.seen.mean():.4g}",
             f"{100.0 * ((flags & Flags.SATURATED) > 0).mean():.3g}",
         ]
+        if several:
+            count = np.zeros(1) if each.found.returns is None else each.found.returns.count
+            line += [f"{100.0 * (count == 2).mean():.4g}", f"{100.0 * (count > 2).mean():.4g}"]
         for kind in kinds:
             off, scale = errors[name][kind], 1e3 if kind == "depth" else 1.0
             values = (scale * off.rmse, scale * off.median, off.psnr, off.ssim)
@@ -210,6 +233,15 @@ def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float,
     from mars_lidar.io import save_cloud
 
     found = next(iter(results.values()))
+    if (every := found.returns) is not None:
+        return save_cloud(
+            path,
+            every.depth_m[0],
+            focal_px,
+            intensity=every.signal[0],
+            error_m=every.depth_error_m[0],
+            overwrite=overwrite,
+        )
     depth, share = np.where(found.seen, found.depth_m, np.nan)[0], found.reflectivity[0]
     error = None if found.depth_error_m is None else found.depth_error_m[0]
     return save_cloud(path, depth, focal_px, intensity=share, error_m=error, overwrite=overwrite)

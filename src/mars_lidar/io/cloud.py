@@ -15,6 +15,8 @@ from mars_lidar._base.types import FloatArray
 def points(depth_m: ArrayLike, focal_px: float) -> FloatArray:
     """Points (H, W, 3), m, of ranges (H, W), m: x to the right, y down, z forward; NaN where the range is.
 
+    Of several ranges a pixel, (H, W, K): (H, W, K, 3).
+
     Parameters
     ----------
     depth_m
@@ -23,15 +25,18 @@ def points(depth_m: ArrayLike, focal_px: float) -> FloatArray:
         Focal length in pixels of this image; its centre is the principal point.
     """
     depth = np.asarray(depth_m, np.float64)
-    if depth.ndim != 2:
-        raise ValueError(f"depth_m must be a map (H, W), got shape {depth.shape}")
+    if depth.ndim not in (2, 3):
+        raise ValueError(f"depth_m must be a map (H, W), or (H, W, K) of several returns, got shape {depth.shape}")
     focal = checks.real("focal_px", focal_px, low=0.0, strict_low=True)
-    height, width = depth.shape
+    height, width = depth.shape[:2]
     ray = np.empty((height, width, 3))
     ray[..., 0] = np.arange(width) - 0.5 * (width - 1)
     ray[..., 1] = (np.arange(height) - 0.5 * (height - 1))[:, None]
     ray[..., 2] = focal
-    return np.asarray(ray * (depth / np.linalg.norm(ray, axis=-1))[..., None])
+    ray /= np.linalg.norm(ray, axis=-1)[..., None]
+    if depth.ndim == 3:
+        ray = ray[:, :, None]
+    return np.asarray(ray * depth[..., None])
 
 
 def save_cloud(
@@ -50,11 +55,11 @@ def save_cloud(
     path
         The file.
     depth_m, focal_px
-        As for `points`; pixels of depth NaN or inf are left out.
+        As for `points`, also (H, W, K) of several returns a pixel; those of depth NaN or inf are left out.
     intensity
-        (H, W) property of the points, such as reflectivity or signal.
+        (H, W), or as the depth, property of the points, such as reflectivity or signal.
     error_m
-        (H, W) standard error of the depth, m; the property ``depth_error``.
+        (H, W), or as the depth, standard error of the depth, m; the property ``depth_error``.
     overwrite
         Replace an existing file.
 
@@ -73,8 +78,10 @@ def save_cloud(
     for name, told, values in (("intensity", "intensity", intensity), ("depth_error", "error_m", error_m)):
         if values is not None:
             columns[name] = np.asarray(values, np.float64)
-            if columns[name].shape != place.shape[:2]:
-                raise ValueError(f"{told} must have the shape of depth_m, {place.shape[:2]}, got {columns[name].shape}")
+            if columns[name].shape != place.shape[:-1]:
+                raise ValueError(
+                    f"{told} must have the shape of depth_m, {place.shape[:-1]}, got {columns[name].shape}"
+                )
     check_target(target, folder=False, overwrite=overwrite)
     seen = np.isfinite(place).all(-1)
     rows = np.stack([values[seen] for values in columns.values()], axis=-1).astype("<f4")

@@ -1,8 +1,10 @@
 """Files of reconstructed maps: .zarr, .h5 or .npz with named dimensions, units and what they were made of.
 
 Variables (method, realization, y, x): ``depth``, ``reflectivity``, ``signal``, ``background``, ``delay``, errors of the
-methods that give them (NaN for the others), ``significance`` and ``flags``. Attributes: ``format`` = "mars-lidar
-maps", ``format_version``, ``system`` (JSON), ``level``, ``source`` (the cube), ``version``.
+methods that give them (NaN for the others), ``significance`` and ``flags``. Where several returns were looked for:
+``returns`` (their number), and of each (method, realization, y, x, return) ``return_depth``, ``return_signal``,
+``return_delay``, their errors, and ``return_false_alarm``, nearest first, NaN beyond the last. Attributes: ``format`` =
+"mars-lidar maps", ``format_version``, ``system`` (JSON), ``level``, ``source`` (the cube), ``version``.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from mars_lidar.instrument.system import System
 FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")
 DIMS = ("method", "realization", "y", "x")
+RETURN = "return"
 _PHOTONS = "photons per laser period"
 _VARIABLES = {  # name in the file: attribute, unit, in words
     "depth": ("depth_m", "m", "depth"),
@@ -35,7 +38,17 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
     "signal_error": ("signal_error", _PHOTONS, "standard error of the signal"),
     "background_error": ("background_error", _PHOTONS, "standard error of the background"),
     "significance": ("significance", "1", "significance of the signal, standard deviations"),
-    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged"),
+    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns"),
+    "returns": ("returns.count", "1", "number of returns"),
+}
+_OF_RETURNS = {  # the same of each return
+    "return_depth": ("depth_m", "m", "depth of each return"),
+    "return_signal": ("signal", _PHOTONS, "signal of each return"),
+    "return_delay": ("delay_ns", "ns", "delay of each return"),
+    "return_depth_error": ("depth_error_m", "m", "standard error of the depth of each return"),
+    "return_signal_error": ("signal_error", _PHOTONS, "standard error of the signal of each return"),
+    "return_delay_error": ("delay_error_ns", "ns", "standard error of the delay of each return"),
+    "return_false_alarm": ("false_alarm", "1", "chance of so much likelihood by a return that is not there"),
 }
 
 
@@ -49,6 +62,10 @@ class Maps(Protocol):
     @property
     def system(self) -> System:
         """The system that the cube was recorded with."""
+
+    @property
+    def returns(self) -> Any:
+        """Every return, or None where one was looked for."""
 
     @property
     def level(self) -> float:
@@ -123,8 +140,10 @@ def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
     if missing:
         raise ValueError(f"has no variable {missing[0]!r}")
     shape = tuple(found[dim].size for dim in DIMS)
-    for name in _VARIABLES:
+    for name in (*_VARIABLES, *_OF_RETURNS):
         values = found.get(name)
+        if name in _OF_RETURNS and values is not None:
+            values = values[..., 0] if values.ndim == len(DIMS) + 1 and values.shape[-1] else values
         if values is not None and (values.shape != shape or values.dtype.kind not in "fiu"):
             raise ValueError(f"{name} must be numbers {shape} {DIMS}, got {values.dtype} {values.shape}")
         if name.endswith("_error") and values is not None and (values < 0).any():
@@ -145,11 +164,16 @@ def _contents(
     for dim, size in zip(DIMS[1:], first.depth_m.shape, strict=True):
         variables[dim] = ((dim,), np.arange(size), {"units": "1" if dim == "realization" else "pixel"})
     for name, (attribute, unit, words) in _VARIABLES.items():
-        given = [getattr(each, attribute) for each in results.values()]
-        if all(values is None for values in given):
-            continue
-        stack = np.stack([np.full(first.depth_m.shape, np.nan) if v is None else v for v in given])
-        variables[name] = (DIMS, stack, {"units": unit, "long_name": words})
+        given = [_find(each, attribute) for each in results.values()]
+        if any(values is not None for values in given):
+            variables[name] = (DIMS, _stacked(given, first.depth_m.shape), {"units": unit, "long_name": words})
+    most = max((each.returns.depth_m.shape[-1] for each in results.values() if each.returns is not None), default=0)
+    if most:
+        variables[RETURN] = ((RETURN,), np.arange(most), {"units": "1", "long_name": "return, nearest first"})
+        for name, (attribute, unit, words) in _OF_RETURNS.items():
+            given = [_find(each, f"returns.{attribute}") for each in results.values()]
+            stack = _stacked(given, (*first.depth_m.shape, most))
+            variables[name] = ((*DIMS, RETURN), stack, {"units": unit, "long_name": words})
     attrs = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -159,6 +183,20 @@ def _contents(
         "version": __version__,
     }
     return variables, attrs
+
+
+def _find(of: Maps, attribute: str) -> NDArray[Any] | None:
+    value: Any = of
+    for name in attribute.split("."):
+        value = None if value is None else getattr(value, name)
+    return None if value is None else np.asarray(value)
+
+
+def _stacked(given: list[NDArray[Any] | None], shape: tuple[int, ...]) -> NDArray[Any]:
+    """The maps of all methods; NaN for those that give none, 0 of a number of returns."""
+    whole_numbers = all(values is None or values.dtype.kind == "u" for values in given)
+    blank = np.zeros(shape, np.uint8) if whole_numbers else np.full(shape, np.nan)
+    return np.stack([blank if values is None else values for values in given])
 
 
 def _write_zarr(path: Path, variables: Mapping[str, Any]) -> None:
@@ -171,8 +209,8 @@ def _write_zarr(path: Path, variables: Mapping[str, Any]) -> None:
         warnings.filterwarnings("ignore", "Consolidated metadata", category=UserWarning)
         warnings.filterwarnings("ignore", "The data type")  # of the methods' names: fixed-length text
         xarray.Dataset(
-            {name: value for name, value in variables.items() if name not in DIMS},
-            coords={name: variables[name] for name in DIMS},
+            {name: value for name, value in variables.items() if name not in (*DIMS, RETURN)},
+            coords={name: variables[name] for name in (*DIMS, RETURN) if name in variables},
         ).to_zarr(
             path,
             mode="w",
@@ -201,9 +239,10 @@ def _write_hdf5(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, An
             stored.attrs.update(more)
             for k, dim in enumerate(dims):
                 stored.dims[k].label = dim
-        for dim in DIMS:
+        scales = [dim for dim in (*DIMS, RETURN) if dim in variables]
+        for dim in scales:
             file[dim].make_scale(dim)
         for name, (dims, _, _) in variables.items():
-            if name not in DIMS:
+            if name not in scales:
                 for k, dim in enumerate(dims):
                     file[name].dims[k].attach_scale(file[dim])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from mars_lidar.io import Cube
-    from mars_lidar.reconstruct import Reconstruction
+    from mars_lidar.reconstruct import Reconstruction, Returns
 
 _MAP_INCHES = 2.35
 
@@ -45,7 +45,8 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
     errors = {name: depth_error_m(cube, each["depth"]) for name, each in pick.items()}
     scale = max((float(np.nanpercentile(np.abs(e), 90)) for e in errors.values() if np.isfinite(e).any()), default=1.0)
     height, width = depth.shape
-    rows, columns = len(results) + known, 2 + known
+    several = {name: each.returns for name, each in results.items() if each.returns is not None}
+    rows, columns = len(results) + known + len(several), 2 + known
     image = _MAP_INCHES * height / width
     with style():
         from matplotlib.figure import Figure
@@ -66,7 +67,9 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
             _draw_map(axes[0, 0], depth, "depth (m)", "viridis", depth_limits, "Truth: depth")
             axes[0, 1].set_axis_off()
             _draw_map(axes[0, 2], truth, unit, "gray", share_limits, f"Truth: {what}")
-        for row, (name, each) in zip(axes[int(known) :], pick.items(), strict=True):
+        for row, (name, found) in zip(axes[int(known) + len(results) :], several.items(), strict=True):
+            _draw_returns(row, name, found, realization)
+        for row, (name, each) in zip(axes[int(known) : int(known) + len(results)], pick.items(), strict=True):
             title = name.replace("_", " ")
             _draw_map(row[0], each["depth"], "depth (m)", "viridis", depth_limits, title)
             if known:
@@ -80,6 +83,20 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
             limits = _limits(each["share"]) if own else share_limits
             _draw_map(row[-1], each["share"], unit, "gray", limits, f"{what}, a scale of its own" if own else what)
     return figure
+
+
+def _draw_returns(row: Any, name: str, found: Returns, realization: int) -> None:
+    """Of a method that looked for several: how many, and the nearest and the farthest of those pixels."""
+    count, depth = found.count[realization].astype(np.int64), found.depth_m[realization]
+    most = depth.shape[-1]
+    where = np.where(count > 1, 1.0, np.nan)
+    farthest = np.take_along_axis(depth, np.maximum(count, 1)[..., None] - 1, axis=-1)[..., 0]
+    _draw_map(row[0], count.astype(np.float64), "returns", "viridis", (0.0, most), f"{name.replace('_', ' ')}: returns")
+    row[0].images[0].colorbar.set_ticks(range(most + 1))
+    limits = _limits(np.stack([where * depth[..., 0], where * farthest])) if (count > 1).any() else (0.0, 1.0)
+    _draw_map(row[-1], where * farthest, "depth (m)", "viridis", limits, "farthest of several")
+    if len(row) > 2:
+        _draw_map(row[1], where * depth[..., 0], "depth (m)", "viridis", limits, "nearest of several")
 
 
 def _elsewhere(share: Any, truth: Any) -> bool:

@@ -2,7 +2,13 @@
 
 from mars_lidar.reconstruct.coates import Coates, coates_rates
 from mars_lidar.reconstruct.generalised_coates import GeneralisedCoates, generalised_coates_rates
-from mars_lidar.reconstruct.histogram_bound import HistogramBound, cramer_rao, window_error, window_weights
+from mars_lidar.reconstruct.histogram_bound import (
+    HistogramBound,
+    cramer_rao,
+    returns_bound,
+    window_error,
+    window_weights,
+)
 from mars_lidar.reconstruct.matched_filter import MatchedFilter
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood, log_likelihood
 from mars_lidar.reconstruct.mchc import ChainCorrection, mchc_rates
@@ -10,6 +16,7 @@ from mars_lidar.reconstruct.method import Flags, Method
 from mars_lidar.reconstruct.methods import METHODS
 from mars_lidar.reconstruct.peak import Peak
 from mars_lidar.reconstruct.reconstruction import Reconstruction, reconstruct
+from mars_lidar.reconstruct.returns import Returns
 
 __all__ = [
     "METHODS",
@@ -23,12 +30,14 @@ __all__ = [
     "Method",
     "Peak",
     "Reconstruction",
+    "Returns",
     "coates_rates",
     "cramer_rao",
     "generalised_coates_rates",
     "log_likelihood",
     "mchc_rates",
     "reconstruct",
+    "returns_bound",
     "window_error",
     "window_weights",
 ]

@@ -16,6 +16,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import core_ns, open_bins, relative_width
 
 _SINGULAR = 1e-11  # of the largest eigenvalue, all of size 1 to 3: rounding of the sums over the bins is 1e-15 of it
+_WAVEFORM_PARTS = 8  # of a bin, in which the light of several returns is taken as even
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +26,11 @@ class HistogramBound:
     Attributes
     ----------
     information
-        (..., 3, 3) Fisher information of (S, B, delay in ns).
+        (..., 3, 3) Fisher information of (S, B, delay in ns); of several returns (2 K + 1, 2 K + 1) of (all S, B, all
+        delays).
     signal, background, delay_ns, depth_m
-        (...) least standard deviations of unbiased estimates; inf where nothing is known of them.
+        (...) least standard deviations of unbiased estimates; inf where nothing is known of them. Of several returns
+        (K,), but for the background.
     """
 
     information: FloatArray
@@ -76,19 +79,61 @@ def cramer_rao(
     if not np.isfinite(tau).all():
         raise ValueError(f"delay_ns must be finite, got {tau[~np.isfinite(tau)].flat[0]}")
     energy, slope, share = _pulse_bins(system, tau)
-    flat = share / system.bins
+    information = _information(system, mean, s[..., None, None], b, energy[..., None, :], slope[..., None, :], share)
+    deviation = np.sqrt(_inverse_diagonal(information))
+    of_signal, of_background, of_delay = np.moveaxis(deviation, -1, 0)
+    return HistogramBound(information, of_signal, of_background, of_delay, system.depth_m(of_delay))
+
+
+def returns_bound(
+    signal: ArrayLike, background: float, system: System, *, delay_ns: ArrayLike, threads: int | None = None
+) -> HistogramBound:
+    """Least standard deviations of every return of one pixel that has several, each with an unknown S and delay.
+
+    As `cramer_rao`, for S (K,), B and delays (K,), ns: returns that overlap are known less well than alone.
+    """
+    from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood
+    from mars_lidar.statistics import mean_histogram
+
+    MaximumLikelihood().check(system)
+    require_effects("returns_bound", system.detector, LIGHT_EFFECTS, _simulate_instead)
+    s, tau = (np.atleast_1d(np.asarray(values, np.float64)) for values in (signal, delay_ns))
+    if s.shape != tau.shape or s.ndim != 1:
+        raise ValueError(f"signal and delay_ns must be (K,), of the same returns, got {s.shape} and {tau.shape}")
+    back = np.asarray(checks.real("background", background, low=0.0, strict_low=True))
+    edges = np.linspace(0.0, system.period_ns, system.bins * _WAVEFORM_PARTS + 1)
+    waves = [np.diff(system.pulse.wrapped_cumulative(edges - at, system.period_ns)) for at in tau]
+    wave = np.maximum(np.tensordot(s, np.array(waves), 1), 0.0)
+    mean = mean_histogram(None, back, system, waveform=wave, threads=threads)
+    energy, slope, share = _pulse_bins(system, tau)
+    information = _information(system, mean, s[:, None], back, energy, slope, share)
+    deviation = np.sqrt(_inverse_diagonal(information))
+    count = s.size
+    of_delay = deviation[count + 1 :]
+    return HistogramBound(information, deviation[:count], deviation[count], of_delay, system.depth_m(of_delay))
+
+
+def _information(
+    system: System,
+    mean: FloatArray,
+    signal: FloatArray,
+    background: FloatArray,
+    energy: FloatArray,
+    slope: FloatArray,
+    share: FloatArray,
+) -> FloatArray:
+    """(R18) of (all S, B, all delays) from S (..., K, 1), B (...), and energy and its slope (..., K, bins)."""
     seen = system.detector.detection_efficiency  # of the photons; dark counts come on top of them
     dark = 1e-9 * system.detector.dark_count_hz * system.period_ns
-    rate = seen * s[..., None] * energy + (seen * b[..., None] + dark) * flat
-    gradient = seen * np.stack([energy, np.broadcast_to(flat, energy.shape), s[..., None] * slope], axis=-1)
+    flat = share / system.bins
+    rate = seen * (signal * energy).sum(-2) + (seen * background[..., None] + dark) * flat
+    by_background = np.broadcast_to(flat, rate.shape)[..., None, :]
+    gradient = seen * np.concatenate([energy, by_background, signal * slope], axis=-2)
     weight = np.where(rate > 0, mean / np.where(rate > 0, rate, 1.0) ** 2, 0.0)  # E[D] / l = E[h] / l^2
     if system.detector.mode == "synchronous" or system.detector.dead_time_ns >= system.bin_ns:
         x = np.clip(0.5 * rate, 1e-6, 300.0)
         weight = weight * (x / np.sinh(x)) ** 2
-    information = np.einsum("...j,...ja,...jb->...ab", weight, gradient, gradient)
-    deviation = np.sqrt(_inverse_diagonal(information))
-    of_signal, of_background, of_delay = np.moveaxis(deviation, -1, 0)
-    return HistogramBound(information, of_signal, of_background, of_delay, system.depth_m(of_delay))
+    return np.asarray(np.einsum("...j,...aj,...bj->...ab", weight, gradient, gradient))
 
 
 def window_error(
@@ -142,17 +187,18 @@ def _simulate_instead(_: str) -> str:
 
 
 def _inverse_diagonal(information: FloatArray) -> FloatArray:
-    """Diagonal of the inverse (..., 3); what nothing is known of is inf and left out of the rest.
+    """Diagonal of the inverse (..., n); what nothing is known of is inf and left out of the rest.
 
     So is what cannot be told from something else: the signal from the background, say, in a single bin.
     """
-    flat = information.reshape(-1, 3, 3)
-    out = np.full((len(flat), 3), np.inf)
+    size = information.shape[-1]
+    flat = information.reshape(-1, size, size)
+    out = np.full((len(flat), size), np.inf)
     for row, matrix in zip(out, flat, strict=True):
         known = np.diag(matrix) > 0
         if known.any():
             row[known] = _variances(matrix[np.ix_(known, known)])
-    return out.reshape(*information.shape[:-1])
+    return out.reshape(information.shape[:-1])
 
 
 def _variances(information: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
@@ -14,6 +14,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import recording_of, relative_width
 from mars_lidar.reconstruct.histograms import Histograms, checked
 from mars_lidar.reconstruct.method import Estimates, Method
+from mars_lidar.reconstruct.returns import MOST_RETURNS, RETURN_COLUMNS
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,17 @@ class MaximumLikelihood(Method):
     less_bias
         Take the bias of first order off the maximum (Cox and Snell, J. R. Stat. Soc. B 30, 248, 1968; R19): some
         tenths of a standard error in bright pixels of short exposures, whose errors it makes smaller too.
+    returns
+        Of each pixel up to so many are looked for, in [1, 8]: one more is taken for as long as twice the gain in log
+        likelihood by it is more than what the others and the background reach anywhere in the period with probability
+        `false_alarm` (R23; docs/reconstruction.md, section 9). Signal, delay and background are those of the strongest
+        then, beside the others.
     """
 
     starts: int = 3
     false_alarm: float = 0.01
     less_bias: bool = True
+    returns: int = 1
 
     name = "maximum_likelihood"
     modes = ("nonparalyzable", "synchronous", "gated")
@@ -44,6 +51,7 @@ class MaximumLikelihood(Method):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "starts", checks.integer("starts", self.starts, low=1, high=8))
+        object.__setattr__(self, "returns", checks.integer("returns", self.returns, low=1, high=MOST_RETURNS))
         checks.real("false_alarm", self.false_alarm, low=1e-12, high=0.5)
 
     def least_gain(self, system: System) -> float:
@@ -72,6 +80,7 @@ class MaximumLikelihood(Method):
             threads=histograms.threads,
             progress=histograms.progress,
         )
+        several = self._several(histograms, out, flags) if self.returns > 1 else None
         column = np.ascontiguousarray(out.T)
         return Estimates(
             signal=column[0],
@@ -82,7 +91,28 @@ class MaximumLikelihood(Method):
             background_error=column[4],
             delay_error=column[5],
             significance=np.sqrt(column[6]),
+            returns=several,
         )
+
+    def _several(self, histograms: Histograms, out: FloatArray, flags: NDArray[np.uint8]) -> FloatArray:
+        """Further returns of what was found: (pixels, returns, 5), and what the strongest of them changes."""
+        from mars_lidar._base.native import _core
+
+        pixels = len(histograms.counts)
+        returns = np.empty((pixels, self.returns * len(RETURN_COLUMNS)))
+        _core.several_returns(
+            histograms.recording,
+            histograms.counts,
+            most=self.returns,
+            starts=self.starts,
+            false_alarm=self.false_alarm,
+            out=out,
+            flags=flags,
+            returns=returns,
+            threads=histograms.threads,
+            progress=histograms.progress,
+        )
+        return returns.reshape(pixels, self.returns, len(RETURN_COLUMNS))
 
 
 def log_likelihood(

@@ -38,6 +38,8 @@ class Flags(IntFlag):
     """Bins that registered whenever they could: the rate has no upper bound."""
     UNCONVERGED = 8
     """The iteration did not come to rest."""
+    MORE_RETURNS = 16
+    """There is light of further returns than the most that were asked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,7 @@ class Estimates:
     background_error: FloatArray | None = None
     delay_error: FloatArray | None = None
     significance: FloatArray | None = field(default=None)
+    returns: FloatArray | None = None  # (pixels, most, len(RETURN_COLUMNS)), NaN beyond those of a pixel
 
 
 class Method(ABC):

@@ -90,7 +90,9 @@ def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:
         if cube.reflectivity is not None:
             out["reflectivity"] = map_error(np.where(lit, cube.reflectivity, np.nan), found.reflectivity)
         else:
-            out["signal"] = map_error(np.where(lit, cube.flux.signal, np.nan), found.signal)
+            strongest = found.returns is not None and len(cube.flux.returns_signal) > 0
+            signal = cube.flux.returns_signal.max(0) if strongest else cube.flux.signal
+            out["signal"] = map_error(np.where(lit, signal, np.nan), found.signal)
     return out
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,8 +14,10 @@ from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histograms import checked
+from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruct.method import Estimates, Flags, Method, tell_effects
 from mars_lidar.reconstruct.methods import METHODS
+from mars_lidar.reconstruct.returns import MOST_RETURNS, Returns, returns_of
 
 ATTENUATIONS = ("none", "inverse_square")
 
@@ -45,6 +47,8 @@ class Reconstruction:
         Root of twice the gain in log likelihood by the signal, in standard deviations about; or None.
     flags
         (...) uint8, `Flags`.
+    returns
+        Every return of each pixel, where several were asked for; then the maps above are those of the strongest.
     """
 
     method: str
@@ -61,6 +65,7 @@ class Reconstruction:
     background_error: FloatArray | None
     significance: FloatArray | None
     flags: NDArray[np.uint8]
+    returns: Returns | None = None
 
     __repr__ = brief
 
@@ -100,6 +105,7 @@ def reconstruct(
     *,
     level: float | None = None,
     attenuation: Literal["none", "inverse_square"] = "none",
+    returns: int = 1,
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Reconstruction:
@@ -121,6 +127,9 @@ def reconstruct(
         None: so that the mean reflectivity of the pixels with a return is 1, which makes it relative.
     attenuation
         As in `Scene.flux`: ``"inverse_square"`` makes reflectivity proportional to S times depth squared.
+    returns
+        Returns to look for in each pixel, 1 to 8: panes of glass, foliage. Each is tested, and all of them are in
+        `Reconstruction.returns`. Of ``"maximum_likelihood"`` alone.
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     progress
@@ -135,7 +144,7 @@ def reconstruct(
         system, cube = cube.system if system is None else system, np.asarray(cube.histogram)
     if system is None:
         raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load carries its own)")
-    used = find_method(method)
+    used = with_returns(find_method(method), returns)
     checks.choice("attenuation", attenuation, ATTENUATIONS)
     if level is not None:
         level = checks.real("level", level, low=0.0, strict_low=True)
@@ -155,6 +164,18 @@ def find_method(method: str | Method) -> Method:
     if isinstance(method, Method):
         return method
     return METHODS[checks.choice("method", method, tuple(METHODS))]
+
+
+def with_returns(method: Method, returns: int) -> Method:
+    """The method, looking for so many returns of each pixel."""
+    if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
+        return method
+    if not isinstance(method, MaximumLikelihood):
+        raise ValueError(
+            f"returns={returns} needs the likelihood of several returns, which method {method.name!r} has not; "
+            "use 'maximum_likelihood'"
+        )
+    return replace(method, returns=int(returns))
 
 
 def assembled(
@@ -189,6 +210,7 @@ def assembled(
         background_error=mapped(found.background_error),
         significance=mapped(found.significance),
         flags=flags,
+        returns=returns_of(found.returns, system, shape),
     )
 
 

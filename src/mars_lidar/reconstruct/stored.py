@@ -15,7 +15,7 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.reconstruct.histograms import checked
 from mars_lidar.reconstruct.method import Estimates, Method, tell_effects
-from mars_lidar.reconstruct.reconstruction import Reconstruction, assembled, find_method
+from mars_lidar.reconstruct.reconstruction import Reconstruction, assembled, find_method, with_returns
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
@@ -37,6 +37,7 @@ def reconstruct_stored(
     *,
     level: float | None = None,
     attenuation: str | None = None,
+    returns: int = 1,
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> dict[str, Timed]:
@@ -48,7 +49,7 @@ def reconstruct_stored(
         The cube. Without `level`, its own: that with which a known scene's reflectivity became its signal.
     methods
         Names or methods of different names.
-    level, attenuation, threads, progress
+    level, attenuation, returns, threads, progress
         As `mars_lidar.reconstruct`; attenuation None: that with which the flux was made, if it says so.
 
     Returns
@@ -58,7 +59,7 @@ def reconstruct_stored(
     """
     progress = shown(progress, "reconstructing")
     system, recipe = cube.system, cube.recipe
-    used = [find_method(method) for method in methods]
+    used = [with_returns(find_method(method), returns) for method in methods]
     for method in used:
         method.check(system)
     tell_effects(system)
@@ -80,14 +81,16 @@ def reconstruct_stored(
                 values = getattr(found, field.name)
                 if values is None:
                     continue
-                whole = buffers[method.name].setdefault(field.name, np.empty(shape, values.dtype))
-                whole[images, rows] = values.reshape(block)
+                whole = buffers[method.name].setdefault(field.name, np.empty((*shape, *values.shape[1:]), values.dtype))
+                whole[images, rows] = values.reshape(*block, *values.shape[1:])
             done += len(counts.counts)
             if progress is not None:
                 progress(done, total)
     results = {}
     for method in used:
-        found = Estimates(**{name: values.reshape(-1) for name, values in buffers[method.name].items()})
+        found = Estimates(
+            **{name: values.reshape(-1, *values.shape[3:]) for name, values in buffers[method.name].items()}
+        )
         results[method.name] = Timed(
             assembled(method.name, system, found, shape, scale, attenuation), seconds[method.name]
         )

@@ -1,5 +1,6 @@
-// Bindings of the maximum-likelihood estimator and of its likelihood; reconstruct/maximizer.h has the loops over a pixel.
-#include "reconstruct/maximizer.h"
+// Bindings of the maximum-likelihood estimator and of its likelihood; reconstruct/maximizer.h
+// and several_returns.h have the loops over a pixel.
+#include "reconstruct/several_returns.h"
 
 #include "python/bindings.h"
 #include "python/count_rows.h"
@@ -22,6 +23,27 @@ void maximum_likelihood(const HistogramRecord& recording, Histograms histogram, 
     run_watched_items(pixels, kChunk, threads, progress, [&] {
         return [&, maximizer = Maximizer(recording, job)](int64_t p) mutable {
             maximizer(counts, p, out.data() + p * kMaximumColumns, flags.data() + p);
+        };
+    });
+}
+
+// `out` and `flags` are those of `maximum_likelihood`, and those of the strongest return afterwards.
+void several_returns(const HistogramRecord& recording, Histograms histogram, int most, int starts, double false_alarm,
+                     Matrix<double> out, Vector<uint8_t> flags, Matrix<double> returns,
+                     int threads, nb::object progress) {
+    const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
+    if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
+        throw nb::value_error("histogram must be (pixels, bins)");
+    if (most < 1 || most > kMostReturns) throw nb::value_error("most must lie in [1, 8]");
+    if (out.shape(0) != histogram.shape(0) || out.shape(1) != kMaximumColumns || flags.shape(0) != histogram.shape(0) ||
+        returns.shape(0) != histogram.shape(0) || static_cast<int>(returns.shape(1)) != most * kReturnColumns)
+        throw nb::value_error("out must be (pixels, 8), returns (pixels, 5 most), flags (pixels)");
+    const ReturnsJob job{most, starts, false_alarm};
+    const CountRows counts = rows_of(histogram);
+    run_watched_items(pixels, kChunk, threads, progress, [&] {
+        return [&, several = SeveralReturns(recording, job)](int64_t p) mutable {
+            several(counts, p, out.data() + p * kMaximumColumns, flags.data() + p,
+                    returns.data() + p * most * kReturnColumns);
         };
     });
 }
@@ -56,6 +78,11 @@ void bind_maximum_likelihood(nb::module_& module) {
                nb::kw_only(), nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"),
                nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"), nb::arg("progress").none(),
                "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).");
+    module.def("several_returns", &several_returns, nb::arg("recording"), nb::arg("histogram").noconvert(),
+               nb::kw_only(), nb::arg("most"), nb::arg("starts"), nb::arg("false_alarm"), nb::arg("out").noconvert(),
+               nb::arg("flags").noconvert(), nb::arg("returns").noconvert(),
+               nb::arg("threads"), nb::arg("progress").none(),
+               "Further returns of each pixel: returns (pixels, most x (delay, S, errors, chance)).");
     module.def("histogram_log_likelihood", &log_likelihood, nb::arg("recording"), nb::arg("histogram"), nb::arg("at"),
                nb::arg("out").noconvert(), nb::arg("whole") = true,
                "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");

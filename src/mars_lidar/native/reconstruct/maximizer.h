@@ -8,6 +8,7 @@
 #include "reconstruct/delay_search.h"
 #include "reconstruct/likelihood_bias.h"
 #include "reconstruct/pixel_flags.h"
+#include "reconstruct/solve.h"
 
 namespace mars {
 
@@ -22,42 +23,12 @@ constexpr double kGain = 5e-7;        // of the log likelihood that a further st
 constexpr double kMostPhotons = 1e4;  // per period: a bound on S and on B
 constexpr int kMaximumColumns = 8;    // of the output: see Maximizer
 
-// Solves A x = b, A symmetric 3 x 3 and positive definite where `free`; x = 0 elsewhere. False where it is singular.
-inline bool solve(const double a[3][3], const double* b, const bool* free, double* x) {
-    double l[3][3] = {}, y[3] = {};
-    for (int i = 0; i < 3; ++i) {
-        if (!free[i]) continue;
-        for (int j = 0; j <= i; ++j) {
-            if (!free[j]) continue;
-            double sum = a[i][j];
-            for (int k = 0; k < j; ++k) sum -= l[i][k] * l[j][k];
-            if (i == j) {
-                if (!(sum > 1e-13 * a[i][i]) || !std::isfinite(sum)) return false;
-                l[i][i] = std::sqrt(sum);
-            } else {
-                l[i][j] = sum / l[j][j];
-            }
-        }
-        y[i] = b[i];
-        for (int k = 0; k < i; ++k) y[i] -= l[i][k] * y[k];
-        y[i] /= l[i][i];
-    }
-    for (int i = 2; i >= 0; --i) {
-        x[i] = 0.0;
-        if (!free[i]) continue;
-        double sum = y[i];
-        for (int k = i + 1; k < 3; ++k) sum -= l[k][i] * x[k];
-        x[i] = sum / l[i][i];
-    }
-    return true;
-}
-
 // What is known where the likelihood stands, without what the ends of the exposure hide, if that is positive definite.
 inline void known_information(const Likelihood& likelihood, const bool* free, double known[3][3]) {
     double none[3] = {}, x[3];
     for (int a = 0; a < 3; ++a)
         for (int b = 0; b < 3; ++b) known[a][b] = likelihood.information[a][b] - likelihood.hidden[a][b];
-    if (!solve(known, none, free, x))
+    if (!solve<3>(known, none, free, x))
         std::copy(&likelihood.information[0][0], &likelihood.information[0][0] + 9, &known[0][0]);
 }
 
@@ -94,7 +65,7 @@ inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_si
         fit.free[2] = with_signal && fit.at[0] > 0.0 && now.information[2][2] > 0.0;
         double move[3], known[3][3];
         known_information(now, fit.free, known);
-        if (solve(known, now.gradient, fit.free, move)) {
+        if (solve<3>(known, now.gradient, fit.free, move)) {
             double gain = 0.0;
             for (int k = 0; k < 3; ++k) gain += 0.5 * move[k] * now.gradient[k];
             if (gain < kGain) {
@@ -108,7 +79,7 @@ inline Fit climb(const PixelLikelihood& pixel, const double* start, bool with_si
             double damped[3][3], next[3];
             for (int a = 0; a < 3; ++a)
                 for (int b = 0; b < 3; ++b) damped[a][b] = known[a][b] * (a == b ? 1.0 + damping : 1.0);
-            if (!solve(damped, now.gradient, fit.free, move)) continue;
+            if (!solve<3>(damped, now.gradient, fit.free, move)) continue;
             next[0] = std::clamp(fit.at[0] + move[0], 0.0, kMostPhotons);
             next[1] = std::clamp(fit.at[1] + move[1], std::max(least, 0.05 * fit.at[1]), kMostPhotons);
             next[2] = fit.at[2] + std::clamp(move[2], -farthest, farthest);
@@ -193,19 +164,15 @@ class Maximizer {
  private:
     // Takes off the first-order bias of the maximum, at most a standard error of it, and of S never more than S.
     void correct(const PixelLikelihood& pixel, double least, Fit& fit) {
-        double known[3][3], inverse[3][3], bias[3];
+        double known[3][3], spread[3][3], bias[3];
         if (!fit.free[0] || !fit.free[1] || !fit.free[2]) return;
         known_information(fit.likelihood, fit.free, known);
-        for (int k = 0; k < 3; ++k) {
-            double unit[3] = {};
-            unit[k] = 1.0;
-            if (!solve(known, unit, fit.free, inverse[k])) return;
-        }
-        bias_(r_, passes_, fit.at, inverse, bias);
+        if (!inverse<3>(known, fit.free, spread)) return;
+        bias_(r_, passes_, fit.at, spread, bias);
         double next[3];
         for (int k = 0; k < 3; ++k) {
             if (!std::isfinite(bias[k])) return;
-            const double most = std::sqrt(inverse[k][k]);
+            const double most = std::sqrt(spread[k][k]);
             next[k] = fit.at[k] - std::clamp(bias[k], -most, most);
         }
         if (bias[0] > 0.0) next[0] = fit.at[0] / (1.0 + bias[0] / fit.at[0]);
@@ -222,7 +189,7 @@ class Maximizer {
         for (int k = 0; k < 3; ++k) {
             double unit[3] = {}, column[3];
             unit[k] = 1.0;
-            if (fit.free[k] && solve(known, unit, fit.free, column)) out[k] = std::sqrt(column[k]);
+            if (fit.free[k] && solve<3>(known, unit, fit.free, column)) out[k] = std::sqrt(column[k]);
         }
     }
 

@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "reconstruct/background_series.h"
+#include "reconstruct/bin_term.h"
 #include "reconstruct/exposure_ends.h"
 
 namespace mars {
@@ -81,7 +82,7 @@ class PixelLikelihood {
             const double dl[3] = {s, share / static_cast<double>(r_.bins), signal * ds};
             int64_t k;
             if (ends.count == 0 || !ends.covers(j, r_.bins, &k)) {
-                bin(out, h, passes_.armed[j], passes_.rearmed[j], l, dl);
+                add(out, bin_term(r_, h, passes_.armed[j], passes_.rearmed[j], l), dl);
                 return;
             }
             const Pass pass(l, passes_.rearmed[j] != 0.0);
@@ -91,7 +92,7 @@ class PixelLikelihood {
                              quiet = armed + passes_.rearmed[j] - h;
                 if (!(armed + passes_.rearmed[j] > 1e-9)) continue;
                 const Expected e(pass, armed, passes_.rearmed[j]);
-                passed(each[c], h, quiet, e, 1.0 / (armed + passes_.rearmed[j]), dl);
+                add(each[c], passed_term(h, quiet, e, 1.0 / (armed + passes_.rearmed[j])), dl);
                 each[c].value += choices[c];
             }
         });
@@ -117,35 +118,9 @@ class PixelLikelihood {
     }
 
  private:
-    // One bin: `h` registrations in `armed` passes from its start on and `rearmed` ones from within it, `l` photons per
-    // pass. Where dead time is below a bin, a bin may register again, and counts are Poisson.
-    void bin(Likelihood& out, double h, double armed, double rearmed, double l, const double* dl) const {
-        if (r_.below_bin()) {
-            if (armed <= 0.0) return;
-            out.value += h * std::log(l) - armed * l;
-            out.add(h / l - armed, armed / l, dl);
-            return;
-        }
-        const double passes = armed + rearmed, time = armed + 0.5 * rearmed;
-        if (!(time > 1e-12)) return;
-        const Expected e(l, armed, rearmed);
-        passed(out, h, passes - h, e, 1.0 / passes, dl);
-        out.value += h * std::log(passes / time);
-    }
-
-    // (R9): `h` of the passes registered, `quiet` did not.
-    static void passed(Likelihood& out, double h, double quiet, const Expected& e, double share, const double* dl) {
-        quiet = std::max(quiet, 0.0);
-        double score = 0.0;
-        if (h > 0.0) {
-            out.value += h * std::log(e.mean * share);
-            score += h / e.mean;
-        }
-        if (quiet > 0.0) {
-            out.value += quiet * std::log(e.silent * share);
-            score -= quiet / e.silent;
-        }
-        out.add(e.slope * score, e.slope * e.slope / (share * e.mean * e.silent), dl);
+    static void add(Likelihood& out, const BinTerm& term, const double* dl) {
+        out.value += term.value;
+        out.add(term.score, term.info, dl);
     }
 
     // Adds the mixture of `each` (R9a): gradient and information are means over what is likely.

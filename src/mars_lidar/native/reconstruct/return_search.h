@@ -1,0 +1,162 @@
+// Where a further return may be, and how far the likelihood gains by one when there is none: docs/reconstruction.md, section 9.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "reconstruct/returns_likelihood.h"
+#include "reconstruct/solve.h"
+
+namespace mars {
+
+// A return that the score of the likelihood tells of: its first S, delay, and the squared score over its variance.
+struct Hint {
+    double signal, delay, gain;
+};
+
+// The score of a weak further return at every delay of a grid, free of what is known of the returns that there are (R21),
+// and the length of the curve that its direction follows (R22).
+class ReturnSearch {
+ public:
+    explicit ReturnSearch(const HistogramRecord& recording) : r_(recording) {
+        HistogramRecord plain = recording;
+        plain.open.clear();
+        const double n = static_cast<double>(r_.bins), at = 0.5 / n;
+        first_ = static_cast<int64_t>(std::floor((at + r_.pulse.low) * n));
+        for_pulse_bins(plain, at, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
+                       [&](int64_t, int64_t, double s, double) { energy_.push_back(s); });
+        step_ = std::max<int64_t>(1, static_cast<int64_t>(r_.width * n / 3.0));
+        points_ = (r_.bins + step_ - 1) / step_;  // the last step may be a shorter one
+        place_.resize(points_ + 1);
+        for (int64_t g = 0; g <= points_; ++g) place_[g] = std::min(g * step_, r_.bins);
+    }
+
+    // At a maximum of the likelihood, evaluated bin by bin: false where its information is singular. `hints`: the
+    // local maxima, the best first.
+    bool operator()(const ReturnsPoint& point, const ReturnsLikelihood& likelihood, std::vector<Hint>& hints) {
+        const int unknowns = point.unknowns();
+        bool free[kUnknowns] = {};
+        for (int a = 0; a < unknowns; ++a) free[a] = point.information[a][a] > 0.0;
+        double spread[kUnknowns][kUnknowns];
+        if (!inverse<kUnknowns>(point.information, free, spread)) return false;
+        const int64_t taps = static_cast<int64_t>(energy_.size());
+        extend(score_, [&](int64_t j) { return likelihood.score()[j]; });
+        extend(info_, [&](int64_t j) { return likelihood.info()[j] * r_.share(j); });
+        nuisance_.resize(unknowns);
+        for (int a = 0; a < unknowns; ++a) {
+            const int k = (a - 1) / 2;
+            const double* by = a == 0 ? nullptr : a % 2 == 1 ? likelihood.energy(k) : likelihood.slope(k);
+            const double scale = a == 0 ? 1.0 / static_cast<double>(r_.bins) : a % 2 == 1 ? 1.0 : point.at[a - 1];
+            extend(nuisance_[a], [&](int64_t j) { return scale * (by ? by[j] : r_.share(j)) * likelihood.info()[j]; });
+        }
+        score_at_.assign(points_, 0.0);
+        variance_.assign(points_, 0.0);
+        along_.assign(points_ * kUnknowns, 0.0);
+        left_.assign(points_ * kUnknowns, 0.0);
+        for (int64_t g = 0; g < points_; ++g) {
+            const int64_t from = start(g);
+            double score = 0.0, all = 0.0;
+            for (int64_t i = 0; i < taps; ++i) {
+                score += energy_[i] * score_[from + i];
+                all += energy_[i] * energy_[i] * info_[from + i];
+            }
+            double *along = &along_[g * kUnknowns], *left = &left_[g * kUnknowns];
+            for (int a = 0; a < unknowns; ++a) {
+                double sum = 0.0;
+                const double* values = nuisance_[a].data() + from;
+                for (int64_t i = 0; i < taps; ++i) sum += energy_[i] * values[i];
+                along[a] = sum;
+            }
+            double known = 0.0;
+            for (int a = 0; a < unknowns; ++a) {
+                for (int b = 0; b < unknowns; ++b) left[a] += spread[a][b] * along[b];
+                known += left[a] * along[a];
+            }
+            score_at_[g] = score;
+            variance_[g] = all - known > kResolved * all ? all - known : 0.0;
+        }
+        measure(unknowns);
+        collect(hints);
+        return true;
+    }
+
+    // Probability that a further return would gain so much, twice the logarithm, anywhere in the period without being there.
+    double chance(double gain) const {
+        const double least = 0.5 * std::erfc(std::sqrt(0.5 * std::max(gain, 0.0)));
+        return std::min(1.0, least + length_ / (2.0 * kPi) * std::exp(-0.5 * std::max(gain, 0.0)));
+    }
+
+    // The gain that has this chance.
+    double least_gain(double false_alarm) const {
+        double low = 0.0, high = 2000.0;
+        while (high - low > 1e-6) {
+            const double middle = 0.5 * (low + high);
+            (chance(middle) > false_alarm ? low : high) = middle;
+        }
+        return high;
+    }
+
+ private:
+    static constexpr double kPi = 3.14159265358979323846;
+    // share of the score's variance that is left at a delay, below which a return there is one of those that there are
+    static constexpr double kResolved = 1e-7;
+
+    int64_t start(int64_t g) const { return shift() + place_[g]; }
+    int64_t shift() const { return ((first_ % r_.bins) + r_.bins) % r_.bins; }
+
+    template <class Of>
+    void extend(std::vector<double>& out, const Of& of) const {
+        const int64_t n = r_.bins, taps = static_cast<int64_t>(energy_.size());
+        out.resize(2 * n + taps);
+        for (int64_t j = 0; j < n; ++j) out[j] = of(j) * r_.share(j);
+        for (int64_t j = n; j < 2 * n + taps; ++j) out[j] = out[j - n];
+    }
+
+    // The sum of the angles between the directions of neighbouring delays that are left.
+    void measure(int unknowns) {
+        const int64_t taps = static_cast<int64_t>(energy_.size());
+        length_ = 0.0;
+        int64_t last = -1, first = -1;
+        auto angle = [&](int64_t g, int64_t h, int64_t apart) {
+            double both = 0.0;
+            const int64_t from = start(g);
+            for (int64_t i = apart; i < taps; ++i) both += energy_[i] * energy_[i - apart] * info_[from + i];
+            for (int a = 0; a < unknowns; ++a) both -= along_[g * kUnknowns + a] * left_[h * kUnknowns + a];
+            return std::acos(std::clamp(both / std::sqrt(variance_[g] * variance_[h]), -1.0, 1.0));
+        };
+        for (int64_t g = 0; g < points_; ++g) {
+            if (!(variance_[g] > 0.0)) continue;
+            if (last >= 0)
+                length_ += angle(last, g, place_[g] - place_[last]);
+            else
+                first = g;
+            last = g;
+        }
+        if (last > first) length_ += angle(last, first, r_.bins - place_[last] + place_[first]);
+    }
+
+    void collect(std::vector<Hint>& hints) const {
+        hints.clear();
+        for (int64_t g = 0; g < points_; ++g) {
+            const double here = gain(g);
+            if (!(here > 0.0) || here < gain((g + points_ - 1) % points_) || here <= gain((g + 1) % points_)) continue;
+            const double delay = (static_cast<double>(place_[g]) + 0.5) / static_cast<double>(r_.bins);
+            hints.push_back({score_at_[g] / variance_[g], delay, here});
+        }
+        std::sort(hints.begin(), hints.end(), [](const Hint& a, const Hint& b) { return a.gain > b.gain; });
+    }
+
+    double gain(int64_t g) const {
+        return variance_[g] > 0.0 && score_at_[g] > 0.0 ? score_at_[g] * score_at_[g] / variance_[g] : 0.0;
+    }
+
+    const HistogramRecord& r_;
+    int64_t first_ = 0, step_ = 1, points_ = 1;
+    double length_ = 0.0;
+    std::vector<int64_t> place_;  // (points + 1) bins
+    std::vector<double> energy_, score_, info_, score_at_, variance_, along_, left_;
+    std::vector<std::vector<double>> nuisance_;
+};
+
+}  // namespace mars

@@ -1,0 +1,243 @@
+"""Study "returns": returns seen that are not there, how near two may be, and how well their errors hold."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar import Detector, Flux, GaussianPulse, System, reconstruct, simulate
+from mars_lidar.reconstruct import MaximumLikelihood, returns_bound
+from studies import Request
+from studies.common.report import Row, write
+
+SEED = 20
+MOST = 3  # returns that are looked for
+FALSE_ALARM = 0.01
+RARE = 0.001
+DELAY_NS = 37.013
+COVERS = {"68 %": 1.0, "95 %": 1.96}
+SYSTEM = System(
+    period_ns=100.0, cycles=4000, bins=500, pulse=GaussianPulse(sigma_ns=0.5), detector=Detector(dead_time_ns=75.3)
+)
+SIGMA_NS = 0.5
+SEPARATIONS = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0)  # sigma
+
+
+def with_dead(dead_ns: float, *, cycles: int = 4000, bins: int = 500, start: str = "armed", **detector: Any) -> System:
+    """`SYSTEM` with another detector."""
+    return SYSTEM.replace(cycles=cycles, bins=bins, start=start, detector=Detector(dead_time_ns=dead_ns, **detector))
+
+
+_GATE = {"mode": "gated", "gate_start_ns": 80.03, "gate_width_ns": 40.0}
+# of one return: system, S, S / B
+ALONE = (
+    (with_dead(0.0), 0.01, 1.0),
+    (with_dead(0.0, cycles=20_000), 0.01, 0.1),
+    (with_dead(0.0), 1.0, 1.0),
+    (with_dead(0.0, cycles=1000), 5.0, 10.0),
+    (with_dead(0.1), 1.0, 1.0),
+    (with_dead(2.5), 3.0, 1.0),
+    (with_dead(20.0), 1.0, 0.05),
+    (with_dead(30.0), 0.05, 0.3),
+    (with_dead(75.3), 0.005, 50.0),
+    (with_dead(75.3), 0.02, 10.0),
+    (with_dead(75.3), 0.1, 100.0),
+    (with_dead(75.3), 1.0, 0.2),
+    (with_dead(75.3), 2.0, 0.1),
+    (with_dead(75.3), 3.0, 3.0),
+    (with_dead(75.3, cycles=1000), 5.0, 1.0),
+    (with_dead(75.3, cycles=20_000), 5.0, 1.0),
+    (with_dead(75.3, cycles=20_000, bins=250), 3.0, 1.0),
+    (with_dead(75.3, cycles=20_000, bins=100), 3.0, 1.0),
+    (with_dead(75.3, start="stationary"), 1.0, 1.0),
+    (with_dead(100.0), 5.0, 10.0),
+    (with_dead(130.7), 2.0, 1.0),
+    (with_dead(253.3, cycles=10_000), 2.0, 4.0),
+    (with_dead(253.3, cycles=1000), 5.0, 1.0),
+    (with_dead(75.0, mode="synchronous"), 2.0, 1.0),
+    (with_dead(75.0, cycles=1000, mode="synchronous"), 5.0, 1.0),
+    (with_dead(45.0, **_GATE), 1.0, 1.0),
+)
+# of two returns: dead time, S of the nearer, S of the farther, B
+PAIRS = (
+    (0.0, 0.1, 0.1, 0.5),
+    (0.0, 1.0, 0.3, 1.0),
+    (75.3, 0.5, 0.5, 0.5),
+    (75.3, 0.1, 0.05, 0.5),
+    (75.3, 0.03, 0.03, 0.02),
+    (75.3, 2.0, 0.5, 0.5),
+    (75.3, 3.0, 2.0, 0.3),
+    (130.7, 0.5, 0.5, 2.0),
+    (253.3, 0.5, 1.0, 0.5),
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Pixels of a case, pixels at the rare level, cycles of the curves of resolution."""
+
+    pixels: int
+    rare: int
+    cycles: tuple[int, ...]
+
+
+FULL = Settings(3000, 40_000, (400, 4000, 40_000))
+QUICK = Settings(150, 300, (4000,))
+
+
+def run(request: Request) -> list[Path]:
+    """Write returns.md, returns.csv and a figure."""
+    from studies.reconstruction.returns_figure import returns_figure
+
+    settings = QUICK if request.quick else FULL
+    request.tell("returns: false alarms")
+    alarms = list(false_alarms(settings))
+    rows = []
+    for dead, first, second, background in PAIRS:
+        request.tell(f"returns: dead time {dead:g} ns, S = {first:g} and {second:g}")
+        for apart in SEPARATIONS:
+            rows.append(pair(with_dead(dead), (first, second), background, apart, settings.pixels))
+    curves = []
+    for cycles in settings.cycles:
+        request.tell(f"returns: resolution, {cycles} cycles")
+        for apart in np.geomspace(0.3, 6.0, 12):
+            system = with_dead(75.3, cycles=cycles)
+            curves.append({"cycles": cycles} | pair(system, (0.5, 0.5), 0.5, float(apart), settings.pixels // 2))
+    figure = returns_figure(request.out / "returns.png", curves, rows)
+    facts = {
+        "s": settings,
+        "alarms": alarms,
+        "worst": max(alarms, key=lambda row: row["extra %"]),
+        "pairs": [row for row in rows if row["separation"] in (1.0, 1.5, 2.0, 5.0, 20.0)],
+        "held": held(rows),
+        "limits": [limit(curves, cycles) for cycles in settings.cycles],
+        "times": timings(settings),
+    }
+    return write(request, "returns", __name__, "returns", facts, rows=rows, figures=[figure])
+
+
+def false_alarms(settings: Settings) -> Iterator[Row]:
+    """Pixels of one return, and of two, in which another was seen."""
+    for system, signal, sbr in ALONE:
+        yield alarm(system, (signal,), signal / sbr, settings.pixels, FALSE_ALARM)
+    for dead, first, second, background in PAIRS:
+        yield alarm(with_dead(dead), (first, second), background, settings.pixels, FALSE_ALARM)
+    yield alarm(with_dead(75.3), (1.0,), 1.0, settings.rare, RARE)
+    yield alarm(with_dead(75.3), (0.1,), 0.01, settings.rare, RARE)
+
+
+def alarm(system: System, signals: tuple[float, ...], background: float, pixels: int, level: float) -> Row:
+    """A line: of the pixels in which all returns were seen, how many show one more."""
+    random = np.random.default_rng(SEED)
+    gated = system.detector.mode == "gated"
+    delay = 90.0 + 15.0 * random.random(pixels) if gated else 100.0 * random.random(pixels)
+    parts = [Flux(np.full(pixels, s), background if k == 0 else 0.0, delay + 20.0 * k) for k, s in enumerate(signals)]
+    cube = simulate(Flux.multi(*parts), system, seed=SEED)[0, 0]
+    found = reconstruct(cube, system, MaximumLikelihood(false_alarm=level), returns=MOST)
+    assert found.returns is not None
+    seen = found.returns.count >= len(signals)
+    more = int((found.returns.count > len(signals)).sum())
+    return {
+        "mode": system.detector.mode,
+        "start": system.start,
+        "dead time ns": system.detector.dead_time_ns,
+        "cycles": system.cycles,
+        "bin ns": system.bin_ns,
+        "S": " + ".join(f"{s:g}" for s in signals),
+        "B": background,
+        "pixels": int(seen.sum()),
+        "level %": 100.0 * level,
+        "extra %": 100.0 * more / max(int(seen.sum()), 1),
+        "+-": 100.0 * np.sqrt(max(more, 1)) / max(int(seen.sum()), 1),
+    }
+
+
+def pair(system: System, signals: tuple[float, float], background: float, apart: float, pixels: int) -> dict[str, Any]:
+    """A line: how often two returns so many sigma apart are both seen, and how well their errors hold then."""
+    delay = DELAY_NS + SIGMA_NS * np.array([0.0, apart])
+    parts = [
+        Flux(np.full(pixels, s), background if k == 0 else 0.0, at)
+        for k, (s, at) in enumerate(zip(signals, delay, strict=True))
+    ]
+    cube = simulate(Flux.multi(*parts), system, seed=SEED)[0, 0]
+    found = reconstruct(cube, system, returns=MOST).returns
+    assert found is not None
+    both = found.count == 2
+    bound = returns_bound(signals, background, system, delay_ns=delay)
+    off = {
+        "depth": ((found.delay_ns[both, :2] - delay), found.delay_error_ns[both, :2], bound.delay_ns),
+        "S": ((found.signal[both, :2] - np.array(signals)), found.signal_error[both, :2], bound.signal),
+    }
+    line: dict[str, Any] = {
+        "dead time ns": system.detector.dead_time_ns,
+        "S": " + ".join(f"{s:g}" for s in signals),
+        "B": background,
+        "separation": apart,
+        "both seen %": 100.0 * float(both.mean()),
+    }
+    for what, (error, stated, least) in off.items():
+        for words, times in COVERS.items():
+            line[f"{what} in {words}"] = _worst(np.abs(error) <= times * stated)
+        line[f"{what} error / bound"] = float(np.max(error.std(0) / least)) if both.sum() > 1 else float("nan")
+        line[f"{what} stated / bound"] = (
+            float(np.max(np.nanmedian(stated, 0) / least)) if both.sum() > 1 else float("nan")
+        )
+    return line
+
+
+def _worst(inside: NDArray[np.bool_]) -> float:
+    """The lesser share, %, of two returns whose interval holds the truth."""
+    return 100.0 * float(inside.mean(0).min()) if len(inside) else float("nan")
+
+
+def held(rows: list[dict[str, Any]]) -> list[Row]:
+    """The worst coverage of all pairs by how surely they are seen."""
+    lines = []
+    for low, high in ((99.0, 101.0), (90.0, 99.0), (50.0, 90.0), (5.0, 50.0)):
+        mine = [row for row in rows if low <= row["both seen %"] < high]
+        if not mine:
+            continue
+        words = f"{low:g} % and more" if high > 100 else f"{low:g} to {high:g} %"
+        line: dict[str, Any] = {"both seen": words, "cases": len(mine)}
+        for what in ("depth", "S"):
+            for share in COVERS:
+                line[f"{what} in {share}, least"] = min(row[f"{what} in {share}"] for row in mine)
+                line[f"{what} in {share}, median"] = float(np.median([row[f"{what} in {share}"] for row in mine]))
+        lines.append(line)
+    return lines
+
+
+def limit(curves: list[dict[str, Any]], cycles: int) -> Row:
+    """The separation, in sigma, at which half and nine tenths of the pairs are seen as two."""
+    mine = [row for row in curves if row["cycles"] == cycles]
+    share = np.maximum.accumulate([row["both seen %"] for row in mine])
+    apart = np.array([row["separation"] for row in mine])
+    return {
+        "cycles": cycles,
+        "photons of each": 0.5 * cycles,
+        "half seen, sigma": float(np.interp(50.0, share, apart)),
+        "90 % seen, sigma": float(np.interp(90.0, share, apart)),
+    }
+
+
+def timings(settings: Settings) -> list[Row]:
+    """Processor seconds of 1000 pixels of one and of two returns."""
+    lines = []
+    for signals in ((1.0,), (0.5, 0.5)):
+        parts = [
+            Flux(np.full(settings.pixels, s), 0.5 if k == 0 else 0.0, 37.0 + 5.0 * k) for k, s in enumerate(signals)
+        ]
+        cube = simulate(Flux.multi(*parts), SYSTEM, seed=SEED)[0, 0]
+        line: dict[str, Any] = {"returns there": len(signals)}
+        for most in (1, MOST):
+            began = time.process_time()
+            reconstruct(cube, SYSTEM, returns=most)
+            line[f"returns={most}, s for 1000 pixels"] = 1000.0 * (time.process_time() - began) / settings.pixels
+        lines.append(line)
+    return lines

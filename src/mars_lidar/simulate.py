@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
@@ -28,6 +29,7 @@ _STAMP_BYTES = 16  # of a time, a cycle and a bin
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
 
+@checked
 def simulate(
     flux: Flux,
     system: System,
@@ -113,6 +115,7 @@ def simulate(
     return cube
 
 
+@checked
 def simulate_timestamps(
     flux: Flux,
     system: System,

@@ -55,6 +55,27 @@ def unmasked(name: str, value: Any) -> Any:
     return value
 
 
+def even_rows(name: str, value: Any) -> Any:
+    """The value, unless it is a list of rows that no array can be made of."""
+    if isinstance(value, list | tuple):
+        try:
+            np.shape(value)
+        except ValueError:
+            raise ValueError(f"{name} must have rows of equal lengths") from None
+    return value
+
+
+def numbers(name: str, value: Any) -> Any:
+    """The value, unless an array made of it would hold anything but real numbers."""
+    even_rows(name, value)
+    dtype = getattr(value, "dtype", None)
+    if dtype is None and not hasattr(value, "__array__"):
+        dtype = np.asarray(value).dtype
+    if isinstance(dtype, np.dtype) and dtype.kind not in "biuf":
+        raise TypeError(f"{name} must be real numbers, got dtype {dtype}")
+    return value
+
+
 def known_keys(name: str, mapping: Any, allowed: tuple[str, ...]) -> dict[str, Any]:
     """A mapping whose keys are all known; a misspelt key is an error, never ignored."""
     if not isinstance(mapping, dict):

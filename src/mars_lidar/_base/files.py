@@ -23,12 +23,10 @@ from numpy.typing import NDArray
 from mars_lidar._base.memory import check_memory
 
 if TYPE_CHECKING:
-    import h5py
     from numpy.lib.npyio import NpzFile
 
 LIMIT = "MARS_LIDAR_READ_GIB"  # of the environment: what the arrays of one file may take in memory
 _LEAST_LIMIT, _TIMES = 512 * 2**20, 512  # without it: so many bytes, or so many times the file
-_HEAP = b"GCOL\1\0\0\0"  # begins a collection of texts in HDF5
 INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is written to
 
 
@@ -213,39 +211,6 @@ def read_npy(path: Path) -> NDArray[Any]:
     """The array of a .npy, mapped: NumPy refuses what the file is too small for."""
     with reading(path, "a .npy"):
         return np.lib.format.open_memmap(path, mode="r")
-
-
-@contextlib.contextmanager
-def open_hdf5(path: Path, kind: str = "an HDF5 file") -> Iterator[h5py.File]:
-    """An HDF5 file; read its data sets with `whole`."""
-    import h5py
-
-    with reading(path, kind):
-        check_heaps(path)
-        with h5py.File(path, "r") as file:
-            yield file
-
-
-def check_heaps(path: Path) -> None:
-    """Raise ValueError for a damaged heap of texts in an HDF5 file, over which the library would loop without an end.
-
-    A collection is a signature, its size, and objects of (index, ..., size); the step over an object of index 0, free
-    space, is its size (HDF5 File Format Specification 3.0, III.E). Looked for in the first 64 MiB.
-    """
-    with open(path, "rb") as stream:
-        content = stream.read(2**26)
-    start = content.find(_HEAP)
-    while start >= 0:
-        at, end = start + 16, start + int.from_bytes(content[start + 8 : start + 16], "little")
-        while at + 16 <= min(end, len(content)):
-            index, size = (
-                int.from_bytes(content[at : at + 2], "little"),
-                int.from_bytes(content[at + 8 : at + 16], "little"),
-            )
-            if index == 0 and size < 16:
-                raise ValueError(f"{path}: is damaged: the heap of its texts at byte {at} does not end")
-            at += size if index == 0 else 16 + (size + 7) // 8 * 8
-        start = content.find(_HEAP, start + 8)
 
 
 def whole(data: Any) -> NDArray[Any]:

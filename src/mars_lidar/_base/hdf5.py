@@ -1,14 +1,35 @@
-"""HDF5 files that survive a full disk: an error for the caller, not the end of the process."""
+"""HDF5 files that survive a full disk, and in which no damage goes unnoticed.
+
+A full disk is an error for the caller, not the end of the process. Every chunk that we write carries the checksum of
+HDF5's Fletcher-32 filter, and every header and index that of HDF5 1.10, which its library looks at whenever it reads
+them. What these do not reach, texts of attributes and data sets that have no chunks, `seal` adds up in one SHA-256 that
+`require` compares on opening. Files without the sum, of earlier versions and of others, open as they are.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.files import FileError, reading, whole
+
 if TYPE_CHECKING:
     import h5py
+
+SEAL = "sha256"  # the attribute of a file
+LIBVER = ("v110", "v110")  # HDF5 1.10, of 2016, on: from there all metadata carry checksums, indices of chunks as well
+_CHUNK_BYTES = 2**20  # HDF5's default chunk cache
+_HEAP = b"GCOL\1\0\0\0"  # begins a collection of texts in HDF5
+# of dimension scales: references, which no reader of ours follows
+_SCALES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS"}
 
 
 class ForgivingFile:
@@ -80,8 +101,104 @@ def new_file(path: Path) -> Iterator[h5py.File]:
 
     disk = ForgivingFile(path)
     try:
-        with h5py.File(disk, "w", libver=("earliest", "v110")) as file:
+        with h5py.File(disk, "w", libver=LIBVER) as file:
             yield file
     finally:
         disk.close()
     disk.check()
+
+
+@contextlib.contextmanager
+def open_hdf5(path: Path, kind: str = "an HDF5 file") -> Iterator[h5py.File]:
+    """An HDF5 file, sealed or not; read its data sets with `whole`."""
+    import h5py
+
+    with reading(path, kind):
+        check_heaps(path)
+        with h5py.File(path, "r") as file:
+            require(file, path)
+            yield file
+
+
+def check_heaps(path: Path) -> None:
+    """Raise ValueError for a damaged heap of texts in an HDF5 file, over which the library would loop without an end.
+
+    A collection is a signature, its size, and objects of (index, ..., size); the step over an object of index 0, free
+    space, is its size (HDF5 File Format Specification 3.0, III.E). Looked for in the first 64 MiB.
+    """
+    with open(path, "rb") as stream:
+        content = stream.read(2**26)
+    start = content.find(_HEAP)
+    while start >= 0:
+        at, end = start + 16, start + int.from_bytes(content[start + 8 : start + 16], "little")
+        while at + 16 <= min(end, len(content)):
+            index, size = (
+                int.from_bytes(content[at : at + 2], "little"),
+                int.from_bytes(content[at + 8 : at + 16], "little"),
+            )
+            if index == 0 and size < 16:
+                raise ValueError(f"{path}: is damaged: the heap of its texts at byte {at} does not end")
+            at += size if index == 0 else 16 + (size + 7) // 8 * 8
+        start = content.find(_HEAP, start + 8)
+
+
+def with_checksums(shape: tuple[int, ...], dtype: Any) -> dict[str, Any]:
+    """Arguments of ``create_dataset`` for data with checksums, in chunks of about 1 MiB of whole rows."""
+    if not math.prod(shape):
+        return {}
+    chunk, nbytes = [1] * len(shape), np.dtype(dtype).itemsize
+    for axis in reversed(range(len(shape))):
+        chunk[axis] = max(1, min(shape[axis], _CHUNK_BYTES // nbytes))
+        nbytes *= chunk[axis]
+    return {"chunks": tuple(chunk), "fletcher32": True} if shape else {}
+
+
+def seal(file: h5py.File) -> None:
+    """Add the sum over all that the checksums of chunks do not reach; nothing may change afterwards."""
+    file.attrs[SEAL] = _sum(file, lambda data: np.asarray(data[...]))
+
+
+def require(file: h5py.File, path: Path) -> None:
+    """Raise FileError where a file that is sealed is not as it was written."""
+    if SEAL not in file.attrs:
+        return
+    try:
+        same = file.attrs[SEAL] == _sum(file, whole)
+    except Exception as error:
+        with reading(path, "HDF5"):
+            raise error
+    if not same:
+        raise FileError(f"{path} is damaged: its attributes or variables are not as they were written")
+
+
+def _sum(file: h5py.File, read: Callable[[Any], NDArray[Any]]) -> str:
+    total = hashlib.sha256()
+
+    def add(node: Any) -> None:
+        attrs = {name: _plain(node.attrs[name]) for name in node.attrs if name not in _SCALES | {SEAL}}
+        told: list[Any] = [node.name, attrs]
+        if hasattr(node, "shape"):
+            told += [str(node.dtype), node.shape, node.chunks, node.fletcher32]
+            if not node.fletcher32:
+                values = read(node)
+                if node.dtype.hasobject:
+                    told.append(_plain(values))
+                else:
+                    total.update(np.ascontiguousarray(values).data)
+        total.update(json.dumps(told, sort_keys=True, default=repr).encode())
+
+    add(file)
+    for node in _nodes(file):
+        add(node)
+    return total.hexdigest()
+
+
+def _nodes(file: h5py.File) -> list[Any]:
+    names: list[str] = []
+    file.visit(names.append)
+    return [file[name] for name in sorted(names)]
+
+
+def _plain(value: Any) -> Any:
+    """For JSON; the type matters too."""
+    return [str(value.dtype), value.tolist()] if isinstance(value, np.ndarray | np.generic) else value

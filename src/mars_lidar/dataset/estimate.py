@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.threads import thread_count
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import MAPS, histogram_array, histogram_blocks
@@ -68,6 +69,7 @@ class Estimate:
     problems: tuple[Problem, ...]
 
 
+@checked
 def estimate(
     recipe: DatasetRecipe | dict[str, Any] | str | Path,
     out: str | Path | None = None,
@@ -80,6 +82,10 @@ def estimate(
     Arguments are those of `mars_lidar.generate`.
     """
 
+    team = thread_count(threads)
+    parent = None if out is None else Path(out).absolute().parent
+    if parent is not None and not parent.is_dir():
+        raise FileNotFoundError(f"out must lie in an existing folder, got {str(out)!r}")
     plan, folder = read_recipe(recipe)
     assert plan is not None
     found, problems = candidates(plan.scenes, folder)
@@ -94,7 +100,6 @@ def estimate(
     dense = math.prod(shape) * dtype.itemsize
     pixels = math.prod(image)
     maps = 4 * len(MAPS) * pixels * total + sum(map(_scene_bytes, looked)) // len(looked) * number
-    team = thread_count(threads or None)
     parts = max(one.waveform_parts(system) for one in looked for system in plan.systems)
     block = making_bytes(chunk, dtype.itemsize, parts)
     shards = math.prod(math.ceil(a / b) for a, b in zip(shape, shard, strict=True))
@@ -104,7 +109,7 @@ def estimate(
         shape=shape,
         dense_bytes=dense,
         bytes=int(dense * ratio) + maps,
-        free_bytes=None if out is None else shutil.disk_usage(Path(out).absolute().parent).free,
+        free_bytes=None if parent is None else shutil.disk_usage(parent).free,
         seconds=seconds * math.prod(shape[1:4]) * total / team + each_s * len(found),
         threads=team,
         memory_bytes=_BASE_BYTES + teams * (2 * block + 5 * 2**24) + 16 * pixels * 64,  # chunks, and shards of maps

@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import TemporarySibling
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
 from mars_lidar.dataset.network_keys import Exposure, check_size, psf, pulse_in_bins
 from mars_lidar.dataset.samples import sample_parts
@@ -87,13 +89,14 @@ class Exported:
     notes: tuple[str, ...]
 
 
+@checked
 def export(
     dataset: Dataset | str | Path,
     out: str | Path,
     *,
     layout: str,
     fill: bool = False,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Exported:
     """Write every exposure of a dataset as a file that a network's loader reads.
 
@@ -109,7 +112,7 @@ def export(
         Give pixels without a return the depth, bin and rates of the nearest pixel with one. Otherwise their bin is 0,
         and loaders that divide rates by their sum make NaN of them.
     progress
-        Called as ``progress(done, total)`` after each exposure.
+        Called as ``progress(done, total)`` after each exposure; True: a bar.
 
     Raises
     ------
@@ -118,6 +121,7 @@ def export(
     OSError
         `out` has something in it, or cannot be written.
     """
+    told = shown(progress, "exporting")
     source = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     chosen = LAYOUTS[checks.choice("layout", layout, tuple(LAYOUTS))]
     folder = Path(out)
@@ -160,8 +164,8 @@ def export(
             if entry not in listed:
                 listed.append(entry)
             written += 1
-            if progress is not None:
-                progress(written, samples * realizations)
+            if told is not None:
+                told(written, samples * realizations)
     (folder / "list.txt").write_text("".join(f"{entry}\n" for entry in listed))
     if chosen.pictures:
         (folder / "blacklist.txt").write_text("")

@@ -12,9 +12,11 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.dataset.store import Dataset, open_dataset
 
 
+@checked
 def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0) -> scipy.sparse.coo_array:
     """One exposure as a sparse matrix: pixel y W + x in rows, bins in columns.
 

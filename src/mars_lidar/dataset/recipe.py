@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.yaml import Key, RecipeError, located, read_yaml
 from mars_lidar.dataset import values
 from mars_lidar.dataset.light import Light, plain_levels, read_light, refuse_for_transients
@@ -97,6 +98,7 @@ class DatasetRecipe:
         return json.dumps(self.to_dict())
 
     @classmethod
+    @checked
     def from_dict(cls, data: Any, folder: Path | None = None) -> DatasetRecipe:
         """The recipe of plain data; files that it names are relative to `folder`.
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
@@ -59,6 +60,7 @@ class Generated:
     seconds: float
 
 
+@checked
 def generate(
     recipe: DatasetRecipe | dict[str, Any] | str | Path | None,
     out: str | Path,

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks, manifest
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, IncompleteFileError, reading
 from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
 from mars_lidar.dataset.recipe import DatasetRecipe
@@ -217,6 +218,7 @@ def is_dataset(path: str | Path) -> bool:
         return False
 
 
+@checked
 def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset:
     """Open a dataset that `mars_lidar.generate` wrote.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mars_lidar._base import checks, manifest
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import FileError, reading
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
@@ -43,6 +44,7 @@ class Verified:
         return not self.different
 
 
+@checked
 def verify(
     path: str | Path,
     *,
@@ -78,7 +80,7 @@ def verify(
         threads = checks.integer("threads", threads, low=1, high=1024)
     random = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     chosen = np.arange(total) if number == total else np.sort(random.choice(total, number, replace=False))
-    maker = Maker(dataset, thread_count(threads or None))
+    maker = Maker(dataset, thread_count(threads))
     with reading(dataset.path, "a dataset of mars-lidar"):
         different = [*manifest.damage(dataset.path), *_labels(dataset)]
     for k, flat in enumerate(chosen):

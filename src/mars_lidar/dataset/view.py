@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.yaml import Key, Lines, RecipeError, located, read_yaml
 from mars_lidar.dataset.light import read_light, refuse_for_transients
 from mars_lidar.dataset.scene_entries import read_scene
@@ -32,6 +33,7 @@ class View:
     source: str
 
 
+@checked
 def read_view(scene: dict[str, Any] | str | Path, system: System, *, whole: bool = True, **replaced: Any) -> View:
     """The one scene that a description means, lit under `system`.
 

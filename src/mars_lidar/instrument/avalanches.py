@@ -172,7 +172,7 @@ class Crosstalk:
         if isinstance(self.kernel, str):
             checks.choice("kernel of crosstalk", self.kernel, tuple(_KERNELS))
             return
-        weights = np.asarray(self.kernel)
+        weights = np.asarray(checks.numbers("kernel of crosstalk", self.kernel))
         if weights.shape != (3, 3) or weights.dtype.kind not in "fiu":
             raise ValueError(
                 f"kernel of crosstalk must be '4', '8' or 3 x 3 weights, got shape {weights.shape} of {weights.dtype}"

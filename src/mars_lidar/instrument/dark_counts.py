@@ -36,7 +36,7 @@ def dark_count_map(
     seed
         Integer in [0, 2**64).
     """
-    if len(shape) != 2:
+    if not isinstance(shape, tuple | list) or len(shape) != 2:
         raise ValueError(f"shape must be (H, W), got {shape!r}")
     size = tuple(checks.integer("shape", n, low=1, high=2**20) for n in shape)
     median = checks.real("median_hz", median_hz, low=0.0)

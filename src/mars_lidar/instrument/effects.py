@@ -77,7 +77,7 @@ def _instance(name: str, value: Any, of: type) -> Any:
 
 
 def _code_density(value: Any) -> tuple[float, ...]:
-    widths = np.asarray(value)
+    widths = np.asarray(checks.numbers("code_density", checks.unmasked("code_density", value)))
     if widths.dtype.kind not in "fiu" or widths.ndim != 1 or not 2 <= widths.size <= _MAX_CODES:
         raise ValueError(
             f"code_density must be 2 to {_MAX_CODES} relative widths of TDC codes (n,), got shape {widths.shape} "

@@ -170,7 +170,7 @@ class SampledPulse(Pulse):
     _bytes: bytes
 
     def __init__(self, values: ArrayLike, bin_ns: float, origin: str = "peak") -> None:
-        samples = np.array(checks.unmasked("values", values), dtype=np.float64)
+        samples = np.array(checks.numbers("values", checks.unmasked("values", values)), dtype=np.float64)
         if samples.ndim != 1 or samples.size == 0:
             raise ValueError(f"values must be a 1-D array of at least one sample, got shape {samples.shape}")
         bad = ~np.isfinite(samples) | (samples < 0)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import check_claim, reading
 from mars_lidar._base.notebook import as_html
@@ -133,10 +134,12 @@ class System:
         """Centres of the histogram bins (bins,), ns."""
         return (np.arange(self.bins, dtype=np.float64) + 0.5) * self.bin_ns
 
+    @checked
     def delay_ns(self, depth_m: ArrayLike) -> NDArray[np.float64]:
         """Round-trip time 2 z / c of depths (...) in m, in ns, not wrapped."""
         return 2.0 / SPEED_OF_LIGHT_M_PER_NS * np.asarray(depth_m, dtype=np.float64)
 
+    @checked
     def depth_m(self, delay_ns: ArrayLike) -> NDArray[np.float64]:
         """Depth c tau / 2 of delays (...) in ns, in m."""
         return 0.5 * SPEED_OF_LIGHT_M_PER_NS * np.asarray(delay_ns, dtype=np.float64)
@@ -196,10 +199,16 @@ class System:
         return json.dumps(self.to_dict())
 
     @classmethod
+    @checked
     def from_json(cls, text: str) -> System:
         """The system that `to_json` wrote."""
-        return cls.from_dict(json.loads(text))
+        try:
+            document = json.loads(text)
+        except ValueError as error:
+            raise ValueError(f"text must be the JSON of a system, got {text[:60]!r} ({error})") from None
+        return cls.from_dict(document)
 
+    @checked
     def save(self, path: str | Path) -> None:
         """Write to a ``.json``, ``.yaml`` or ``.yml`` file."""
         target = Path(path)
@@ -213,6 +222,7 @@ class System:
             raise ValueError(f"path must end in .json, .yaml or .yml, got {str(path)!r}")
 
     @classmethod
+    @checked
     def load(cls, path: str | Path) -> System:
         """Read what `save` wrote; an error names the file, the line and the key."""
         source = Path(path)

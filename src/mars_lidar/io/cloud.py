@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import TemporarySibling, check_target
 from mars_lidar._base.types import FloatArray
 
 
+@checked
 def points(depth_m: ArrayLike, focal_px: float) -> FloatArray:
     """Points (H, W, 3), m, of ranges (H, W), m: x to the right, y down, z forward; NaN where the range is.
 
@@ -39,6 +41,7 @@ def points(depth_m: ArrayLike, focal_px: float) -> FloatArray:
     return np.asarray(ray * depth[..., None])
 
 
+@checked
 def save_cloud(
     path: str | Path,
     depth_m: ArrayLike,

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import Progress
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save
 from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
@@ -33,6 +34,7 @@ class Converted:
     lost: tuple[str, ...]
 
 
+@checked
 def convert(
     source: str | Path,
     target: str | Path,
@@ -87,6 +89,7 @@ def convert(
         return _cube(cube, old, new, realization, overwrite)
 
 
+@checked
 def photons(
     cube: Cube,
     *,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import (
     INCOMPLETE_SUFFIX,
@@ -159,6 +160,7 @@ def _opened_again(path: Path, incomplete: bool) -> Cube:
     return load(path, allow_incomplete=incomplete)
 
 
+@checked
 def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
     """Write a cube to a ``.zarr``, ``.h5``, ``.hdf5``, ``.npz``, ``.mat`` or ``.ptu``.
 
@@ -190,6 +192,7 @@ def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
         raise
 
 
+@checked
 def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     """Open a cube; its counts stay on disk until they are indexed.
 

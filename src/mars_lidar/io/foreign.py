@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import check_claim, open_hdf5, open_npz, read_mat5, read_npy, reading, whole
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.files import check_claim, open_npz, read_mat5, read_npy, reading, whole
+from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
@@ -60,6 +62,7 @@ class ForeignCounts:
             raise ValueError(f"{self.path}: {error}") from error
 
 
+@checked
 def foreign_cube(
     path: str | Path,
     system: System,
@@ -111,7 +114,7 @@ def read_counts(
     name, array = _chosen(source, arrays(source) if told_by is None else told_by.arrays, variable)
     if isinstance(array, np.ndarray) and array.dtype == object:
         return ForeignCounts(source, name, None, array, "")
-    told = axes or _guessed(source, array.shape, bins)
+    told = _guessed(source, array.shape, bins) if axes is None else axes
     try:
         return ForeignCounts(source, name, in_order(array, told, image), None, told, told_by)
     except (ValueError, TypeError) as error:

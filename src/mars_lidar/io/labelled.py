@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mars_lidar._base.arguments import checked_with_masks
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.cube import Cube
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 _OF_A_RUN = ("engine", "engine_settings", "seed", "first_realization", "source")
 
 
+@checked_with_masks
 def to_xarray(
     cube: Cube | ArrayLike,
     system: System | None = None,

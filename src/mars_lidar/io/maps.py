@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
-from mars_lidar._base.files import TemporarySibling, check_target, open_hdf5, open_npz, reading, whole
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.files import TemporarySibling, check_target, open_npz, reading, whole
+from mars_lidar._base.hdf5 import new_file, open_hdf5, seal, with_checksums
 from mars_lidar.instrument.system import System
 
 FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
@@ -80,6 +82,7 @@ def check_maps_output(path: str | Path, *, overwrite: bool = False) -> None:
     check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
 
 
+@checked
 def save_maps(path: str | Path, results: Mapping[str, Maps], *, source: str = "", overwrite: bool = False) -> Path:
     """Write reconstructions (realizations, H, W) of one cube, by method; the file is whole or not there at all."""
     target = Path(path)
@@ -100,6 +103,7 @@ def save_maps(path: str | Path, results: Mapping[str, Maps], *, source: str = ""
     return target
 
 
+@checked
 def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Variables by name, and attributes, of a file of `save_maps`. ``xarray.open_zarr`` opens a .zarr as well."""
     source = Path(path)
@@ -227,14 +231,13 @@ def _write_npz(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any
 
 
 def _write_hdf5(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
-    from mars_lidar._base.hdf5 import new_file
-
     with new_file(path) as file:
         file.attrs.update(attrs)
         for name, (dims, data, more) in variables.items():
             if data.dtype.kind == "U":
                 data = np.char.encode(data)
             packed = {"compression": "gzip", "shuffle": True} if data.ndim > 1 else {}
+            packed |= with_checksums(data.shape, data.dtype)
             stored = file.create_dataset(name, data=data, **packed)
             stored.attrs.update(more)
             for k, dim in enumerate(dims):
@@ -246,3 +249,4 @@ def _write_hdf5(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, An
             if name not in scales:
                 for k, dim in enumerate(dims):
                     file[name].dims[k].attach_scale(file[dim])
+        seal(file)

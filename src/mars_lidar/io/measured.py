@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
@@ -20,6 +21,7 @@ _AXES = {1: "t", 2: "(yx)t", 3: "yxt", 4: "nyxt"}  # by the number of dimensions
 _WHOLE = 1e-3  # share of a bin by which a start may miss a whole number of bins
 
 
+@checked_with_masks
 def from_histograms(
     counts: ArrayLike,
     system: System,
@@ -81,6 +83,7 @@ def from_histograms(
     return Cube(histogram=whole, recipe=recording, registrations=int(whole.sum(dtype=np.uint64)))
 
 
+@checked
 def from_photon_times(
     cells: Any, system: System, *, unit_ns: float = 1.0, start_ns: float = 0.0, source: str = ""
 ) -> Cube:
@@ -110,7 +113,7 @@ def from_photon_times(
     unit = checks.real("unit_ns", unit_ns, low=0.0, strict_low=True)
     start = checks.real("start_ns", start_ns)
     image = _cells(cells)
-    times = [np.asarray(cell, np.float64).ravel() for cell in image.ravel()]
+    times = [np.asarray(checks.numbers("cells", cell), np.float64).ravel() for cell in image.ravel()]
     raw = np.concatenate([np.empty(0), *times])
     bad = ~(np.isfinite(raw) & (raw >= 0))
     if bad.any():
@@ -136,7 +139,9 @@ def in_order(counts: Any, axes: str | None, image: tuple[int, int] | None) -> ND
     array = np.asarray(counts)
     if array.dtype.kind not in "iuf":
         raise TypeError(f"counts must be an array of numbers, got {array.dtype}")
-    told = _AXES.get(array.ndim, "") if axes is None else axes
+    if axes is None and array.ndim not in _AXES:
+        raise ValueError(f"counts must be (t,), (pixels, t), (y, x, t) or (n, y, x, t), got shape {array.shape}")
+    told = _AXES[array.ndim] if axes is None else axes
     names = re.findall(r"\((?:yx|xy)\)|[nyxt]", told)
     letters = "".join(names).translate({40: None, 41: None})
     if "".join(names) != told or len(set(letters)) != len(letters) or "t" not in letters:
@@ -204,8 +209,11 @@ def _check_counts(counts: NDArray[Any], most: float, system: System) -> None:
 
 def _cells(cells: Any) -> NDArray[Any]:
     """(H, W) of arrays of times."""
+    checks.unmasked("cells", cells)
     array = cells if isinstance(cells, np.ndarray) else np.empty(0)
     if not isinstance(cells, np.ndarray):
+        if not isinstance(cells, list | tuple):
+            raise TypeError(f"cells must be (H, W) of arrays of times, got {type(cells).__name__}")
         rows = list(cells)
         if all(isinstance(cell, Real) for cell in rows):
             return _cells(np.asarray(rows, np.float64))

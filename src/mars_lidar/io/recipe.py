@@ -113,6 +113,16 @@ class Recording(_Blocks):
 
     first_realization: ClassVar[int] = 0
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.system, System):
+            raise TypeError(f"system must be a System, got {self.system!r}")
+        if not isinstance(self.pixels, tuple) or len(self.pixels) != 2:
+            raise TypeError(f"pixels must be (H, W), got {self.pixels!r}")
+        for size in self.pixels:
+            checks.integer("pixels", size, low=1, high=2**32)
+        checks.integer("realizations", self.realizations, low=1, high=2**32)
+        _require_text("source", self.source)
+
     @property
     def image(self) -> tuple[int, int]:
         """(H, W)."""
@@ -176,12 +186,16 @@ class Recipe(_Blocks):
             object.__setattr__(self, name, number)
         if not isinstance(self.engine, str):
             raise TypeError(f"engine must be the name of an engine, got {self.engine!r}")
+        _require_text("source", self.source)
+        for name in ("options", "settings"):
+            if not isinstance(getattr(self, name), dict):
+                raise TypeError(f"{name} must be a dictionary, got {getattr(self, name)!r}")
         depth = self.system.depth_m(self.flux.delay_ns) if self.depth_m is None else self.depth_m
         object.__setattr__(self, "depth_m", self._map("depth_m", depth))
         if self.reflectivity is not None:
             object.__setattr__(self, "reflectivity", self._map("reflectivity", self.reflectivity))
         if self.pixel_index is not None:
-            index = np.ascontiguousarray(self.pixel_index)
+            index = np.ascontiguousarray(checks.numbers("pixel_index", self.pixel_index))
             pixels = math.prod(self.flux.shape)
             if index.dtype.kind not in "iu" or index.size != pixels:
                 raise ValueError(
@@ -191,7 +205,7 @@ class Recipe(_Blocks):
             object.__setattr__(self, "pixel_index", index.astype(np.int64).ravel())
 
     def _map(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.asarray(checks.numbers(name, checks.unmasked(name, value)), dtype=np.float64)
         if array.shape != self.flux.shape:
             raise ValueError(f"{name} must have the flux's shape {self.flux.shape}, got {array.shape}")
         return array
@@ -233,3 +247,8 @@ class Recipe(_Blocks):
     def replace(self, **changes: Any) -> Recipe:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+
+def _require_text(name: str, value: Any) -> None:
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be a text, got {value!r}")

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_claim, reading
 from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
@@ -55,6 +57,7 @@ class Problem:
         return self.reason if self.reason.startswith(str(self.path)) else f"{self.path}: {self.reason}"
 
 
+@checked
 def scan(
     folder: str | Path,
     *,
@@ -101,6 +104,9 @@ def scan(
     ValueError, TypeError
         A folder or manifest that does not exist, a manifest without a column ``depth``, or a bad argument.
     """
+    for name, value in (("depth_unit_m", depth_unit_m), ("focal_px", focal_px)):
+        if value is not None:
+            checks.real(name, value, low=0.0, strict_low=True)
     root = Path(folder)
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks, manifest
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import WriteError as WriteError
 from mars_lidar._base.files import reason
 from mars_lidar._base.progress import shown
@@ -61,6 +62,7 @@ class Interrupted(KeyboardInterrupt):
     """Ctrl-C during `simulate_to`; its text says what is left on disk."""
 
 
+@checked
 def simulate_to(
     path: str | Path,
     flux: Flux,
@@ -179,6 +181,7 @@ def simulate_to(
     return Written(target, registrations, simulate_s, write_s, report)
 
 
+@checked
 def regenerate(
     cube: Cube | Recipe,
     *,
@@ -216,6 +219,7 @@ def regenerate(
     return _simulate(recipe, parts[0], parts[1], threads, None)
 
 
+@checked
 def verify(
     cube: Cube, *, threads: int | None = None, progress: Progress | bool | None = None, table: Table | None = None
 ) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_target, reading
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import mat
@@ -44,6 +45,7 @@ class SpadMat:
     photons: float
 
 
+@checked
 def read_mat(path: str | Path) -> SpadMat:
     """Read a file of this layout, of mars-lidar or of others.
 
@@ -84,6 +86,7 @@ def _spad(source: Path, found: dict[str, Any]) -> SpadMat:
     )
 
 
+@checked
 def save_mat(
     path: str | Path,
     cube: Cube,

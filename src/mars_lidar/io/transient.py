@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import check_claim, open_hdf5, open_npz, read_mat5, read_npy, reading
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.files import check_claim, open_npz, read_mat5, read_npy, reading
+from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.light.transient import Transient
 
@@ -19,6 +21,7 @@ _T_SX_SY = 1  # tal.enums.HFormat (github.com/diegoroyo/tal)
 _TAL_FORMATS = {0: "UNKNOWN", 1: "T_Sx_Sy", 2: "T_Lx_Ly_Sx_Sy", 3: "T_Si", 4: "T_Li_Si"}
 
 
+@checked
 def read_transient(
     path: str | Path,
     *,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray
@@ -66,6 +67,7 @@ class Flux:
     waveform: FloatArray | None
     info: dict[str, Any]
 
+    @checked_with_masks
     def __init__(
         self,
         signal: ArrayLike | None = None,
@@ -135,6 +137,7 @@ class Flux:
         flux: Flux = rendered.flux(system, **level)
         return flux
 
+    @checked
     def detected(self, system: System) -> Flux:
         """The photons that avalanches follow: times `Detector.detection_efficiency`, plus `Detector.dark_count_hz`.
 
@@ -153,6 +156,7 @@ class Flux:
         delay = np.ascontiguousarray(self.returns_delay_ns.reshape(-1, pixels)) / period_ns
         return np.nan_to_num(delay - np.floor(delay), nan=0.0)
 
+    @checked
     def with_dark_counts(self, rate_hz: ArrayLike, system: System) -> Flux:
         """This flux with dark counts at `rate_hz`, counts/s: scalar or (H, W), such as `dark_count_map` draws.
 
@@ -175,6 +179,7 @@ class Flux:
         _fill(flux, self.returns_signal * share, self.returns_delay_ns, background, wave, self.info)
         return flux
 
+    @checked
     def in_fog(
         self,
         system: System,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
 
 MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
@@ -58,7 +59,7 @@ def broadcast(names: Sequence[str], maps: Sequence[FloatArray]) -> list[FloatArr
 
 def waveform_maps(waveform: ArrayLike, background: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Waveforms (H, W, T) and background (H, W)."""
-    wave = np.asarray(waveform)
+    wave = np.asarray(checks.unmasked("waveform", waveform))
     if wave.dtype.kind not in "fiub":
         raise TypeError(f"waveform must be real numbers, got dtype {wave.dtype}")
     if wave.ndim not in (1, 2, 3) or wave.size == 0:

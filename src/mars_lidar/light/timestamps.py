@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 
@@ -98,6 +99,7 @@ class Timestamps:
     def _repr_html_(self) -> str:
         return as_html(self, {"photons": np.diff(self.offsets).reshape(self.shape)})
 
+    @checked
     def save(self, path: str | Path, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
         """Write to a ``.npz`` (exact), ``.ptu`` or ``.h5`` / ``.hdf5`` (Photon-HDF5); see docs/formats.md.
 
@@ -119,6 +121,7 @@ class Timestamps:
         late("io.streams.files:save")(path, self, overwrite=overwrite, clock_ps=clock_ps)
 
     @classmethod
+    @checked
     def load(
         cls,
         path: str | Path,
@@ -155,6 +158,7 @@ class Timestamps:
     def pixel(self, y: int, x: int) -> Timestamps:
         """The registrations of one pixel, as views."""
         h, w = self.shape
+        y, x = checks.integer("y", y, low=-(2**31), high=2**31), checks.integer("x", x, low=-(2**31), high=2**31)
         if not (-h <= y < h and -w <= x < w):
             raise IndexError(f"pixel ({y}, {x}) is outside of an image of {h} x {w}")
         k = (y % h) * w + x % w

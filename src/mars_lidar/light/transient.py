@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.resample import new_size, window
 from mars_lidar._base.types import FloatArray
@@ -49,6 +50,7 @@ class Transient:
         (H, W), sums over all bins, where they are known already: else the values are read once for them.
     """
 
+    @checked
     def __init__(
         self,
         values: RateArray | ArrayLike,
@@ -60,7 +62,8 @@ class Transient:
     ) -> None:
         self.bin_ns = checks.real("bin_ns", bin_ns, low=0.0, strict_low=True)
         self.start_ns = checks.real("start_ns", start_ns)
-        rates: Any = values if hasattr(values, "shape") else np.asarray(values)
+        rates: Any = values if hasattr(values, "shape") else np.asarray(checks.numbers("values", values))
+        checks.unmasked("values", values)
         if len(rates.shape) != 3 or 0 in rates.shape:
             raise ValueError(f"values must be (H, W, T) with at least one bin, got shape {tuple(rates.shape)}")
         self.values: RateArray = rates
@@ -85,6 +88,7 @@ class Transient:
         rows, columns = window("transient", key, self.shape)
         return self._with(CroppedRates(self.values, rows, columns))
 
+    @checked
     def resize(self, size: int | tuple[int, int]) -> Transient:
         """At another size, (H, W) or the longer side: mean light over the area of the new pixels; nothing is read."""
         return self._with(ResizedRates(self.values, new_size(size, self.shape)))
@@ -110,6 +114,7 @@ class Transient:
         width = self.shape[1]
         return np.arange(first * width, last * width, dtype=np.int64)
 
+    @checked
     def flux(
         self,
         system: System,
@@ -200,6 +205,7 @@ class Transient:
         }
         return Flux(waveform=waveform, background=background, info=info)
 
+    @checked
     def stored_flux(
         self,
         system: System,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import require_effects
@@ -42,6 +43,7 @@ class HistogramBound:
     __repr__ = brief
 
 
+@checked
 def cramer_rao(
     signal: ArrayLike, background: ArrayLike, system: System, *, delay_ns: ArrayLike, threads: int | None = None
 ) -> HistogramBound:

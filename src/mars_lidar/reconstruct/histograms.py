@@ -42,7 +42,7 @@ def checked(
         raise TypeError(f"system must be a System, got {type(system).__name__}")
     team = thread_count(threads)
     progress = shown(progress, "reconstructing")
-    counts = np.asarray(checks.unmasked("cube", cube))
+    counts = np.asarray(checks.even_rows("cube", checks.unmasked("cube", cube)))
     if counts.dtype.kind in "OUS":
         raise TypeError(f"cube must be an array of counts (of a loaded cube its histogram), got {type(cube).__name__}")
     if counts.ndim == 0 or counts.shape[-1] != system.bins or counts.size == 0:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.files import reading
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
@@ -51,6 +52,7 @@ class Scene:
     reflectivity: FloatArray
     background: FloatArray | None
 
+    @checked_with_masks
     def __init__(self, depth_m: ArrayLike, reflectivity: ArrayLike, background: ArrayLike | None = None) -> None:
         depth = _numbers("depth_m", depth_m)
         if depth.ndim != 2 or depth.size == 0:
@@ -125,6 +127,7 @@ class Scene:
         scene._fill(depth(self.depth_m), image(self.reflectivity), background)
         return scene
 
+    @checked
     def flux(
         self,
         system: System,
@@ -220,6 +223,7 @@ class Scene:
         return cls(*room(shape, seed))
 
     @classmethod
+    @checked
     def from_rgbd(
         cls,
         depth_path: str | Path,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.notebook import as_html
@@ -35,6 +36,7 @@ _CELLS = (2**13, 2**15, 2**16)  # of a histogram of more than MANY_BINS, tried i
 _BLOCK = 64  # windows solved at a time
 
 
+@checked
 def joint_law(
     signal: float | None,
     background: float,

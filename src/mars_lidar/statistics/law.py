@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
@@ -130,6 +131,7 @@ class CountLaw:
         return f"CountLaw(method={self.method!r}, mean {self.mean:.6g}, variance {self.variance:.6g})"
 
 
+@checked
 def count_law(
     signal: ArrayLike | None,
     background: ArrayLike,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
@@ -25,6 +26,7 @@ from mars_lidar.statistics.timing import recorded
 _SHAPES = ("exposure", "stationary", "chain")
 
 
+@checked
 def registration_pdf(
     signal: ArrayLike | None,
     background: ArrayLike,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
@@ -158,6 +159,7 @@ class HoldingTimeCovariance:
         return values, weights * self._unit
 
 
+@checked
 def holding_time_covariance(
     signal: float | None,
     background: float,

@@ -43,7 +43,7 @@ def axis_values(name: str, grid: Grid) -> FloatArray:
         if not high > low:
             raise ValueError(f"{name} must be (low, high, points) with high > low, got {grid!r}")
         return np.concatenate([[0.0], np.geomspace(low, high, points)])
-    values = np.array(grid)
+    values = np.array(checks.numbers(name, checks.unmasked(name, grid)))
     if values.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be (low, high, points) or real numbers, got dtype {values.dtype}")
     if values.ndim != 1 or not 1 <= values.size <= MAX_POINTS:

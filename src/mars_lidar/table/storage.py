@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import TemporarySibling, check_target, open_hdf5, reading, whole
+from mars_lidar._base.files import TemporarySibling, check_target, reading, whole
+from mars_lidar._base.hdf5 import new_file, open_hdf5, seal
 from mars_lidar.instrument.system import System
 from mars_lidar.table.entries import Entries
 from mars_lidar.table.node_laws import NodeLaws
@@ -25,8 +26,6 @@ _READABLE = (1, FORMAT)  # the first kept no laws of entries
 
 def save(table: Nodes, path: Path, *, overwrite: bool) -> None:
     """Write all of a table; the file gets its name when it is complete."""
-    from mars_lidar._base.hdf5 import new_file
-
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
     check_target(path, folder=False, overwrite=overwrite)
@@ -35,6 +34,7 @@ def save(table: Nodes, path: Path, *, overwrite: bool) -> None:
             file.attrs[name] = value
         for name, array in _arrays(table).items():
             file.create_dataset(name, data=array)
+        seal(file)
 
 
 def load(make: type[N], path: Path, system: System | None) -> N:

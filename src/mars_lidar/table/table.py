@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import Rearm
@@ -47,6 +48,7 @@ class Table(Nodes):
     """
 
     @classmethod
+    @checked
     def build(
         cls,
         system: System,
@@ -140,11 +142,13 @@ class Table(Nodes):
         """
         return law_error(self, samples, seed, cycles, threads)
 
+    @checked
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
         save(self, Path(path), overwrite=overwrite)
 
     @classmethod
+    @checked
     def load(cls, path: str | Path, system: System | None = None) -> Table:
         """The table of a file, for `system` (None: for the one it was made for); shapes stay in the file, mapped.
 
@@ -157,6 +161,7 @@ class Table(Nodes):
         return load(cls, Path(path), system)
 
     @classmethod
+    @checked
     def cached(
         cls,
         system: System,

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import check_claim, open_hdf5
+from mars_lidar._base.files import check_claim
+from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar.io.rgbd.pixels import describe
 
 

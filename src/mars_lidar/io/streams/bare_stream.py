@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import open_hdf5, open_npz, read_mat5, whole
+from mars_lidar._base.files import open_npz, read_mat5, whole
+from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar.io.streams.photons import NoLaserError, Photons
 from mars_lidar.light.timestamps import Timestamps
 

@@ -126,7 +126,9 @@ def _read_bare(
 
         return bare_stream.read(source, period_ns, bins, unit_ns, variable)
     if not (period_ns is None and bins is None and unit_ns is None and variable is None):
-        raise ValueError(f"{source} tells its period and bins: period_ns and bins are for the streams of others")
+        raise ValueError(
+            f"{source} tells all of itself: period_ns, bins, unit_ns and variable are for the streams of others"
+        )
     return _read_npz(source)
 
 

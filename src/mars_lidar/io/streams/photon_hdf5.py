@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import INCOMPLETE_SUFFIX, open_hdf5, whole
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, whole
+from mars_lidar._base.hdf5 import open_hdf5, seal
 from mars_lidar._base.optional import needed
 from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
@@ -91,7 +92,11 @@ def write(path: Path, times: Timestamps) -> None:
         with warnings.catch_warnings(), open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
             warnings.simplefilter("ignore")  # of PyTables, about names that are no Python identifiers
             save_photon_hdf5(
-                content, str(path), overwrite=True, warnings=False, compression={"complevel": 1, "complib": "zlib"}
+                content,
+                str(path),
+                overwrite=True,
+                warnings=False,
+                compression={"complevel": 1, "complib": "zlib", "fletcher32": True},
             )
     except Exception as error:  # on a full disk PyTables tells a back trace, or phconvert that the file is wrong
         told = re.search(r"errno = (\d+)", str(error))
@@ -102,7 +107,7 @@ def write(path: Path, times: Timestamps) -> None:
         file = content.get("_data_file")
         if file is not None and file.isopen:
             file.close()
-    _rename(path, path.with_name(path.name.removesuffix(INCOMPLETE_SUFFIX)))
+    _name_and_seal(path, path.with_name(path.name.removesuffix(INCOMPLETE_SUFFIX)))
 
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
@@ -159,8 +164,8 @@ def is_stream(path: Path) -> bool:
         return _PHOTONS in file
 
 
-def _rename(path: Path, target: Path) -> None:
-    """Put the name that the file will have where phconvert put the one that it has now."""
+def _name_and_seal(path: Path, target: Path) -> None:
+    """Put the name that the file will have where phconvert put the one that it has now, and the sum over all."""
     import h5py
 
     with h5py.File(path, "r+") as file:
@@ -172,6 +177,7 @@ def _rename(path: Path, target: Path) -> None:
             del file[place]
             file[place] = np.bytes_(value.encode())
             file[place].attrs.update(labels)
+        seal(file)
 
 
 def _tcspc_unit(file: Any) -> float:

@@ -1,0 +1,110 @@
+"""HDF5 that we write carries checksums: no flipped bit changes what is read, and files without them open as before."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar._base.files import FileError
+from mars_lidar._base.hdf5 import SEAL, with_checksums
+from mars_lidar.io.maps import save_maps
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
+)
+
+
+@pytest.fixture
+def files(tmp_path) -> dict[str, Path]:
+    flux = ml.Flux(np.linspace(0.1, 1.0, 24).reshape(4, 6), 0.1, 40.0)
+    io.simulate_to(tmp_path / "cube.h5", flux, SYSTEM)
+    found = ml.reconstruct(np.asarray(io.load(tmp_path / "cube.h5").histogram), SYSTEM, "peak")
+    save_maps(tmp_path / "maps.h5", {"peak": found})
+    ml.Table.build(SYSTEM, signal=(0.1, 1, 2), background=(0.1, 1, 2)).save(tmp_path / "table.h5")
+    return {path.name: path for path in tmp_path.glob("*.h5")}
+
+
+def test_every_array_has_a_checksum(files):
+    for name in ("cube.h5", "maps.h5"):
+        with h5py.File(files[name]) as file:
+            assert len(file) > 6
+            assert all(data.fletcher32 for data in file.values())
+    for path in files.values():
+        with h5py.File(path) as file:
+            assert len(file.attrs[SEAL]) == 64
+
+
+def test_photon_hdf5_has_checksums(tmp_path):
+    pytest.importorskip("phconvert")
+    times = ml.simulate_timestamps(ml.Flux(np.ones((2, 3)), 0.1, 40.0), SYSTEM)
+    times.save(tmp_path / "photons.h5")
+    with h5py.File(tmp_path / "photons.h5") as file:
+        assert all(file[f"photon_data/{name}"].fletcher32 for name in ("timestamps", "detectors", "nanotimes"))
+    with h5py.File(tmp_path / "photons.h5", "r+") as file:
+        file["photon_data/timestamps_specs/timestamps_unit"][()] = 1.0
+    with pytest.raises(FileError, match=r"photons\.h5 is damaged: its attributes or variables are not as they were"):
+        ml.Timestamps.load(tmp_path / "photons.h5")
+
+
+def test_a_changed_number_is_refused(files):
+    """By the checksum of its chunk: the bytes are changed in the file, behind HDF5's back."""
+    with h5py.File(files["cube.h5"]) as file:
+        place = file["histogram"].id.get_chunk_info(0)
+        depth = file["signal"].id.get_chunk_info(0)
+    for found, read in ((place, lambda cube: cube.histogram[0]), (depth, lambda cube: cube.flux.signal)):
+        content = bytearray(files["cube.h5"].read_bytes())
+        content[found.byte_offset + found.size // 2] ^= 4
+        files["cube.h5"].write_bytes(content)
+        with pytest.raises(FileError, match=r"cube\.h5"):
+            read(io.load(files["cube.h5"]))
+        content[found.byte_offset + found.size // 2] ^= 4
+        files["cube.h5"].write_bytes(content)
+    with io.load(files["cube.h5"]) as cube:
+        assert cube.histogram[0].sum() == cube.registrations
+
+
+def test_what_is_mapped_into_memory_is_checked_too(files):
+    with h5py.File(files["table.h5"]) as file:
+        at = file["shape"].id.get_offset() + file["shape"].nbytes // 2
+    content = bytearray(files["table.h5"].read_bytes())
+    content[at] ^= 1
+    files["table.h5"].write_bytes(content)
+    with pytest.raises(FileError, match=r"table\.h5 is damaged"):
+        ml.Table.load(files["table.h5"])
+
+
+def test_a_changed_text_is_refused(files):
+    """Texts of attributes lie in a heap that has no checksum of HDF5's own."""
+    content = files["cube.h5"].read_bytes()
+    assert content.count(b'"period_ns": 100.0') == 1
+    files["cube.h5"].write_bytes(content.replace(b'"period_ns": 100.0', b'"period_ns": 101.0'))
+    with pytest.raises(FileError, match=r"cube\.h5 is damaged: its attributes or variables"):
+        io.load(files["cube.h5"])
+
+
+def test_files_of_earlier_versions_open_as_before(tmp_path):
+    with zipfile.ZipFile(Path(__file__).parents[1] / "data" / "files_of_0.1.0.zip") as archive:
+        archive.extractall(tmp_path)
+    found = sorted(tmp_path.rglob("*.h5"))
+    assert found
+    for path in found:
+        with h5py.File(path) as file:
+            assert SEAL not in file.attrs
+    with io.load(tmp_path / "cube.h5") as cube:
+        assert np.asarray(cube.histogram).sum() == cube.registrations
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (3,), (5, 0), (7, 9), (300, 400, 500), (2, 3_000_000)])
+def test_chunks_fit_their_array_and_hdf5s_cache(shape):
+    given = with_checksums(shape, np.float64)
+    if not shape or 0 in shape:
+        assert given == {}
+        return
+    assert all(1 <= part <= whole for part, whole in zip(given["chunks"], shape, strict=True))
+    assert 8 * np.prod(given["chunks"]) <= 2**20

@@ -1,0 +1,341 @@
+"""Wrong calls: every argument of every public function, by its signature, is refused by its name.
+
+A value that does no harm, or that means something, stands in `ACCEPTED` with the reason. The good calls are below; what
+is wrong for an argument follows from its annotation.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import functools
+import inspect
+import itertools
+import math
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mars_lidar as ml
+from mars_lidar import io
+from mars_lidar.dataset import DatasetRecipe, estimate, export, open_dataset, read_sparse, read_view, verify
+from mars_lidar.io.maps import load_maps, save_maps
+
+SYSTEM = ml.System(
+    period_ns=100.0, cycles=20, bins=16, pulse=ml.GaussianPulse(sigma_ns=2.0), detector=ml.Detector(dead_time_ns=30.0)
+)
+FLUX = ml.Flux(np.full((2, 3), 0.5), 0.1, 40.0)
+SCENE = ml.Scene(np.full((2, 3), 2.0), np.full((2, 3), 0.5))
+NUMBERS = itertools.count()
+RECIPE = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": 0.5}}
+
+
+@functools.cache
+def times() -> ml.Timestamps:
+    return ml.simulate_timestamps(ml.Flux(0.05, 0.02, 40.0), SYSTEM.replace(cycles=100_000))
+
+
+@functools.cache
+def counts() -> np.ndarray:
+    return ml.simulate(FLUX, SYSTEM)
+
+
+@functools.cache
+def table() -> ml.Table:
+    return ml.Table.build(SYSTEM, signal=(0.1, 1, 2), background=(0.1, 1, 2))
+
+
+@functools.cache
+def calibration() -> ml.Calibration:
+    return ml.calibrate(times())
+
+
+def cube() -> io.Cube:
+    return io.from_histograms(counts(), SYSTEM)
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("wrong")
+    io.simulate_to(folder / "cube.zarr", FLUX, SYSTEM)
+    ml.generate(RECIPE, folder / "set.zarr")
+    times().save(folder / "photons.npz")
+    table().save(folder / "table.h5")
+    np.save(folder / "light.npy", np.random.default_rng(1).random((2, 3, 50)))
+    np.save(folder / "counts.npy", counts()[0])
+    io.save_mat(folder / "a.mat", io.load(folder / "cube.zarr"))
+    np.save(folder / "depth.npy", np.full((2, 3), 2.0))
+    SYSTEM.save(folder / "system.yaml")
+    save_maps(folder / "maps.npz", {"peak": ml.reconstruct(counts(), SYSTEM, "peak")})
+    (folder / "scene.yaml").write_text("depth: depth.npy\nlight: {signal: 1, sbr: 2}\n")
+    return folder
+
+
+def transient() -> io.Transient:
+    return io.Transient(np.ones((2, 3, 8)), 5.0)
+
+
+# name: what is called, and good arguments by name (those it needs; others have their defaults)
+CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = {
+    "System": lambda _: (
+        ml.System,
+        {"period_ns": 100.0, "cycles": 5, "bins": 8, "pulse": SYSTEM.pulse, "detector": SYSTEM.detector},
+    ),
+    "System.from_dict": lambda _: (ml.System.from_dict, {"data": SYSTEM.to_dict()}),
+    "System.from_json": lambda _: (ml.System.from_json, {"text": SYSTEM.to_json()}),
+    "System.load": lambda at: (ml.System.load, {"path": at / "system.yaml"}),
+    "System.save": lambda at: (SYSTEM.save, {"path": at / "a.yaml"}),
+    "System.delay_ns": lambda _: (SYSTEM.delay_ns, {"depth_m": 1.0}),
+    "System.depth_m": lambda _: (SYSTEM.depth_m, {"delay_ns": 1.0}),
+    "Detector": lambda _: (ml.Detector, {"dead_time_ns": 5.0}),
+    "Detector.preset": lambda _: (ml.Detector.preset, {"name": "excelitas-spcm-aqrh"}),
+    "Detector.from_dict": lambda _: (ml.Detector.from_dict, {"data": {"dead_time_ns": 5.0}}),
+    "GaussianPulse": lambda _: (ml.GaussianPulse, {"sigma_ns": 1.0}),
+    "GaussianPulse.from_fwhm": lambda _: (ml.GaussianPulse.from_fwhm, {"fwhm_ns": 1.0}),
+    "SampledPulse": lambda _: (ml.SampledPulse, {"values": [1.0, 2.0, 1.0], "bin_ns": 0.5}),
+    "Jitter": lambda _: (ml.Jitter, {"sigma_ns": 0.1}),
+    "Jitter.from_fwhm": lambda _: (ml.Jitter.from_fwhm, {"fwhm_ns": 0.1}),
+    "SampledJitter": lambda _: (ml.SampledJitter, {"values": (1.0, 2.0, 1.0), "bin_ns": 0.5}),
+    "Afterpulsing": lambda _: (ml.Afterpulsing, {"probability": 0.01, "delay_ns": 50.0}),
+    "Crosstalk": lambda _: (ml.Crosstalk, {"probability": 0.01}),
+    "dark_count_map": lambda _: (ml.dark_count_map, {"shape": (2, 3), "median_hz": 100.0}),
+    "Flux": lambda _: (ml.Flux, {"signal": 0.5, "background": 0.1, "delay_ns": 40.0}),
+    "Flux waveform": lambda _: (ml.Flux, {"waveform": np.full(8, 0.1)}),
+    "Flux.from_transient": lambda _: (
+        ml.Flux.from_transient,
+        {"values": np.ones((2, 3, 8)), "system": SYSTEM, "bin_ns": 5.0, "signal": 0.5},
+    ),
+    "Flux.detected": lambda _: (FLUX.detected, {"system": SYSTEM}),
+    "Flux.with_dark_counts": lambda _: (FLUX.with_dark_counts, {"rate_hz": 100.0, "system": SYSTEM}),
+    "Flux.in_fog": lambda _: (FLUX.in_fog, {"system": SYSTEM, "extinction_per_m": 0.01, "backscatter": 0.01}),
+    "Scene": lambda _: (ml.Scene, {"depth_m": np.ones((2, 3)), "reflectivity": 0.5 * np.ones((2, 3))}),
+    "Scene.resize": lambda _: (SCENE.resize, {"size": (4, 6)}),
+    "Scene.example": lambda _: (ml.Scene.example, {"size": 4}),
+    "Scene.flux": lambda _: (SCENE.flux, {"system": SYSTEM, "signal": 0.5, "sbr": 2.0}),
+    "Scene.from_rgbd": lambda at: (ml.Scene.from_rgbd, {"depth_path": at / "depth.npy"}),
+    "simulate": lambda _: (ml.simulate, {"flux": FLUX, "system": SYSTEM}),
+    "simulate_timestamps": lambda _: (ml.simulate_timestamps, {"flux": FLUX, "system": SYSTEM}),
+    "reconstruct": lambda _: (ml.reconstruct, {"cube": counts(), "system": SYSTEM}),
+    "cramer_rao": lambda _: (
+        ml.cramer_rao,
+        {"signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
+    ),
+    **{
+        call.__name__: lambda _, call=call: (
+            call,
+            {"signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
+        )
+        for call in (ml.count_law, ml.registration_pdf, ml.joint_law)
+    },
+    "holding_time_covariance": lambda _: (
+        ml.holding_time_covariance,
+        {"signal": 0.5, "background": 0.1, "system": SYSTEM, "delay_ns": 40.0},
+    ),
+    "Table.build": lambda _: (
+        ml.Table.build,
+        {"system": SYSTEM, "signal": (0.1, 1, 2), "background": (0.1, 1, 2)},
+    ),
+    "Table.quantisation_error": lambda _: (table().quantisation_error, {"samples": 3}),
+    "Table.law_error": lambda _: (table().law_error, {"samples": 2}),
+    "Table.save": lambda at: (table().save, {"path": at / "b.h5", "overwrite": True}),
+    "Table.load": lambda at: (ml.Table.load, {"path": at / "table.h5"}),
+    "calibrate": lambda _: (ml.calibrate, {"times": times()}),
+    "validate": lambda _: (
+        ml.validate,
+        {"times": times(), "calibration": calibration(), "cycles": 100, "simulated": 200},
+    ),
+    "Timestamps.save": lambda at: (times().save, {"path": at / "b.npz", "overwrite": True}),
+    "Timestamps.load": lambda at: (ml.Timestamps.load, {"path": at / "photons.npz"}),
+    "Timestamps.pixel": lambda _: (times().pixel, {"y": 0, "x": 0}),
+    "to_xarray": lambda _: (ml.to_xarray, {"cube": counts(), "system": SYSTEM, "flux": FLUX}),
+    "generate": lambda at: (ml.generate, {"recipe": RECIPE, "out": at / f"g{next(NUMBERS)}.zarr"}),
+    "estimate": lambda _: (estimate, {"recipe": RECIPE}),
+    "export": lambda at: (
+        export,
+        {"dataset": at / "set.zarr", "out": at / f"exported{next(NUMBERS)}", "layout": "sun"},
+    ),
+    "open_dataset": lambda at: (open_dataset, {"path": at / "set.zarr"}),
+    "dataset.verify": lambda at: (verify, {"path": at / "set.zarr"}),
+    "read_sparse": lambda at: (read_sparse, {"dataset": at / "set.zarr", "sample": 0}),
+    "read_view": lambda at: (read_view, {"scene": at / "scene.yaml", "system": SYSTEM}),
+    "DatasetRecipe.from_dict": lambda _: (DatasetRecipe.from_dict, {"data": RECIPE}),
+    "io.load": lambda at: (io.load, {"path": at / "cube.zarr"}),
+    "io.save": lambda at: (io.save, {"path": at / "c.npz", "cube": cube(), "overwrite": True}),
+    "io.simulate_to": lambda at: (
+        io.simulate_to,
+        {"path": at / "d.npz", "flux": FLUX, "system": SYSTEM, "overwrite": True},
+    ),
+    "io.from_histograms": lambda _: (io.from_histograms, {"counts": counts(), "system": SYSTEM}),
+    "io.from_photon_times": lambda _: (
+        io.from_photon_times,
+        {"cells": [[np.array([1.0, 2.0]), np.array([3.0])]], "system": SYSTEM},
+    ),
+    "io.convert": lambda at: (
+        io.convert,
+        {"source": at / "cube.zarr", "target": at / "e.npz", "overwrite": True},
+    ),
+    "io.foreign_cube": lambda at: (io.foreign_cube, {"path": at / "counts.npy", "system": SYSTEM}),
+    "io.points": lambda _: (io.points, {"depth_m": np.ones((2, 3)), "focal_px": 100.0}),
+    "io.save_cloud": lambda at: (
+        io.save_cloud,
+        {"path": at / "a.ply", "depth_m": np.ones((2, 3)), "focal_px": 100.0, "overwrite": True},
+    ),
+    "io.read_transient": lambda at: (io.read_transient, {"path": at / "light.npy", "bin_ns": 1.0}),
+    "io.read_mat": lambda at: (io.read_mat, {"path": at / "a.mat"}),
+    "io.save_mat": lambda at: (
+        io.save_mat,
+        {"path": at / "a.mat", "cube": io.load(at / "cube.zarr"), "overwrite": True},
+    ),
+    "io.scan": lambda at: (io.scan, {"folder": at}),
+    "io.photons": lambda at: (io.photons, {"cube": io.load(at / "cube.zarr")}),
+    "io.regenerate": lambda at: (io.regenerate, {"cube": io.load(at / "cube.zarr")}),
+    "io.verify": lambda at: (io.verify, {"cube": io.load(at / "cube.zarr")}),
+    "io.Transient": lambda _: (io.Transient, {"values": np.ones((2, 3, 8)), "bin_ns": 5.0}),
+    "io.Transient.flux": lambda _: (transient().flux, {"system": SYSTEM, "signal": 0.5}),
+    "io.Transient.resize": lambda _: (transient().resize, {"size": (4, 6)}),
+    "io.Recipe": lambda _: (io.Recipe, {"system": SYSTEM, "flux": FLUX}),
+    "io.Recording": lambda _: (io.Recording, {"system": SYSTEM, "pixels": (2, 3)}),
+    "io.SceneFile.load": lambda at: (io.SceneFile(depth=at / "depth.npy").load, {}),
+    "load_maps": lambda at: (load_maps, {"path": at / "maps.npz"}),
+}
+
+NAN, INF = math.nan, math.inf
+MASKED = np.ma.MaskedArray([1.0, 2.0], mask=[True, False])
+NUMBER = {"text": "1 ns", "None": None, "bool": True, "complex": 1j, "nan": NAN, "-inf": -INF, "empty": [], "-1": -1}
+INTEGER = {"text": "3", "None": None, "bool": True, "complex": 1j, "nan": NAN, "half": 1.5, "empty": [], "-1": -1}
+INTEGER |= {"huge": 2**70}
+ARRAY = {"text": "abc", "complex": 1j, "nan": NAN, "-inf": -INF, "empty": np.empty((0, 3)), "masked": MASKED}
+ARRAY |= {"objects": np.array([object()]), "shape": np.ones((1, 2, 3, 4, 5)), "-1": -1.0, "ragged": [[1.0], [1.0, 2.0]]}
+TEXT = {"other": "no such thing", "None": None, "number": 3, "empty": "", "list": ["a"]}
+PATH = {"None": None, "number": 3.5, "missing": "/no such folder/a.xyz", "null": "a\0b.npz", "list": [], "empty": ""}
+OBJECT = {"None": None, "number": 3.5, "text": "abc", "dict": {"a": 1}, "list": []}
+SIZES = {
+    "text": "4x6",
+    "None": None,
+    "negative": (-1, 2),
+    "three": (1, 2, 3),
+    "nan": (NAN, 2),
+    "zero": 0,
+    "huge": 2**40,
+}
+PROGRESS = {"number": 5, "text": "yes"}
+
+
+def wrong(annotation: str) -> dict[str, Any]:
+    """Values that an argument of this annotation cannot take, by what they are."""
+    optional = "None" in annotation
+    kinds = [
+        (r"bool'?$", {}),  # flags are taken by their truth, as everywhere in Python
+        (r"^Progress", PROGRESS),
+        (r"Path", PATH),
+        (r"int \| tuple|tuple\[int", SIZES),
+        (r"ArrayLike|NDArray|tuple\[float|Grid|Any", ARRAY),
+        (r"^float", NUMBER),
+        (r"^int", INTEGER),
+        (r"^str|^Literal|Method|Rearm|Interpolation|Mode|axes", TEXT),
+    ]
+    values = next((values for pattern, values in kinds if re.search(pattern, annotation)), OBJECT)
+    return {label: value for label, value in values.items() if not (optional and value is None)}
+
+
+# (call, argument, what is wrong): why it is taken. A star stands for any.
+ACCEPTED: dict[tuple[str, str, str], str] = {
+    ("System.*", "d*", "*"): "a unit is converted, of an array of any shape; NaN is no return",
+    ("*", "delay_ns", "-1"): "light that comes before the pulse comes in the period before: delays are cyclic",
+    ("*", "start_ns", "-1"): "times may begin before the pulse",
+    ("cramer_rao", "*", "shape"): "of an image of any shape",
+    ("count_law", "*", "shape"): "of an image of any shape",
+    ("registration_pdf", "*", "shape"): "of an image of any shape",
+    ("simulate", "report", "dict"): "a dictionary is what it should be",
+    ("Timestamps.pixel", "*", "-1"): "from the end, as everywhere in Python",
+    ("DatasetRecipe.from_dict", "folder", "missing"): "only looked into for files that the recipe names",
+    ("*", "source", "other"): "free text",
+    ("*", "source", "empty"): "free text",
+    ("io.Recipe", "engine", "*"): "engines of others are found by their names when the recipe is simulated",
+    ("io.foreign_cube", "variable", "empty"): "the array of a .npy has no name",
+    ("io.points", "depth_m", "empty"): "no pixel, no point",
+    ("io.save_cloud", "depth_m", "empty"): "no pixel, no point",
+    ("io.scan", "pattern", "other"): "matches no file, and no scene is found",
+}
+# What the error calls an argument that has another name in the signature.
+SAYS = {
+    ("System.from_dict", "data"): "system",
+    ("Detector.from_dict", "data"): "detector",
+    ("DatasetRecipe.from_dict", "data"): "recipe",
+    ("Detector.preset", "name"): "preset",
+    ("to_xarray", "cube"): "counts",
+}
+# Public names that hold results or are raised: people get them, and do not call them.
+RESULTS = {
+    *("Calibration", "CountLaw", "Generated", "JointLaw", "Lookup", "Pulse", "QuantisationError", "Reconstruction"),
+    *("Table", "Timestamps", "UnitWarning", "Validation", "__version__", "to_xarray"),  # the last is io's too
+    *("io.Converted", "io.Cube", "io.IncompleteFileError", "io.Interrupted", "io.MissingLibraryError", "io.Problem"),
+    *("io.SUFFIXES", "io.SceneFile", "io.SpadMat", "io.WriteError", "io.Written"),
+}
+
+
+def accepted(call: str, argument: str, label: str) -> bool:
+    return any(
+        all(fnmatch.fnmatch(got, want) for want, got in zip(entry, (call, argument, label), strict=True))
+        for entry in ACCEPTED
+    )
+
+
+def names(error: BaseException, argument: str, value: Any) -> bool:
+    """Whether an error is one that a caller expects, and says which argument it is about, or which text."""
+    if not isinstance(error, TypeError | ValueError | OSError | MemoryError | IndexError):
+        return False
+    text = str(error)
+    mentioned = isinstance(value, str) and value != "" and repr(value)[1:-1] in text
+    return mentioned or bool(re.search(rf"\b{re.escape(argument)}\b", text))
+
+
+@functools.cache
+def outcomes(name: str, here: Path) -> list[tuple[str, str, str]]:
+    """(argument and what is wrong with it, outcome, what was told) for each wrong call of one function."""
+    found = []
+    for argument, parameter in inspect.signature(CALLS[name](here)[0]).parameters.items():
+        if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            continue
+        for label, value in wrong(str(parameter.annotation)).items():
+            call, good = CALLS[name](here)
+            where, kind, told = f"{argument}: {label}", "taken", ""
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    call(**good | {argument: value})
+            except Exception as error:
+                said = {argument, SAYS.get((name, argument), argument)}
+                kind = "refused" if any(names(error, word, value) for word in said) else "unnamed"
+                told = f"{type(error).__name__}: {error}"
+            if kind == "taken" and accepted(name, argument, label):
+                kind = "documented"
+            found.append((where, kind, told))
+    return found
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_wrong_arguments_are_refused_by_name(here, name):
+    call, good = CALLS[name](here)
+    call(**good)  # what is refused below is refused for the one argument
+    found = outcomes(name, here)
+    assert found
+    assert not [one for one in found if one[1] in ("taken", "unnamed")]
+
+
+def test_every_public_name_is_called():
+    public = {*ml.__all__, *(f"io.{name}" for name in io.__all__)}
+    called = {name.split(" ")[0] for name in CALLS} | {"io.to_xarray"}
+    assert public - called == RESULTS - called
+
+
+def test_what_is_documented_as_taken_is_taken(here):
+    """An entry that nothing needs any more is removed."""
+    found = [(name, where) for name in CALLS for where, kind, _ in outcomes(name, here) if kind == "documented"]
+    for call, argument, label in ACCEPTED:
+        wanted = (call, f"{argument}: {label}")
+        assert any(all(map(fnmatch.fnmatch, one, wanted)) for one in found), wanted

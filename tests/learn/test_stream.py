@@ -7,6 +7,7 @@ import math
 import pickle
 import sys
 import threading
+import warnings
 
 import numpy as np
 import pytest
@@ -61,7 +62,7 @@ def assert_same(first, second):
 @pytest.mark.parametrize("workers", [1, 2, 4])
 @pytest.mark.parametrize("settings", [{}, {"dtype": None}, {"layout": "sparse"}])
 def test_batches_do_not_depend_on_workers(workers, settings):
-    dataset = stream(batch_size=4, **settings)
+    dataset = stream(batch_size=4, repeat=True, **settings)
     alone = list(dataset)
     assert len(alone) == len(dataset) == 6
     together = list(loader(dataset, workers, batch_size=None))
@@ -75,7 +76,7 @@ def test_batches_do_not_depend_on_workers(workers, settings):
 
 @pytest.mark.filterwarnings("ignore:This DataLoader will create")
 def test_single_samples_are_those_of_the_batches():
-    dataset = stream()
+    dataset = stream(repeat=True)
     alone = list(dataset)
     assert [int(one["index"]) for one in alone] == list(range(22))
     for workers in (0, 2, 4):
@@ -95,6 +96,104 @@ def test_epochs_seeds_and_threads_differ_or_not_as_they_should():
         assert not torch.equal(first["cube"], one["cube"])
         assert int(one["seed"]) != int(first["seed"])
     assert_same(first, next(iter(other.__class__(SYSTEMS, size=6, seed=3))))  # without end: the same samples
+
+
+def indices(examples) -> list[list[int]]:
+    return [one["index"].reshape(-1).tolist() + one["seed"].reshape(-1).tolist() for one in examples]
+
+
+def passes(dataset, number: int) -> list[list[list[int]]]:
+    """What the first epochs of a stream give, each set by hand."""
+    found = []
+    for epoch in range(number):
+        dataset.set_epoch(epoch)
+        found.append(indices(dataset))
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.parametrize("lives_on", [False, True])
+@pytest.mark.parametrize("workers", [0, 1, 3])
+def test_epochs_advance_by_themselves(workers, lives_on):
+    wanted = passes(stream(batch_size=3), 5)
+    assert len({str(one) for one in wanted}) == 5
+    dataset = stream(batch_size=3)
+    made = loader(dataset, workers, batch_size=None, persistent_workers=lives_on and workers > 0)
+    assert dataset.epoch == 0
+    for epoch in range(3):
+        torch.manual_seed(0)  # loaders draw the seeds of their workers from it: the same in every pass
+        assert indices(made) == wanted[epoch]
+        assert dataset.epoch == epoch
+    next(iter(made))  # one that is broken off is a pass
+    if not lives_on:  # workers that live on still have it in their queues
+        assert indices(made) == wanted[4]
+    dataset.set_epoch(1)
+    assert dataset.epoch == 1
+    assert indices(made) == wanted[1]
+    assert indices(made) == wanted[2]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_validation_repeats_its_epoch(workers):
+    wanted = passes(stream(batch_size=3), 3)
+    dataset = stream(batch_size=3, repeat=True)
+    made = loader(dataset, workers, batch_size=None)
+    assert [indices(made), indices(made)] == [wanted[0]] * 2
+    dataset.set_epoch(2)
+    assert [indices(made), indices(made)] == [wanted[2]] * 2
+
+
+def test_the_parent_of_workers_does_not_know_where_they_are():
+    dataset = stream(batch_size=3)
+    taken = iter(loader(dataset, 2, batch_size=None))
+    next(taken)
+    with pytest.raises(ValueError, match="batches must be given"):
+        dataset.state_dict()
+    assert dataset.state_dict(batches=1) == {"seed": 3, "epoch": 0, "start": 3}
+    del taken
+    dataset.set_epoch(1)
+    assert dataset.state_dict() == {"seed": 3, "epoch": 1, "start": 0}
+    with pytest.raises(ValueError, match="with 2 workers, this one has no"):
+        dataset.load_state_dict({"seed": 3, "epoch": 0, "start": 0, "given": 1, "workers": 2})
+
+
+@pytest.mark.parametrize(("batch_size", "told"), [(3, "stacks the batches"), (None, "worker by worker")])
+def test_a_loader_that_stacks_is_warned_of(batch_size, told):
+    with pytest.warns(UserWarning, match=told):
+        next(iter(loader(stream(batch_size=batch_size), 0, batch_size=2)))
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
+@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")  # which torchdata calls
+@pytest.mark.parametrize("at", [0, 4, 8], ids=["before", "within", "at the end"])
+@pytest.mark.parametrize("workers", [0, 2, 4])
+def test_stateful_loaders_resume_exactly(workers, at):
+    stateful = pytest.importorskip("torchdata.stateful_dataloader")
+    context = ("fork" if sys.platform == "linux" else "spawn") if workers else None
+
+    def make():
+        dataset = stream(batch_size=3)
+        return stateful.StatefulDataLoader(
+            dataset, batch_size=None, num_workers=workers, multiprocessing_context=context
+        )
+
+    wanted = passes(stream(batch_size=3), 4)
+    assert len(wanted[1]) == 8
+    first = make()
+    assert indices(first) == wanted[0]
+    begun = iter(first)
+    taken = indices(itertools.islice(begun, at))
+    if at == 8:
+        assert next(begun, None) is None
+    state = pickle.loads(pickle.dumps(first.state_dict()))
+    assert taken == wanted[1][:at]
+    del begun, first
+    again = make()
+    again.load_state_dict(state)
+    if at < 8:
+        assert indices(again) == wanted[1][at:]
+    assert indices(again) == wanted[2]
+    assert indices(again) == wanted[3]
 
 
 def test_workers_that_live_on_hear_of_epochs():
@@ -288,7 +387,7 @@ def test_maps_of_a_dataset_are_scenes(tmp_path):
     scenes = {"example": "room", "size": [6, 8], "seeds": [0, 1, 2]}
     ml.generate({"scenes": scenes, "systems": [SYSTEM.replace(bins=16)], "light": light}, tmp_path / "set.zarr")
     maps = ml.dataset.open_dataset(tmp_path / "set.zarr").maps
-    dataset = stream(SYSTEMS, tmp_path / "set.zarr", epoch_size=6, flips=False, size=None)
+    dataset = stream(SYSTEMS, tmp_path / "set.zarr", epoch_size=6, flips=False, size=None, repeat=True)
     alone = list(dataset)
     depths = sorted(float(one[0, 0]) for one in maps["depth"][:])
     assert sorted(float(one["depth"][0, 0]) for one in alone[:3]) == pytest.approx(depths, rel=1e-6)
@@ -338,7 +437,7 @@ def test_ranks_of_torchrun(monkeypatch):
 
 
 def test_buffers_are_not_given_out_while_they_are_held():
-    dataset = stream(SYSTEM, batch_size=2, epoch_size=40)
+    dataset = stream(SYSTEM, batch_size=2, epoch_size=40, repeat=True)
     held = [one["cube"][0] for one in dataset]  # a view keeps the memory
     copies = [one["cube"][0].clone() for one in dataset]
     assert len({one.data_ptr() for one in held}) == len(held)
@@ -359,7 +458,7 @@ def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
 
     As PyTorch sees them they are ordinary tensors, also where the loader stacks them, and after a transform.
     """
-    dataset = stream(SYSTEM, epoch_size=40, **settings)
+    dataset = stream(SYSTEM, epoch_size=40, repeat=True, **settings)
     held = [(one["cube"][..., :3].numpy(), one) for one in loader(dataset, 2, batch_size=None)]
     for (part, one), alone in zip(held, dataset, strict=True):
         assert type(one["cube"]) is torch.Tensor
@@ -372,7 +471,9 @@ def test_what_workers_pass_on_is_not_overwritten_while_it_is_held(settings):
     for (part, rest), alone in zip(changed, stream(SYSTEM, epoch_size=4), strict=True):
         assert torch.equal(part, alone["cube"][:32])
         assert float(rest["own"]) == float(alone["cube"].sum())
-    stacked = list(loader(stream(SYSTEM, epoch_size=4), 2, batch_size=2))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "this loader puts batches together worker by worker")
+        stacked = list(loader(stream(SYSTEM, epoch_size=4), 2, batch_size=2))
     assert sorted(stacked[0]["index"].tolist() + stacked[1]["index"].tolist()) == [0, 1, 2, 3]
     assert type(stacked[0]["cube"]) is torch.Tensor
     assert stacked[0]["cube"].shape == (2, 64, 6, 6)

@@ -19,6 +19,7 @@ from mars_lidar.learn.ahead import ahead as made_ahead
 from mars_lidar.learn.cubes import CubeMaker
 from mars_lidar.learn.distributed import rank_of, worker_of
 from mars_lidar.learn.needed import torch
+from mars_lidar.learn.passes import Passes, warn_if_put_together
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
 from mars_lidar.learn.sample import Recipe, Sample, maps_of, numbers_of
 from mars_lidar.learn.scenes import as_source
@@ -88,6 +89,9 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     ahead
         Examples that a background thread simulates while the last one is in use, without workers and on the CPU;
         0: none. Another process would cost a copy of every cube, this costs none.
+    repeat
+        False: every pass is the next epoch, as a training wants it. True: every pass is the same one, as a validation
+        does.
     transform
         Called on each example; what it returns is given out.
     rank, world_size
@@ -125,6 +129,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         seed: int = 0,
         threads: int | None = None,
         ahead: int = 1,
+        repeat: bool = False,
         transform: Callable[[dict[str, Any]], Any] | None = None,
         rank: int | None = None,
         world_size: int | None = None,
@@ -157,10 +162,13 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         self._maker = CubeMaker(find_engine(engine), drawn.corners(), device, layout, axes, dtype)
         self._transform = transform
         self._rank, self._world = rank_of(rank, world_size)
-        # epoch and first sample: in shared memory, so that workers that live on through epochs see them change
-        self._state = torch.zeros(2, dtype=torch.int64)
-        self._state.share_memory_()  # type: ignore[no-untyped-call]
-        self._given = 0
+        self._repeat = bool(repeat)
+        self._passes = Passes()
+        self._given, self._pass_start = (
+            0,
+            0,
+        )  # batches of the pass that were given here, and in a worker those of the others before them
+        self._joined: tuple[int, int, int] | None = None  # epoch, first sample, batches given: of a pass to go on with
 
     def __repr__(self) -> str:
         told = {"size": self._recipe.size, "epoch_size": self._size, "batch_size": self._batch}
@@ -170,39 +178,72 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
     def set_epoch(self, epoch: int, start: int = 0) -> None:
         """Choose the epoch of the next pass, and its first sample: the one before which an earlier run stopped.
 
-        Without it each pass gives the same epoch again. After n batches a loader has given samples up to
-        ``n * batch_size * world_size``; from there the batches of the rest are those of a run that did not stop.
+        Without it the first pass is epoch 0 and each gives the next one; with ``repeat=True`` all give the same. After
+        n batches a loader has given samples up to ``n * batch_size * world_size``; from there the batches of the rest
+        are those of a run that did not stop.
         """
         number = checks.integer("epoch", epoch, low=0, high=_LAST)
         most = _LAST if self._size is None else self._size
-        self._state[1] = checks.integer("start", start, low=0, high=most)
-        self._state[0], self._given = number, 0
+        self._passes.begin_at(number, checks.integer("start", start, low=0, high=most))
+        self._given, self._pass_start, self._joined = 0, start, None
 
     @property
     def epoch(self) -> int:
-        """Number of the next pass, or of the one that is going on."""
-        return int(self._state[0])
+        """Number of the pass that began last; before any, of the first."""
+        first, _ = self._passes.first
+        return first if self._repeat else first + max(self._passes.begun - 1, 0)
 
     def state_dict(self, batches: int | None = None) -> dict[str, int]:
         """Where the pass stands, for `load_state_dict`.
 
+        torchdata's ``StatefulDataLoader`` asks for it in each of its workers, and resumes exactly with any number of
+        them. The parent of a plain loader's workers does not know how far the pass has gone: they run ahead.
+
         Parameters
         ----------
         batches
-            Examples taken from a loader with workers, since the last `set_epoch` or `load_state_dict`: only the
-            caller knows that number. None: counted here, right without workers.
+            Examples taken from a plain loader with workers since the pass began: only the caller knows that number.
+            None: counted here, without workers.
+
+        Raises
+        ------
+        ValueError
+            Without `batches` in the parent of workers.
         """
+        if torch.utils.data.get_worker_info() is not None:
+            _, workers = worker_of()
+            state = {"seed": self._recipe.seed, "epoch": self.epoch, "start": self._pass_start}
+            return state | {"given": self._given, "workers": workers}
+        if batches is None and self._passes.by_workers:
+            raise ValueError(
+                "batches must be given: workers of a loader made the pass, and only its caller knows how many batches "
+                "were taken; or use torchdata's StatefulDataLoader, whose own state_dict knows"
+            )
         given = self._given if batches is None else checks.integer("batches", batches, low=0, high=_LAST)
-        start = int(self._state[1]) + given * (self._batch or 1) * self._world
+        start = (self._pass_start if batches is None else self._passes.start) + given * (self._batch or 1) * self._world
         if self._size is not None:
             start = min(start, self._size)
         return {"seed": self._recipe.seed, "epoch": self.epoch, "start": start}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where `state_dict` was taken; the settings must be the same."""
+        """Go on where `state_dict` was taken; the settings must be the same.
+
+        A pass that was at its end then gives nothing more, and the one after it is the next epoch.
+        """
         if state["seed"] != self._recipe.seed:
             raise ValueError(f"the state is of a stream with seed {state['seed']}, this one has {self._recipe.seed}")
-        self.set_epoch(state["epoch"], state["start"])
+        _, workers = worker_of()
+        in_worker = torch.utils.data.get_worker_info() is not None
+        if in_worker != ("workers" in state) or state.get("workers", workers) != workers:
+            raise ValueError(
+                f"the state is of a loader with {state.get('workers', 'no')} workers, this one has "
+                f"{workers if in_worker else 'no'} workers"
+            )
+        if in_worker:
+            self._passes.join(state["epoch"], state["start"])
+            self._joined = state["epoch"], state["start"], state["given"]
+        else:
+            self.set_epoch(state["epoch"], state["start"])
 
     def sample(self, index: int) -> Sample:
         """Scene, Flux, System and seed of a sample of this epoch, not simulated."""
@@ -213,23 +254,36 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         """Examples of one pass on this rank, all workers together."""
         if self._size is None:
             raise TypeError("a stream without end has no length; give epoch_size")
-        return math.ceil((self._size - int(self._state[1])) // self._world / (self._batch or 1))
+        return math.ceil((self._size - self._passes.start) // self._world / (self._batch or 1))
 
     def __iter__(self) -> Iterator[Any]:
-        epoch, start = self._state.tolist()
         worker, workers = worker_of()
         in_worker = torch.utils.data.get_worker_info() is not None
         if in_worker and self._maker.on_gpu:
             raise ValueError("device='cuda' simulates in the process of the loader: use num_workers=0")
+        warn_if_put_together(self._batch is not None)
+        if self._joined is None:
+            before, start = self._passes.begin(worker)
+            epoch, given = self._passes.first[0] + (0 if self._repeat else before), 0
+        else:
+            epoch, start, given = self._joined
+        self._joined, self._given, self._pass_start = None, given, start
+        mine = (
+            (place, indices)
+            for place, indices in enumerate(self._batches(start))
+            if place >= given and place % workers == worker
+        )
         threads = self._threads or max(1, thread_count(None) // workers)
-        self._given = 0
-        mine = ((place, indices) for place, indices in enumerate(self._batches(start)) if place % workers == worker)
         examples = ((place, self._example(epoch, indices, threads)) for place, indices in mine)
         if self._ahead and not in_worker and not self._maker.on_gpu:
             examples = made_ahead(examples, self._ahead)  # type: ignore[assignment]
+        return self._given_out(examples)
+
+    def _given_out(self, examples: Iterator[tuple[int, dict[str, Any]]]) -> Iterator[Any]:
         for place, example in examples:
             self._given = place + 1
             yield example if self._transform is None else self._transform(example)
+        self._passes.end()
 
     def _batches(self, start: int) -> Iterator[range]:
         """Samples of this rank, batch by batch: ranks take whole batches in turn, and equal parts of the last ones."""

@@ -58,7 +58,7 @@ def _transient(path: str) -> None:
     if path.endswith(".npy"):
         np.save(path, values)
         return
-    if path.startswith("colours"):
+    if "colours" in path:
         values = np.repeat(values[..., None], 3, axis=-1)
     with h5py.File(path, "w") as file:
         file["transient"] = values
@@ -68,8 +68,8 @@ def _transient(path: str) -> None:
 def _foliage() -> None:
     import numpy as np
 
-    depth = np.stack([np.full((30, 40), 3.0), np.full((30, 40), 6.0)])
-    np.savez("foliage.npz", depth=depth, reflectivity=np.full((2, 30, 40), 0.4))
+    depth = np.stack([np.full((60, 80), 3.0), np.full((60, 80), 6.0)])
+    np.savez("foliage.npz", depth=depth, reflectivity=np.full((2, 60, 80), 0.4))
 
 
 def _room() -> None:
@@ -141,7 +141,7 @@ FILES: dict[str, Callable[[], None]] = {
     "colours.hdf5": lambda: _transient("colours.hdf5"),
     "render.npy": lambda: _transient("render.npy"),
     "render.yaml": _scene_file,
-    "renders/": lambda: _transient("renders/a.hdf5"),
+    "renders/": lambda: _transient("renders/colours.hdf5"),
     "foliage.npz": _foliage,
     "room.zarr": _room,
     "face.mat": lambda: _counts("face.mat"),

@@ -1,4 +1,4 @@
-"""Tables of README and of pages in docs/ from the saved run: ``python -m benchmarks.readme``; a test compares them."""
+"""Tables of README, paper and pages from the saved run: ``python -m benchmarks.readme``; a test compares them."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _exposure(saved: Saved, cycles: int) -> dict[str, str]:
 
 
 BLOCKS = {"speed": speed, "figures": figures, "exposures": exposures}
-TABLES = ("README.md", "docs/engines.md", "docs/speed.md")
+TABLES = ("README.md", "docs/engines.md", "docs/speed.md", "paper.md")
 
 
 def filled(name: str) -> tuple[str, str]:

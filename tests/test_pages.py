@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import json
 import re
 import shlex
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 
 from studies import STUDIES
 
@@ -90,7 +92,7 @@ def test_marks_are_read():
     assert (block.files, block.extras, block.small) == (["depth.png", "rgbd/"], ["io", "learn"], "run 2\n")
     assert pages.blocks(text.replace("100 ->", "101 ->"))[0].mark == "run"
     with pytest.raises(SystemExit, match="no '101'"):
-        pages.blocks(text.replace("100 ->", "101 ->"))[0].small
+        assert pages.blocks(text.replace("100 ->", "101 ->"))[0].small
 
 
 def test_the_gallery_is_short():
@@ -109,3 +111,24 @@ def test_the_site_has_every_public_name():
     for module in ("mars_lidar", "mars_lidar.io", "mars_lidar.learn", "mars_lidar.plot"):
         names = {name for name in import_module(module).__all__ if name not in ("__version__", "SUFFIXES")}
         assert names <= listed, f"{module}: {sorted(names - listed)}"
+
+
+def test_the_paper_shows_figures_of_the_gallery_and_cites_what_it_lists():
+    paper, entries = (ROOT / "paper.md").read_text(encoding="utf-8"), (ROOT / "paper.bib").read_text(encoding="utf-8")
+    figures = re.findall(r"\]\(docs/gallery/images/sphx_glr_(\w+)_001\.png\)", paper)
+    assert figures
+    assert all((ROOT / "examples" / "gallery" / f"{name}.py").exists() for name in figures)
+    assert set(re.findall(r"@(\w+\d{4}|spcsim|deepinv)", paper)) == set(
+        re.findall(r"^@\w+\{(\w+),", entries, re.MULTILINE)
+    )
+
+
+def test_metadata_agree():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text())
+    assert citation["version"] == version
+    assert citation["license"] == zenodo["license"] == "MIT"
+    assert set(citation["keywords"]) <= set(zenodo["keywords"])
+    for form in ROOT.glob(".github/ISSUE_TEMPLATE/*.yml"):
+        assert {"name", "description", "body"} <= set(yaml.safe_load(form.read_text(encoding="utf-8")))

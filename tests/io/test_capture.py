@@ -71,13 +71,16 @@ def write(path: Path, layout: str) -> tuple[Path, np.ndarray]:
             file["t_accounts_first_and_last_bounces"] = False
             file["volume_format"] = h5py.Empty(float)
             file["scene_info"] = "{}"
-        else:  # bounces 2 and 3 have half of the light each; (colours, t, bounces, sx, sy, lx, ly) or reversed
-            parts = np.zeros((1, BINS, 6, nx, ny, *light.shape[:2]))
-            parts[0, :, 2:4] = 0.5 * light.transpose(4, 2, 3, 0, 1)[:, None]
+        else:  # Zaragoza's: bounces 2 and 3 have half of the light each; axes as tal/io/format.py moves them
+            parts = np.zeros((*light.shape[:4], 6, BINS, 1))  # X Y x y b T c
+            parts[..., 2:4, :, 0] = 0.5 * light[..., None, :]
+            letters = "XYxybTc"
             if kind == "confocal":
-                parts = parts[..., 0, 0]
-            # in the other order the data set is that of the axes y before x throughout
-            file["data"] = parts if "rows" in layout else parts.T
+                parts, letters = parts[0, 0], letters[2:]
+                wanted = "cTbyx" if "rows" in layout else "xybTc"
+            else:
+                wanted = "cTbyxYX" if "rows" in layout else "YXyxbTc"
+            file["data"] = parts.transpose([letters.index(one) for one in wanted])
             for name, points in (("camera", sensor), ("laser", laser)):
                 file[f"{name}GridPositions"] = points
                 file[f"{name}GridNormals"] = np.zeros_like(points)

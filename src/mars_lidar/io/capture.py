@@ -28,7 +28,7 @@ CAPTURE_SUFFIXES = (".h5", ".hdf5")
 # b bounces, which are added up. tal.enums.HFormat has the numbers.
 _TAL = {1: "Txy", 2: "TXYxy", 3: "Ti", 4: "Tli"}
 _TAL_NAMES = {0: "UNKNOWN", 1: "T_Sx_Sy", 2: "T_Lx_Ly_Sx_Sy", 3: "T_Si", 4: "T_Li_Si"}
-_ZARAGOZA = {5: ("yxbTc", "cTbxy"), 7: ("YXyxbTc", "cTbxyXY")}
+_ZARAGOZA = {5: ("xybTc", "cTbyx"), 7: ("YXyxbTc", "cTbyxYX")}  # as ``tal/io/format.py`` moves them
 _TIMES = {"H": ("delta_t", "t_start"), "data": ("deltaT", "t0")}
 _BAND_BYTES = 64 * 2**20
 

@@ -47,7 +47,6 @@ def write(path: Path, layout: str) -> tuple[Path, np.ndarray]:
     """A capture as its documentation says, and its light as an image (H, W, T) by hand."""
     kind = layout.rpartition(" ")[2]
     light, laser, sensor = hidden_point(kind)
-    nx, ny = sensor.shape[:2]
     with h5py.File(path, "w") as file:
         if layout.startswith("tal"):
             formats = {"UNKNOWN": 0, "T_Sx_Sy": 1, "T_Lx_Ly_Sx_Sy": 2, "T_Si": 3, "T_Li_Si": 4}

@@ -5,8 +5,12 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from mars_lidar import io
+from mars_lidar.cli import app
 from mars_lidar.io.rgbd import read_rgbd
+from mars_lidar.io.rgbd.layered import read_layers
 from mars_lidar.scene.scene import Scene
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "rgbd"
@@ -249,7 +253,7 @@ def test_sizes_must_agree(tmp_path, millimetres):
     assert "got 3 x 2" in told
 
 
-@pytest.mark.parametrize("option", ["depth_unit_m", "focal_px"])
+@pytest.mark.parametrize("option", ["depth_unit_m", "focal_px", "max_depth_m"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
 def test_bad_options(tmp_path, millimetres, option, value):
     refused(f"{option} must be", png(tmp_path / "d.png", millimetres), **{option: value})
@@ -285,3 +289,42 @@ def test_middlebury_art():
     # The rim of the paper cup spans columns 534 to 621 at half size, a focal length of 1870 px.
     width = (621 - 534) / 1870 * scene.depth_m[425, 575]
     assert 0.06 < width < 0.09
+
+
+def test_depths_beyond_the_largest_are_no_return(tmp_path):
+    """In a file, through the command, in a manifest; of perpendicular depth where there is a focal length."""
+    depth = np.array([[1.0, 5.0, 100.0], [2.0, 6.0, 1000.0]])
+    path = tmp_path / "d.npy"
+    np.save(path, depth)
+    near, _, _ = read_rgbd(path, max_depth_m=5.0)
+    assert np.array_equal(np.isnan(near), depth > 5.0)
+    assert np.array_equal(np.isnan(read_rgbd(path, max_depth_m=5.0, focal_px=1.0)[0]), depth > 5.0)
+    with pytest.raises(ValueError, match="no pixel has a depth"):
+        read_rgbd(path, max_depth_m=0.5)
+    (tmp_path / "manifest.csv").write_text("depth,max_depth_m\nd.npy,10\n")
+    (listed,), problems = io.scan(tmp_path)
+    assert problems == []
+    assert np.array_equal(np.isnan(listed.load().depth_m), depth > 10.0)
+    np.savez(tmp_path / "layers.npz", depth=np.stack([depth, depth + 1.0]), reflectivity=np.ones((2, 2, 3)))
+    layers = read_layers(tmp_path / "layers.npz", max_depth_m=5.5).layers
+    assert np.array_equal(np.isnan(layers[1].depth_m), depth + 1.0 > 5.5)
+    out = tmp_path / "out.npz"
+    options = ["--depth", str(path), "--max-depth-m", "5", "--cycles", "100", "--no-picture", "-o", str(out)]
+    told = CliRunner().invoke(app, ["simulate", *options])
+    assert told.exit_code == 0, told.output
+    assert np.array_equal(np.isnan(io.load(out).depth_m), depth > 5.0)
+    options = ["-o", str(tmp_path / "set.zarr"), "--cycles", "100", "--max-depth-m", "5"]
+    told = CliRunner().invoke(app, ["generate", str(path), *options])
+    assert told.exit_code == 0, told.output
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])
+def test_a_colour_image_is_no_depth(tmp_path, suffix):
+    colours = np.random.default_rng(1).integers(0, 255, (4, 5, 3)).astype(np.uint8)
+    path = tmp_path / f"colour{suffix}"
+    if suffix == ".npy":
+        np.save(path, colours)
+    else:
+        iio.imwrite(path, colours)
+    with pytest.raises(ValueError, match=rf"colour\{suffix}: .*(4, 5, 3)"):
+        read_rgbd(path, depth_unit_m=1.0)

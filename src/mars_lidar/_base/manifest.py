@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -97,6 +97,14 @@ def damage(store: Path, *, every: bool = True) -> Iterator[str]:
     )
     documents = {name for name in there if name.rpartition("/")[2] == _ROOT}
     yield from (f"{name} is not in its {NAME}" for name in sorted(documents - {name for _, _, name in lines}))
+
+
+def changed(told: Mapping[str, str], read: Callable[[str], bytes]) -> list[str]:
+    """Names of documents and coordinates that are not as `told`, the lines of a manifest by name, has them."""
+    small = sorted(name for name in told if _SMALL.search(name))
+    with ThreadPoolExecutor(_THREADS) as pool:
+        contents = list(pool.map(read, small))
+    return [n for n, one in zip(small, contents, strict=True) if hashlib.sha256(one).hexdigest() != told[n]]
 
 
 def _files(store: Path) -> set[str]:

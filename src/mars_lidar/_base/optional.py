@@ -10,11 +10,11 @@ class MissingLibraryError(ImportError, ValueError):
     """What was asked for needs a library that is not installed."""
 
 
-def needed(module: str, what: str) -> Any:
-    """The module, or an error that says how to install it; `what` names the format."""
+def needed(module: str, what: str, extra: str = "io") -> Any:
+    """The module, or an error that says how to install it, by which extra; `what` names the format."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingLibraryError(
-            f"{what} needs the library {module.partition('.')[0]}: pip install 'mars-lidar[io]' ({error})"
+            f"{what} needs the library {module.partition('.')[0]}: pip install 'mars-lidar[{extra}]' ({error})"
         ) from error

@@ -85,6 +85,10 @@ def generate(
             help="RGB-D: focal length, pixels of the file: turns depth along the axis into range along the ray.",
         ),
     ] = None,
+    max_depth_m: Annotated[
+        float | None,
+        _option("--max-depth-m", panel=_SCENES, help="RGB-D: depths beyond this are no return, m.", default="none"),
+    ] = None,
     system: Annotated[
         list[Path] | None,
         _option(
@@ -170,7 +174,7 @@ def generate(
             raise ValueError("with a recipe, single options of the system need the --system whose values they replace")
         if crops is not None and crop is None:
             raise ValueError("--crops belongs to --crop, which is not given")
-        rgbd = _given(depth_unit_m=depth_unit_m, focal_px=focal_px)
+        rgbd = _given(depth_unit_m=depth_unit_m, focal_px=focal_px, max_depth_m=max_depth_m)
         recipe = _recipe(source, replaced, scene_seeds, rgbd, resume)
         if dry_run:
             if recipe is None:

@@ -20,7 +20,13 @@ if TYPE_CHECKING:
 
 
 def info(
-    file: Annotated[Path, typer.Argument(help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu.", show_default=False)],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of others.",
+            show_default=False,
+        ),
+    ],
     verify: Annotated[
         bool,
         typer.Option("--verify", help="Simulate again and compare every count; exit code 1 if they differ."),
@@ -138,13 +144,14 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
         complete += f"; {manifest.told(cube.path)}"
     if cube.progress:
         complete += f"; {cube.progress}"
+    stored = "elsewhere" if cube.url else f"{_on_disk(cube) / 1e6:,.4g} MB on disk"
     rows = [
-        ("file", f"{cube.path} (mars-lidar {cube.version})"),
+        ("file", f"{cube.url or cube.path} (mars-lidar {cube.version})"),
         ("complete", complete),
         (
             "counts",
             f"{count} × {height} × {width} × {bins} (realization, y, x, time) {recipe.dtype}, "
-            f"{recipe.nbytes / 1e6:,.4g} MB in memory, {_on_disk(cube) / 1e6:,.4g} MB on disk",
+            f"{recipe.nbytes / 1e6:,.4g} MB in memory, {stored}",
         ),
     ]
     if cube.registrations is not None:
@@ -178,8 +185,9 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
         rows.append(("table", ", ".join(f"{name} {value}" for name, value in cube.settings["table"].items())))
     if recipe.source:
         rows.append(("source" if cube.measured else "scene", recipe.source))
-    opener = f"xarray.open_zarr({str(cube.path)!r})" if str(cube.path).endswith(".zarr") else ""
-    mine = f"mars_lidar.io.load({str(cube.path)!r})"
+    place = cube.url or str(cube.path)
+    opener = f"xarray.open_zarr({place!r})" if place.endswith(".zarr") else ""
+    mine = f"mars_lidar.io.load({place!r})"
     if not cube.complete:
         rows.append(("open with", f"{mine[:-1]}, allow_incomplete=True)"))
     else:

@@ -10,6 +10,7 @@ import typer
 
 from mars_lidar.cli.console import reported, table
 from mars_lidar.instrument.effects import FIELDS
+from mars_lidar.instrument.instruments import INSTRUMENTS, sourced
 
 _FILE = Path("system.yaml")
 # The values are those of `system_options.DEFAULT_SYSTEM`; a test reads the file back and compares.
@@ -66,6 +67,22 @@ def commented(file: Path) -> str:
     return TEMPLATE.format(name=file, effects="\n".join(effects))
 
 
+def of_instrument(name: str) -> str:
+    """A system file of an instrument, each value with its source; a detector alone gets the default's laser."""
+    from mars_lidar.cli.system_options import DEFAULT_SYSTEM
+
+    told = sourced(name)
+    of_default = "not of the detector: the default of mars-lidar"
+    default = {key: (getattr(DEFAULT_SYSTEM, key), of_default) for key in ("period_ns", "cycles", "bins")}
+    laser = {**default, "pulse_fwhm_ns": (0.5, of_default), **INSTRUMENTS[name].get("laser", {})}
+    lines = [f"# {name}, for mars-lidar (docs/detectors.md). Check what is an assumption before you rely on it."]
+    lines += [f"{key}: {value}  # {source}" for key, (value, source) in laser.items() if key != "pulse_fwhm_ns"]
+    fwhm, source = laser["pulse_fwhm_ns"]
+    lines += ["pulse:", "  kind: gaussian", f"  fwhm_ns: {fwhm}  # {source}", "detector:"]
+    lines += [f"  {key}: {value}  # {source}" for key, (value, source) in told.items() if key not in laser]
+    return "\n".join([*lines, "start: armed", ""])
+
+
 def schema(
     file: Annotated[str, typer.Argument(help="Of which file: scene, recipe or system.")] = "recipe",
     out: Annotated[
@@ -92,6 +109,10 @@ def init(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="The same, as with the other commands.", show_default=False)
     ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option("--preset", help=f"An instrument: {', '.join(INSTRUMENTS)}.", show_default=False),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a commented YAML file that describes a system: laser, detector, histogram.
@@ -107,5 +128,5 @@ def init(
             raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
         if file.exists() and not overwrite:
             raise FileExistsError(f"{file} exists already; choose another name or give --overwrite")
-        file.write_text(commented(file))
+        file.write_text(commented(file) if preset is None else of_instrument(preset))
         table([("wrote", str(file))])

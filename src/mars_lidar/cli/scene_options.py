@@ -94,6 +94,10 @@ class SceneOptions:
         int | None,
         _option("--index", panel=_SCENE, help="Frame of a NYUv2 .mat given as --depth, from 0."),
     ] = None
+    max_depth_m: Annotated[
+        float | None,
+        _option("--max-depth-m", panel=_SCENE, help="Depths of --depth beyond this are no return, m.", default="none"),
+    ] = None
     transient: Annotated[
         Path | None,
         _option(

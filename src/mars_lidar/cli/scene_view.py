@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions
 
 if TYPE_CHECKING:
+    from mars_lidar.cli.system_options import SystemOptions
     from mars_lidar.dataset.view import View
     from mars_lidar.instrument.system import System
+    from mars_lidar.io.capture import Capture
 
 # options by the kind of scene, and the keys of a description that they give (`mars_lidar.dataset.scene_entries`)
 _KEYS: dict[str, dict[str, str]] = {
@@ -20,6 +23,7 @@ _KEYS: dict[str, dict[str, str]] = {
         "depth_unit_m": "depth_unit_m",
         "focal_px": "focal_px",
         "index": "index",
+        "max_depth_m": "max_depth_m",
     },
     "transient": {
         "transient_bin_ns": "bin_ns",
@@ -30,6 +34,37 @@ _KEYS: dict[str, dict[str, str]] = {
     },
 }
 _SUFFIXES = (".yaml", ".yml")
+
+
+def alike(
+    like: Path, instrument: SystemOptions, system: System, scene: SceneOptions
+) -> tuple[Capture, System, SceneOptions]:
+    """The capture, the system with its time bins, and the scene that it is, as light from time 0 on.
+
+    The period is that of the capture's bins, or --period-ns, of a whole number of them; bin 0 is the capture's bin 0.
+    """
+    from mars_lidar.io.capture import read_capture
+
+    for kind in ("scene", "depth", "transient"):
+        if getattr(scene, kind) is not None:
+            raise ValueError(f"--like takes its light from {like}: leave out --{kind}")
+    for option in ("transient_bin_ns", "transient_start_ns"):
+        if getattr(scene, option) is not None:
+            raise ValueError(f"--like takes time bins from {like}: leave out --{option.replace('_', '-')}")
+    capture = read_capture(like)
+    width, bins = float(capture.bin_ns or 0.0), capture.image[2]
+    asked = instrument.changes
+    if asked.bins is not None:
+        raise ValueError(f"--like takes time bins from {like}: leave out --bins")
+    if asked.period_ns is not None:
+        bins = round(asked.period_ns / width)
+        if bins < capture.image[2] or abs(asked.period_ns / width - bins) > 1e-6 * bins:
+            raise ValueError(
+                f"--period-ns must be a whole number of bins of {width:.7g} ns, {capture.image[2]} at least "
+                f"({capture.image[2] * width:.7g} ns), got {asked.period_ns:g}"
+            )
+    light = replace(scene, transient=like, transient_start_ns=0.0)
+    return capture, system.replace(period_ns=bins * width, bins=bins), light
 
 
 def seen(scene: SceneOptions, light: LightOptions, system: System, *, in_parts: bool = False) -> View:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from mars_lidar._base.progress import span
 from mars_lidar.cli import options
 from mars_lidar.cli.console import progress_bar, reported, save_picture, say
 from mars_lidar.cli.console import table as print_table
 from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.scene_options import LightOptions, SceneOptions
-from mars_lidar.cli.scene_view import seen
+from mars_lidar.cli.options import _option
+from mars_lidar.cli.scene_options import _SCENE, LightOptions, SceneOptions
+from mars_lidar.cli.scene_view import alike, seen
 from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
@@ -32,6 +35,7 @@ EPILOG = "\n\n".join(
         "mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr",
         "mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr",
         "mars-lidar simulate --transient render.hdf5 --signal 0.5 --sbr 5 -o transient.zarr",
+        "mars-lidar simulate --like render.hdf5 --signal 0.5 --sbr 5 -o capture.hdf5",
         "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
         "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
         "mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr",
@@ -59,6 +63,15 @@ def simulate(
     out: options.Out,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
+    like: Annotated[
+        Path | None,
+        _option(
+            "--like",
+            panel=_SCENE,
+            help="A capture (tal, mitransient, Zaragoza's HDF5): its light, in its bins; to -o of .hdf5 or .h5 a "
+            "capture of the same layout is written.",
+        ),
+    ] = None,
     picture: options.Picture = True,
 ) -> None:
     """Simulate histograms of a scene under dead time, and write the cube with a picture of it.
@@ -66,17 +79,28 @@ def simulate(
     The file holds all that is needed to make the cube again. xarray.open_zarr(OUT) opens a .zarr with named
     dimensions and units; mars_lidar.io.load(OUT) opens any of the formats.
     """
-    with reported():
+    from mars_lidar.io import load, save_capture, simulate_to
+    from mars_lidar.io.capture import CAPTURE_SUFFIXES
+
+    with reported(), contextlib.ExitStack() as after:
         began = time.perf_counter()
         png = out.with_suffix(".png")
         if picture and png.exists() and not overwrite and not resume:
             raise FileExistsError(f"{png} exists already; give --overwrite, --no-picture or another --out")
         if out.exists() and not overwrite and not resume:
             raise FileExistsError(f"{out} exists already; give --overwrite or another --out")
-        system = instrument.build(effects)
+        system, capture = instrument.build(effects), None
+        if like is not None:
+            capture, system, scene = alike(like, instrument, system, scene)
+            if realizations != 1:
+                raise ValueError(f"--like writes a capture, which holds one exposure, not {realizations}")
+        target = out
+        if capture is not None and out.suffix.lower() in CAPTURE_SUFFIXES:
+            if resume or out.suffix != out.suffix.lower():
+                raise ValueError("a capture is written when all is simulated: leave out --resume")
+            folder = after.enter_context(tempfile.TemporaryDirectory(prefix=".mars-lidar-", dir=out.parent))
+            target = Path(folder) / "cube.zarr"
         view = seen(scene, light, system, in_parts=True)
-        from mars_lidar.io import simulate_to
-
         lookup, table_outside = _table(table, system, engine, view.flux, table_outside, threads)
         chosen: EngineOptions = {
             "table": lookup,
@@ -88,7 +112,7 @@ def simulate(
             tell_time(view.flux, system, engine, realizations, threads, chosen)
         with progress_bar("simulating") as progress:
             written = simulate_to(
-                out,
+                target,
                 view.flux,
                 system,
                 engine=engine,
@@ -104,9 +128,12 @@ def simulate(
                 progress=progress,
                 **chosen,
             )
+        if capture is not None and target != out:
+            with load(target) as cube:
+                save_capture(out, cube, capture.path, overwrite=overwrite)
         if picture:
-            _draw(out, png)
-        _summary(written, png if picture else None, began)
+            _draw(target, png)
+        _summary(written, png if picture else None, began, out)
 
 
 def tell_time(
@@ -160,7 +187,7 @@ def _draw(cube: Path, png: Path) -> None:
         raise
 
 
-def _summary(written: Written, png: Path | None, began: float) -> None:
+def _summary(written: Written, png: Path | None, began: float, out: Path) -> None:
     from mars_lidar.io import load
 
     with load(written.path) as cube:
@@ -177,7 +204,7 @@ def _summary(written: Written, png: Path | None, began: float) -> None:
                 f"{span(written.simulate_s)} simulating{each}; {span(written.write_s)} writing; "
                 f"{span(time.perf_counter() - began)} in all",
             ),
-            ("cube", str(written.path)),
+            ("cube" if written.path == out else "capture", str(out)),
         ]
         if written.report:
             rows.insert(2, ("engine", _told(written.report)))

@@ -44,6 +44,7 @@ KINDS: dict[str, Fields] = {
         "manifest": values.text("Of a folder: a CSV with a column depth."),
         "depth_unit_m": values.real("Metres per stored unit of depth.", low=0.0, strict_low=True),
         "focal_px": values.real("Focal length, pixels: depth becomes range.", low=0.0, strict_low=True),
+        "max_depth_m": values.real("Depths beyond this, m, are no return.", low=0.0, strict_low=True),
         "frames": values.numbers("Of NYUv2: which frames.", "frames"),
         "size": _SIZE,
         **_BEFORE,

@@ -123,7 +123,7 @@ def seed_of(recipe: DatasetRecipe, scene: str, system: str, signal: float, sbr: 
 
 def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iterator[SceneFile]:
     path = folder / entry["path"]
-    options = {name: entry[name] for name in ("depth_unit_m", "focal_px") if name in entry}
+    options = {name: entry[name] for name in ("depth_unit_m", "focal_px", "max_depth_m") if name in entry}
     image = entry.get("image")
     if path.is_dir():
         from mars_lidar.io.rgbd import middlebury
@@ -202,7 +202,8 @@ def _resized(load: Callable[[], Shown], size: Any) -> Shown:
 def _surfaces(file: SceneFile) -> Shown:
     """A scene, or the layers of an ``.npz``."""
     if is_stack(file.depth):
-        return Surfaces(read_layers(file.depth, depth_unit_m=file.depth_unit_m, focal_px=file.focal_px))
+        options = {name: getattr(file, name) for name in ("depth_unit_m", "focal_px", "max_depth_m")}
+        return Surfaces(read_layers(file.depth, **options))
     return Surfaces(file.load())
 
 

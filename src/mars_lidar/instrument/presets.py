@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar.instrument.avalanches import Afterpulsing
+from mars_lidar.instrument.instruments import INSTRUMENTS, detector_of
 
 # Afterpulses of the module of serial number 3605H by time after the recovery, ns, and the share of them up to then:
 # the distribution that goes with Straka et al. (github.com/ivo-s/SPAD-counting-model, apDist_3605H.txt, 81 ps bins),
@@ -47,6 +49,7 @@ PRESETS: dict[str, Callable[[], dict[str, Any]]] = {
     "excelitas-spcm-aqrh": _excelitas_spcm_aqrh,
     "thorlabs-spcm20a": _thorlabs_spcm20a,
     "thorlabs-spcm50a": _thorlabs_spcm50a,
+    **{name: partial(detector_of, name) for name in INSTRUMENTS},
 }
 
 

@@ -20,6 +20,7 @@ from mars_lidar._base.notebook import as_html
 from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
+from mars_lidar.instrument.instruments import sourced
 from mars_lidar.instrument.pulse import Pulse, pulse_from_dict
 from mars_lidar.instrument.units import check_units, period_hint
 
@@ -193,6 +194,20 @@ class System:
         known["pulse"] = pulse_from_dict(known["pulse"])
         known["detector"] = Detector.from_dict(known["detector"])
         return cls(**known)
+
+    @classmethod
+    def preset(cls, name: str) -> System:
+        """An instrument by its name in `mars_lidar.instrument.instruments.INSTRUMENTS`, with its laser and time bins.
+
+        Where each value is from, or that it is an assumption, stands in docs/detectors.md and in the file that
+        ``mars-lidar init --preset NAME`` writes. ValueError for one that is a detector alone (`Detector.preset`).
+        """
+        told = sourced(name)
+        if "period_ns" not in told:
+            raise ValueError(f"{name} is a detector, without a laser: use Detector.preset({name!r})")
+        period, cycles, bins, fwhm = (told[key][0] for key in ("period_ns", "cycles", "bins", "pulse_fwhm_ns"))
+        pulse = pulse_from_dict({"kind": "gaussian", "fwhm_ns": fwhm})
+        return cls(period_ns=period, cycles=cycles, bins=bins, pulse=pulse, detector=Detector.preset(name))
 
     def to_json(self) -> str:
         """One line of JSON; floats are written so that they read back to the same bits."""

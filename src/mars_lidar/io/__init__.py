@@ -5,6 +5,7 @@ Every library is imported when its format is first used.
 
 from mars_lidar._base.files import IncompleteFileError
 from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar.io.capture import save_capture
 from mars_lidar.io.cloud import points, save_cloud
 from mars_lidar.io.convert import Converted, convert, photons
 from mars_lidar.io.cube import SUFFIXES, Cube, load, save
@@ -44,6 +45,7 @@ __all__ = [
     "read_transient",
     "regenerate",
     "save",
+    "save_capture",
     "save_cloud",
     "save_mat",
     "scan",

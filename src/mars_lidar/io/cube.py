@@ -27,6 +27,7 @@ from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
+from mars_lidar.io.remote import Elsewhere, open_url, url_of
 from mars_lidar.io.store import CountArray, OnDisk, OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 
@@ -55,7 +56,9 @@ class Cube:
     version
         Version of mars-lidar that wrote the file.
     path
-        The file, or None for a cube in memory.
+        The file, or None for a cube in memory or at a `url`.
+    url
+        Where a cube that is read from elsewhere lies; "" for others.
     """
 
     histogram: CountArray
@@ -64,6 +67,7 @@ class Cube:
     registrations: int | None = None
     version: str = ""
     path: Path | None = None
+    url: str = ""
     progress: str = ""
     _close: Callable[[], None] = field(default=_nothing, repr=False)
 
@@ -141,6 +145,8 @@ class Cube:
 
     def __reduce__(self) -> Any:
         """Pickled as its path, for another process to open; without one, with its counts."""
+        if self.url:
+            return _opened_again, (self.url, not self.complete)
         if self.path is None:
             return super().__reduce__()
         return _opened_again, (self.path.absolute(), not self.complete)
@@ -156,7 +162,7 @@ class Cube:
         self.close()
 
 
-def _opened_again(path: Path, incomplete: bool) -> Cube:
+def _opened_again(path: Path | str, incomplete: bool) -> Cube:
     return load(path, allow_incomplete=incomplete)
 
 
@@ -199,7 +205,8 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     Parameters
     ----------
     path
-        ``.zarr``, ``.h5``, ``.hdf5``, ``.npz``, ``.mat`` or ``.ptu`` written by mars-lidar.
+        ``.zarr``, ``.h5``, ``.hdf5``, ``.npz``, ``.mat`` or ``.ptu`` written by mars-lidar; or the URL of a ``.zarr``
+        (``https://``, ``s3://``, ...: extra ``remote``), of which what is indexed is fetched.
     allow_incomplete
         Open what an unfinished run left; parts that were not written read as zeros.
 
@@ -212,6 +219,9 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     FileError
         Not a cube of mars-lidar, or damaged (a ValueError that names the file); a store that lacks a part.
     """
+    url = url_of(path)
+    if url is not None:
+        return _opened(open_url(url), Path(url), allow_incomplete, url)
     source = Path(path)
     form = _format(source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX)), "path")
     if not source.exists():
@@ -230,23 +240,25 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
         raise
 
 
-def _opened(store: OpenedStore, source: Path, allow_incomplete: bool) -> Cube:
+def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str = "") -> Cube:
+    lazy: type[OnDisk] = Elsewhere if url else OnDisk
     try:
         complete = store.complete and not source.name.endswith(INCOMPLETE_SUFFIX)
         if not (complete or allow_incomplete):
             told = f" ({store.progress})" if store.progress else ""
-            raise IncompleteFileError(f"{source} is incomplete: its simulation did not finish{told}")
+            raise IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{told}")
         rows_of = store.rows_of
-        rows = None if rows_of is None else lambda name: OnDisk(rows_of(name), source)
+        rows = None if rows_of is None else lambda name: lazy(rows_of(name), source)
         recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]), rows)
         total = store.attrs.get("registrations")
         return Cube(
-            histogram=OnDisk(store.histogram, source),
+            histogram=lazy(store.histogram, source),
             recipe=recipe,
             complete=complete,
             registrations=None if total is None else int(total),
             version=str(store.attrs["version"]),
-            path=source,
+            path=None if url else source,
+            url=url,
             progress=store.progress,
             _close=store.close,
         )

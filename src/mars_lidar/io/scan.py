@@ -16,7 +16,7 @@ from mars_lidar._base.types import Progress
 from mars_lidar.scene.scene import Scene
 
 MANIFEST = "manifest.csv"
-_COLUMNS = ("depth", "image", "index", "depth_unit_m", "focal_px")
+_COLUMNS = ("depth", "image", "index", "depth_unit_m", "focal_px", "max_depth_m")
 _DEPTH = (".png", ".tif", ".tiff", ".npy", ".pfm", ".exr")
 _ALONE = (".npz", ".pfm", ".exr")  # depth whatever their name
 _IMAGE = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm", ".npy")
@@ -33,6 +33,7 @@ class SceneFile:
     index: int | None = None
     depth_unit_m: float | None = None
     focal_px: float | None = None
+    max_depth_m: float | None = None
 
     def load(self, *, size: int | tuple[int, int] | None = None) -> Scene:
         """Read the scene, at `size` as in `mars_lidar.Scene.resize`."""
@@ -43,6 +44,7 @@ class SceneFile:
             depth_unit_m=self.depth_unit_m,
             focal_px=self.focal_px,
             index=self.index,
+            max_depth_m=self.max_depth_m,
         )
 
 
@@ -66,6 +68,7 @@ def scan(
     manifest: str | Path | None = None,
     depth_unit_m: float | None = None,
     focal_px: float | None = None,
+    max_depth_m: float | None = None,
     check: bool = True,
     progress: Progress | bool | None = None,
 ) -> tuple[list[SceneFile], list[Problem]]:
@@ -74,8 +77,8 @@ def scan(
     What is a scene, in this order:
 
     - `manifest`, or a ``manifest.csv`` in the folder: a CSV with a header; columns ``depth``, and where needed
-      ``image``, ``index``, ``depth_unit_m``, ``focal_px``; paths are relative to the manifest. Empty means
-      "not given".
+      ``image``, ``index``, ``depth_unit_m``, ``focal_px``, ``max_depth_m``; paths are relative to the manifest. Empty
+      means "not given".
     - `pattern`: every depth file or folder that it matches (``"**/*_depth.png"``); its image is the file whose
       path, relative to `folder`, has the second text of `image` in place of the first
       (``("_depth.png", "_colors.png")``).
@@ -87,7 +90,7 @@ def scan(
 
     Parameters
     ----------
-    depth_unit_m, focal_px
+    depth_unit_m, focal_px, max_depth_m
         As for `mars_lidar.Scene.from_rgbd`, for all scenes; a manifest's own values come first.
     check
         Read every scene once, so that damaged files are found now and not in the middle of a long run.
@@ -119,7 +122,7 @@ def scan(
     if manifest is None and pattern is None and (root / MANIFEST).is_file():
         manifest = root / MANIFEST
     if manifest is not None:
-        found = _listed(Path(manifest), depth_unit_m, focal_px, problems)
+        found = _listed(Path(manifest), depth_unit_m, focal_px, max_depth_m, problems)
     elif pattern is not None:
         found = _matching(root, pattern, image, problems)
     else:
@@ -128,7 +131,7 @@ def scan(
     if manifest is None:
         _tell_images(root, candidates)
     if manifest is None:
-        candidates = [_with(one, depth_unit_m, focal_px) for one in candidates]
+        candidates = [_with(one, depth_unit_m, focal_px, max_depth_m) for one in candidates]
     if not check:
         return candidates, problems
     scenes = []
@@ -144,7 +147,7 @@ def scan(
     return scenes, problems
 
 
-def _with(one: SceneFile, unit: float | None, focal: float | None) -> SceneFile:
+def _with(one: SceneFile, unit: float | None, focal: float | None, most: float | None) -> SceneFile:
     own_unit = one.depth.is_dir() or one.depth.suffix.lower() == ".mat"  # these are in metres
     return SceneFile(
         depth=one.depth,
@@ -152,10 +155,13 @@ def _with(one: SceneFile, unit: float | None, focal: float | None) -> SceneFile:
         index=one.index,
         depth_unit_m=None if own_unit else unit,
         focal_px=focal,
+        max_depth_m=most,
     )
 
 
-def _listed(path: Path, unit: float | None, focal: float | None, problems: list[Problem]) -> Iterator[SceneFile]:
+def _listed(
+    path: Path, unit: float | None, focal: float | None, most: float | None, problems: list[Problem]
+) -> Iterator[SceneFile]:
     if not path.exists():
         raise ValueError(f"{path}: no such file")
     with reading(path, "CSV"), open(path, newline="", encoding="utf-8-sig") as lines:
@@ -176,6 +182,7 @@ def _listed(path: Path, unit: float | None, focal: float | None, problems: list[
                 index=int(row["index"]) if row.get("index") else None,
                 depth_unit_m=float(row["depth_unit_m"]) if row.get("depth_unit_m") else unit,
                 focal_px=float(row["focal_px"]) if row.get("focal_px") else focal,
+                max_depth_m=float(row["max_depth_m"]) if row.get("max_depth_m") else most,
             )
         except ValueError as error:
             problems.append(Problem(path, f"line {number}: {error}"))

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_claim, open_npz, read_mat5, read_npy, reading
 from mars_lidar._base.hdf5 import open_hdf5
-from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
+from mars_lidar.io.capture import Capture, capture_in
 from mars_lidar.light.transient import Transient
 
 SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _NAME = "transient"
 _TIMES: tuple[str, ...] = ("bin_ns", "start_ns")
-_T_SX_SY = 1  # tal.enums.HFormat (github.com/diegoroyo/tal)
-_TAL_FORMATS = {0: "UNKNOWN", 1: "T_Sx_Sy", 2: "T_Lx_Ly_Sx_Sy", 3: "T_Si", 4: "T_Li_Si"}
+_CONFOCAL = ("rect_data", "meas")  # of a .mat, in place of "transient": O'Toole 2018; Lindell 2019
 
 
 @checked
@@ -36,12 +35,13 @@ def read_transient(
     - ``.npz``: the array `name` (default ``transient``); ``bin_ns`` and ``start_ns`` where it holds them.
     - ``.h5``, ``.hdf5``: the data set `name` (default ``transient``), with attributes ``bin_ns`` and
       ``start_ns`` where it has them.
-    - ``.mat``: the variable `name` (default ``transient``), (H, W, T), with ``bin_ns`` and ``start_ns`` where it holds
-      them. Version 7.3 stays on disk, older ones are read whole.
-    - ``.h5``, ``.hdf5`` with a data set ``H``: a capture of tal: ``H_format`` T_Sx_Sy, so ``H`` is (T, x, y);
-      ``delta_t`` and ``t_start`` are metres of optical path (time = path / c). Pixel (y, x) is H[:, x, y].
-      Whether the ways from the laser and to the camera are in it, ``t_accounts_first_and_last_bounces`` tells;
-      the times are taken as they are.
+    - ``.mat``: the variable `name` (default ``transient``, or ``rect_data`` or ``meas`` of confocal scans), (H, W, T),
+      with ``bin_ns`` and ``start_ns`` where it holds them. Version 7.3 stays on disk, older ones are read whole.
+    - ``.h5``, ``.hdf5`` with ``H`` and ``H_format``, captures of tal and mitransient, or with ``data`` and ``deltaT``,
+      of the Zaragoza data set, whose colours and bounces are added up (`mars_lidar.io.capture`). Times are metres of
+      optical path (time = path / c). Pixel (y, x) is that of the sensor's grid, of a confocal or single capture; of an
+      exhaustive one each laser point is a row of the image and each sensor point a column. Whether the ways from the
+      laser and to the camera are in it, ``t_accounts_first_and_last_bounces`` tells; the times are taken as they are.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def _read(
     elif suffix in (".h5", ".hdf5"):
         values, told = _from_hdf5(source, name)
     elif suffix == ".mat":
-        values, told = _from_mat(source, name or _NAME)
+        values, told = _from_mat(source, name or _mat_name(source))
     else:
         raise ValueError(f"{source}: a transient must be one of {', '.join(SUFFIXES)}")
     width = told.get("bin_ns") if bin_ns is None else bin_ns
@@ -110,16 +110,33 @@ def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
     import h5py
 
     with open_hdf5(path) as file:
-        if name is None and "H" in file and "H_format" in file:
-            return _tal(path, file)
+        capture = capture_in(path, file) if name is None else None
+        if capture is not None:
+            times = {"bin_ns": capture.bin_ns, "start_ns": capture.start_ns}
+            return _Captured(capture), {key: value for key, value in times.items() if value is not None}
         wanted = name or _NAME
         if not isinstance(file.get(wanted), h5py.Dataset):
             names = ", ".join(file) or "nothing"
-            raise ValueError(f"{path}: no data set {wanted!r} and no capture of tal ('H', 'H_format'), got {names}")
+            raise ValueError(
+                f"{path}: no data set {wanted!r} and no capture ('H' and 'H_format', 'data' and 'deltaT'), got {names}"
+            )
         data = file[wanted]
         check_claim(path, data.size * data.dtype.itemsize, wanted, in_parts=True)
         told = {key: float(data.attrs[key]) for key in _TIMES if key in data.attrs}
         return _Rows(path, wanted, tuple(data.shape), turned=False), told
+
+
+def _mat_name(path: Path) -> str:
+    """The name of the light, by those that there are."""
+    import h5py
+    from scipy.io import whosmat
+
+    if h5py.is_hdf5(path):
+        with open_hdf5(path) as file:
+            found = set(file)
+    else:
+        found = {each for each, _, _ in whosmat(path)}
+    return next((name for name in (_NAME, *_CONFOCAL) if name in found), _NAME)
 
 
 def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
@@ -142,18 +159,15 @@ def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
     return found[name], {key: float(np.ravel(found[key])[0]) for key in _TIMES if key in found}
 
 
-def _tal(path: Path, file: Any) -> tuple[Any, dict[str, float]]:
-    form = int(np.ravel(file["H_format"][()])[0])
-    shape = file["H"].shape
-    if form != _T_SX_SY or len(shape) != 3:
-        known = _TAL_FORMATS.get(form, str(form))
-        raise ValueError(f"H must be T_Sx_Sy, an image of (T, x, y), got H_format {known} and shape {shape}")
-    check_claim(path, file["H"].size * file["H"].dtype.itemsize, "H", in_parts=True)
-    told = {}
-    for key, label in (("delta_t", "bin_ns"), ("t_start", "start_ns")):
-        if key in file and file[key].shape is not None:  # tal stores None as an empty data set
-            told[label] = float(np.ravel(file[key][()])[0]) / SPEED_OF_LIGHT_M_PER_NS
-    return _Rows(path, "H", (shape[2], shape[1], shape[0]), turned=True), told
+class _Captured:
+    """Rows of a capture."""
+
+    def __init__(self, capture: Capture) -> None:
+        self._capture = capture
+        self.shape = capture.image
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        return self._capture.read(rows)
 
 
 class _Rows:

@@ -233,6 +233,7 @@ class Scene:
         depth_unit_m: float | None = None,
         focal_px: float | None = None,
         index: int | None = None,
+        max_depth_m: float | None = None,
     ) -> Scene:
         """A scene from a depth file and an image; what is read, and how: `mars_lidar.io.rgbd.read_rgbd`.
 
@@ -253,6 +254,8 @@ class Scene:
             RGB-D cameras give, into range along the ray. None: the depth is taken as it is.
         index
             Frame of a NYUv2 ``.mat``, from 0; None for everything else.
+        max_depth_m
+            Depths of the file beyond this, m, are no return (a sky, a wall behind everything); None: none.
 
         Raises
         ------
@@ -262,7 +265,12 @@ class Scene:
         if size is not None:  # refuse a bad size before reading anything
             cls(np.ones((1, 1)), 1.0).resize(size)
         read = late("io.rgbd:read_rgbd")(
-            depth_path, image_path, depth_unit_m=depth_unit_m, focal_px=focal_px, index=index
+            depth_path,
+            image_path,
+            depth_unit_m=depth_unit_m,
+            focal_px=focal_px,
+            index=index,
+            max_depth_m=max_depth_m,
         )
         with reading(depth_path, "a scene"):
             scene = cls(*read)

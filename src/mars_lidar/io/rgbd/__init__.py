@@ -25,6 +25,7 @@ def read_rgbd(
     depth_unit_m: float | None = None,
     focal_px: float | None = None,
     index: int | None = None,
+    max_depth_m: float | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Depth in m (NaN = no return), reflectivity in [0, 1], and the background map or None; (H, W) each.
 
@@ -54,7 +55,7 @@ def read_rgbd(
 
     `focal_px` (pixels of the depth file, principal point at the centre) turns depth perpendicular to the
     image plane into range along the ray, ``r = z sqrt(1 + (x^2 + y^2) / f^2)``; without it depth is taken as
-    range.
+    range. Depths of the file beyond `max_depth_m` are no return.
 
     Raises
     ------
@@ -65,14 +66,15 @@ def read_rgbd(
     source = Path(depth_path)
     image = None if image_path is None else Path(image_path)
     unit, focal = _positive("depth_unit_m", depth_unit_m), _positive("focal_px", focal_px)
+    most = _positive("max_depth_m", max_depth_m)
     if not source.exists():
         raise ValueError(f"{source}: no such file or folder")
     with reading(source, "a scene"):
-        return _read(source, image, unit, focal, index)
+        return _read(source, image, unit, focal, index, most)
 
 
 def _read(
-    source: Path, image: Path | None, unit: float | None, focal: float | None, index: int | None
+    source: Path, image: Path | None, unit: float | None, focal: float | None, index: int | None, most: float | None
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     suffix = source.suffix.lower()
     if (index is not None) != (suffix == ".mat" and source.is_file()):
@@ -105,6 +107,7 @@ def _read(
                 f"{image}: image must have the size of the depth, {pixels.size(depth)} in {source}, "
                 f"got {pixels.size(reflectivity)}"
             )
+    depth = within(source, depth, most)
     if focal is not None:
         depth = depth * _obliquity(depth.shape, focal)
     return depth, np.ones(depth.shape) if reflectivity is None else reflectivity, background
@@ -178,6 +181,11 @@ def _depth(path: Path, stored: NDArray[Any], unit: float | None) -> FloatArray:
     if (depth < 0.0).any():
         raise ValueError(f"{path}: depth must not be negative, got {depth[depth < 0.0][0]:g} m")
     return pixels.known(path, np.where((depth > 0.0) & (depth < np.inf), depth, np.nan))
+
+
+def within(path: Path, depth: FloatArray, most_m: float | None) -> FloatArray:
+    """Depths up to `most_m`, m; those beyond are no return."""
+    return depth if most_m is None else pixels.known(path, np.where(depth <= most_m, depth, np.nan))
 
 
 def _obliquity(shape: tuple[int, ...], focal: float) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mars_lidar._base.files import npy_header, reading
 from mars_lidar._base.types import FloatArray
-from mars_lidar.io.rgbd import _depth, _npz_arrays, _obliquity, pixels
+from mars_lidar.io.rgbd import _depth, _npz_arrays, _obliquity, pixels, within
 
 
 def is_stack(path: Path) -> bool:
@@ -24,7 +24,7 @@ def is_stack(path: Path) -> bool:
 
 
 def read_stack(
-    path: Path, *, depth_unit_m: float | None = None, focal_px: float | None = None
+    path: Path, *, depth_unit_m: float | None = None, focal_px: float | None = None, max_depth_m: float | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Depth in m (NaN = no return) and reflectivity in [0, 1], (layers, H, W), and the background (H, W) or None.
 
@@ -35,6 +35,7 @@ def read_stack(
     stored = arrays["depth"]
     layers, height, width = stored.shape
     depth = _depth(path, stored.reshape(layers * height, width), depth_unit_m).reshape(stored.shape)
+    depth = within(path, depth, max_depth_m)
     if focal_px is not None:
         depth = depth * _obliquity((height, width), focal_px)
     if "image" in arrays:

@@ -1,0 +1,217 @@
+"""HDF5 captures of light around corners: tal and mitransient, and the Zaragoza NLOS data set. Read, and written back.
+
+tal (github.com/diegoroyo/tal, ``tal/io``): ``H`` with the time first and ``H_format``; ``delta_t``, ``t_start``. The
+Zaragoza data set (graphics.unizar.es/nlos_dataset): ``data`` with colours and bounces, ``deltaT``, ``t0``, in the order
+of MATLAB or of HDF5, told apart as tal does. Times are metres of optical path, time = path / c.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.files import TemporarySibling, check_claim, check_target, open_hdf5
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
+
+if TYPE_CHECKING:
+    from mars_lidar.io.cube import Cube
+
+CAPTURE_SUFFIXES = (".h5", ".hdf5")
+# What the axes are: T time, x and y of the sensor grid, X and Y of the laser's, i and l without a grid, c colours and
+# b bounces, which are added up. tal.enums.HFormat has the numbers.
+_TAL = {1: "Txy", 2: "TXYxy", 3: "Ti", 4: "Tli"}
+_TAL_NAMES = {0: "UNKNOWN", 1: "T_Sx_Sy", 2: "T_Lx_Ly_Sx_Sy", 3: "T_Si", 4: "T_Li_Si"}
+_ZARAGOZA = {5: ("xybTc", "cTbyx"), 7: ("YXyxbTc", "cTbyxYX")}  # as ``tal/io/format.py`` moves them
+_TIMES = {"H": ("delta_t", "t_start"), "data": ("deltaT", "t0")}
+_BAND_BYTES = 64 * 2**20
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Where the light of a capture is, and how it becomes an image.
+
+    Attributes
+    ----------
+    path, name, axes, shape
+        The file, its data set, a letter for each axis, and its shape.
+    bin_ns, start_ns
+        Width of a time bin and travel time at the first one, ns; None where the file does not tell.
+    """
+
+    path: Path
+    name: str
+    axes: str
+    shape: tuple[int, ...]
+    bin_ns: float | None
+    start_ns: float | None
+
+    @property
+    def rows(self) -> str:
+        """Axes of the image's rows: the laser's points where there are several, else y of the sensor's."""
+        size = dict(zip(self.axes, self.shape, strict=True))
+        several = math.prod(size.get(one, 1) for one in "XYl") > 1
+        return "".join(one for one in ("XYl" if several else "y") if one in size)
+
+    @property
+    def columns(self) -> str:
+        """Axes of the image's columns."""
+        return "".join(one for one in "xyi" if one in self.axes and one not in self.rows)
+
+    @property
+    def image(self) -> tuple[int, int, int]:
+        """(H, W, T)."""
+        size = dict(zip(self.axes, self.shape, strict=True))
+        return (
+            math.prod(size[one] for one in self.rows),
+            math.prod(size[one] for one in self.columns),
+            size["T"],
+        )
+
+    def read(self, rows: slice) -> NDArray[Any]:
+        """Light of some rows (rows, W, T)."""
+        first, last, _ = rows.indices(self.image[0])
+        slab, skipped = self._slab(first, last)
+        with open_hdf5(self.path) as file:
+            found = np.asarray(file[self.name][slab])
+        order = [self.axes.index(one) for one in self.rows + self.columns + "T"]
+        rest = tuple(k for k in range(len(self.axes)) if k not in order)
+        image = found.transpose(*order, *rest).reshape(
+            -1, self.image[1], self.image[2], *(found.shape[k] for k in rest)
+        )
+        return np.asarray(image[skipped : skipped + last - first].sum(axis=tuple(range(3, image.ndim))))
+
+    def write(self, data: Any, first: int, counts: NDArray[Any]) -> None:
+        """Put whole steps of the first axis of the rows, from row `first` on, into a data set of the same shape."""
+        slab, _ = self._slab(first, first + len(counts))
+        order = [self.axes.index(one) for one in self.rows + self.columns + "T"]
+        rest = [k for k in range(len(self.axes)) if k not in order]
+        place = tuple(0 if k in rest else one for k, one in enumerate(slab))  # the first colour and bounce
+        kept = [k for k in range(len(self.axes)) if k not in rest]
+        sizes = [len(range(*slab[k].indices(self.shape[k]))) for k in order]
+        data[place] = counts.reshape(sizes).transpose([order.index(k) for k in kept])
+
+    def _slab(self, first: int, last: int) -> tuple[tuple[slice, ...], int]:
+        """Part of the data set that holds some rows, and how many rows of it come before the first."""
+        slab = [slice(None)] * len(self.axes)
+        if not self.rows:
+            return tuple(slab), first
+        inner = self.image[0] // self.shape[self.axes.index(self.rows[0])]
+        low, high = first // inner, -(-last // inner)
+        slab[self.axes.index(self.rows[0])] = slice(low, high)
+        return tuple(slab), first - low * inner
+
+    @property
+    def step(self) -> int:
+        """Rows that belong to one step of their first axis."""
+        return self.image[0] // self.shape[self.axes.index(self.rows[0])] if self.rows else self.image[0]
+
+    def bands(self) -> Iterator[slice]:
+        """Rows that are written together: whole steps."""
+        height, width, bins = self.image
+        many = max(1, _BAND_BYTES // (4 * width * bins * self.step)) * self.step
+        for first in range(0, height, many):
+            yield slice(first, min(first + many, height))
+
+
+def capture_in(path: Path, file: Any) -> Capture | None:
+    """The capture in an open HDF5 file, or None where it is none."""
+    if "H" in file and "H_format" in file:
+        name, axes = "H", _tal_axes(file)
+    elif "data" in file and "deltaT" in file:
+        name, axes = "data", _zaragoza_axes(file["data"].shape)
+    else:
+        return None
+    data = file[name]
+    check_claim(path, data.size * data.dtype.itemsize, name, in_parts=True)
+    told = [_metres(file, key) for key in _TIMES[name]]
+    width, start = (None if one is None else one / SPEED_OF_LIGHT_M_PER_NS for one in told)
+    return Capture(path, name, axes, tuple(data.shape), width, start)
+
+
+def read_capture(path: str | Path) -> Capture:
+    """The capture in a file; ValueError where it is none, or does not tell its time bins."""
+    source = Path(path)
+    if source.suffix.lower() not in CAPTURE_SUFFIXES:
+        raise ValueError(f"{source}: a capture must be one of {', '.join(CAPTURE_SUFFIXES)}")
+    with open_hdf5(source, "a capture") as file:
+        found = capture_in(source, file)
+        if found is None:
+            raise ValueError(f"{source}: no capture of tal ('H', 'H_format') or Zaragoza's ('data', 'deltaT')")
+    if found.bin_ns is None or not found.bin_ns > 0.0:
+        raise ValueError(f"{source}: does not tell the width of a time bin ({_TIMES[found.name][0]})")
+    return found
+
+
+def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: bool = False) -> None:
+    """Write the counts of a cube as a capture with the layout of another one, for the programs that read that.
+
+    Parameters
+    ----------
+    path
+        The new ``.hdf5``.
+    cube
+        Of one exposure, of the image of `like` and at least as many bins, of the same width; later bins are left out.
+    like
+        A capture of tal, mitransient, or the Zaragoza data set: everything but the light is copied from it, grids of
+        laser and sensor, ``t_start``, ``scene_info``. Of colours and bounces the first one holds the counts. The recipe
+        is in the attribute ``mars_lidar`` of the file, which those programs pass over.
+
+    Raises
+    ------
+    ValueError
+        Sizes or widths that differ.
+    """
+    import h5py
+
+    target, source = Path(path), read_capture(like)
+    if target.suffix.lower() not in CAPTURE_SUFFIXES:
+        raise ValueError(f"path of a capture must end in one of {', '.join(CAPTURE_SUFFIXES)}, got {str(path)!r}")
+    exposures, height, width, bins = cube.shape
+    if exposures != 1 or (height, width) != source.image[:2] or bins < source.image[2]:
+        told = " x ".join(map(str, source.image))
+        raise ValueError(f"cube must be one exposure of {told} (H, W, T) as {like} is, got {cube.shape}")
+    if abs(cube.system.bin_ns / float(source.bin_ns or 0.0) - 1.0) > 1e-6:
+        raise ValueError(f"cube must have bins of {source.bin_ns:g} ns as {like} has, got {cube.system.bin_ns:g}")
+    check_target(target, folder=False, overwrite=overwrite)
+    with (
+        TemporarySibling(target).writing() as unfinished,
+        open_hdf5(source.path) as old,
+        h5py.File(unfinished, "w") as new,
+    ):
+        for name in old:
+            if name != source.name:
+                old.copy(name, new)
+        data = new.create_dataset(source.name, source.shape, np.float32, fillvalue=0.0)
+        for rows in source.bands():
+            counts = np.asarray(cube.histogram[0, rows])[..., : source.image[2]]
+            source.write(data, rows.start, counts.astype(np.float32))
+        recipe = {"system": cube.system.to_dict(), "engine": cube.engine, "seed": cube.seed, "like": str(like)}
+        new.attrs["mars_lidar"] = json.dumps(recipe)
+
+
+def _tal_axes(file: Any) -> str:
+    form, shape = int(np.ravel(file["H_format"][()])[0]), file["H"].shape
+    axes = _TAL.get(form, "")
+    if len(axes) != len(shape):
+        known = _TAL_NAMES.get(form, str(form))
+        raise ValueError(f"H must be one of {', '.join(list(_TAL_NAMES.values())[1:])}, got {known} and shape {shape}")
+    return axes
+
+
+def _zaragoza_axes(shape: tuple[int, ...]) -> str:
+    if len(shape) not in _ZARAGOZA:
+        raise ValueError(f"data must have 5 axes (confocal) or 7, as Zaragoza's captures have, got shape {shape}")
+    return max(_ZARAGOZA[len(shape)], key=lambda axes: shape[axes.index("T")])  # time is the long one
+
+
+def _metres(file: Any, key: str) -> float | None:
+    if key not in file or file[key].shape is None:  # tal stores None as an empty data set
+        return None
+    return float(np.ravel(file[key][()])[0])

@@ -1,0 +1,117 @@
+"""Zarr stores that lie elsewhere, for reading: any URL that fsspec opens (``https://``, ``s3://``, ``memory://``)."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base import manifest
+from mars_lidar._base.files import FileError
+from mars_lidar._base.memory import check_memory
+from mars_lidar._base.optional import MissingLibraryError, needed
+from mars_lidar.io import layout
+from mars_lidar.io.store import OnDisk, OpenedStore
+
+_URL = re.compile(r"^((?:[A-Za-z][\w+.-]*::)*[A-Za-z][\w+.-]+):/+(.*)$")  # a drive, C:\, is none
+
+
+def url_of(path: str | Path) -> str | None:
+    """The URL that a text is, also after `Path` has taken its second slash; None for a file."""
+    found = _URL.match(str(path))
+    if found is None:
+        return None
+    scheme, rest = found.groups()
+    return f"{scheme}://{'/' if scheme.endswith('file') else ''}{rest}"
+
+
+class Elsewhere(OnDisk):
+    """An array of a store at a URL: what goes wrong when it is read names the URL."""
+
+    def _read(self, read: Callable[[], Any]) -> Any:
+        try:
+            return read()
+        except (IndexError, TypeError):  # of the key
+            raise
+        except Exception as error:
+            raise _told(str(self._path), error) from error
+
+
+def open_url(url: str) -> OpenedStore:
+    """Open a store for reading; its documents and coordinates are compared with its manifest, and its names if listed.
+
+    Raises
+    ------
+    FileError
+        Nothing there, no cube, or damaged; the message names the URL.
+    MissingLibraryError
+        fsspec, or what it needs for this kind of URL, is not installed.
+    """
+    if not url.rstrip("/").endswith(".zarr"):
+        raise FileError(f"{url}: only a .zarr is opened from a URL; fetch other files first")
+    core = needed("fsspec.core", url, "remote")
+    try:
+        system, root = core.url_to_fs(url)
+        document = json.loads(system.cat_file(f"{root}/zarr.json"))
+        attrs = document.get("attributes", {})
+        layout.check_format(Path(url), attrs)
+        complete = attrs.get("complete") is True
+        if complete:
+            _require(url, system, root)
+        group = _group(url)
+        names = frozenset(group.array_keys())
+        if "histogram" not in names:
+            raise ValueError("it has no variable 'histogram': its writing stopped at the very start")
+    except Exception as error:
+        raise _told(url, error) from error
+
+    def read(name: str) -> NDArray[Any]:
+        array = group[name]
+        check_memory(math.prod(array.shape) * array.dtype.itemsize, f"{name} of {url}", "read it on a larger machine")
+        return np.asarray(Elsewhere(array, Path(url))[...])
+
+    return OpenedStore(attrs, names, read, group["histogram"], complete, "", lambda: None, group.__getitem__)
+
+
+def _group(url: str) -> Any:
+    import zarr
+    from zarr.storage import FsspecStore
+
+    return zarr.open_group(FsspecStore.from_url(url, read_only=True), mode="r")
+
+
+def _require(url: str, system: Any, root: str) -> None:
+    """Raise where a document or coordinate is not as it was written, or a file is missing where they can be listed."""
+    try:
+        lines = system.cat_file(f"{root}/{manifest.NAME}").decode()
+    except FileNotFoundError:
+        return  # of an earlier version
+    told = dict(reversed(line.split("  ", 1)) for line in lines.splitlines() if "  " in line)
+    wrong = [
+        f"{name} is not as it was written" for name in manifest.changed(told, lambda n: system.cat_file(f"{root}/{n}"))
+    ]
+    try:
+        there = {str(name).rpartition(f"{root}/")[2] for name in system.find(root)}
+    except Exception:  # what cannot be listed (most web servers)
+        there = set()
+    if manifest.NAME in there:
+        wrong += [f"{name} is missing" for name in sorted(set(told) - there)]
+    if wrong:
+        raise ValueError(f"is damaged: {', '.join(wrong[:3])}")
+
+
+def _told(url: str, error: Exception) -> Exception:
+    if isinstance(error, MissingLibraryError | MemoryError):
+        return error
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, ImportError):
+        return MissingLibraryError(f"{url}: {text}")
+    if isinstance(error, FileNotFoundError | KeyError):
+        return FileError(f"{url}: there is no Zarr store ({text[:200]})")
+    return FileError(text if url in text else f"{url}: {text[:400]}")

@@ -57,7 +57,7 @@ export class HistogramChart extends Chart {
         x: { time: false }, counts: this.logarithmic ? { distr: 3, range: logRange } : { range: positive }, light: { range: positive },
       },
       axes: [
-        axis("time in the period (ns)"), axis("counts per bin", { scale: "counts", values: shortAll, size: 56 }),
+        axis("time in the period (ns)", { space: 40 }), axis("counts per bin", { scale: "counts", values: shortAll, size: 56 }),
         axis("photons per bin and period", { scale: "light", side: 1, grid: { show: false }, values: shortAll, size: 60 }),
       ],
       series: [

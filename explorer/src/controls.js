@@ -77,7 +77,8 @@ export class Controls {
       const place = placeOf(number, value, this.most(number));
       if (Number(slider.value) !== place && document.activeElement !== slider) slider.value = place;
       slider.setAttribute("aria-valuetext", `${value} ${number.unit}`);
-      if (document.activeElement !== box || Number(box.value) !== value) box.value = value;
+      const shown = Number(value.toPrecision(5));
+      if (Number(box.value) !== shown || box.value === "") box.value = shown;
     }
     for (const key of ["mode", "start"]) {
       this.rows[key].select.value = state[key];

@@ -4,6 +4,7 @@ import { Refusal } from "./engine.js";
 import { SPEED_OF_LIGHT, detected, inPeriods, lawless } from "./model.js";
 
 const LATER = ["mean", "law", "estimate", "band"]; // after "draw"
+const LATE_MS = 60;
 
 const digits = (x, n = 4) => (Number.isFinite(x) ? Number(x.toPrecision(n)).toLocaleString("en") : "none");
 const metres = (periods, period) => (SPEED_OF_LIGHT / 2) * period * periods;
@@ -41,13 +42,15 @@ export class Figure {
         const light = detected(state, [pixel.signal], [pixel.delayNs], [pixel.index]);
         const system = inPeriods(state), results = { state, notes: [] };
         results.draw = await this.engine.ask("draw", { system, light, seed: state.seed, counts: pixel.counts });
-        this.#show(results);
         const without = lawless(state);
         const why = reason || (without.length ? `There is no exact law here with ${without.join(" and ")}: the dots are simulated all the same.` : "");
         if (why) results.notes.push(why);
+        results.lawless = Boolean(why);
+        const late = setTimeout(() => this.#show(results), LATE_MS); // the dots do not wait for a slow mean
         for (const stage of why ? ["estimate"] : LATER) {
-          if (this.wanted) break;
           await this.#stage(stage, results);
+          clearTimeout(late);
+          if (this.wanted) break;
         }
         results.whole = !this.wanted;
         this.#show(results);
@@ -69,8 +72,9 @@ export class Figure {
       if (stage === "mean") throw error;
       results.notes.push(`${error.message[0].toUpperCase()}${error.message.slice(1)}${stage === "band" ? ": the band is Poisson's, two roots of the mean." : "."}`);
       if (stage === "band") results.band = { variances: null };
+      if (stage === "law") results.lawless = true;
     }
-    if (!this.wanted || stage === "mean") this.#show(results);
+    this.#show(results);
   }
 
   #show(results) {
@@ -78,7 +82,7 @@ export class Figure {
     const time = Array.from(draw.counts, (_, j) => ((j + 0.5) * period) / state.bins);
     const spread = mean && band ? (band.variances ?? mean.mean).map(Math.sqrt) : null;
     this.histogram.show({ time, incident: draw.incident, mean: mean?.mean, spread, counts: draw.counts }, state.log === 1);
-    this.count.show(law ?? null, draw.registered);
+    if (law || results.lawless) this.count.show(law ?? null, draw.registered); // until then the last one stays
     this.results = { ...results, spread };
     const photons = state.cycles * draw.incident.reduce((a, b) => a + b, 0);
     const facts = [["Arriving photons, mean", digits(photons, 5)], ["Registered, this exposure", draw.registered.toLocaleString("en")]];

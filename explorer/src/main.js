@@ -144,7 +144,7 @@ async function begin() {
 
   // For tests, and for those who look behind the page.
   window.explorer = {
-    set, pick, figure, painter, source, get state() { return state; }, get picture() { return lastPicture; },
+    set, pick, figure, painter, source, initial: INITIAL, get state() { return state; }, get picture() { return lastPicture; },
     golden: async () => (await figure.engine.ask("golden")).cubes, pictureCube: async () => (await painter.ask("cube")).cube,
   };
   at("loading").hidden = true;

@@ -28,6 +28,7 @@ export class Picture {
   /** Values (height * width), NaN for none, from `low` to `high` in the colours; `told` says a value in words. */
   show(values, height, width, [low, high], told) {
     [this.height, this.width] = [height, width];
+    this.canvas.style.aspectRatio = `${width} / ${height}`;
     const image = new ImageData(width, height), last = this.colours.length - 1;
     for (let p = 0; p < values.length; ++p) {
       if (Number.isNaN(values[p])) continue;
@@ -44,6 +45,7 @@ export class Picture {
 
   /** Marks a pixel; null: none. */
   select(selected) {
+    if (String(this.selected) === String(selected)) return;
     this.selected = selected;
     this.#paint();
   }

@@ -8,6 +8,9 @@
 #if defined(__x86_64__) || defined(__i386__)
 #include <immintrin.h>
 #define MARS_X86
+#elif defined(__wasm_simd128__)
+#include <wasm_simd128.h>
+#define MARS_WASM
 #endif
 
 namespace mars {
@@ -127,12 +130,23 @@ MARS_INLINE bool any(HardMask m) {
     return _mm256_movemask_ps((__m256)m) != 0;
 #elif defined(MARS_X86)
     return _mm_movemask_ps((__m128)m) != 0;
+#elif defined(MARS_WASM)
+    return wasm_v128_any_true((v128_t)m);
 #else
     return (m[0] | m[1] | m[2] | m[3]) != 0;
 #endif
 }
+#if defined(MARS_WASM)
+MARS_INLINE HardInt choose(HardMask m, HardInt yes, HardInt no) {
+    return (HardInt)wasm_v128_bitselect((v128_t)yes, (v128_t)no, (v128_t)m);
+}
+MARS_INLINE HardFloat choose(HardMask m, HardFloat yes, HardFloat no) {
+    return (HardFloat)wasm_v128_bitselect((v128_t)yes, (v128_t)no, (v128_t)m);
+}
+#else
 MARS_INLINE HardInt choose(HardMask m, HardInt yes, HardInt no) { return m ? yes : no; }
 MARS_INLINE HardFloat choose(HardMask m, HardFloat yes, HardFloat no) { return m ? yes : no; }
+#endif
 #endif
 MARS_INLINE bool any(Mask m) { return any((HardMask)(m.low | m.high)); }
 MARS_INLINE Int select(Mask m, Int yes, Int no) {
@@ -170,6 +184,9 @@ MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return (HardFloat)_mm512_
 #elif defined(MARS_LEVEL_avx2)
 MARS_INLINE HardFloat least(HardFloat a, HardFloat b) { return (HardFloat)_mm256_min_ps((__m256)a, (__m256)b); }
 MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return (HardFloat)_mm256_max_ps((__m256)a, (__m256)b); }
+#elif defined(MARS_WASM)
+MARS_INLINE HardFloat least(HardFloat a, HardFloat b) { return (HardFloat)wasm_f32x4_pmin((v128_t)b, (v128_t)a); }
+MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return (HardFloat)wasm_f32x4_pmax((v128_t)b, (v128_t)a); }
 #else
 MARS_INLINE HardFloat least(HardFloat a, HardFloat b) { return a < b ? a : b; }
 MARS_INLINE HardFloat most(HardFloat a, HardFloat b) { return a > b ? a : b; }
@@ -181,6 +198,8 @@ MARS_INLINE HardFloat square_root(HardFloat x) {
     return (HardFloat)_mm256_sqrt_ps((__m256)x);
 #elif defined(MARS_X86)
     return (HardFloat)_mm_sqrt_ps((__m128)x);
+#elif defined(MARS_WASM)
+    return (HardFloat)wasm_f32x4_sqrt((v128_t)x);
 #else
     for (int k = 0; k < kHardwareLanes; ++k) x[k] = sqrtf(x[k]);
     return x;
@@ -218,6 +237,12 @@ MARS_INLINE void multiply(HardUInt x, uint32_t factor, HardUInt& high, HardUInt&
     const __m128i even = _mm_mul_epu32(a, by), odd = _mm_mul_epu32(_mm_srli_epi64(a, 32), by);
     high = (HardUInt)_mm_or_si128(_mm_srli_epi64(even, 32), _mm_and_si128(odd, upper));
     low = (HardUInt)_mm_or_si128(_mm_andnot_si128(upper, even), _mm_slli_epi64(odd, 32));
+#elif defined(MARS_WASM)
+    const v128_t by = wasm_i32x4_splat(static_cast<int32_t>(factor));
+    const v128_t first = wasm_u64x2_extmul_low_u32x4((v128_t)x, by),
+                 second = wasm_u64x2_extmul_high_u32x4((v128_t)x, by);
+    high = (HardUInt)wasm_i32x4_shuffle(first, second, 1, 3, 5, 7);
+    low = (HardUInt)wasm_i32x4_shuffle(first, second, 0, 2, 4, 6);
 #else
     for (int k = 0; k < kHardwareLanes; ++k) {
         const uint64_t product = static_cast<uint64_t>(x[k]) * factor;
@@ -240,6 +265,8 @@ MARS_INLINE uint64_t lane_bits(HardMask m) {
     return static_cast<uint64_t>(_mm256_movemask_ps((__m256)m));
 #elif defined(MARS_X86)
     return static_cast<uint64_t>(_mm_movemask_ps((__m128)m));
+#elif defined(MARS_WASM)
+    return static_cast<uint64_t>(wasm_i32x4_bitmask((v128_t)m));
 #else
     uint64_t found = 0;
     for (int k = 0; k < kHardwareLanes; ++k) found |= static_cast<uint64_t>(m[k] & 1) << k;

@@ -79,6 +79,13 @@ MARS_INLINE void gather_pair(const float* table, const int32_t* k, HardFloat& fi
     const __m128 low = (__m128)two_pairs(table, k), high = (__m128)two_pairs(table, k + 2);
     first = (HardFloat)_mm_shuffle_ps(low, high, 0x88);
     second = (HardFloat)_mm_shuffle_ps(low, high, 0xdd);
+#elif defined(MARS_WASM)
+    const auto two = [&](int lane) {
+        return wasm_v128_load64_lane(table + 2 * k[lane + 1], wasm_v128_load64_zero(table + 2 * k[lane]), 1);
+    };
+    const v128_t low = two(0), high = two(2);
+    first = (HardFloat)wasm_i32x4_shuffle(low, high, 0, 2, 4, 6);
+    second = (HardFloat)wasm_i32x4_shuffle(low, high, 1, 3, 5, 7);
 #else
     for (int lane = 0; lane < kHardwareLanes; ++lane) {
         first[lane] = table[2 * k[lane]];

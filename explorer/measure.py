@@ -1,0 +1,105 @@
+"""How fast the explorer's page is in headless Chromium: docs/results/explorer.md.
+
+    python explorer/measure.py            prints the table
+    python explorer/measure.py --write    writes it
+
+Times are of the page's own clock: from the start of the navigation to the frame after the first figure with its exact
+mean, and from a slider's input event to the frame after the figure that it changes. Needs the extra `browser`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "explore"))
+from pages import PAGE, Page, chromium
+
+RESULTS = PAGE.parents[3] / "docs" / "results" / "explorer.md"
+LOADS, MOVES = 5, {"mean": 15, "law": 5, "band": 3}
+WATCH = """
+const first = () => {
+    if (window.explorer?.figure.results.mean) window.firstDrawn = performance.now();
+    else requestAnimationFrame(first);
+};
+requestAnimationFrame(first);
+"""
+MOVE = """async ([key, place, stage]) => {
+    const slider = document.getElementById(key + "-slider"), { figure } = explorer;
+    while (figure.busy) await new Promise((go) => setTimeout(go, 5));
+    await new Promise(requestAnimationFrame);
+    figure.results = {};
+    const began = performance.now();
+    slider.value = place;
+    slider.dispatchEvent(new Event("input"));
+    for (;;) {
+        await new Promise(requestAnimationFrame);
+        if (figure.results[stage]) return performance.now() - began;
+    }
+}"""
+STATES = {
+    "start of the page": {},
+    "bright": {"signal": 10, "background": 1},
+    "512 bins, pulse of 0.3 ns": {"bins": 512, "sigma": 0.3},
+    "paralyzable": {"mode": "paralyzable"},
+    "synchronous": {"mode": "synchronous"},
+}
+STAGES = {"mean": "dots and mean", "law": "law of the count", "band": "band"}
+
+
+def row(name: str, times: list[float]) -> str:
+    """A line of the table."""
+    ordered = sorted(times)
+    return f"| {name} | {len(ordered)} | {ordered[0]:.0f} | {statistics.median(ordered):.0f} |"
+
+
+def first_drawings(browser: Any) -> list[float]:
+    """Times (ms) from the start of the navigation to the first figure."""
+    times = []
+    for _ in range(LOADS):
+        context = browser.new_context()
+        tab = context.new_page()
+        tab.add_init_script(WATCH)
+        tab.goto(PAGE.as_uri())
+        while not tab.evaluate("window.firstDrawn"):
+            tab.wait_for_timeout(20)
+        times.append(float(tab.evaluate("firstDrawn")))
+        context.close()
+    return times
+
+
+def main() -> None:
+    """Measure, and print or write the table."""
+    lines = ["| what | times | fastest (ms) | median (ms) |", "|---|---|---|---|"]
+    load = os.getloadavg()[0]
+    with chromium() as browser:
+        version = browser.version
+        lines.append(row("first drawing", first_drawings(browser)))
+        page = Page(browser, PAGE.as_uri())
+        for name, changes in STATES.items():
+            page.set(**json.loads(page.tab.evaluate("JSON.stringify(explorer.initial)")) | {"cycles": 10000} | changes)
+            for stage, told in STAGES.items():
+                if stage == "band" and changes.get("mode"):
+                    continue
+                times = [page.tab.evaluate(MOVE, ["dead", 20 + 2 * k, stage]) for k in range(MOVES[stage])]
+                lines.append(row(f"a slider, {name}: {told}", times))
+    cores = len(os.sched_getaffinity(0))
+    text = f"""# The explorer's page in a browser
+
+Made by `python explorer/measure.py --write`: Chromium {version}, headless, {cores} processor cores on which {load:.0f}
+other processes were running, the page of {PAGE.stat().st_size:,} bytes from a file. A slider moves the dead time at
+10,000 laser periods while the pictures of all pixels are drawn anew in the background; times are to the next frame.
+
+{chr(10).join(lines)}
+"""
+    print(text)
+    if "--write" in sys.argv:
+        RESULTS.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
+from mars_lidar import _core
+from mars_lidar.engines.engine import Records, Task
+from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.instrument.jitter import Jitter
 
 
 @pytest.mark.parametrize("engine", ["exact", "sequential"])
@@ -79,3 +83,77 @@ def test_units_are_nanoseconds(system: ml.System):
     b = ml.simulate_timestamps(ml.Flux(2.0, 0.5, 25.0), half, seed=3)
     assert np.array_equal(a.times_ns, 2 * b.times_ns)
     assert np.array_equal(a.bin, b.bin)
+
+
+@pytest.mark.parametrize("light", ["pulse", "waveform"])
+@pytest.mark.parametrize("level", _core.levels())
+def test_one_pass_wherever_the_records_are_kept(level: str, light: str):
+    """Blocks in any order, more or fewer registrations than there is room for."""
+    random = np.random.default_rng(3)
+    bright = random.uniform(0.0, 2.0, (5, 90)) * (random.uniform(size=(5, 90)) < 0.8)
+    if light == "pulse":
+        flux = ml.Flux(bright, 0.1 * bright, random.uniform(0.0, 100.0, bright.shape))
+    else:
+        flux = ml.Flux(waveform=bright[..., None] * random.dirichlet(np.ones(16), bright.shape))
+    system = ml.System(
+        period_ns=100.0,
+        cycles=1000,
+        bins=16,
+        pulse=ml.GaussianPulse(sigma_ns=1.0),
+        detector=ml.Detector(dead_time_ns=10.0, jitter=Jitter(sigma_ns=5.0)),
+    )
+    engine = ExactEngine(level)
+    index = np.arange(bright.size, dtype=np.uint32)
+    histograms = np.zeros((2, bright.size, 16), system.histogram_dtype)
+    found = []
+    for threads, expected in ((1, 0.0), (2, 4e5), (2, 1e5), (2, 0.0)):
+        task = Task(flux, system, 2, 0, index, 1, threads, None)
+        found.append(engine.records(task, expected))
+    engine.histogram(task, histograms.reshape(-1, 16))
+    first = found[0]
+    assert np.array_equal(np.diff(first.offsets), histograms.sum(axis=2).ravel())
+    assert np.array_equal(np.diff(first.offsets), engine.counts(task))
+    item = np.repeat(np.arange(2 * bright.size), np.diff(first.offsets))
+    assert np.array_equal(np.bincount(item * 16 + first.bin, minlength=histograms.size), histograms.ravel())
+    assert not ((np.diff(first.times) < 0) & (np.diff(item) == 0)).any()
+    assert first.cycle.min() >= 0
+    assert first.cycle.max() < 1000
+    for other in found[1:]:
+        for name in ("offsets", "times", "cycle", "bin"):
+            assert np.array_equal(getattr(first, name), getattr(other, name))
+
+
+def test_more_registrations_of_a_pixel_than_a_segment_holds():
+    detector = ml.Detector(dead_time_ns=30.0)
+    system = ml.System(
+        period_ns=100.0, cycles=300_000, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=detector
+    )
+    flux = ml.Flux(np.array([[0.5, 0.0, 1.0]]), 0.1, 20.0)
+    times = ml.simulate_timestamps(flux, system, seed=2)
+    assert times.counts.max() > 2 * 65_536
+    assert np.array_equal(times.histogram(), ml.simulate(flux, system, seed=2)[0])
+
+
+def test_records_into_memory_that_is_there(system: ml.System, flux: ml.Flux):
+    task = Task(flux, system, 1, 0, np.arange(6, dtype=np.uint32), 1, 1, None)
+    engine = ExactEngine()
+    records = Records.allocate(engine.counts(task))
+    engine.timestamps(task, records)
+    assert np.array_equal(records.times, engine.records(task, 0.0).times)
+    with pytest.raises(ValueError, match="one length"):
+        _core.exact_records(
+            task.job, task.pulse, records.offsets, records.times, records.cycle, records.bin[1:], 1, None, ""
+        )
+    with pytest.raises(ValueError, match="items \\+ 1"):
+        _core.exact_records(
+            task.job, task.pulse, records.offsets[1:], records.times, records.cycle, records.bin, 1, None, ""
+        )
+
+
+def test_where_memory_is_scarce_they_are_counted_first(
+    system: ml.System, flux: ml.Flux, monkeypatch: pytest.MonkeyPatch
+):
+    plenty = ml.simulate_timestamps(flux, system, seed=3)
+    monkeypatch.setattr("mars_lidar.engines.exact.available_bytes", lambda: 16)
+    scarce = ml.simulate_timestamps(flux, system, seed=3)
+    assert np.array_equal(plenty.times_ns, scarce.times_ns)

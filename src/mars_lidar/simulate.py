@@ -15,7 +15,7 @@ from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
-from mars_lidar.engines.engine import Records, Task
+from mars_lidar.engines.engine import IN_PARTS, Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.units import check_delays
 from mars_lidar.light.flux import MAX_RETURNS, Flux
@@ -25,7 +25,6 @@ from mars_lidar.light.timestamps import Timestamps
 if TYPE_CHECKING:
     pass
 
-_STAMP_BYTES = 16  # of a time, a cycle and a bin
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
 
@@ -148,12 +147,9 @@ def simulate_timestamps(
     else:
         detected = flux.detected(system)
         share = np.exp(-detected.total * system.dead_time_periods) if system.detector.mode == "paralyzable" else 1.0
-        least = 0.5 * float((share * _expected_registrations(detected, system)).sum())
-        _check_memory((math.ceil(least),), _STAMP_BYTES, "timestamps")  # before they are counted: half of the work
-        counts = drawn_by.counts(task)
-        _check_memory((int(counts.sum()),), _STAMP_BYTES, "timestamps")
-        records = Records.allocate(counts)
-        drawn_by.timestamps(task, records)
+        expected = float((share * _expected_registrations(detected, system)).sum())
+        _check_memory((math.ceil(0.5 * expected),), Records.BYTES, "timestamps")  # before any work
+        records = drawn_by.records(task, expected)
     times_ns = records.times
     times_ns *= system.period_ns
     return Timestamps(
@@ -285,6 +281,5 @@ def _check_memory(shape: tuple[int, ...], itemsize: int, what: str) -> None:
     check_memory(
         math.prod(shape) * itemsize,
         f"{what} of shape {shape}",
-        "simulate rows (flux[rows] with pixel_index) or realizations (first_realization) one after another, "
-        "or give out= a memory map",
+        IN_PARTS,
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.memory import check_memory
 from mars_lidar._base.types import Progress
 from mars_lidar.instrument.detector import MODES, Detector, Mode
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS, LIGHT_EFFECTS, RECORDING_EFFECTS, native_fields
@@ -19,6 +20,12 @@ from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
     from mars_lidar._base.native import _core
+
+
+IN_PARTS = (
+    "simulate rows (flux[rows] with pixel_index) or realizations (first_realization) one after another, "
+    "or give out= a memory map"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +119,24 @@ class Records:
     cycle: NDArray[np.int32]
     bin: NDArray[np.int32]
 
+    BYTES: ClassVar[int] = 16  # of a time, a cycle and a bin
+
     @classmethod
     def allocate(cls, counts: NDArray[np.int64]) -> Records:
-        """Room for `counts` (items,) registrations each."""
+        """Room for `counts` (items,) registrations each; MemoryError where there is not that much memory."""
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        n = int(offsets[-1])
-        return cls(offsets, np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32))
+        return cls.reserve(offsets, int(offsets[-1]))
+
+    @classmethod
+    def reserve(cls, offsets: NDArray[np.int64], room: int) -> Records:
+        """Room for `room` registrations, wherever items begin; MemoryError where there is not that much memory."""
+        check_memory(room * cls.BYTES, f"timestamps of shape ({room},)", IN_PARTS)
+        return cls(offsets, np.empty(room), np.empty(room, np.int32), np.empty(room, np.int32))
+
+    def resize(self) -> None:
+        """As much room as there are registrations: what has not been written to costs no memory till now."""
+        for array in (self.times, self.cycle, self.bin):
+            array.resize(int(self.offsets[-1]), refcheck=False)
 
     def sort(self) -> None:
         """Put the registrations of each item in order of time, which jitter may have changed."""
@@ -162,6 +181,15 @@ class Engine(ABC):
     def counts(self, task: Task) -> NDArray[np.int64]:
         """Registrations of each exposure (items,), with the draws of `histogram`."""
         raise ValueError(f"engine {self.name!r} draws histograms only, not single registrations; use 'exact'")
+
+    def records(self, task: Task, expected: float) -> Records:
+        """Every registration, with the draws of `histogram`, of which about `expected` are to be expected in all.
+
+        Here in two passes, `counts` and `timestamps`.
+        """
+        records = Records.allocate(self.counts(task))
+        self.timestamps(task, records)
+        return records
 
     def timestamps(self, task: Task, records: Records) -> None:
         """Fill `records`, allocated from `counts`, with the draws of `histogram`."""

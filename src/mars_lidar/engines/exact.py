@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.memory import available_bytes
 from mars_lidar._base.native import _core
 from mars_lidar.engines.engine import Engine, Records, Task
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import EFFECTS
+
+_ROOM = 1.3  # for registrations, over those that a constant rate would leave
 
 
 class ExactEngine(Engine):
@@ -34,14 +37,31 @@ class ExactEngine(Engine):
         _core.exact_histogram(task.job, task.pulse, out, task.threads, task.progress, self.level)
 
     def counts(self, task: Task) -> NDArray[np.int64]:
-        """The first of the two passes for timestamps."""
+        """Registrations alone, of which nothing is kept."""
         out = np.empty(task.items, np.int64)
         _core.exact_counts(task.job, task.pulse, out, task.threads, None, self.level)
         return out
 
-    def timestamps(self, task: Task, records: Records) -> None:
-        """The second pass: the same draws again, now with a place to go."""
-        where = (records.offsets, records.times, records.cycle, records.bin)
-        _core.exact_timestamps(task.job, task.pulse, *where, task.threads, task.progress, self.level)
+    def records(self, task: Task, expected: float) -> Records:
+        """In one pass, into more room than is needed; where memory is scarce they are counted before."""
+        room = int(_ROOM * expected) + 1024
+        available = available_bytes()
+        if available is not None and 2 * Records.BYTES * room > available:
+            room = int(self.counts(task).sum())
+        records = Records.reserve(np.empty(task.items + 1, np.int64), room)
+        arrays = (records.times, records.cycle, records.bin)
+        drawn = _core.exact_records(
+            task.job, task.pulse, records.offsets, *arrays, task.threads, task.progress, self.level
+        )
+        records.resize()
+        if records.times.size > room:
+            drawn.rest(*arrays)
         if task.system.detector.jitter is not None:
             records.sort()
+        return records
+
+    def timestamps(self, task: Task, records: Records) -> None:
+        """The same as `records`, into memory that is there."""
+        drawn = self.records(task, float(records.times.size))
+        for to, array in ((records.times, drawn.times), (records.cycle, drawn.cycle), (records.bin, drawn.bin)):
+            to[:] = array

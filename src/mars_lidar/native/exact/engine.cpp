@@ -7,6 +7,7 @@
 #include "exact/start.h"
 #include "exact/trap_law.h"
 #include "instrument/pulse_table.h"
+#include "instrument/records.h"
 #include "lanes/kernels.h"
 
 namespace mars {
@@ -40,7 +41,8 @@ void run_exact(const Job& job, const PulseTable& pulse, const Output& output, in
     // four blocks to a thread, so that the last ones end together; not below 64 items, which keep the lanes of any
     // level busy
     const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));
-    const int64_t items = std::min(kMaxItems, share);
+    const int64_t most = output.records ? std::max<int64_t>(64, output.records->items_of_block()) : kMaxItems;
+    const int64_t items = std::min({kMaxItems, most, share});
     run_chunks((job.items() + items - 1) / items, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {
         ExactBlock block = proto;
         block.first_item = chunk * items;
@@ -53,7 +55,13 @@ void run_exact(const Job& job, const PulseTable& pulse, const Output& output, in
             block.start_cycle = starts.cycle.data();
             block.start_phase = starts.phase.data();
         }
+        std::unique_ptr<RecordRuns> runs;
+        if (output.records) {
+            runs = output.records->begin();
+            block.output.runs = runs.get();
+        }
         if (!stop.load(std::memory_order_relaxed)) kernel(block);
+        if (runs) output.records->end(chunk, block.first_item, block.items, std::move(runs));
     });
 }
 

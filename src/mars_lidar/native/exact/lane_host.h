@@ -120,7 +120,7 @@ class LaneHost {
         recorder_.take(seen_, key0_, key1_, event_, log_.timed());
         for (int k = 0; k < kAhead; ++k) {
             log_.put(k, seen_[k].lost, seen_[k].bin);
-            if (log_.timed()) log_.put_time(k, seen_[k].cycle, seen_[k].phase);
+            if (log_.timed()) log_.put_time(k, seen_[k].lost, seen_[k].cycle, seen_[k].phase);
         }
         if (recorder_.fills())  // nothing more can be recorded there
             armed_ = earlier(recorder_.full(), clock_.all(Clock::idle()), armed_);

@@ -6,6 +6,7 @@
 
 #include "exact/kernel.h"
 #include "instrument/recording.h"
+#include "instrument/records.h"
 #include "lanes/lanes.h"
 
 namespace mars {
@@ -22,7 +23,8 @@ class LaneLog {
         : output_(output),
           timed_(output.sink == Sink::kTimestamps),
           bins_(static_cast<size_t>(job.bins)),
-          cycles_(job.cycles) {
+          cycles_(job.cycles),
+          most_(timed_ ? kLog / 2 : kLog) {
         for (int lane = 0; lane < kLanes; ++lane) items_[lane] = -1;
     }
 
@@ -49,22 +51,22 @@ class LaneLog {
         if (busy(lane)) write<1>(lane, first_row_[lane], rows_);
         first_row_[lane] = rows_;
         items_[lane] = item;
-        if (item >= 0 && timed_) next_[lane] = output_.offsets[item];
     }
 
     // Row k after those that are complete: the registrations of all lanes, some of them outside of the exposure.
     MARS_INLINE void put(int k, Mask lost, Int bin) { store(bin_[rows_ + k], select(lost, splat(-1), bin)); }
     // Their times, kept if timed(): `phase` as a vector or in memory.
     template <class Phases>
-    MARS_INLINE void put_time(int k, Int cycle, const Phases& phase) {
+    MARS_INLINE void put_time(int k, Mask lost, Int cycle, const Phases& phase) {
         static_assert(sizeof phase == sizeof phase_[0], "a phase per lane");
+        odd_[rows_ + k] = lane_bits(lost | (as_uint(cycle) >= static_cast<uint32_t>(cycles_)));
         store(cycle_[rows_ + k], cycle);
         memcpy(phase_[rows_ + k], &phase, sizeof phase);
     }
 
     // `n` rows, a divisor of kLog, are complete.
     void advance(int n) { rows_ += n; }
-    bool full() const { return rows_ == kLog; }
+    bool full() const { return rows_ == most_; }
 
     // Several lanes at once, where all have work: the processor is busy while a bin that was just counted is still on
     // its way to the cache.
@@ -138,30 +140,70 @@ class LaneLog {
     }
     template <int n>
     void tell_times(int lane, int from, int to) {
+        RecordRuns& runs = *output_.runs;
+        const int64_t most = to - from;
+        if (most <= 0) return;
+        if (runs.used + n * most > RecordRuns::kSegment) runs.grow();
+        if (runs.number + n > runs.most) runs.grow_runs();
         int64_t next[n];
-        for (int i = 0; i < n; ++i) next[i] = next_[lane + i];
-        for (int k = from; k < to; ++k)
+        for (int i = 0; i < n; ++i) next[i] = runs.used + i * most;
+        for (int k = from; k < to;) {
+            if constexpr (n == 4 && sizeof(Phase) == 4) {
+                if (k + 4 <= to && ((odd_[k] | odd_[k + 1] | odd_[k + 2] | odd_[k + 3]) >> lane & 15) == 0) {
+                    tell_four(lane, k, runs.at, next);
+                    k += 4;
+                    continue;
+                }
+            }
             for (int i = 0; i < n; ++i) {
                 const int32_t bin = bin_[k][lane + i];
                 if (bin < 0) continue;
                 const int64_t record = next[i]++;
                 const int32_t cycle = round_exposure(cycle_[k][lane + i], cycles_);
-                output_.times[record] = registration_time(cycle, phase_[k][lane + i]);
-                output_.cycles[record] = cycle;
-                output_.bins[record] = bin;
+                runs.at.times[record] = registration_time(cycle, phase_[k][lane + i]);
+                runs.at.cycles[record] = cycle;
+                runs.at.bins[record] = bin;
             }
-        for (int i = 0; i < n; ++i) next_[lane + i] = next[i];
+            ++k;
+        }
+        for (int i = 0; i < n; ++i) {
+            const int64_t first = runs.used + i * most;
+            if (next[i] > first) runs.runs[runs.number++] = {items_[lane + i], next[i] - first, runs.at.from(first)};
+        }
+        runs.used = n == 1 ? next[0] : runs.used + n * most;
     }
+#if MARS_LANES > 1
+    // Four rows of four lanes, all of them registered, and in the exposure.
+    MARS_INLINE void tell_four(int lane, int row, const RecordArrays& at, int64_t (&next)[4]) const {
+        FourInts bin[4], cycle[4];
+        FourFloats phase[4];
+        columns_of_four(&bin_[row][lane], bin);
+        columns_of_four(&cycle_[row][lane], cycle);
+        columns_of_four(&phase_[row][lane], phase);
+        for (int i = 0; i < 4; ++i) {
+            const int64_t to = next[i];
+            const FourDoubles exact = __builtin_convertvector(phase[i], FourDoubles);  // as registration_time
+            const FourDoubles below = exact < FourDoubles{} + 1.0 ? exact : FourDoubles{} + (1.0 - 0x1p-25);
+            const FourDoubles time = __builtin_convertvector(cycle[i], FourDoubles) + below;
+            memcpy(at.times + to, &time, sizeof time);
+            memcpy(at.cycles + to, &cycle[i], sizeof cycle[i]);
+            memcpy(at.bins + to, &bin[i], sizeof bin[i]);
+            next[i] = to + 4;
+        }
+    }
+#endif
 
     const Output output_;
     const bool timed_;
     const size_t bins_;
     const int32_t cycles_;
-    int64_t items_[kLanes], next_[kLanes];  // of the job, or -1; the lane's next record
+    const int most_;         // rows: as many as stay in the first cache
+    int64_t items_[kLanes];  // of the job, or -1
     int first_row_[kLanes] = {}, rows_ = 0;
     alignas(64) int32_t bin_[kLog][kLanes];  // -1: not registered
     alignas(64) int32_t cycle_[kLog][kLanes];
     alignas(64) Phase phase_[kLog][kLanes];
+    uint64_t odd_[kLog];  // lanes that are not registered, or not in the exposure
 };
 
 }  // namespace MARS_LEVEL

@@ -169,7 +169,7 @@ class Runner final : ExactLanes<stage> {
             seen.lost = r.lost;
         } else {
             this->log_.put(k, r.lost, bin_of(r.phase, this->system_.bins));
-            if (this->log_.timed()) this->log_.put_time(k, r.cycle, r.phase);
+            if (this->log_.timed()) this->log_.put_time(k, r.lost, r.cycle, r.phase);
         }
     }
 

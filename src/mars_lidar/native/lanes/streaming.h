@@ -1,7 +1,11 @@
-// Counters written past the caches: histograms that nobody reads before all of them are done would only displace what
-// the next pixel needs.
+// Counters and records written past the caches: what nobody reads before all of it is done would only displace what the
+// next pixel needs, and lines that are written whole need not be read before.
 #pragma once
 #include "lanes/lanes.h"
+#if (defined(__x86_64__) || defined(_M_X64)) && !defined(__CUDACC__)
+#include <emmintrin.h>
+#define MARS_STREAMS
+#endif
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -11,7 +15,7 @@ inline namespace MARS_LEVEL {
 MARS_INLINE int64_t stream_counters([[maybe_unused]] uint16_t* from, [[maybe_unused]] uint16_t* to,
                                     [[maybe_unused]] int64_t n) {
     int64_t j = 0;
-#if defined(MARS_X86)
+#if defined(MARS_STREAMS)
     constexpr int64_t kLine = 32;  // counters
     if (reinterpret_cast<uintptr_t>(to) % 16 != 0) return 0;
     for (; j + kLine <= n; j += kLine) {
@@ -24,9 +28,55 @@ MARS_INLINE int64_t stream_counters([[maybe_unused]] uint16_t* from, [[maybe_unu
     return j;
 }
 
+// Numbers written one after the other from `to` on, whole lines of the cache at a time.
+template <class Number>
+class LineWriter {
+ public:
+    explicit LineWriter(Number* to) : to_(to) {
+        while ((reinterpret_cast<uintptr_t>(to) & 63u) != 0 && ahead_ < kLine) ++ahead_, ++to;
+    }
+    ~LineWriter() {
+        for (int64_t k = 0; k < held_; ++k) to_[k] = line_[k];
+    }
+    LineWriter(const LineWriter&) = delete;
+    LineWriter& operator=(const LineWriter&) = delete;
+
+    MARS_INLINE void append(const Number* from, int64_t n) {
+        for (; n > 0 && ahead_ > 0; --n, --ahead_) *to_++ = *from++;
+        for (; n > 0 && held_ > 0; --n) {
+            line_[held_++] = *from++;
+            if (held_ == kLine) {
+                stream(line_);
+                held_ = 0;
+            }
+        }
+        for (; n >= kLine; n -= kLine, from += kLine) stream(from);
+        for (; n > 0; --n) line_[held_++] = *from++;
+    }
+
+ private:
+    static constexpr int64_t kLine = 64 / sizeof(Number);
+
+    MARS_INLINE void stream(const Number* from) {
+#if defined(MARS_STREAMS)
+        for (int k = 0; k < 4; ++k) {
+            const __m128i quarter = _mm_loadu_si128(reinterpret_cast<const __m128i*>(from) + k);
+            _mm_stream_si128(reinterpret_cast<__m128i*>(to_) + k, quarter);
+        }
+#else
+        memcpy(to_, from, 64);
+#endif
+        to_ += kLine;
+    }
+
+    Number* to_;
+    int64_t ahead_ = 0, held_ = 0;  // numbers before the first whole line, and those of a line that is not complete
+    Number line_[kLine];
+};
+
 // Before other threads may read what was streamed.
 MARS_INLINE void finish_streaming() {
-#if defined(MARS_X86)
+#if defined(MARS_STREAMS)
     _mm_sfence();
 #endif
 }

@@ -1,13 +1,16 @@
 // Bindings of the engines that draw a job's registrations one by one, or their histograms at once: exact/engine.h and
 // waveform/engine.h (one engine to Python), sequential/engine.h, poisson/engine.h.
+#include <memory>
 #include <string>
 
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
 #include "base/clock.h"
 #include "exact/engine.h"
 #include "instrument/pulse_table.h"
+#include "instrument/records.h"
 #include "poisson/engine.h"
 #include "python/bindings.h"
 #include "python/watched.h"
@@ -71,22 +74,69 @@ void bind_registrations(nb::module_& module, const std::string& name, Run<Level.
                nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(), nb::arg("threads"),
                nb::arg("progress").none(), nb::arg(sizeof(Level) ? "level" : "")...,
                "Registrations out (items): the draws of the histogram.");
+}
+
+void bind_sequential_timestamps(nb::module_& module) {
     module.def(
-        (name + "_timestamps").c_str(),
-        [run](const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> offsets, Vector<double> times,
-              Vector<int32_t> cycle, Vector<int32_t> bin, int threads, const nb::object& progress,
-              const Level&... level) {
+        "sequential_timestamps",
+        [](const BoundJob& job, const PulseTable& pulse, Vector<const int64_t> offsets, Vector<double> times,
+           Vector<int32_t> cycle, Vector<int32_t> bin, int threads, const nb::object& progress) {
             const int64_t items = size_of(offsets) - 1, total = items < 0 ? 0 : offsets.data()[items];
             if (items != job.items() || size_of(times) != total || size_of(cycle) != total || size_of(bin) != total)
                 throw nb::value_error("offsets must have items + 1 values, and the other arrays offsets[-1]");
-            const Output output{Sink::kTimestamps, nullptr, offsets.data(), times.data(), cycle.data(), bin.data()};
-            watched(progress, [&](const Watch& watch) { run(job, pulse, output, threads, watch, level...); });
+            Output output{};
+            output.sink = Sink::kTimestamps;
+            output.offsets = offsets.data();
+            output.times = times.data();
+            output.cycles = cycle.data();
+            output.bins = bin.data();
+            watched(progress, [&](const Watch& watch) { sequential(job, pulse, output, threads, watch); });
         },
         nb::arg("job"), nb::arg("pulse"), nb::arg("offsets").noconvert(), nb::arg("times").noconvert(),
         nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("progress").none(),
-        nb::arg(sizeof(Level) ? "level" : "")...,
         "Registrations item after item, item i in [offsets[i], offsets[i + 1]), times in periods: the draws of the "
         "histogram.");
+}
+
+// Arrays of records with room for the same number.
+RecordArrays records_in(const Vector<double>& times, const Vector<int32_t>& cycle, const Vector<int32_t>& bin) {
+    if (size_of(cycle) != size_of(times) || size_of(bin) != size_of(times))
+        throw nb::value_error("times, cycle and bin must be of one length");
+    return {times.data(), cycle.data(), bin.data()};
+}
+
+void bind_exact_records(nb::module_& module) {
+    nb::class_<RecordsInOrder>(module, "RecordsInOrder", "Registrations drawn once, by `exact_records`.")
+        .def(
+            "rest",
+            [](RecordsInOrder& self, const Vector<double>& times, const Vector<int32_t>& cycle,
+               const Vector<int32_t>& bin) {
+                const RecordArrays to = records_in(times, cycle, bin);
+                if (size_of(times) != self.total()) throw nb::value_error("the arrays must hold offsets[-1] records");
+                const nb::gil_scoped_release release;
+                self.rest(to);
+            },
+            nb::arg("times").noconvert(), nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(),
+            "Fill in what there was no room for, in arrays that begin as those that were filled and hold all.");
+    module.def(
+        "exact_records",
+        [](const BoundJob& job, const PulseTable& pulse, Vector<int64_t> offsets, const Vector<double>& times,
+           const Vector<int32_t>& cycle, const Vector<int32_t>& bin, int threads, const nb::object& progress,
+           const std::string& level) {
+            if (size_of(offsets) != job.items() + 1) throw nb::value_error("offsets must have items + 1 values");
+            auto records = std::make_unique<RecordsInOrder>(offsets.data(), job.items(), records_in(times, cycle, bin),
+                                                            size_of(times));
+            Output output{};
+            output.sink = Sink::kTimestamps;
+            output.records = records.get();
+            watched(progress, [&](const Watch& watch) { exact(job, pulse, output, threads, watch, level); });
+            return records;
+        },
+        nb::arg("job"), nb::arg("pulse"), nb::arg("offsets").noconvert(), nb::arg("times").noconvert(),
+        nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("progress").none(),
+        nb::arg("level"),
+        "Registrations item after item, item i in [offsets[i], offsets[i + 1]), times in periods: the draws of the "
+        "histogram. Offsets are filled; what the other arrays have no room for is kept.");
 }
 
 }  // namespace
@@ -96,6 +146,8 @@ void bind_engines(nb::module_& module) {
                "Vector levels that this processor runs, widest first; all give the same bits.");
     bind_registrations(module, "exact", &exact<std::string>);
     bind_registrations(module, "sequential", &sequential);
+    bind_exact_records(module);
+    bind_sequential_timestamps(module);
     bind_histograms(module, "poisson", &poisson);
 #if defined(__GNUC__) || defined(__clang__)
     module.def("addition_chain", &addition_chain, nb::arg("rounds"),

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "exact/trap_law.h"
+#include "instrument/records.h"
 #include "lanes/kernels.h"
 #include "waveform/start.h"
 #include "waveform/table.h"
@@ -51,8 +52,10 @@ void run_waveform(const Job& job, const Output& output, int threads, const std::
     proto.job = &job;
     proto.team = std::max<int64_t>(1, std::min<int64_t>(kMostWaveLanes, kTableBytes / table_bytes));
     const int64_t share = std::max<int64_t>(64, job.items() / (4 * std::max(threads, 1)));
-    const int64_t items = std::min(kMaxItems, share);
-    const int64_t realizations = std::min(items, job.realizations), pixels = items / realizations;
+    const int64_t most = output.records ? std::max<int64_t>(64, output.records->items_of_block()) : kMaxItems;
+    const int64_t items = std::min({kMaxItems, most, share});
+    // records come in the order of the items: pixels of a realization together
+    const int64_t realizations = output.records ? 1 : std::min(items, job.realizations), pixels = items / realizations;
     const int64_t along = (job.realizations + realizations - 1) / realizations;
     const int64_t across = (job.pixels + pixels - 1) / pixels;
     run_chunks(across * along, threads, watch, [&](int64_t chunk, const std::atomic<bool>& stop) {
@@ -76,7 +79,16 @@ void run_waveform(const Job& job, const Output& output, int threads, const std::
         const std::unique_ptr<uint16_t[]> guides(new uint16_t[proto.team * layout.cells]);
         block.edges = edges[0].edges;
         block.guides = guides.get();
+        std::unique_ptr<RecordRuns> runs;
+        if (output.records) {
+            runs = output.records->begin();
+            block.output.runs = runs.get();
+        }
         if (!stop.load(std::memory_order_relaxed)) kernel(block);
+        if (runs) {
+            const int64_t first = block.first_realization * job.pixels + block.first_pixel;
+            output.records->end(chunk, first, block.pixels, std::move(runs));
+        }
     });
 }
 

@@ -65,7 +65,7 @@ class WaveRunner final : LaneHost<PartClock, stage> {
             if (!this->log_.timed()) return;
             alignas(64) double phase[kLanes];
             this->clock_.places.find_phase(hit, phase);
-            this->log_.put_time(k, hit.cycle, phase);
+            this->log_.put_time(k, outside | unseen, hit.cycle, phase);
         }
     }
 

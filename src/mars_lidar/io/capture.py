@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import TemporarySibling, check_claim, check_target, open_hdf5
+from mars_lidar._base.files import TemporarySibling, check_claim, check_target
+from mars_lidar._base.hdf5 import new_file, open_hdf5, with_checksums
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 
 if TYPE_CHECKING:
@@ -168,8 +169,6 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
     ValueError
         Sizes or widths that differ.
     """
-    import h5py
-
     target, source = Path(path), read_capture(like)
     if target.suffix.lower() not in CAPTURE_SUFFIXES:
         raise ValueError(f"path of a capture must end in one of {', '.join(CAPTURE_SUFFIXES)}, got {str(path)!r}")
@@ -183,12 +182,14 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
     with (
         TemporarySibling(target).writing() as unfinished,
         open_hdf5(source.path) as old,
-        h5py.File(unfinished, "w") as new,
+        new_file(unfinished) as new,
     ):
         for name in old:
             if name != source.name:
                 old.copy(name, new)
-        data = new.create_dataset(source.name, source.shape, np.float32, fillvalue=0.0)
+        data = new.create_dataset(
+            source.name, source.shape, np.float32, fillvalue=0.0, **with_checksums(source.shape, np.float32)
+        )
         for rows in source.bands():
             counts = np.asarray(cube.histogram[0, rows])[..., : source.image[2]]
             source.write(data, rows.start, counts.astype(np.float32))

@@ -13,15 +13,18 @@ import itertools
 import math
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar import io
+from mars_lidar.cli import app
 from mars_lidar.dataset import DatasetRecipe, estimate, export, open_dataset, read_sparse, read_view, verify
 from mars_lidar.io.maps import load_maps, save_maps
 
@@ -60,7 +63,10 @@ def cube() -> io.Cube:
 
 @pytest.fixture(scope="module")
 def here(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("wrong")
+    return make(tmp_path_factory.mktemp("wrong"))
+
+
+def make(folder: Path) -> Path:
     io.simulate_to(folder / "cube.zarr", FLUX, SYSTEM)
     ml.generate(RECIPE, folder / "set.zarr")
     times().save(folder / "photons.npz")
@@ -339,3 +345,78 @@ def test_what_is_documented_as_taken_is_taken(here):
     for call, argument, label in ACCEPTED:
         wanted = (call, f"{argument}: {label}")
         assert any(all(map(fnmatch.fnmatch, one, wanted)) for one in found), wanted
+
+
+# The command line: arguments that make each command do something small, by the files of `here`.
+COMMANDS: dict[str, Callable[[Path], list[Any]]] = {
+    "simulate": lambda at: ["--scene", "room", "--size", 3, "-o", at / f"cli{next(NUMBERS)}.npz"],
+    "compare": lambda at: [
+        *("--scene", "room", "--size", 3, "--engines", "exact", "--realizations", 50),
+        *("-o", at / f"cli{next(NUMBERS)}.png"),
+    ],
+    "generate": lambda at: ["room", "--size", 3, "-o", at / f"cli{next(NUMBERS)}.zarr"],
+    "verify": lambda at: [at / "set.zarr"],
+    "export": lambda at: [at / "set.zarr", "--layout", "sun", "-o", at / f"cli{next(NUMBERS)}"],
+    "view": lambda at: [at / "cube.zarr", "-o", at / f"cli{next(NUMBERS)}.png"],
+    "convert": lambda at: [at / "cube.zarr", at / f"cli{next(NUMBERS)}.npz"],
+    "timestamps": lambda at: [at / "cube.zarr", "-o", at / f"cli{next(NUMBERS)}.npz"],
+    "inspect": lambda at: [at / "photons.npz"],
+    "calibrate": lambda at: [at / "photons.npz"],
+    "validate": lambda at: [at / "photons.npz", "--cycles", 100],
+    "reconstruct": lambda at: [at / "cube.zarr", "-o", at / f"cli{next(NUMBERS)}.npz"],
+    "init": lambda at: [at / f"cli{next(NUMBERS)}.yaml"],
+    "schema": lambda _: [],
+    "table build": lambda at: ["-o", at / f"cli{next(NUMBERS)}.h5", "--signal", "0.1,1,2", "--background", "0.1,1,2"],
+}
+WORDS = {
+    int: ("three", "1.5", "nan", "-99999999999", "99999999999999999999", ""),
+    float: ("wide", "nan", "-inf", "1j", "", "-1e9"),
+    Path: ("/no such folder/a.xyz", ""),
+    str: ("no such thing", "", "nan"),
+}
+# (command, option, word): why it is taken.
+TAKEN: dict[tuple[str, str, str], str] = {}
+
+
+def options(command: str) -> Iterator[tuple[str, type]]:
+    """(name, type) of the options of a command that take a value."""
+    found: Any = typer.main.get_command(app)
+    for word in command.split():
+        found = found.commands[word]
+    for one in found.params:
+        if getattr(one, "opts", [""])[0].startswith("-") and not one.is_flag:
+            kind = one.type_descriptor.annotation
+            yield (
+                max(one.opts, key=len),
+                next((k for k in WORDS if isinstance(kind, type) and issubclass(kind, k)), str),
+            )
+
+
+def command_outcomes(command: str, here: Path, seen: set[str]) -> Iterator[tuple[str, str, str, str]]:
+    """(option, word, outcome, what was told) for options that no command before had."""
+    for option, kind in options(command):
+        if option in seen:
+            continue
+        seen.add(option)
+        for word in WORDS[kind]:
+            arguments = [*command.split(), *map(str, COMMANDS[command](here)), f"{option}={word}"]
+            done = CliRunner(env={"COLUMNS": "2000", "TERM": "dumb"}).invoke(app, arguments)
+            told = " ".join(done.output.split())
+            if done.exit_code == 0:
+                given = (command, option, word)
+                took = any(all(map(fnmatch.fnmatch, given, entry)) for entry in TAKEN)
+                yield option, word, "documented" if took else "taken", told
+            else:
+                ours = done.exit_code in (1, 2) and isinstance(done.exception, SystemExit)
+                named = option in told or option[2:].replace("-", "_") in told or (word != "" and word in told)
+                yield option, word, "refused" if ours and named else "unnamed", told
+
+
+def test_wrong_options_are_refused_by_name(here):
+    seen: set[str] = set()
+    for command, make in COMMANDS.items():
+        done = CliRunner().invoke(app, [*command.split(), *map(str, make(here))])
+        assert done.exit_code == 0, (command, done.output)
+        found = list(command_outcomes(command, here, seen))
+        assert not [one for one in found if one[2] in ("taken", "unnamed")], command
+    assert len(seen) > 90

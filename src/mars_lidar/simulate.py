@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.arguments import checked
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
 
-@checked
 def simulate(
     flux: Flux,
     system: System,
@@ -94,6 +92,8 @@ def simulate(
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
         with ``device="cuda"``.
     """
+    if not isinstance(report, dict | None):
+        raise TypeError(f"report must be a dictionary, got {type(report).__name__}")
     drawn_by = find_engine(engine, **options)
     task = _task(flux, system, drawn_by, realizations, first_realization, pixel_index, seed, threads, progress)
     shape = (task.realizations, *flux.shape, system.bins)
@@ -114,7 +114,6 @@ def simulate(
     return cube
 
 
-@checked
 def simulate_timestamps(
     flux: Flux,
     system: System,
@@ -231,7 +230,7 @@ def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArr
     pixels = shape[0] * shape[1]
     if pixel_index is None:
         return np.arange(pixels, dtype=np.uint32)
-    index = np.asarray(checks.unmasked("pixel_index", pixel_index))
+    index = np.asarray(checks.even_rows("pixel_index", checks.unmasked("pixel_index", pixel_index)))
     if index.dtype.kind not in "iu":
         raise TypeError(f"pixel_index must be integers, got dtype {index.dtype}")
     if index.shape not in ((pixels,), shape):

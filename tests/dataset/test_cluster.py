@@ -103,3 +103,15 @@ def test_a_wrong_address_is_noticed_before_the_scenes_are_read(tmp_path, recipe,
     with pytest.raises(ValueError, match="scheduler must be the address"):
         ml.generate(recipe, tmp_path / "set.zarr", scheduler="tcp://127.0.0.1:9")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_scheduler_that_is_not_there_is_not_what_later_computations_wait_for(tmp_path):
+    import dask.array
+    from distributed import default_client
+
+    recipe = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": 0.5}}
+    with pytest.raises(ValueError, match="scheduler must be the address"):
+        ml.generate(recipe, tmp_path / "set.zarr", scheduler="no such thing")
+    with pytest.raises(ValueError, match="No clients found"):
+        default_client()
+    assert dask.array.ones(5).sum().compute() == 5

@@ -24,6 +24,8 @@ _FIELDS = {  # of the package, where an option has another name
     "sigma_ns": "pulse_sigma_ns",
     "fwhm_ns": "pulse_fwhm_ns",
     "values": "pulse_file",
+    "preset": "detector",
+    "outside": "table_outside",
     "example": "scene",
     "channel": "transient_channel",
     "start_ns": "transient_start_ns",

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+from mars_lidar._base import checks
 from mars_lidar.cli.options import _option
 from mars_lidar.instrument.effects import FIELDS
 
@@ -95,6 +96,8 @@ class StreamEffects:
             "tail_fraction": self.jitter_tail_fraction,
         }
         gaussian = {name: value for name, value in gaussian.items() if value is not None}
+        if self.jitter_fwhm_ns is not None:
+            checks.real("--jitter-fwhm-ns", self.jitter_fwhm_ns, low=0.0, strict_low=True)
         if self.jitter_file is not None:
             if gaussian:
                 raise ValueError("the jitter is given once: choose --jitter-file or --jitter-fwhm-ns and its tail")

@@ -66,7 +66,11 @@ class ForeignOptions:
     @property
     def given(self) -> bool:
         """Whether any option was given."""
-        return any(value not in (None, 0.0, PulseOptions()) for value in (getattr(self, f.name) for f in fields(self)))
+        return bool(self._given)
+
+    @property
+    def _given(self) -> list[str]:
+        return [f.name for f in fields(self) if getattr(self, f.name) not in (None, 0.0, PulseOptions())]
 
     def of_histograms(self, path: Path) -> bool:
         """Whether `path` is taken for histograms: by its suffix, or by options that neither cubes nor streams have."""
@@ -89,6 +93,9 @@ class ForeignOptions:
                 raise ValueError(
                     f"{path} is not a cube written by mars-lidar; for one of others give {_NEEDED}"
                 ) from error
+        if path.suffix in SUFFIXES and path.suffix not in FOREIGN_SUFFIXES:
+            told = ", ".join(f"--{name.replace('_', '-')}" for name in self._given)
+            raise ValueError(f"{path} tells all of its histograms: {told} must be left out")
         base = self._file()
         found = read_counts(
             path,

@@ -7,6 +7,7 @@ import inspect
 from collections.abc import Callable
 from contextvars import ContextVar
 from functools import partial, wraps
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import typer
@@ -39,6 +40,7 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def run(**given: Any) -> None:
         OPTIONS.set({p.name: _option_name(p) for p in parameters if given[p.name] not in (p.default, None, False, [])})
+        _refuse_empty({_option_name(p): given[p.name] for p in parameters})
         built = {name: _taken(kind, given) for name, kind in groups.items()}
         command(**given, **built)
 
@@ -46,6 +48,13 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature  # type: ignore[attr-defined]  # what typer reads
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
+
+
+def _refuse_empty(given: dict[str, Any]) -> None:
+    """A shell makes an empty text of a variable that is not set; as a path that is the folder one is in."""
+    for option, value in given.items():
+        if option.startswith("-") and (value == "" or (value == Path() and any(Path().iterdir()))):
+            raise typer.BadParameter("it is empty, or the folder that this runs in.", param_hint=option)
 
 
 def _option_name(parameter: inspect.Parameter) -> str:

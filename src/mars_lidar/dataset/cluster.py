@@ -64,7 +64,7 @@ def make_all(
         distributed.LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
         ) as cluster,
-        distributed.Client(cluster) as client,
+        distributed.Client(cluster, set_as_default=False) as client,
     ):
         _share_out(distributed, client, dataset, todo, add, threads)
 
@@ -83,7 +83,10 @@ def make_part(path: str, run: str, item: Item, threads: int) -> Made:
 
 def _client(distributed: Any, address: str) -> Any:
     try:
-        return distributed.Client(address, timeout=TIMEOUT_S)
+        if not address.startswith(("inproc:", "ucx:", "ws:", "wss:")):
+            distributed.comm.get_address_host_port(address, strict=True)  # a client with a wrong one ends after 40 s
+        # one that cannot connect would stay the default, and every later dask computation of the process wait for it
+        return distributed.Client(address, timeout=TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise ValueError(f"scheduler must be the address of a dask scheduler, got {address!r}: {error}") from error
 

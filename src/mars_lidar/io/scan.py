@@ -272,5 +272,5 @@ def _tell_images(root: Path, found: list[SceneFile]) -> None:
             f"{alone[0].depth.name} takes one of the same name without 'depth', or with 'rgb', 'color' or 'image' in "
             "place of it (docs/formats.md), or give pattern and image",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,  # of `scan`, through what checks its arguments
         )

@@ -127,7 +127,6 @@ class Scene:
         scene._fill(depth(self.depth_m), image(self.reflectivity), background)
         return scene
 
-    @checked
     def flux(
         self,
         system: System,

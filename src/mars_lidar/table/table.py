@@ -48,7 +48,6 @@ class Table(Nodes):
     """
 
     @classmethod
-    @checked
     def build(
         cls,
         system: System,
@@ -161,7 +160,6 @@ class Table(Nodes):
         return load(cls, Path(path), system)
 
     @classmethod
-    @checked
     def cached(
         cls,
         system: System,

@@ -2,6 +2,9 @@
 // put in order by shuffles, and the place of a number among ascending ones. As in lanes/vector.h the gather
 // instructions are left alone: they are slow where processors guard against data sampling.
 #pragma once
+#include <cstdint>
+#include <cstring>
+
 #include "lanes/lanes.h"
 
 namespace mars {
@@ -57,7 +60,10 @@ struct Given {
 #if defined(MARS_X86)
 // Entries a and a + 1, b and b + 1.
 MARS_INLINE __m128i load_two(const int32_t* table, int32_t a, int32_t b) {
-    return _mm_castpd_si128(_mm_loadh_pd(_mm_load_sd((const double*)(table + a)), (const double*)(table + b)));
+    int64_t first, second;  // not at addresses of int64_t, which no pointer to it may hold
+    std::memcpy(&first, table + a, sizeof first);
+    std::memcpy(&second, table + b, sizeof second);
+    return _mm_set_epi64x(second, first);
 }
 #endif
 

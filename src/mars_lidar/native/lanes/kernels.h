@@ -10,22 +10,22 @@
 
 // MARS_EACH_LEVEL(each, name) expands each(level, runs, name) for the levels of this build, widest first.
 #if defined(MARS_HAS_avx512)
-#define MARS_LEVEL_OF_512(each, name) each(avx512, has_avx512(), name)
+#define MARS_LEVEL_OF_512(each, name) each(avx512, has_avx512() && may_run("avx512"), name)
 #else
 #define MARS_LEVEL_OF_512(each, name)
 #endif
 #if defined(MARS_HAS_avx2)
-#define MARS_LEVEL_OF_256(each, name) each(avx2, has_avx2(), name)
+#define MARS_LEVEL_OF_256(each, name) each(avx2, has_avx2() && may_run("avx2"), name)
 #else
 #define MARS_LEVEL_OF_256(each, name)
 #endif
 #if defined(MARS_HAS_vector128)
-#define MARS_LEVEL_OF_128(each, name) each(vector128, true, name)
+#define MARS_LEVEL_OF_128(each, name) each(vector128, may_run("vector128"), name)
 #else
 #define MARS_LEVEL_OF_128(each, name)
 #endif
 #if defined(MARS_HAS_scalar)
-#define MARS_LEVEL_OF_ONE(each, name) each(scalar, true, name)
+#define MARS_LEVEL_OF_ONE(each, name) each(scalar, may_run("scalar"), name)
 #else
 #define MARS_LEVEL_OF_ONE(each, name)
 #endif

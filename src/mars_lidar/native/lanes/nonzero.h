@@ -86,7 +86,7 @@ MARS_AVX512 size_t find_nonzero_wide(const Count* values, size_t size, uint32_t*
 template <class Count>
 auto finder() -> size_t (*)(const Count*, size_t, uint32_t*) {
 #if defined(MARS_AVX512)
-    if (has_avx512()) return &find_nonzero_wide<Count>;
+    if (has_avx512() && may_run("avx512")) return &find_nonzero_wide<Count>;
 #endif
     return &find_nonzero<Count>;
 }

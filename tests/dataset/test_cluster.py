@@ -105,11 +105,10 @@ def test_a_wrong_address_is_noticed_before_the_scenes_are_read(tmp_path, recipe,
     assert not list(tmp_path.iterdir())
 
 
-def test_a_scheduler_that_is_not_there_is_not_what_later_computations_wait_for(tmp_path):
+def test_a_scheduler_that_is_not_there_is_not_what_later_computations_wait_for(tmp_path, recipe):
     import dask.array
     from distributed import default_client
 
-    recipe = {"scenes": {"example": "room", "size": [3, 4]}, "systems": [SYSTEM], "light": {"signal": 0.5}}
     with pytest.raises(ValueError, match="scheduler must be the address"):
         ml.generate(recipe, tmp_path / "set.zarr", scheduler="no such thing")
     with pytest.raises(ValueError, match="No clients found"):

@@ -58,6 +58,7 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "remove_config_comments": True,
     "min_reported_time": 5,
+    "thumbnail_size": (480, 280),
     "abort_on_example_error": True,
     "reset_modules": ("matplotlib", _style),
     "image_srcset": [],
@@ -71,30 +72,28 @@ html_theme_options = {
     "show_prev_next": False,
     "secondary_sidebar_items": ["page-toc"],
     "navbar_align": "left",
-    "header_links_before_dropdown": 8,
+    "header_links_before_dropdown": 7,
     "footer_start": ["copyright"],
     "footer_end": [],
     "show_toc_level": 2,
 }
 html_show_sourcelink = False
-
-# The explorer is built by itself, in explorer/; the site takes it along where that has been done.
-EXPLORER = next((f.parent for f in sorted(ROOT.glob("explorer/**/index.html")) if "node_modules" not in f.parts), None)
-if EXPLORER:
-    tags.add("explorer")  # noqa: F821 - a name that Sphinx gives
-
+html_sidebars = {page: [] for page in ("start", "explorer", "coming_from")}  # pages without pages below them
 
 # Pages that stand elsewhere, where the programs or the hosts of repositories look for them, and what a program says.
 COPIED = ROOT / "docs" / "copied"
+COPIES = {report: COPIED / "benchmarks" / report.name for report in ROOT.glob("benchmarks/results/*.md")}
+COPIES |= {ROOT / name: COPIED / "project" / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md")}
 
 
 def _copy(source: Path, target: Path) -> None:
     def link(found: re.Match[str]) -> str:
-        return f"]({os.path.relpath(source.parent / found[1], target.parent)})"
+        file, hash_mark, anchor = found[1].partition("#")
+        meant = (source.parent / file).resolve()
+        return f"]({os.path.relpath(COPIES.get(meant, meant), target.parent)}{hash_mark}{anchor})"
 
     target.parent.mkdir(parents=True, exist_ok=True)
     text = re.sub(r"\]\((?!https?:|#)([^)\s]+)\)", link, source.read_text(encoding="utf-8"))
-    text = text.replace(f"]({os.path.relpath(ROOT / 'benchmarks' / 'results', target.parent)}/", "](../benchmarks/")
     target.write_text(text, encoding="utf-8")
 
 
@@ -110,10 +109,8 @@ def _commands() -> str:
     return re.sub(r"\[/?(?:bold|dim)\]", "", text)
 
 
-for report in ROOT.glob("benchmarks/results/*.md"):
-    _copy(report, COPIED / "benchmarks" / report.name)
-for name in ("CHANGELOG", "CONTRIBUTING", "CODE_OF_CONDUCT"):
-    _copy(ROOT / f"{name}.md", COPIED / "project" / f"{name.lower()}.md")
+for copied in COPIES.items():
+    _copy(*copied)
 COPIED.joinpath("commands.md").write_text(_commands(), encoding="utf-8")
 
 
@@ -122,8 +119,10 @@ def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 def _take_explorer(app: Sphinx, error: Exception | None) -> None:
-    if EXPLORER and not error:
-        shutil.copytree(EXPLORER, Path(app.outdir) / "explorer", dirs_exist_ok=True)
+    if not error:
+        target = Path(app.outdir) / "explorer" / "index.html"
+        target.parent.mkdir(exist_ok=True)
+        shutil.copyfile(ROOT / "src" / "mars_lidar" / "explore" / "page.html", target)
 
 
 def setup(app: Sphinx) -> None:

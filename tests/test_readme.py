@@ -17,16 +17,13 @@ README = ROOT.joinpath("README.md").read_text()
 
 
 def test_python():
-    own, first, *more = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    own, *more = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     space: dict[str, object] = {}
     exec(own, space)
+    assert space["cube"].shape == (1, 48, 64, 1024)
     assert np.nanmedian(np.abs(space["found"].depth_m - space["depth_m"])) < 0.02
-    exec(first, space)
-    assert space["cube"].shape == (2, 128, 128, 1024)
-    assert (space["times"].histogram() == space["cube"][0]).all()
     for code in more:  # each goes on where the one before ended
         exec(code, space)
-    assert space["long"].shape == (1, 128, 128, 1024)
 
 
 def test_commands_that_the_checks_run_are_there():

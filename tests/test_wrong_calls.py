@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import typer
@@ -75,6 +76,8 @@ def make(folder: Path) -> Path:
     np.save(folder / "counts.npy", counts()[0])
     io.save_mat(folder / "a.mat", io.load(folder / "cube.zarr"))
     np.save(folder / "depth.npy", np.full((2, 3), 2.0))
+    with h5py.File(folder / "capture.h5", "w") as file:  # of tal: T x y
+        file["H"], file["H_format"], file["delta_t"] = np.ones((16, 3, 2)), 1, 0.299792458 * SYSTEM.bin_ns
     SYSTEM.save(folder / "system.yaml")
     save_maps(folder / "maps.npz", {"peak": ml.reconstruct(counts(), SYSTEM, "peak")})
     (folder / "scene.yaml").write_text("depth: depth.npy\nlight: {signal: 1, sbr: 2}\n")
@@ -189,6 +192,10 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     "io.save_cloud": lambda at: (
         io.save_cloud,
         {"path": at / "a.ply", "depth_m": np.ones((2, 3)), "focal_px": 100.0, "overwrite": True},
+    ),
+    "io.save_capture": lambda at: (
+        io.save_capture,
+        {"path": at / "b.h5", "cube": io.load(at / "cube.zarr"), "like": at / "capture.h5", "overwrite": True},
     ),
     "io.read_transient": lambda at: (io.read_transient, {"path": at / "light.npy", "bin_ns": 1.0}),
     "io.read_mat": lambda at: (io.read_mat, {"path": at / "a.mat"}),

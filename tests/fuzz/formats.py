@@ -16,6 +16,7 @@ from mars_lidar.dataset import DatasetRecipe, open_dataset, read_sparse
 from mars_lidar.dataset.view import read_view
 from mars_lidar.io.foreign import foreign_cube
 from mars_lidar.io.maps import load_maps, save_maps
+from mars_lidar.io.recorder import recorded
 from mars_lidar.io.rgbd.layered import read_layers
 from mars_lidar.io.transient_truth import read_truth
 
@@ -60,7 +61,10 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "set.zarr": _dataset,
     "read.mat": io.read_mat,
     **dict.fromkeys(["photons.npz", "photons.h5", "photons.ptu", "bare.mat", "bare73.mat", "bare.npz"], _stream),
-    **dict.fromkeys(["light.npy", "light.npz", "light.h5", "light.mat", "light73.mat", "tal.hdf5"], _light),
+    **dict.fromkeys(
+        ["light.npy", "light.npz", "light.h5", "light.mat", "light73.mat", "tal.hdf5", "zaragoza.hdf5"], _light
+    ),
+    "scan.ptu": recorded,
     **dict.fromkeys(["maps.zarr", "maps.h5", "maps.npz"], load_maps),
     "table.h5": ml.Table.load,
     **dict.fromkeys(["depth.png", "depth.tif", "depth.npy", "depth.npz", "depth.pfm", "depth.exr"], ml.Scene.from_rgbd),
@@ -85,6 +89,7 @@ LEAVES_OUT = ("folder/a.npz", "folder/nyu.mat")  # never an error: what is damag
 def make(folder: Path) -> list[str]:
     """Write them all; the names of those whose libraries are here."""
     import h5py
+    import ptufile
     from PIL import Image
     from scipy.io import savemat
 
@@ -118,6 +123,10 @@ def make(folder: Path) -> list[str]:
     with h5py.File(folder / "tal.hdf5", "w") as file:
         file["H"], file["H_format"] = light.transpose(2, 1, 0), 1
         file["delta_t"], file["t_start"] = 0.01, 0.5
+    with h5py.File(folder / "zaragoza.hdf5", "w") as file:  # x y bounces time colours
+        file["data"], file["deltaT"], file["t0"] = light.reshape(4, 3, 1, 50, 1), 0.01, 0.5
+    scan = np.random.default_rng(5).poisson(1.0, (2, 3, 4, 1, 20)).astype(np.uint16)
+    ptufile.imwrite(folder / "scan.ptu", scan, 50e-9, 2.5e-9, pixel_time=50 * 50e-9)
     maps = {"peak": ml.reconstruct(np.asarray(io.load(folder / "cube.npz").histogram), SYSTEM, "peak")}
     for suffix in (".zarr", ".h5", ".npz"):
         save_maps(folder / f"maps{suffix}", maps)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.intervals import Piece, Stream
@@ -76,6 +77,7 @@ class ArrivalInspection:
     __repr__ = brief
 
 
+@checked
 def inspect_arrivals(
     times_ns: ArrayLike, *, unit_ns: float = 0.0, dead_time_ns: float | None = None
 ) -> ArrivalInspection:

@@ -12,17 +12,16 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import TemporarySibling, check_claim, check_target
-from mars_lidar._base.hdf5 import new_file, open_hdf5, with_checksums
+from mars_lidar._base.hdf5 import new_file, open_hdf5
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
-
-if TYPE_CHECKING:
-    from mars_lidar.io.cube import Cube
+from mars_lidar.io.cube import Cube
 
 CAPTURE_SUFFIXES = (".h5", ".hdf5")
 # What the axes are: T time, x and y of the sensor grid, X and Y of the laser's, i and l without a grid, c colours and
@@ -150,6 +149,7 @@ def read_capture(path: str | Path) -> Capture:
     return found
 
 
+@checked
 def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: bool = False) -> None:
     """Write the counts of a cube as a capture with the layout of another one, for the programs that read that.
 
@@ -187,13 +187,13 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
         for name in old:
             if name != source.name:
                 old.copy(name, new)
-        data = new.create_dataset(
-            source.name, source.shape, np.float32, fillvalue=0.0, **with_checksums(source.shape, np.float32)
-        )
+        data = new.create_dataset(source.name, source.shape, np.float32, fillvalue=0.0)
         for rows in source.bands():
             counts = np.asarray(cube.histogram[0, rows])[..., : source.image[2]]
             source.write(data, rows.start, counts.astype(np.float32))
-        recipe = {"system": cube.system.to_dict(), "engine": cube.engine, "seed": cube.seed, "like": str(like)}
+        recipe: dict[str, Any] = {"system": cube.system.to_dict(), "engine": cube.engine, "like": str(like)}
+        if not cube.measured:
+            recipe["seed"] = cube.seed
         new.attrs["mars_lidar"] = json.dumps(recipe)
 
 

@@ -107,7 +107,7 @@ def scan(
     ValueError, TypeError
         A folder or manifest that does not exist, a manifest without a column ``depth``, or a bad argument.
     """
-    for name, value in (("depth_unit_m", depth_unit_m), ("focal_px", focal_px)):
+    for name, value in (("depth_unit_m", depth_unit_m), ("focal_px", focal_px), ("max_depth_m", max_depth_m)):
         if value is not None:
             checks.real(name, value, low=0.0, strict_low=True)
     root = Path(folder)

@@ -78,10 +78,8 @@ html_theme_options = {
 }
 html_show_sourcelink = False
 
-# The explorer is built by itself, in explorer/; the site takes it along where that has been done.
-EXPLORER = next((f.parent for f in sorted(ROOT.glob("explorer/**/index.html")) if "node_modules" not in f.parts), None)
-if EXPLORER:
-    tags.add("explorer")  # noqa: F821 - a name that Sphinx gives
+# The explorer's page, as explorer/build makes it; it is committed, and in wheels.
+EXPLORER = ROOT / "src" / "mars_lidar" / "explore" / "page.html"
 
 
 # Pages that stand elsewhere, where the programs or the hosts of repositories look for them, and what a program says.
@@ -122,8 +120,10 @@ def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 def _take_explorer(app: Sphinx, error: Exception | None) -> None:
-    if EXPLORER and not error:
-        shutil.copytree(EXPLORER, Path(app.outdir) / "explorer", dirs_exist_ok=True)
+    if not error:
+        target = Path(app.outdir) / "explorer"
+        target.mkdir(exist_ok=True)
+        shutil.copyfile(EXPLORER, target / "index.html")
 
 
 def setup(app: Sphinx) -> None:

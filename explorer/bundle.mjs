@@ -20,6 +20,6 @@ const parts = {
   WORKER: await bundled("worker.js"),
   MAIN: await bundled("main.js"),
 };
-const html = readFileSync(here("src/index.html"), "utf8").replace(/%([A-Z]+)%/g, (_, name) => parts[name]);
+const html = readFileSync(here("src/template.html"), "utf8").replace(/%([A-Z]+)%/g, (_, name) => parts[name]);
 writeFileSync(page, html);
 console.log(`${page}: ${html.length} characters`);

@@ -13,8 +13,8 @@ export class Figure {
   constructor(page, engine) {
     this.page = page; // elements by name
     this.engine = engine;
-    this.histogram = new HistogramChart(page.histogram, () => (innerWidth < 700 ? 260 : 340));
-    this.count = new LawChart(page.law, () => (innerWidth < 700 ? 220 : 340));
+    this.histogram = new HistogramChart(page.histogram, () => (innerWidth < 760 ? 230 : 340));
+    this.count = new LawChart(page.law, () => (innerWidth < 760 ? 210 : 340));
     this.busy = false;
     this.wanted = null;
     this.settled = Promise.resolve();

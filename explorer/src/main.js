@@ -50,7 +50,7 @@ async function begin() {
     controls.show(state, [...source.fixed, ...(state.pixel >= 0 && !told ? ["delay"] : [])]);
     at("method").value = state.method;
     at("log").checked = state.log === 1;
-    at("again").textContent = `Draw again (seed ${state.seed})`;
+    at("again").textContent = `Draw again (${state.seed})`;
     at("python").textContent = snippet(state, pixel, pixel.stored);
     at("which").textContent = whichPixel(pixel);
     at("free").hidden = told || state.pixel < 0;

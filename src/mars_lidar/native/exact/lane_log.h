@@ -7,7 +7,7 @@
 #include "exact/kernel.h"
 #include "instrument/recording.h"
 #include "instrument/records.h"
-#include "lanes/lanes.h"
+#include "lanes/transpose.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {

@@ -85,9 +85,7 @@ class MeanLaw {
         auto is_rare = [&](int i) {
             return (armed[i] < few ? 1 : 0) & ((mean[i] > counts ? 1 : 0) | (p[i] > likely ? 1 : 0));
         };
-        int32_t some = 0;
-        for (int i = 0; i < kTeam; ++i) some |= is_rare(i);
-        if (!some) return 0u;
+        if (!any_lane([&](int first) { return load<Float>(armed + first) < few; })) return 0u;
         uint32_t bits = 0;
         for (int i = 0; i < kTeam; ++i) bits |= static_cast<uint32_t>(is_rare(i)) << i;
         return bits;

@@ -3,6 +3,7 @@
 #pragma once
 #include "feedback/kernel.h"
 #include "feedback/math.h"
+#include "lanes/transpose.h"
 
 namespace mars {
 inline namespace MARS_LEVEL {
@@ -32,38 +33,45 @@ MARS_NOINLINE bool write_lane(const FeedbackBatch& batch, const int32_t* sums, b
 // 32 bins of all lanes at a time, so that both sides stay in the first-level cache. False if a count does not fit.
 template <class Count>
 MARS_NOINLINE bool write_counts(const FeedbackBatch& batch, const int32_t* sums, const bool* drawing, int32_t draw) {
-    if constexpr (kTeam == 1) return write_lane<Count>(batch, sums, drawing[0], draw);
-    constexpr int32_t kBlock = 32;
-    const FeedbackGrid& grid = *batch.grid;
-    const int32_t bins = grid.bins;
-    uint32_t largest = 0;
-    alignas(64) Count block[kTeam][kBlock];
-    for (int32_t first = 0; first < bins; first += kBlock) {
-        const int32_t count = bins - first < kBlock ? bins - first : kBlock;
-        for (int32_t b = 0; b < count; ++b) {
-            alignas(64) uint32_t counts[kTeam] = {};
-            for (int64_t lap = 0; lap < grid.laps; ++lap) {
-                const int32_t* from = sums + (lap * grid.cells + grid.bin_cell[first + b]) * kRow;
-                const int32_t* to = sums + (lap * grid.cells + grid.bin_cell[first + b + 1]) * kRow;
-                for (int i = 0; i < kTeam; ++i)
-                    counts[i] += static_cast<uint32_t>(to[i]) - static_cast<uint32_t>(from[i]);
+    if constexpr (kTeam == 1) {
+        return write_lane<Count>(batch, sums, drawing[0], draw);
+    } else {
+        constexpr int32_t kBlock = 32;
+        const FeedbackGrid& grid = *batch.grid;
+        const int32_t bins = grid.bins;
+        alignas(64) uint32_t most[kTeam] = {};
+        alignas(64) Count rows[kBlock][kTeam] = {}, block[kTeam][kBlock];
+        for (int32_t first = 0; first < bins; first += kBlock) {
+            const int32_t count = bins - first < kBlock ? bins - first : kBlock;
+            for (int32_t b = 0; b < count; ++b) {
+                alignas(64) uint32_t counts[kTeam] = {};
+                for (int64_t lap = 0; lap < grid.laps; ++lap) {
+                    const int32_t* from = sums + (lap * grid.cells + grid.bin_cell[first + b]) * kRow;
+                    const int32_t* to = sums + (lap * grid.cells + grid.bin_cell[first + b + 1]) * kRow;
+                    for (int i = 0; i < kTeam; ++i)
+                        counts[i] += static_cast<uint32_t>(to[i]) - static_cast<uint32_t>(from[i]);
+                }
+                for (int i = 0; i < kTeam; ++i) {
+                    most[i] = counts[i] > most[i] ? counts[i] : most[i];
+                    rows[b][i] = static_cast<Count>(counts[i]);
+                }
             }
+            for (int32_t b = 0; b < kBlock; b += 8)
+                for (int i = 0; i < kTeam; i += 8) transpose_eight(&rows[b][i], kTeam, &block[i][b], kBlock);
             for (int i = 0; i < kTeam; ++i) {
-                largest = drawing[i] && counts[i] > largest ? counts[i] : largest;
-                block[i][b] = static_cast<Count>(counts[i]);
+                if (!drawing[i]) continue;
+                Count* out = static_cast<Count*>(batch.rows[i]) + static_cast<int64_t>(draw) * batch.row_step;
+                int32_t to = first + batch.first_bin[i];
+                if (to >= bins) to -= bins;
+                const int32_t straight = bins - to < count ? bins - to : count;
+                memcpy(out + to, block[i], sizeof(Count) * static_cast<size_t>(straight));
+                memcpy(out, block[i] + straight, sizeof(Count) * static_cast<size_t>(count - straight));
             }
         }
-        for (int i = 0; i < kTeam; ++i) {
-            if (!drawing[i]) continue;
-            Count* out = static_cast<Count*>(batch.rows[i]) + static_cast<int64_t>(draw) * batch.row_step;
-            int32_t to = first + batch.first_bin[i];
-            if (to >= bins) to -= bins;
-            const int32_t straight = bins - to < count ? bins - to : count;
-            memcpy(out + to, block[i], sizeof(Count) * static_cast<size_t>(straight));
-            memcpy(out, block[i] + straight, sizeof(Count) * static_cast<size_t>(count - straight));
-        }
+        uint32_t largest = 0;
+        for (int i = 0; i < kTeam; ++i) largest = drawing[i] && most[i] > largest ? most[i] : largest;
+        return sizeof(Count) == 4 || largest <= 0xffffu;
     }
-    return sizeof(Count) == 4 || largest <= 0xffffu;
 }
 
 MARS_INLINE bool write_histograms(const FeedbackBatch& batch, const int32_t* sums, const bool* drawing, int32_t draw) {

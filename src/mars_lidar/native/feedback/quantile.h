@@ -10,6 +10,14 @@
 namespace mars {
 inline namespace MARS_LEVEL {
 
+// Whether holds(first) is true of any lane, `first` the first of those that it tells of.
+template <class Holds>
+MARS_INLINE bool any_lane(const Holds& holds) {
+    bool some = false;
+    for (int first = 0; first < kTeam; first += kLanes) some |= any(holds(first));
+    return some;
+}
+
 constexpr float kInversionBelow = 6.0f;
 constexpr float kFarBelowOne = 0.1f;
 constexpr int kMostTerms = 48;  // a mean of 6 exceeds it with a probability of 1e-26
@@ -50,7 +58,6 @@ struct Terms {
     MARS_NOINLINE void sum(const float* __restrict__ mean, const float* __restrict__ variance,
                            const float* __restrict__ uniform) {
         alignas(64) float trials[kTeam], odds[kTeam], limit[kTeam], chance[kTeam], exponent[kTeam];
-        int32_t large = 0;
         for (int i = 0; i < kTeam; ++i) {
             const bool few = mean[i] < kInversionBelow, dark = !(mean[i] > 1e-25f);
             const float mu = few ? (dark ? 1e-25f : mean[i]) : 1.0f;
@@ -63,9 +70,8 @@ struct Terms {
             chance[i] = p;
             limit[i] = few ? uniform[i] : 2.0f;  // a uniform number of 2 falls into the first term
             exponent[i] = trials[i] * log_one_minus(p);
-            large |= p >= 0.125f ? 1 : 0;
         }
-        if (large)
+        if (any_lane([&](int first) { return load<Float>(chance + first) >= 0.125f; }))
             for (int i = 0; i < kTeam; ++i) {
                 const float rest = 1.0f - chance[i];
                 const float direct = trials[i] * log_of(rest > 1e-30f ? rest : 1e-30f);
@@ -107,9 +113,14 @@ struct Terms {
 };
 
 MARS_INLINE bool any_few(const float* mean) {
-    int32_t some = 0;
-    for (int i = 0; i < kTeam; ++i) some |= mean[i] < kInversionBelow ? 1 : 0;
-    return some != 0;
+    return any_lane([&](int first) { return load<Float>(mean + first) < kInversionBelow; });
+}
+
+// Whether any line is steeper than limit_slopes allows.
+MARS_INLINE bool any_steep(const float* p, const float* q, const float* alpha) {
+    return any_lane([&](int first) {
+        return load<Float>(alpha + first) * maximum(load<Float>(p + first), load<Float>(q + first)) > 1.0f;
+    });
 }
 
 // The steepest line that a count may follow: one exposure more armed (p of mu), or re-armed (q), adds at most one
@@ -118,7 +129,7 @@ MARS_NOINLINE void limit_slopes(const float* __restrict__ p, const float* __rest
                                 const float* __restrict__ mean, float* __restrict__ alpha, float* __restrict__ beta) {
     for (int i = 0; i < kTeam; ++i) {
         const float most = p[i] > q[i] ? p[i] : q[i], limit = 1.0f / (most > 1e-30f ? most : 1e-30f);
-        const float slope = alpha[i] < limit ? alpha[i] : limit;
+        const float slope = alpha[i] * most > 1.0f ? limit : alpha[i];  // whatever the other lanes
         beta[i] += (alpha[i] - slope) * mean[i];
         alpha[i] = slope;
     }
@@ -128,15 +139,13 @@ MARS_NOINLINE void limit_slopes(const float* __restrict__ p, const float* __rest
 // its mean may well be several times what it is expected to be, because few exposures are armed.
 MARS_INLINE void follow_quantile(const float* mean, const float* variance, const float* p, const float* q, bool bursts,
                                  const Uniforms& uniforms, float* alpha, float* beta) {
-    int32_t steep = 0;
     for (int i = 0; i < kTeam; ++i) {
         const float mu = mean[i] > 1.0f ? mean[i] : 1.0f, least = mu * 1e-7f;
         const float var = variance[i] > least ? variance[i] : least;
         float growth;
-        const float more = excess(mu, var, uniforms.normal[i], growth), most = p[i] > q[i] ? p[i] : q[i];
+        const float more = excess(mu, var, uniforms.normal[i], growth);
         alpha[i] = 1.0f + growth / mu;
         beta[i] = more - growth;
-        steep |= alpha[i] * most > 1.0f ? 1 : 0;
     }
     if (any_few(mean)) {
         Terms terms;
@@ -158,14 +167,13 @@ MARS_INLINE void follow_quantile(const float* mean, const float* variance, const
             float down =
                 short_of / (1.0f - 0.5f * ((k - 1.0f) / (mean[i] > 1e-3f ? mean[i] : 1e-3f) - 1.0f) * short_of);
             down = down > 0.0f ? (down < 1e3f ? down : 1e3f) : 0.0f;
-            const float slope = none ? 1.0f : 1.0f / (up + down), most = p[i] > q[i] ? p[i] : q[i];
+            const float slope = none ? 1.0f : 1.0f / (up + down);
             const bool few = mean[i] < kInversionBelow;
             alpha[i] = few ? slope : alpha[i];
             beta[i] = few ? k - slope * (mean[i] + up) : beta[i];
-            steep |= alpha[i] * most > 1.0f ? 1 : 0;
         }
     }
-    if (steep) limit_slopes(p, q, mean, alpha, beta);
+    if (any_steep(p, q, alpha)) limit_slopes(p, q, mean, alpha, beta);
 }
 
 // The count itself, for all lanes.

@@ -111,25 +111,5 @@ MARS_INLINE Float of_thirty_two(const float* table, Int index) {
 #endif
 }
 
-// Four lanes.
-typedef float FourFloats __attribute__((vector_size(16)));
-typedef int32_t FourInts __attribute__((vector_size(16)));
-typedef double FourDoubles __attribute__((vector_size(32)));
-
-// Four numbers of each of four rows of lanes, from `rows` on, by columns.
-template <class Four, class Scalar>
-MARS_INLINE void columns_of_four(const Scalar* rows, Four (&columns)[4]) {
-    static_assert(sizeof(Scalar) == 4, "numbers of 32 bits");
-#if defined(MARS_X86)
-    __m128 row[4];
-    for (int k = 0; k < 4; ++k) row[k] = _mm_loadu_ps((const float*)(rows + k * kLanes));
-    _MM_TRANSPOSE4_PS(row[0], row[1], row[2], row[3]);
-    for (int k = 0; k < 4; ++k) columns[k] = (Four)row[k];
-#else
-    for (int i = 0; i < 4; ++i)
-        for (int k = 0; k < 4; ++k) columns[i][k] = rows[k * kLanes + i];
-#endif
-}
-
 }  // namespace MARS_LEVEL
 }  // namespace mars

@@ -88,6 +88,10 @@ _STUDIES = {
         "reconstruction.returns",
         "several returns of a pixel: false alarms, how near two may be, how well their errors hold",
     ),
+    "neighbourhood": (
+        "reconstruction.neighbourhood",
+        "depth of dim cubes with and without the pixels around, and how well its errors hold",
+    ),
     "transients": ("transients.run", "two returns in fog through the dead time of three detectors"),
     "downstream": ("downstream.run", "T5: networks trained on every simulator's data, tested on gold; --config"),
     "downstream-baselines": (

@@ -114,6 +114,22 @@ def test_several_returns_read_back(tmp_path, suffix):
     assert "returns=2 needs the likelihood" in refused.stderr
 
 
+def test_a_neighbourhood_of_a_dim_cube(tmp_path):
+    """The command takes whole images at a time, and says what it says of an array."""
+    dim = ("--size", 16, "--cycles", 300, "--bins", 256, "--signal", 0.005, "--realizations", 2, "--no-picture")
+    assert run("simulate", "--scene", "room", *dim, "-o", tmp_path / "dim.zarr").exit_code == 0
+    done = run("reconstruct", tmp_path / "dim.zarr", "--neighbourhood", 2, "-o", tmp_path / "m.zarr")
+    assert done.exit_code == 0, done.output
+    assert "neighbourhood" in done.stdout
+    found, _ = load_maps(tmp_path / "m.zarr")
+    assert set(np.unique(found["radius"])) <= {1, 2}
+    with io.load(tmp_path / "dim.zarr") as stored:
+        direct = ml.reconstruct(stored, neighbourhood=2)
+    assert np.array_equal(found["depth"][0], direct.depth_m, equal_nan=True)
+    assert np.array_equal(found["depth_error"][0], direct.depth_error_m, equal_nan=True)
+    assert np.array_equal(found["radius"][0], direct.radius)
+
+
 def test_all_methods_and_errors_in_the_table(cube, tmp_path):
     done = run("reconstruct", cube, "--method", "all", "--no-picture", "-o", tmp_path / "m.npz")
     assert done.exit_code == 0, done.output
@@ -200,3 +216,12 @@ def test_study(tmp_path):
     for figure in tmp_path.glob("*.png"):
         assert figure.name in text
         assert 5_000 < figure.stat().st_size <= MAX_FIGURE_BYTES
+
+
+@pytest.mark.parametrize("name", ["returns", "neighbourhood"])
+def test_studies_of_returns_and_neighbours(tmp_path, name):
+    assert main([name, "--quick", "--out", str(tmp_path)]) == 0
+    text = (tmp_path / f"{name}.md").read_text()
+    assert "Quick form" in text
+    assert 5_000 < (tmp_path / f"{name}.png").stat().st_size < MAX_FIGURE_BYTES
+    assert (tmp_path / f"{name}.csv").stat().st_size > 1000

@@ -79,6 +79,17 @@ def reconstruct(
             help="Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood.",
         ),
     ] = 1,
+    neighbourhood: Annotated[
+        int | None,
+        typer.Option(
+            "--neighbourhood",
+            min=1,
+            max=12,
+            help="For dim cubes: take neighbours within up to so many pixels together, on a plane; such as 4. "
+            "[dim]Default: each pixel alone.[/dim]",
+            show_default=False,
+        ),
+    ] = None,
     threads: Annotated[
         int | None, typer.Option("--threads", min=1, help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
     ] = None,
@@ -131,6 +142,7 @@ def reconstruct(
                     level=level,
                     attenuation=attenuation,
                     returns=returns,
+                    neighbourhood=neighbourhood,
                     threads=threads,
                     progress=progress,
                 )

@@ -42,6 +42,7 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
     "significance": ("significance", "1", "significance of the signal, standard deviations"),
     "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns"),
     "returns": ("returns.count", "1", "number of returns"),
+    "radius": ("radius", "pixel", "radius of the window whose photons were taken together"),
 }
 _OF_RETURNS = {  # the same of each return
     "return_depth": ("depth_m", "m", "depth of each return"),

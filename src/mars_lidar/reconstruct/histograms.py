@@ -21,12 +21,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Histograms:
-    """What a method works on: `counts` (pixels, bins) of uint16, uint32 or float64, and how they were recorded."""
+    """What a method works on: `counts` (pixels, bins) of uint16, uint32 or float64, and how they were recorded.
+
+    `image`: the shape (..., H, W) that the pixels had.
+    """
 
     counts: NDArray[Any]
     system: System
     threads: int
     progress: Progress | None = None
+    image: tuple[int, ...] = ()
 
     @property
     def recording(self) -> _core.HistogramRecord:
@@ -51,7 +55,7 @@ def checked(
         )
     shape = counts.shape[:-1]
     flat = np.ascontiguousarray(_typed(counts).reshape(-1, system.bins))
-    return Histograms(flat, system, team, progress), shape
+    return Histograms(flat, system, team, progress, shape), shape
 
 
 def _typed(counts: NDArray[Any]) -> NDArray[Any]:

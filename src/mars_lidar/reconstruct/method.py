@@ -57,6 +57,7 @@ class Estimates:
     background_error: FloatArray | None = None
     delay_error: FloatArray | None = None
     significance: FloatArray | None = field(default=None)
+    radius: NDArray[np.uint8] | None = None  # of the window whose photons were taken together, pixels
     returns: FloatArray | None = None  # (pixels, most, len(RETURN_COLUMNS)), NaN beyond those of a pixel
 
 

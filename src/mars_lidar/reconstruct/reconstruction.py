@@ -17,6 +17,7 @@ from mars_lidar.reconstruct.histograms import checked
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruct.method import Estimates, Flags, Method, tell_effects
 from mars_lidar.reconstruct.methods import METHODS
+from mars_lidar.reconstruct.neighbourhood import Neighbourhood
 from mars_lidar.reconstruct.returns import MOST_RETURNS, Returns, returns_of
 
 ATTENUATIONS = ("none", "inverse_square")
@@ -49,6 +50,8 @@ class Reconstruction:
         (...) uint8, `Flags`.
     returns
         Every return of each pixel, where several were asked for; then the maps above are those of the strongest.
+    radius
+        (...) pixels to each side whose photons were taken together, where a neighbourhood was asked for.
     """
 
     method: str
@@ -66,6 +69,7 @@ class Reconstruction:
     significance: FloatArray | None
     flags: NDArray[np.uint8]
     returns: Returns | None = None
+    radius: NDArray[np.uint8] | None = None
 
     __repr__ = brief
 
@@ -106,6 +110,7 @@ def reconstruct(
     level: float | None = None,
     attenuation: Literal["none", "inverse_square"] = "none",
     returns: int = 1,
+    neighbourhood: int | None = None,
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Reconstruction:
@@ -130,6 +135,10 @@ def reconstruct(
     returns
         Returns to look for in each pixel, 1 to 8: panes of glass, foliage. Each is tested, and all of them are in
         `Reconstruction.returns`. Of ``"maximum_likelihood"`` alone.
+    neighbourhood
+        For dim cubes (..., H, W, bins): take the photons of the pixels around together, up to so many pixels to each
+        side, on a plane, and over the window that predicts left-out photons best (docs/reconstruction.md, section 10).
+        Of ``"maximum_likelihood"`` alone, for one return a pixel. None: each pixel alone.
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     progress
@@ -144,7 +153,7 @@ def reconstruct(
         system, cube = cube.system if system is None else system, np.asarray(cube.histogram)
     if system is None:
         raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load carries its own)")
-    used = with_returns(find_method(method), returns)
+    used = with_options(find_method(method), returns, neighbourhood)
     checks.choice("attenuation", attenuation, ATTENUATIONS)
     if level is not None:
         level = checks.real("level", level, low=0.0, strict_low=True)
@@ -166,16 +175,21 @@ def find_method(method: str | Method) -> Method:
     return METHODS[checks.choice("method", method, tuple(METHODS))]
 
 
-def with_returns(method: Method, returns: int) -> Method:
-    """The method, looking for so many returns of each pixel."""
-    if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
+def with_options(method: Method, returns: int, neighbourhood: int | None) -> Method:
+    """The method, looking for so many returns of each pixel, or over a neighbourhood."""
+    several = checks.integer("returns", returns, low=1, high=MOST_RETURNS) > 1
+    if not several and neighbourhood is None:
         return method
+    asked = f"returns={returns}" if several else f"neighbourhood={neighbourhood}"
     if not isinstance(method, MaximumLikelihood):
         raise ValueError(
-            f"returns={returns} needs the likelihood of several returns, which method {method.name!r} has not; "
-            "use 'maximum_likelihood'"
+            f"{asked} needs the likelihood, which method {method.name!r} has not; use 'maximum_likelihood'"
         )
-    return replace(method, returns=int(returns))
+    if neighbourhood is None:
+        return replace(method, returns=int(returns))
+    if several:
+        raise ValueError(f"neighbourhood={neighbourhood} is for one return a pixel, got {asked}")
+    return Neighbourhood(neighbourhood, false_alarm=method.false_alarm)
 
 
 def assembled(
@@ -211,6 +225,7 @@ def assembled(
         significance=mapped(found.significance),
         flags=flags,
         returns=returns_of(found.returns, system, shape),
+        radius=None if found.radius is None else found.radius.reshape(shape),
     )
 
 

@@ -15,7 +15,7 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar.reconstruct.histograms import checked
 from mars_lidar.reconstruct.method import Estimates, Method, tell_effects
-from mars_lidar.reconstruct.reconstruction import Reconstruction, assembled, find_method, with_returns
+from mars_lidar.reconstruct.reconstruction import Reconstruction, assembled, find_method, with_options
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
@@ -38,6 +38,7 @@ def reconstruct_stored(
     level: float | None = None,
     attenuation: str | None = None,
     returns: int = 1,
+    neighbourhood: int | None = None,
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> dict[str, Timed]:
@@ -49,7 +50,7 @@ def reconstruct_stored(
         The cube. Without `level`, its own: that with which a known scene's reflectivity became its signal.
     methods
         Names or methods of different names.
-    level, attenuation, returns, threads, progress
+    level, attenuation, returns, neighbourhood, threads, progress
         As `mars_lidar.reconstruct`; attenuation None: that with which the flux was made, if it says so.
 
     Returns
@@ -59,7 +60,7 @@ def reconstruct_stored(
     """
     progress = shown(progress, "reconstructing")
     system, recipe = cube.system, cube.recipe
-    used = [with_returns(find_method(method), returns) for method in methods]
+    used = [with_options(find_method(method), returns, neighbourhood) for method in methods]
     for method in used:
         method.check(system)
     tell_effects(system)
@@ -71,7 +72,10 @@ def reconstruct_stored(
     buffers: dict[str, dict[str, np.ndarray]] = {method.name: {} for method in used}
     seconds = dict.fromkeys(buffers, 0.0)
     total, done = len(used) * shape[0] * shape[1] * shape[2], 0
-    for images, rows in recipe.blocks(recipe.chunks(_CHUNK_BYTES)):
+    blocks = recipe.blocks(recipe.chunks(_CHUNK_BYTES))
+    if neighbourhood is not None:  # a whole image at a time
+        blocks = ((slice(k, k + 1), slice(0, shape[1])) for k in range(shape[0]))
+    for images, rows in blocks:
         counts, block = checked(np.asarray(cube.histogram[images, rows]), system, team)
         for method in used:
             began = time.perf_counter()

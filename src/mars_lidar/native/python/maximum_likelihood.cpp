@@ -1,6 +1,7 @@
 // Bindings of the maximum-likelihood estimator and of its likelihood; reconstruct/maximizer.h
 // and several_returns.h have the loops over a pixel.
 #include "reconstruct/several_returns.h"
+#include "reconstruct/surface_fit.h"
 
 #include "python/bindings.h"
 #include "python/count_rows.h"
@@ -29,8 +30,8 @@ void maximum_likelihood(const HistogramRecord& recording, Histograms histogram, 
 
 // `out` and `flags` are those of `maximum_likelihood`, and those of the strongest return afterwards.
 void several_returns(const HistogramRecord& recording, Histograms histogram, int most, int starts, double false_alarm,
-                     Matrix<double> out, Vector<uint8_t> flags, Matrix<double> returns,
-                     int threads, nb::object progress) {
+                     Matrix<double> out, Vector<uint8_t> flags, Matrix<double> returns, int threads,
+                     nb::object progress) {
     const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
     if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
         throw nb::value_error("histogram must be (pixels, bins)");
@@ -44,6 +45,26 @@ void several_returns(const HistogramRecord& recording, Histograms histogram, int
         return [&, several = SeveralReturns(recording, job)](int64_t p) mutable {
             several(counts, p, out.data() + p * kMaximumColumns, flags.data() + p,
                     returns.data() + p * most * kReturnColumns);
+        };
+    });
+}
+
+void surface_fits(const HistogramRecord& recording, Vector<const int64_t> first, Vector<const int32_t> bins,
+                  Vector<const double> exposure, int64_t width, int radius, bool tilted, Matrix<const double> before,
+                  Matrix<double> planes, Matrix<double> out, int threads, nb::object progress) {
+    const int64_t pixels = size_of(exposure);
+    if (size_of(first) != pixels + 1 || width < 1 || pixels % width != 0)
+        throw nb::value_error("first must be (pixels + 1), pixels a multiple of width");
+    expect("before", before, pixels, 4);
+    expect("planes", planes, pixels, 4);
+    expect("out", out, pixels, kSurfaceColumns);
+    static_assert(sizeof(Plane) == 4 * sizeof(double));
+    const PhotonImage image{pixels / width, width, first.data(), bins.data(), exposure.data()};
+    const Plane* from = reinterpret_cast<const Plane*>(before.data());
+    Plane* to = reinterpret_cast<Plane*>(planes.data());
+    run_watched_items(pixels, kChunk, threads, progress, [&] {
+        return [&, fit = SurfaceFit(recording, image, radius)](int64_t p) mutable {
+            to[p] = fit(p, from, tilted, out.data() + p * kSurfaceColumns);
         };
     });
 }
@@ -80,9 +101,14 @@ void bind_maximum_likelihood(nb::module_& module) {
                "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).");
     module.def("several_returns", &several_returns, nb::arg("recording"), nb::arg("histogram").noconvert(),
                nb::kw_only(), nb::arg("most"), nb::arg("starts"), nb::arg("false_alarm"), nb::arg("out").noconvert(),
-               nb::arg("flags").noconvert(), nb::arg("returns").noconvert(),
-               nb::arg("threads"), nb::arg("progress").none(),
+               nb::arg("flags").noconvert(), nb::arg("returns").noconvert(), nb::arg("threads"),
+               nb::arg("progress").none(),
                "Further returns of each pixel: returns (pixels, most x (delay, S, errors, chance)).");
+    module.def("surface_fits", &surface_fits, nb::arg("recording"), nb::arg("first"), nb::arg("bins"),
+               nb::arg("exposure"), nb::kw_only(), nb::arg("width"), nb::arg("radius"), nb::arg("tilted"),
+               nb::arg("before"), nb::arg("planes").noconvert(), nb::arg("out").noconvert(), nb::arg("threads"),
+               nb::arg("progress").none(),
+               "Planes (share, delay, right, down) of windows of an image: planes (pixels, 4), out (pixels, 7).");
     module.def("histogram_log_likelihood", &log_likelihood, nb::arg("recording"), nb::arg("histogram"), nb::arg("at"),
                nb::arg("out").noconvert(), nb::arg("whole") = true,
                "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");

@@ -152,8 +152,7 @@ class SeveralReturns {
                 }
                 if (!solve<kUnknowns>(next.information, point.gradient, free, move)) continue;
                 next.count = point.count;
-                next.at[0] =
-                    std::clamp(point.at[0] + move[0], std::max(least_, 0.05 * point.at[0]), kMostPhotons);
+                next.at[0] = std::clamp(point.at[0] + move[0], std::max(least_, 0.05 * point.at[0]), kMostPhotons);
                 for (int k = 0; k < point.count; ++k) {
                     const int a = 2 * k + 1;
                     next.at[a] = std::clamp(point.at[a] + move[a], 0.0, kMostPhotons);
@@ -204,8 +203,8 @@ class SeveralReturns {
             const double row[kReturnColumns] = {turn[order[k]], best.at[a], error[a + 1], error[a], chance_[order[k]]};
             std::copy(row, row + kReturnColumns, out + k * kReturnColumns);
         }
-        const double row[6] = {best.at[2 * top + 1], best.at[0],          best.at[2 * top + 2],
-                               error[2 * top + 1],   error[0], error[2 * top + 2]};
+        const double row[6] = {best.at[2 * top + 1], best.at[0], best.at[2 * top + 2],
+                               error[2 * top + 1],   error[0],   error[2 * top + 2]};
         std::copy(row, row + 6, one);
         one[7] = best.value;
     }

@@ -97,7 +97,7 @@ def warn_if_put_together(batched: bool) -> None:
     why = (
         "stacks the batches of the stream once more"
         if batched
-        else "puts batches together worker by worker, so that they depend on the number of workers, and cannot be resumed"
+        else "puts batches together worker by worker, so that they depend on the number of workers"
     )
     warnings.warn(
         f"this loader {why}: give batch_size to CubeStream and batch_size=None to the loader", UserWarning, stacklevel=4

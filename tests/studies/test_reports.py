@@ -27,7 +27,6 @@ NAMES = {  # of every command that a committed report prints
     "detectors",
     "domain",
     "downstream",
-    "downstream-baselines",
     "effects",
     "hardware",
     "joint",
@@ -44,6 +43,7 @@ NAMES = {  # of every command that a committed report prints
     "streams",
     "table",
     "transients",
+    "uncertainty",
 }
 
 

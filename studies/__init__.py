@@ -24,7 +24,8 @@ class Request:
     """What is asked of a study: output folder, quick or full, reference data, who hears of progress.
 
     `truth` is the engine whose simulation the study "count-law" takes for true; `stream` a measured photon stream for
-    the study "hardware"; `config` the size of the study "downstream"; `seed` another sweep of the study "domain".
+    the studies "hardware" and "uncertainty"; `config` the size of "downstream" and "uncertainty"; `seed` another
+    sweep of the study "domain".
     """
 
     out: Path
@@ -93,10 +94,13 @@ _STUDIES = {
         "depth of dim cubes with and without the pixels around, and how well its errors hold",
     ),
     "transients": ("transients.run", "two returns in fog through the dead time of three detectors"),
-    "downstream": ("downstream.run", "T5: networks trained on every simulator's data, tested on gold; --config"),
-    "downstream-baselines": (
-        "downstream.baselines",
-        "what no network needs, on the cubes of T5: estimators of depth, a polynomial for reflectivity, the bound",
+    "downstream": (
+        "downstream.run",
+        "T5: networks trained on every simulator's data, tested on gold, beside what needs no training; --config",
+    ),
+    "uncertainty": (
+        "uncertainty.run",
+        "do 90 % intervals of networks trained on every simulator's data hold on gold? --stream adds a measured light",
     ),
     "start-up": ("table.start_up", "what the shape of a table leaves out: the start-up at other delays"),
     "table": ("table.run", "lookup tables: what they hold, and their errors between entries and at any delay"),

@@ -39,14 +39,13 @@ def _parser(command: str) -> argparse.ArgumentParser:
         "--data",
         type=Path,
         metavar="DIR",
-        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance', 'domain'), or of "
-        "measured scenes, rgbd/ (study 'downstream')",
+        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance', 'domain')",
     )
     parser.add_argument(
         "--stream",
         type=Path,
         metavar="FILE",
-        help="measured photon stream: a .mat with times in units of 64 ps (study 'hardware')",
+        help="measured photon stream: a .mat with times in units of 64 ps (studies 'hardware', 'uncertainty')",
     )
     parser.add_argument(
         "--truth",
@@ -59,8 +58,8 @@ def _parser(command: str) -> argparse.ArgumentParser:
         "--config",
         choices=("small", "full"),
         default="small",
-        help="size of the study 'downstream': an hour or two of two cores, or a GPU (default: %(default)s); with "
-        "--quick a tiny one, seconds",
+        help="size of the studies 'downstream' and 'uncertainty': half an hour of one core each, or several hours "
+        "(default: %(default)s); with --quick a tiny one, seconds",
     )
     parser.add_argument("--seed", type=int, metavar="N", help="another sweep (study 'domain')")
     return parser
@@ -75,8 +74,8 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
     given = parser.parse_args(asked)
     if "reference" in given.studies and given.data is None:
         parser.error("study 'reference' needs --data DIR, the folder of the reference cases")
-    if given.data is not None and not (any(given.data.glob("*.json")) or (given.data / "rgbd").is_dir()):
-        parser.error(f"--data must be a folder with *.json cases or rgbd/, got {str(given.data)!r}")
+    if given.data is not None and not any(given.data.glob("*.json")):
+        parser.error(f"--data must be a folder with *.json cases, got {str(given.data)!r}")
     if given.stream is not None and not given.stream.is_file():
         parser.error(f"--stream must be a file, got {str(given.stream)!r}")
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mars_lidar import Detector, GaussianPulse, Scene, System, Table, simulate
 from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
-from studies.downstream.fit import FitPlan
+from mars_lidar.learn import CubeStream, Uniform
+from mars_lidar.table.start_phase import StartPhases
 from studies.neural import NeuralEngine
 
 SYSTEM = System(  # that of the network beside studies/neural
@@ -32,27 +33,22 @@ WORDS = {
 class Config:
     """All that is fixed before the first run.
 
-    `arms` simulators and the seeds of their networks; `train`, `validation`, `test` (first, number) of scenes, which
-    are disjoint; `photons` signal photons per period of a reflectivity of 1; `render` side of the picture that a
-    scene's crop of side `size` is taken from; `depth_range_m` and 1 are the ranges of depth and reflectivity, of PSNR
-    and of the networks' outputs; `table` points of the tables' axes.
+    `arms` simulators, and the seeds of their networks; `train` and `test` (first, number) of rooms, which are
+    disjoint; `photons` signal photons per period of a reflectivity of 1; `render` side of a room's picture, `size` of a
+    test scene cut from it, `crop` of the stream's; `depth_range_m` and 1 the ranges of PSNR; `steps` of the window
+    network and of the bin network, `batch` crops each; `table` points of the tables' axes.
     """
 
     name: str
-    sbr: tuple[float, ...]
+    steps: tuple[int, int]
+    train: tuple[int, int] = (1000, 40)
+    test: tuple[int, int] = (3000, 8)
     arms: dict[str, tuple[int, ...]]
-    train: tuple[int, int]
-    validation: tuple[int, int]
-    test: tuple[int, int]
-    size: int
-    render: int
-    steps: int
-    batch: int
-    every: int
-    patience: int
-    stem: int
-    widths: tuple[int, ...]
-    blocks: int
+    sbr: tuple[float, ...] = (0.6, 1.0)
+    size: int = 64
+    render: int = 160
+    crop: int = 32
+    batch: int = 2
     table: tuple[int, int] = (256, 100)
     photons: float = 4.0
     depth_range_m: float = 10.0
@@ -60,93 +56,58 @@ class Config:
     gold: str = "sequential"
     seed: int = 20_265
 
-    def plan(self, seed: int) -> FitPlan:
-        """The training of one network."""
-        return FitPlan(steps=self.steps, batch=self.batch, every=self.every, patience=self.patience, seed=seed)
-
 
 _ONE, _THREE = (0,), (0, 1, 2)
-_ARMS: dict[str, tuple[int, ...]] = dict.fromkeys(WORDS, _ONE) | {"mars": _THREE, "exact": _THREE}
 _SMALL = Config(
     name="small",
-    sbr=(1.0,),
-    arms=_ARMS,
-    train=(1000, 40),
-    validation=(2000, 6),
-    test=(3000, 8),
-    size=64,
-    render=160,
-    steps=1000,
-    batch=4,
-    every=100,
-    patience=4,
-    stem=64,
-    widths=(32, 64, 96),
-    blocks=1,
+    steps=(150, 150),
+    arms=dict.fromkeys(WORDS, _ONE) | {"mars": _THREE, "exact": _THREE},
+    test=(3000, 6),
 )
 _FULL = replace(
     _SMALL,
     name="full",
-    sbr=(0.6, 1.0),
-    arms=dict.fromkeys(_ARMS, _THREE),
+    steps=(3000, 3000),
+    arms=dict.fromkeys(WORDS, _THREE),
     train=(1000, 400),
-    validation=(2000, 40),
     test=(3000, 40),
-    steps=40_000,
-    batch=16,
-    every=500,
-    patience=10,
-    stem=128,
-    widths=(64, 128, 256, 256),
-    blocks=2,
+    batch=4,
 )
 _TINY = replace(
     _SMALL,
     name="tiny",
-    arms={"poisson": _ONE, "neural": _ONE, "nearest": _ONE, "mars": (0, 1)},
+    steps=(4, 4),
+    arms={"poisson": _ONE, "neural": _ONE, "mars": (0, 1)},
+    sbr=(1.0,),
     train=(1000, 3),
-    validation=(2000, 1),
     test=(3000, 2),
     size=16,
     render=32,
-    steps=6,
-    batch=2,
-    every=3,
-    patience=5,
-    stem=8,
-    widths=(8, 16),
+    crop=8,
     table=(10, 8),
 )
 CONFIGS = {config.name: config for config in (_SMALL, _FULL, _TINY)}
 
 
+def room(number: int, config: Config) -> Scene:
+    """A room of its own furniture, at the scale of its own camera: those of all rooms stand at the same place."""
+    scene = Scene.example("room", size=config.render, seed=number)
+    return Scene(scene.depth_m * _random(config, number).uniform(*config.depth_scale), scene.reflectivity)
+
+
 def crop(number: int, config: Config) -> Scene:
-    """A crop of a room of its own furniture and scale."""
-    random = np.random.default_rng([config.seed, number])
-    room = Scene.example("room", size=config.render, seed=number)
-    top, left = random.integers(0, config.render - config.size + 1, 2)
-    cut = room[top : top + config.size, left : left + config.size]
-    depth = cut.depth_m * random.uniform(*config.depth_scale)  # the cameras of all rooms stand at the same place
-    if random.random() < 0.5:
-        return Scene(depth[:, ::-1], cut.reflectivity[:, ::-1])
-    return Scene(depth, cut.reflectivity)
+    """A part of a room, for a test."""
+    top, left = _random(config, number, 1).integers(0, config.render - config.size + 1, 2)
+    return room(number, config)[top : top + config.size, left : left + config.size]
 
 
-def rgbd_scenes(folder: Path, config: Config) -> dict[str, Scene]:
-    """Measured scenes that are there, at the size of the crops: their middle."""
-    files = {
-        "Art (Middlebury 2005)": ("middlebury_art",),
-        "NYUv2 frame 1": ("nyuv2_00001_depth.png", "nyuv2_00001_colors.png"),
-    }
-    scenes = {}
-    for name, parts in files.items():
-        if not (folder / parts[0]).exists():
-            continue
-        scene = Scene.from_rgbd(*(folder / part for part in parts))
-        side = min(scene.shape)
-        top, left = ((n - side) // 2 for n in scene.shape)
-        scenes[name] = scene[top : top + side, left : left + side].resize((config.size, config.size))
-    return scenes
+def level(scene: Scene, config: Config) -> float:
+    """Mean signal at which a reflectivity means the same photons in every scene."""
+    return config.photons * float(scene.reflectivity[scene.valid].mean())
+
+
+def _random(config: Config, *numbers: int) -> np.random.Generator:
+    return np.random.default_rng([config.seed, *numbers])
 
 
 class Simulators:
@@ -154,7 +115,6 @@ class Simulators:
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._table: Table | None = None
 
     def cubes(self, arm: str, scenes: Sequence[Scene], sbr: float, seed: int) -> NDArray[Any]:
         """Histograms (N, H, W, bins), one exposure of each scene; `arm` one of `WORDS`, or the gold standard."""
@@ -162,35 +122,70 @@ class Simulators:
         shape = (len(scenes), *scenes[0].shape, SYSTEM.bins)
         out = np.empty(shape, SYSTEM.histogram_dtype)
         for k, scene in enumerate(scenes):
-            # so that a reflectivity means the same photons in every scene
-            signal = self._config.photons * float(scene.reflectivity[scene.valid].mean())
-            flux = scene.flux(SYSTEM, signal=signal, sbr=sbr)
-            simulate(flux, SYSTEM, engine=engine, first_realization=k, seed=seed, out=out[k : k + 1])
+            flux = scene.flux(SYSTEM, signal=level(scene, self._config), sbr=sbr)
+            simulate(flux, SYSTEM, engine=engine, first_realization=k, seed=seed, threads=1, out=out[k : k + 1])
         return out
+
+    def stream(self, arm: str, sbr: float, seed: int) -> CubeStream:
+        """Batches of crops of the training rooms, (N, H, W, bins) of counts, no exposure twice.
+
+        The mean signal is drawn from the range that whole rooms have: what a crop's own is, is for the network to see.
+        """
+        config = self._config
+        levels = [level(scene, config) for scene in self._rooms]
+        return CubeStream(
+            SYSTEM,
+            self._rooms,
+            size=config.crop,
+            batch_size=config.batch,
+            signal=Uniform(0.7 * min(levels), 1.3 * max(levels)),
+            sbr=sbr,
+            engine=self._engine(arm),
+            axes="HWT",
+            dtype=None,
+            seed=seed,
+            threads=1,
+            ahead=0,
+        )
+
+    @cached_property
+    def _rooms(self) -> list[Scene]:
+        first, number = self._config.train
+        return [room(first + k, self._config) for k in range(number)]
 
     def _engine(self, arm: str) -> str | Engine:
         if arm == "neural":
-            return NeuralEngine()
+            return MarsEngine(self._neural, count="gaussian", outside="exact")
         if arm == "renewal":
-            return RenewalEngine(self._shared, outside="exact")
+            return RenewalEngine(self._table, outside="exact")
         if arm == "mars":
-            return MarsEngine(self._shared, outside="exact")
+            return MarsEngine(self._table, outside="exact")
         if arm == "nearest":  # the paper's: its count law, nearest grid point
-            return MarsEngine(self._shared, count="gaussian", interpolation="nearest", outside="exact")
+            return MarsEngine(self._table, count="gaussian", interpolation="nearest", outside="exact")
         return arm
 
-    @property
-    def _shared(self) -> Table:
-        if self._table is None:
-            points = self._config.table
-            self._table = Table.build(SYSTEM, (0.01, 10.0, points[0]), (0.01, 10.0, points[1]))
-        return self._table
+    @cached_property
+    def _table(self) -> Table:
+        s, b = self._config.table
+        return Table.build(SYSTEM, (0.01, 10.0, s), (0.01, 10.0, b), threads=1)
+
+    @cached_property
+    def _neural(self) -> Table:
+        """What the neural map says at the points of a table, its mean, variance and shape in place of the exact ones.
+
+        The map itself takes a millisecond a pixel; it too is asked for at one delay, and its answer is moved.
+        """
+        s, b = (np.geomspace(0.01, 10.0, max(4, points // 4)) for points in self._config.table)
+        exact = Table.build(SYSTEM, s, b, threads=1)
+        light = np.meshgrid(exact.signal, exact.background, indexing="ij")
+        engine = NeuralEngine()
+        law = engine.count_law(*light, SYSTEM)
+        shape = engine.registration_pdf(*light, SYSTEM).reshape(-1, SYSTEM.bins).astype(np.float32)
+        entries = replace(exact.entries, cumulants=law.cumulants.reshape(-1, 4), shape=shape, startup=None)
+        return replace(exact, entries=entries, start_phases=StartPhases.none())
 
 
-def truths(scenes: Sequence[Scene], target: str, config: Config) -> NDArray[np.float32]:
-    """Maps (N, H, W) that a network is to give: depth over its range, or reflectivity; 0 where there is no return."""
-    if target == "reflectivity":
-        maps = [np.where(scene.valid, scene.reflectivity, 0.0) for scene in scenes]
-    else:
-        maps = [np.where(scene.valid, np.nan_to_num(scene.depth_m), 0.0) / config.depth_range_m for scene in scenes]
-    return np.stack(maps).astype(np.float32)
+def truths(scenes: Sequence[Scene]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depth, m, NaN without a return, and reflectivity, 0 there: (N, H, W)."""
+    light = [np.where(scene.valid, scene.reflectivity, 0.0) for scene in scenes]
+    return np.stack([scene.depth_m for scene in scenes]), np.stack(light)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mars_lidar.plot.style import style
 from studies.downstream.data import Config, crop
-from studies.downstream.run import SHOWN, TARGETS, Run
+from studies.downstream.run import TARGETS, Run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,7 +19,7 @@ _SHORT = {"poisson": "Poisson", "nearest": "MaRS, nearest", "mars": "MaRS"}
 
 
 def picture(folder: Path, config: Config, found: Mapping[Run, Any], sbr: float) -> Figure:
-    """The first test scene: truth, and every arm on its own and on gold-standard data, reflectivity and depth."""
+    """The first test scene: truth, and every arm's window network on its own and on gold-standard data."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -33,20 +33,19 @@ def picture(folder: Path, config: Config, found: Mapping[Run, Any], sbr: float) 
             true = scene.depth_m if target == "depth" else scene.reflectivity
             limits: dict[str, Any] = {"vmin": float(np.nanmin(true)), "vmax": float(np.nanmax(true))}
             limits["cmap"] = "viridis" if target == "depth" else "gray"
-            scale = config.depth_range_m if target == "depth" else 1.0
             axes[2 * half, 0].imshow(true, **limits)
             axes[2 * half, 0].set_title(f"{target}, true")
             axes[2 * half + 1, 0].axis("off")
             for k, arm in enumerate(arms, 1):
-                one = Run(arm, sbr, target, config.arms[arm][0])
-                with np.load(folder / one.name / SHOWN) as shown:
+                one = Run(arm, sbr, config.arms[arm][0])
+                with np.load(folder / f"{one.name}.npz") as shown:
                     for row, data in enumerate(("own", "gold")):
                         ax = axes[2 * half + row, k]
-                        ax.imshow(shown[data] * scale, **limits)
-                        error = found[one][data]
+                        ax.imshow(shown[f"{data}_window_{target}"], **limits)
+                        error = found[one][data]["window"][target]
                         told = f"{error['rmse']:.3f} m" if target == "depth" else f"{error['psnr']:.1f} dB"
                         ax.set_title(f"{_SHORT.get(arm, arm)}\n{data}: {told}" if row == 0 else f"{data}: {told}")
         for ax in axes.flat:
             ax.set(xticks=[], yticks=[])
-        figure.suptitle(f"SBR {sbr:g}; figures under the names: over all test scenes", fontsize=8)
+        figure.suptitle(f"Window networks, SBR {sbr:g}; figures under the names: over all test scenes", fontsize=8)
     return figure

@@ -1,13 +1,14 @@
-"""Study "downstream", T5 of the MaRS paper: networks trained on every simulator's data, tested on gold-standard data.
+"""Study "downstream", T5 of the MaRS paper: what is trained on every simulator's data, tested on gold-standard data.
 
-A network for each simulator, ratio, target and seed; each leaves its result in a folder of its own, and a study that
-was stopped goes on where it was.
+For each simulator, ratio and seed, one stream of fresh exposures trains a polynomial, a window network and a bin
+network side by side. Each leaves its result in a file of its own, and a study that was stopped goes on with the next.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,44 +16,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Scene
+from mars_lidar import Scene, cramer_rao, reconstruct
 from mars_lidar._base import checks
-from studies import OtherRunsError, Request, Tell
+from mars_lidar._base.types import FloatArray
+from studies import OtherRunsError, Request
 from studies.common.report import save_whole
 from studies.downstream.counts import count_bias
-from studies.downstream.data import CONFIGS, SYSTEM, Config, Simulators, crop, rgbd_scenes, truths
+from studies.downstream.data import CONFIGS, SYSTEM, Config, Simulators, crop, level, truths
+from studies.downstream.metrics import psnr, rmse, ssim
 
 TARGETS = ("reflectivity", "depth")
-RESULT, SHOWN, CONFIG, COUNTS = "result.json", "shown.npz", "config.json", "counts.json"
-# streams of the cubes: those of a test differ from those of the training, and gold from own
-_TRAINING, _VALIDATION, _OWN, _GOLD, _MEASURED = range(5)
+MODELS = {"polynomial": "polynomial", "window": "window network", "bins": "bin network"}
+METHODS = ("peak", "matched_filter", "generalised_coates", "maximum_likelihood")  # that need no training
+CONFIG, COUNTS, REFERENCES = "config.json", "counts.json", "references.json"
+DEGREE = 4  # of the polynomial, in log(1 + total) and log(1 + counts of the window)
+LIGHT_M_PER_NS = 0.299792458 / 2.0  # of depth
+_TRAINING, _OWN, _GOLD = range(3)  # streams of noise
 
 
 @dataclass(frozen=True)
 class Run:
-    """One network."""
+    """One simulator's data at one ratio, by one seed."""
 
     arm: str
     sbr: float
-    target: str
     seed: int
 
     @property
     def name(self) -> str:
-        """Of its folder."""
-        return f"{self.arm}-sbr{self.sbr:g}-{self.target}-{self.seed}"
+        """Of its files."""
+        return f"{self.arm}-sbr{self.sbr:g}-{self.seed}"
 
 
 def runs(config: Config) -> list[Run]:
-    """All of them, those of the same data together, the first seed of every arm before any second."""
-    deepest = max(len(seeds) for seeds in config.arms.values())
+    """All of them, the first seed of every arm before any second."""
+    turns = range(max(map(len, config.arms.values())))
     return [
-        Run(arm, sbr, target, seeds[turn])
-        for turn in range(deepest)
+        Run(arm, sbr, seeds[turn])
+        for turn in turns
         for sbr in config.sbr
         for arm, seeds in config.arms.items()
         if turn < len(seeds)
-        for target in TARGETS
     ]
 
 
@@ -64,17 +68,19 @@ def run(request: Request) -> list[Path]:
     config = CONFIGS[checks.choice("config", name, tuple(CONFIGS))]
     folder = request.out / f"downstream-{config.name}"
     fixed(folder, config)
-    left = [one for one in runs(config) if not (folder / one.name / RESULT).exists()]
-    request.tell(f"downstream: {len(left)} of {len(runs(config))} networks to train")
-    data = Data(config, None if request.data is None else request.data / "rgbd")
+    data = Data(config)
+    left = [one for one in runs(config) if not (folder / f"{one.name}.json").exists()]
+    request.tell(f"downstream: {len(left)} of {len(runs(config))} streams to train on")
     for done, one in enumerate(left):
-        told = f"downstream: {one.name} ({len(left) - done} left)"
-        train_and_test(one, config, data, folder / one.name, lambda text, told=told: request.tell(f"{told}: {text}"))  # type: ignore[misc]
-    found = {one: json.loads((folder / one.name / RESULT).read_text()) for one in runs(config)}
-    if not (folder / COUNTS).exists():
-        request.tell("downstream: counts of every simulator on the test scenes")
-        save_whole(folder / COUNTS, json.dumps(count_bias(config, data.test, data.simulators), indent=2) + "\n")
-    return report(request, folder, config, found, json.loads((folder / COUNTS).read_text()))
+        train_and_test(one, data, folder)
+        request.tell(f"downstream: {one.name} ({len(left) - done - 1} left)")
+    for file, make in ((REFERENCES, data.references), (COUNTS, data.count_bias)):
+        if not (folder / file).exists():
+            request.tell(f"downstream: {file.removesuffix('.json')}")
+            save_whole(folder / file, json.dumps(make(), indent=2) + "\n")
+    found = {one: json.loads((folder / f"{one.name}.json").read_text()) for one in runs(config)}
+    once = [json.loads((folder / file).read_text()) for file in (REFERENCES, COUNTS)]
+    return report(request, folder, config, found, *once)
 
 
 def fixed(folder: Path, config: Config) -> None:
@@ -88,94 +94,159 @@ def fixed(folder: Path, config: Config) -> None:
 
 
 class Data:
-    """Scenes, and the cubes of one arm and ratio at a time; those of the gold standard are kept."""
+    """Test scenes, their cubes, and what needs no training on them."""
 
-    def __init__(self, config: Config, measured: Path | None) -> None:
+    def __init__(self, config: Config) -> None:
         self.config = config
-        self.training, self.validation, self.test = (
-            [crop(first + k, config) for k in range(number)]
-            for first, number in (config.train, config.validation, config.test)
-        )
-        self.measured = {} if measured is None else rgbd_scenes(measured, config)
+        first, number = config.test
+        self.test = [crop(first + k, config) for k in range(number)]
         self.simulators = Simulators(config)
-        self._own: tuple[tuple[str, float], list[NDArray[Any]]] | None = None
-        self._gold: dict[float, list[NDArray[Any]]] = {}
+        self._gold: dict[float, NDArray[Any]] = {}
 
-    def own(self, arm: str, sbr: float) -> list[NDArray[Any]]:
-        """Cubes of training, validation and test by `arm`."""
-        if self._own is None or self._own[0] != (arm, sbr):
-            self._own = None  # frees them before others are made
-            sets = (self.training, _TRAINING), (self.validation, _VALIDATION), (self.test, _OWN)
-            self._own = ((arm, sbr), [self._cubes(arm, scenes, sbr, stream) for scenes, stream in sets])
-        return self._own[1]
+    def own(self, arm: str, sbr: float) -> NDArray[Any]:
+        """Cubes of the test scenes by `arm`."""
+        return self.simulators.cubes(arm, self.test, sbr, (self.config.seed << 8) + _OWN)
 
-    def gold(self, sbr: float) -> list[NDArray[Any]]:
-        """Cubes of the test scenes, and of measured ones if there are, by the gold standard."""
+    def gold(self, sbr: float) -> NDArray[Any]:
+        """Cubes of the test scenes by the gold standard."""
         if sbr not in self._gold:
-            sets = [(self.test, _GOLD)] + ([(list(self.measured.values()), _MEASURED)] if self.measured else [])
-            self._gold[sbr] = [self._cubes(self.config.gold, scenes, sbr, stream) for scenes, stream in sets]
+            seed = (self.config.seed << 8) + _GOLD
+            self._gold[sbr] = self.simulators.cubes(self.config.gold, self.test, sbr, seed)
         return self._gold[sbr]
 
-    def _cubes(self, arm: str, scenes: list[Scene], sbr: float, stream: int) -> NDArray[Any]:
-        return self.simulators.cubes(arm, scenes, sbr, (self.config.seed << 8) + stream)
+    def count_bias(self) -> dict[str, Any]:
+        """See `studies.downstream.counts`."""
+        return count_bias(self.config, self.test, self.simulators)
+
+    def references(self) -> dict[str, dict[str, float]]:
+        """By ratio: RMSE of depth, m, of each method on gold-standard cubes, and the Cramer-Rao bound's."""
+        found: dict[str, dict[str, float]] = {}
+        true, _ = truths(self.test)
+        for sbr in self.config.sbr:
+            rows: dict[str, float] = {}
+            for method in METHODS:
+                depth = reconstruct(self.gold(sbr), SYSTEM, method, threads=1).depth_m
+                away = np.where(np.isfinite(depth), depth, 0.5 * SYSTEM.unambiguous_range_m)
+                rows[method.replace("_", " ")] = rmse(away, true)
+            bounds = []
+            for scene in self.test:
+                flux = scene.flux(SYSTEM, signal=level(scene, self.config), sbr=sbr)
+                lit = flux.signal > 0
+                bound = cramer_rao(flux.signal[lit], flux.background[lit], SYSTEM, delay_ns=flux.delay_ns[lit])
+                bounds.append(bound.depth_m)
+            rows["Cramer-Rao bound"] = float(np.sqrt(np.mean(np.concatenate(bounds) ** 2)))
+            found[f"{sbr:g}"] = rows
+        return found
 
 
-def train_and_test(one: Run, config: Config, data: Data, folder: Path, tell: Tell) -> None:
-    """Train a network, or go on with it, and leave its result in `folder`."""
+def train_and_test(one: Run, data: Data, folder: Path) -> None:
+    """Train on one stream, and leave what the three tell of the test scenes in `folder`."""
     import torch
 
-    from studies.downstream.fit import Examples, fit, predict
-    from studies.downstream.unet import CubeUNet, Target
+    from studies.common.intervals import Steps
+    from studies.downstream.networks import BinNetwork, WindowNetwork
 
-    target: Target = "depth" if one.target == "depth" else "reflectivity"
+    torch.set_num_threads(1)  # the networks are too small to gain from more
     torch.manual_seed(one.seed)
-    network = CubeUNet(SYSTEM.bins, target, stem=config.stem, widths=config.widths, blocks=config.blocks)
-    training, validation, test = data.own(one.arm, one.sbr)
-    plan = config.plan(one.seed)
-    fitted = fit(
-        network,
-        Examples(training, truths(data.training, target, config)),
-        Examples(validation, truths(data.validation, target, config)),
-        folder,
-        plan,
-        about=asdict(one),
-        tell=tell,
-    )
-    gold = data.gold(one.sbr)
-    own_maps, gold_maps = predict(network, test, plan.scale), predict(network, gold[0], plan.scale)
-    result: dict[str, Any] = {
-        "run": asdict(one),
-        "training": asdict(fitted),
-        "own": errors(own_maps, data.test, target, config),
-        "gold": errors(gold_maps, data.test, target, config),
-    }
-    if data.measured:
-        maps = predict(network, gold[1], plan.scale)
-        result["measured"] = {
-            name: errors(maps[k : k + 1], [scene], target, config)
-            for k, (name, scene) in enumerate(data.measured.items())
+    config, began = data.config, time.process_time()
+    networks = {"window": WindowNetwork(SYSTEM.bins), "bins": BinNetwork(SYSTEM.bins)}
+    steps = dict(zip(networks, config.steps, strict=True))
+    crops = {"window": config.batch, "bins": max(1, config.batch // 2)}  # pixel by pixel, one crop tells enough
+    optimizers = {name: Steps(network, steps[name]) for name, network in networks.items()}
+    polynomial = Polynomial()
+    stream = data.simulators.stream(one.arm, one.sbr, (config.seed << 8) + 16 * one.seed + _TRAINING)
+    for step, batch in zip(range(max(config.steps)), stream, strict=False):
+        delay = batch["flux"]["delay"] / SYSTEM.bin_ns
+        light = batch["flux"]["signal"] / config.photons  # the reflectivity that gives these photons
+        polynomial.take(batch["cube"].numpy(), light.numpy())
+        for name, network in networks.items():
+            if step < steps[name]:
+                some = slice(crops[name])
+                told = network(batch["cube"][some])
+                optimizers[name].step(told.loss(delay[some].flatten(), light[some].flatten()))
+    result: dict[str, Any] = {"run": asdict(one), "seconds": time.process_time() - began}
+    shown: dict[str, FloatArray] = {}
+    for where, cubes in (("own", data.own(one.arm, one.sbr)), ("gold", data.gold(one.sbr))):
+        result[where] = {"polynomial": tested({"reflectivity": polynomial.told(cubes)}, {}, data.test, config)}
+        for name, network in networks.items():
+            maps, spread = predicted(network, cubes)
+            result[where][name] = tested(maps, spread, data.test, config)
+            shown |= {f"{where}_{name}_{target}": maps[target][0] for target in TARGETS}
+    np.savez_compressed(folder / f"{one.name}.npz", allow_pickle=False, **shown)
+    save_whole(folder / f"{one.name}.json", json.dumps(result, indent=2) + "\n")
+
+
+class Polynomial:
+    """Reflectivity as a polynomial of two numbers of a pixel, by least squares."""
+
+    def __init__(self) -> None:
+        terms = (DEGREE + 1) * (DEGREE + 2) // 2
+        self._square, self._product = np.zeros((terms, terms)), np.zeros(terms)
+
+    def take(self, cubes: NDArray[Any], reflectivity: NDArray[Any]) -> None:
+        """Add pixels to the fit."""
+        terms = _terms(cubes)
+        self._square += terms.T @ terms
+        self._product += terms.T @ reflectivity.reshape(-1)
+
+    def told(self, cubes: NDArray[Any]) -> FloatArray:
+        """Maps (N, H, W) of cubes (N, H, W, bins)."""
+        weights = np.linalg.lstsq(self._square, self._product, rcond=1e-14)[0]
+        return np.concatenate([(_terms(cube) @ weights).reshape(1, *cube.shape[:2]) for cube in cubes])
+
+
+def _terms(cubes: NDArray[Any]) -> FloatArray:
+    """Monomials (pixels, terms), of numbers of the order of 1."""
+    from studies.common.windows import features
+
+    total, near = 0.2 * features(cubes.reshape(-1, cubes.shape[-1]))[0][:, -2:].T.astype(np.float64)
+    return np.stack([total**i * near**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=-1)
+
+
+def predicted(network: Any, cubes: NDArray[Any]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Maps (N, H, W) of reflectivity and depth, m, and their standard deviations."""
+    import torch
+
+    parts: dict[str, list[FloatArray]] = {}
+    with torch.inference_mode():
+        for cube in cubes:
+            told = network(torch.from_numpy(cube[None]))
+            metres = SYSTEM.bin_ns * LIGHT_M_PER_NS
+            for name, values in (
+                ("reflectivity", told.reflectivity),
+                ("depth", metres * torch.remainder(told.delay, told.bins)),
+                ("reflectivity spread", torch.exp(0.5 * told.reflectivity_log_variance)),
+                ("depth spread", metres * torch.exp(0.5 * told.delay_log_variance)),
+            ):
+                parts.setdefault(name, []).append(values.double().numpy().reshape(cube.shape[:2]))
+    maps = {name: np.stack(values) for name, values in parts.items()}
+    return {name: maps[name] for name in TARGETS}, {name: maps[f"{name} spread"] for name in TARGETS}
+
+
+def tested(
+    maps: Mapping[str, FloatArray], spread: Mapping[str, FloatArray], scenes: Sequence[Scene], config: Config
+) -> dict[str, dict[str, float]]:
+    """PSNR and SSIM, means over the scenes, and RMSE over all pixels; of depth in m, pixels without return left out.
+
+    ``covered``: the share of pixels inside their 90 % interval, where there are intervals.
+    """
+    out: dict[str, dict[str, float]] = {}
+    for target, found in maps.items():
+        peak = config.depth_range_m if target == "depth" else 1.0
+        true = truths(scenes)[0 if target == "depth" else 1]
+        filled = np.where(np.isfinite(true), true, found)
+        out[target] = {
+            "psnr": float(np.mean([psnr(a, b, peak) for a, b in zip(found, true, strict=True)])),
+            "ssim": float(np.mean([ssim(a, b, peak) for a, b in zip(found, filled, strict=True)])),
+            "rmse": rmse(found, true),
         }
-    np.savez_compressed(folder / SHOWN, own=own_maps[0], gold=gold_maps[0])
-    save_whole(folder / RESULT, json.dumps(result, indent=2) + "\n")
+        if target in spread:
+            inside = np.abs(found - true) <= 1.6448536 * spread[target]
+            out[target]["covered"] = float(inside[np.isfinite(true)].mean())
+    return out
 
 
-def errors(maps: NDArray[np.float32], scenes: list[Scene], target: str, config: Config) -> dict[str, float]:
-    """PSNR and SSIM, means over the scenes, and RMSE over all pixels; of depth in m, pixels without return left out."""
-    from studies.downstream.metrics import psnr, rmse, ssim
-
-    peak = config.depth_range_m if target == "depth" else 1.0
-    found = maps.astype(np.float64) * peak
-    true = np.stack([scene.depth_m if target == "depth" else scene.reflectivity for scene in scenes])
-    filled = np.where(np.isfinite(true), true, found)
-    return {
-        "psnr": float(np.mean([psnr(a, b, peak) for a, b in zip(found, true, strict=True)])),
-        "ssim": float(np.mean([ssim(a, b, peak) for a, b in zip(found, filled, strict=True)])),
-        "rmse": rmse(found, true),
-    }
-
-
-def by_arm(found: Mapping[Run, Any]) -> Iterator[tuple[str, float, dict[str, list[Any]]]]:
-    """Results by arm and ratio: of each target, one for each seed."""
+def by_arm(found: Mapping[Run, Any]) -> Iterator[tuple[str, float, list[Any]]]:
+    """Results by arm and ratio, one for each seed."""
     for sbr, arm in dict.fromkeys((one.sbr, one.arm) for one in found):
-        here = {one: result for one, result in found.items() if (one.sbr, one.arm) == (sbr, arm)}
-        yield arm, sbr, {target: [r for one, r in here.items() if one.target == target] for target in TARGETS}
+        yield arm, sbr, [result for one, result in found.items() if (one.sbr, one.arm) == (sbr, arm)]

@@ -7,8 +7,17 @@ import pytest
 import torch
 
 import mars_lidar as ml
-from mars_lidar.learn import armed_periods, bin_photons, expected_histogram, histogram_log_likelihood
+from mars_lidar.learn import (
+    armed_periods,
+    bin_photons,
+    cyclic_solver,
+    expected_histogram,
+    forward,
+    histogram_log_likelihood,
+)
 from mars_lidar.reconstruct.maximum_likelihood import log_likelihood
+
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # torch's own forward mode calls it
 
 PULSES = (ml.GaussianPulse(sigma_ns=3.0), ml.SampledPulse([1, 4, 9, 7, 3, 1, 0.5], bin_ns=2.7))
 
@@ -36,9 +45,66 @@ def test_gradients(dead_ns, pulse):
     assert torch.autograd.gradcheck(lambda *x: histogram_log_likelihood(counts, *x, one), at)
     for start in ("stationary", "armed"):
         begun = one.replace(start=start, cycles=4 if start == "armed" else 1)
-        assert torch.autograd.gradcheck(
-            lambda *x, begun=begun: expected_histogram(*x, begun, refine=2), at, eps=1e-5, fast_mode=True
+
+        def mean(*x, begun=begun):
+            return expected_histogram(*x, begun, refine=2)
+
+        assert torch.autograd.gradcheck(mean, at, eps=1e-5, fast_mode=True, check_forward_ad=True)
+        assert torch.autograd.gradgradcheck(mean, at, eps=1e-5, fast_mode=True)
+
+
+@pytest.mark.parametrize("start", ["stationary", "armed"])
+def test_transforms_of_torch_func(start):
+    """Jacobians by both modes, second derivatives by three routes and by differences, each pixel by itself."""
+    one, at = system(start=start), [x.detach() for x in point(*AT)]
+    torch.manual_seed(0)
+    weights = torch.randn(20, dtype=torch.float64)
+
+    def mean(*x):
+        return expected_histogram(*x, one)
+
+    def loss(x):
+        return mean(*x) @ weights
+
+    every = (0, 1, 2)
+    reverse, ahead = (mode(mean, argnums=every)(*at) for mode in (torch.func.jacrev, torch.func.jacfwd))
+    alone = torch.vmap(torch.func.jacrev(mean, argnums=every))(*at)
+    torch.testing.assert_close(torch.vmap(mean)(*at), mean(*at), rtol=0, atol=0)
+    for k in every:
+        torch.testing.assert_close(reverse[k], ahead[k], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(alone[k], torch.einsum("pbp->pb", reverse[k]), rtol=1e-9, atol=1e-9)
+        # no share of one pixel in another's
+        assert (
+            float((reverse[k] - torch.einsum("pb,pq->pbq", alone[k], torch.eye(3, dtype=torch.float64))).abs().max())
+            < 1e-9
         )
+    moved = torch.func.jvp(mean, tuple(at), tuple(map(torch.ones_like, at)))[1]
+    torch.testing.assert_close(moved, sum(alone), rtol=1e-9, atol=1e-9)
+    for x in torch.stack(at, 1)[:2]:
+        hessian = torch.func.hessian(loss)(x)
+        twice = torch.func.jacrev(torch.func.jacrev(loss))(x)
+        steps = 1e-4 * torch.diag(x)
+        grad = torch.func.grad(loss)
+        central = torch.stack([(grad(x + step) - grad(x - step)) / (2.0 * step.sum()) for step in steps])
+        scale = float(hessian.abs().max())
+        torch.testing.assert_close(hessian, twice, rtol=0, atol=1e-9 * scale)
+        torch.testing.assert_close(hessian, central, rtol=0, atol=1e-5 * scale)
+        with pytest.raises(ValueError, match="forward mode within forward mode"):
+            torch.func.jacfwd(torch.func.jacfwd(loss))(x)
+    each = torch.vmap(torch.func.hessian(loss))(torch.stack(at, 1)[:2])
+    torch.testing.assert_close(each[1], hessian, rtol=1e-9, atol=1e-9 * scale)
+
+
+def test_blocks_of_another_size_are_solved_alike(monkeypatch):
+    at = point(*AT)
+    whole = expected_histogram(*at, system())
+    monkeypatch.setattr(cyclic_solver, "_BLOCK", 1)
+    monkeypatch.setattr(forward, "_BLOCK", 1)
+    parts = expected_histogram(*at, system())
+    torch.testing.assert_close(parts, whole, rtol=1e-11, atol=0)
+    weights = torch.arange(20.0, dtype=torch.float64)
+    one = torch.autograd.grad((whole @ weights).sum(), at)
+    torch.testing.assert_close(torch.autograd.grad((parts @ weights).sum(), at), one, rtol=1e-9, atol=1e-9)
 
 
 def test_gradient_at_many_bins_is_that_of_the_exact_mean_histogram():

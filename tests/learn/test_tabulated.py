@@ -66,6 +66,25 @@ def test_gradients(table):
     assert torch.autograd.gradcheck(windows, at, eps=1e-6, atol=1e-6)
 
 
+def test_kinks_at_the_nodes_are_as_small_as_is_said():
+    """The spacing of the paper's 256 x 100 table; jumps over what the derivatives are, summed over the bins."""
+    system = build(bins=256, sigma_ns=1.0).system
+    axes = (10 ** (-0.3 + 3.0 * np.arange(6) / 255), 10 ** (-0.3 + 3.0 * np.arange(6) / 99))
+    model = HistogramTable(ml.Table.build(system, *axes, threads=1)).double()
+    nodes = [float(axes[0][3]), float(axes[1][2]), (0.5 - 40 / 256) * system.period_ns]
+    for place, most in enumerate((0.05, 0.15, 1e-3)):
+        others = [torch.tensor([0.999 * x], dtype=torch.float64) for x in nodes]
+
+        def along(x, place=place, others=others):
+            return model(*(x if k == place else one for k, one in enumerate(others)))[0]
+
+        below, above = (
+            torch.autograd.functional.jacobian(along, torch.tensor([nodes[place] * (1.0 + step)], dtype=torch.float64))
+            for step in (-1e-9, 1e-9)
+        )
+        assert 0.0 < float((above - below).abs().sum() / above.abs().sum()) < most
+
+
 def test_delay_moves_it_continuously_and_keeps_the_total(table):
     model = HistogramTable(table).double()
     bin_ns = table.system.bin_ns

@@ -27,7 +27,6 @@ NAMES = {  # of every command that a committed report prints
     "detectors",
     "domain",
     "downstream",
-    "downstream-baselines",
     "effects",
     "hardware",
     "joint",
@@ -46,6 +45,7 @@ NAMES = {  # of every command that a committed report prints
     "streams",
     "table",
     "transients",
+    "uncertainty",
 }
 
 

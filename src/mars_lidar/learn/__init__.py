@@ -33,14 +33,7 @@ _MODULES = {
 }
 
 
-_IN_STUDIES = {"CubeUNet": "unet", "Examples": "fit", "FitPlan": "fit", "Fitted": "fit"}
-
-
 def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
-    if name in _IN_STUDIES:
-        raise AttributeError(
-            f"{name} is studies.downstream.{_IN_STUDIES[name]}.{name} of a checkout, not of the package"
-        )
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

@@ -34,7 +34,8 @@ Rows = torch.Tensor  # (pixels, bins), double
 _KRYLOV, _RESTARTS = 40, 25
 TOLERANCE = 1e-13  # of the residual, relative to the source
 _GOOD = 1e-9  # that is still accepted where rounding ends the descent
-_BLOCK = 2**15  # pixels x bins solved at a time: what is used again and again stays in the cache
+_BLOCK = 2**15  # pixels x bins solved at a time on a CPU: what is used again and again stays in the cache
+_HELD = 24  # arrays (pixels, bins) beside the Krylov space, the powers of two of the recursion among them
 
 
 def fired(light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -43,6 +44,14 @@ def fired(light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     dim = light < 0.02
     series = light * (0.5 - light * (1 / 6 - light * (1 / 24 - light * (1 / 120 - light / 720))))
     return p, torch.where(dim, series, 1 - p / torch.where(dim, torch.ones_like(light), light))
+
+
+def slopes(light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Derivatives of p and q in the photons of a bin."""
+    dim = light < 0.02
+    series = 0.5 - light * (1 / 3 - light * (1 / 8 - light * (1 / 30 - light * (1 / 144 - light / 840))))
+    some = torch.where(dim, torch.ones_like(light), light)
+    return torch.exp(-light), torch.where(dim, series, (-torch.expm1(-some) / some - torch.exp(-some)) / some)
 
 
 class Delay:
@@ -72,6 +81,10 @@ class Delay:
         below = torch.nn.functional.pad(torch.cat([h, h], -1).cumsum(-1), (1, 0))
         window = below[..., n : 2 * n] - below[..., n - d : 2 * n - d] + self.part * torch.roll(h, d + 1, -1)
         return window + self.whole * h.sum(-1, keepdim=True)
+
+    def blind_transposed(self, y: torch.Tensor) -> torch.Tensor:
+        """G' y: G is a correlation round the circle, so G' is G from the other side."""
+        return self.blind(y.flip(-1)).flip(-1)
 
     def left(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """What dead time at the end of the exposure leaves of settled registrations h a period: e and its falls.
@@ -218,42 +231,91 @@ def _krylov(apply: Callable[[Rows], Rows], rest: Rows, enough: torch.Tensor) -> 
     return torch.bmm(steps.mT, basis[:, :used]).squeeze(1)
 
 
-class _Registered(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, photons: Rows, source: Rows, delay: Delay, tolerance: float, known: Rows | None) -> Rows:
-        ctx.delay, ctx.tolerance = delay, tolerance
-        if known is None:
-            h = torch.cat([Circle(light, delay).solve(s, tolerance) for light, s in _blocks(photons, source)])
-        else:
-            h = known.clone()
-        ctx.save_for_backward(photons, h)
-        return h
+class _Solution(torch.autograd.Function):
+    """x of A x = s, or of A' x = s, for rows of photons and sources.
+
+    Derivatives of any order and of both modes, for they are solutions themselves: with y of A' y = g,
+
+        dx = A^-1 (ds - dA x),     dA x = dp G x - dq L x,     s -> y,     l -> y (q' L x - p' G x).
+    """
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Rows) -> tuple[Rows, Rows, None, None, None]:
-        photons, h = ctx.saved_tensors
-        parts = _blocks(photons, gradient)
-        worth = torch.cat([Circle(light, ctx.delay).solve_transposed(g, ctx.tolerance) for light, g in parts])
-        with torch.enable_grad():
-            light = photons.detach().requires_grad_()
-            p, q = fired(light)
-            # of A h = s with s held: A dh = -dp G h + dq L h
-            (moved,) = torch.autograd.grad((worth * (q * ctx.delay.rearmed(h) - p * ctx.delay.blind(h))).sum(), light)
-        return moved, worth, None, None, None
+    def forward(photons: Rows, source: Rows, known: Rows | None, delay: Delay, tolerance: float, turned: bool) -> Rows:
+        if known is not None:
+            return known.clone()
+        done = []
+        for light, wanted in _blocks(photons, source):
+            circle = Circle(light, delay)
+            done.append((circle.solve_transposed if turned else circle.solve)(wanted, tolerance))
+        return torch.cat(done)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Rows) -> None:
+        photons, _, _, *ctx.settings = inputs
+        ctx.save_for_backward(photons, output)
+        ctx.save_for_forward(photons, output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Rows) -> tuple[Rows, Rows, None, None, None, None]:
+        photons, x = ctx.saved_tensors
+        delay, tolerance, turned = ctx.settings
+        y = _Solution.apply(photons, gradient, None, delay, tolerance, not turned)  # type: ignore[no-untyped-call]
+        p, q = slopes(photons)
+        right, left = (y, x) if turned else (x, y)
+        return left * (q * delay.rearmed(right) - p * delay.blind(right)), y, None, None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, photons_moved: Rows | None, source_moved: Rows | None, *_: None) -> Rows:
+        photons, x = ctx.saved_tensors
+        delay, tolerance, turned = ctx.settings
+        moved = torch.zeros_like(x) if source_moved is None else source_moved
+        if photons_moved is not None:
+            p, q = (slope * photons_moved for slope in slopes(photons))
+            if turned:
+                moved = moved + delay.rearmed_transposed(q * x) - delay.blind_transposed(p * x)
+            else:
+                moved = moved + q * delay.rearmed(x) - p * delay.blind(x)
+        out: Rows = _Solution.apply(photons, moved, None, delay, tolerance, turned)  # type: ignore[no-untyped-call]
+        return out
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return by_rows(_Solution, info, in_dims, given)
+
+
+def by_rows(function: Any, info: Any, in_dims: tuple[int | None, ...], given: tuple[Any, ...]) -> Any:
+    """The rule of `torch.vmap` for a function of rows that are independent of each other: more of them."""
+    number, flat = info.batch_size, []
+    for one, dim in zip(given, in_dims, strict=True):
+        if isinstance(one, torch.Tensor):
+            whole = one.expand(number, *one.shape) if dim is None else one.movedim(dim, 0)
+            one = whole.reshape(-1, *whole.shape[2:])
+        flat.append(one)
+    out = function.apply(*flat)
+    if isinstance(out, torch.Tensor):
+        return out.reshape(number, -1, *out.shape[1:]), 0
+    return tuple(one.reshape(number, len(one) // number, *one.shape[1:]) for one in out), (0,) * len(out)
 
 
 def registered(
     photons: Rows, source: Rows, delay: Delay, tolerance: float = TOLERANCE, known: Rows | None = None
 ) -> Rows:
-    """h (pixels, bins) of (1) from photons and sources (pixels, bins), in double; differentiable once in both.
+    """h (pixels, bins) of (1) from photons and sources (pixels, bins), in double; differentiable in both.
 
-    `known`: h itself, where it was found before and only gradients are wanted.
+    `known`: h itself, where it was found before and only derivatives are wanted.
     """
-    h: Rows = _Registered.apply(photons, source, delay, tolerance, known)  # type: ignore[no-untyped-call]
+    h: Rows = _Solution.apply(photons, source, known, delay, tolerance, False)  # type: ignore[no-untyped-call]
     return h
 
 
 def _blocks(*rows: Rows) -> Any:
-    some = max(1, _BLOCK // rows[0].shape[-1])
+    some = max(1, _block(rows[0].device) // rows[0].shape[-1])
     return zip(*(torch.split(one, some) for one in rows), strict=True)
+
+
+def _block(device: torch.device) -> int:
+    """Pixels x bins solved at a time on a device: what a cache holds, or half of what a GPU has free."""
+    if device.type != "cuda":
+        return _BLOCK
+    free, _ = torch.cuda.mem_get_info(device)
+    return max(_BLOCK, free // (2 * 8 * (_KRYLOV + _HELD)))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.cyclic_solver import TOLERANCE, Delay, fired, registered
-from mars_lidar.learn.light import bin_photons, check_detector, detected, inputs
+from mars_lidar.learn.cyclic_solver import TOLERANCE, Delay, by_rows, fired, registered
+from mars_lidar.learn.light import alike, check_detector, check_values, detected, photons_in
 from mars_lidar.learn.needed import torch
 
 _FINE = 4.0  # parts of a sigma of the pulse
@@ -24,15 +25,18 @@ def expected_histogram(
     *,
     refine: int | None = None,
 ) -> torch.Tensor:
-    """Expected registrations in each bin (..., bins) under dead time; differentiable once in all three arguments.
+    """Expected registrations in each bin (..., bins) under dead time; differentiable in all three arguments.
+
+    Any number of times, and under `torch.func`: ``vmap``, ``grad``, ``vjp``, ``jacrev``, ``jvp``, ``jacfwd``,
+    ``hessian``.
 
     Solves ``h = p (N_r + e - G h) + q (L h - b)`` round the circle of a period: G counts the registrations of the
-    preceding dead time, L those of one dead time ago; e and b are what the dead time that outlasts the exposure adds
-    where it began armed (docs/joint_law.md, 3.2 and 4.6). The gradient is that of the solution, by one solution of the
-    transposed equation, not of the steps that led there. Exact, up to the grid, where the exposure forgets its start
-    before its end; `mars_lidar.statistics.mean_histogram` needs no such condition. The error of the grid falls with the
-    square of `refine`: at the default a total variation below 1e-4, but some 1e-3 where the dead time is within a bin
-    of 0 or of whole periods.
+    preceding dead time, L those of one dead time ago; e and b are what the dead time that outlasts the exposure
+    adds where it began armed (docs/joint_law.md, 3.2 and 4.6). Derivatives are those of the solution, by solutions
+    of the same equation or of the transposed one, not of the steps that led there. Exact, up to the grid, where the
+    exposure forgets its start before its end; `mars_lidar.statistics.mean_histogram` needs no such condition. The
+    error of the grid falls with the square of `refine`: at the default a total variation below 1e-4, but some 1e-3
+    where the dead time is within a bin of 0 or of whole periods.
 
     Parameters
     ----------
@@ -46,7 +50,8 @@ def expected_histogram(
     Raises
     ------
     ValueError, TypeError
-        Bad arguments; a detector that this form does not describe.
+        Bad arguments; a detector that this form does not describe; forward mode within forward mode, of which PyTorch
+        drops a part without a word: take ``jacfwd(jacrev(f))``, which is ``hessian(f)``.
     ConvergenceError
         Where the equation is not solved to 1e-9.
 
@@ -56,7 +61,8 @@ def expected_histogram(
     the accuracy of a table: `HistogramTable`.
     """
     check_detector(system, light=True)
-    given = inputs(signal, background, delay_ns)
+    _refuse_nested_forward()
+    given = alike(signal, background, delay_ns)
     given[0], given[1], system = detected(given[0], given[1], system)
     if given[0].numel() == 0:
         return given[0].new_empty((*given[0].shape, system.bins))
@@ -65,53 +71,89 @@ def expected_histogram(
         refine = max(1, math.ceil(_FINE * system.bin_ns / pulse.sigma_ns)) if isinstance(pulse, GaussianPulse) else 1
     parts = checks.integer("refine", refine, low=1, high=2**16)
     flat = [one.reshape(-1) for one in given]
-    out: torch.Tensor = _Expected.apply(*flat, system, parts)  # type: ignore[no-untyped-call]
+    out: torch.Tensor = _Expected.apply(*flat, system, parts)[0]  # type: ignore[no-untyped-call]
     return out.reshape(*given[0].shape, system.bins)
 
 
 class _Expected(torch.autograd.Function):
-    """Registrations (pixels, bins) of signal, background and delay (pixels,); keeps nothing of the way there."""
+    """Registrations (pixels, bins) of signal, background and delay (pixels,), and the solutions that lead to them.
+
+    Of the way there nothing else is kept: derivatives go it again, block by block, with the solutions known.
+    """
 
     @staticmethod
-    def forward(ctx: Any, signal: Any, background: Any, delay_ns: Any, system: System, parts: int) -> torch.Tensor:
-        ctx.system, ctx.parts = system, parts
-        out, ctx.found = [], []
-        for rows in _blocks(system.bins * parts, signal, background, delay_ns):
-            histogram, found = _registered(rows, system, parts)
-            out.append(histogram.to(signal.dtype))
-            ctx.found.append(found)
-        ctx.save_for_backward(signal, background, delay_ns)
-        return torch.cat(out)
+    def forward(signal: Any, background: Any, delay_ns: Any, system: System, parts: int) -> tuple[torch.Tensor, ...]:
+        check_values(signal, background, delay_ns)
+        blocks = _blocks(system.bins * parts, signal, background, delay_ns)
+        done = [_registered(rows, system, parts) for rows in blocks]
+        return tuple(torch.cat(one) for one in zip(*done, strict=True))
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        moved = []
-        blocks = _blocks(ctx.system.bins * ctx.parts, *ctx.saved_tensors, gradient)
-        for (*rows, wanted), found in zip(blocks, ctx.found, strict=True):
-            with torch.enable_grad():
-                leaves = [one.detach().requires_grad_() for one in rows]
-                histogram, _ = _registered(leaves, ctx.system, ctx.parts, found)
-                moved.append(torch.autograd.grad(histogram, leaves, wanted.to(histogram.dtype)))
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
+        *light, ctx.system, ctx.parts = inputs
+        ctx.save_for_backward(*light, *output[1:])
+        ctx.save_for_forward(*light, *output[1:])
+        ctx.mark_non_differentiable(*output[1:])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor, *_: Any) -> tuple[torch.Tensor | None, ...]:
+        moved = [torch.func.vjp(again, *rows)[1](part[0]) for again, rows, part in _again(ctx, gradient)]
         return (*(torch.cat(one) for one in zip(*moved, strict=True)), None, None)
 
+    @staticmethod
+    def jvp(ctx: Any, *given: Any) -> tuple[torch.Tensor | None, ...]:
+        light = ctx.saved_tensors[:3]
+        moves = [torch.zeros_like(one) if moved is None else moved for one, moved in zip(light, given, strict=False)]
+        done = []
+        for again, rows, part in _again(ctx, *moves):  # forward mode does not nest: the transpose of the transpose
+            out, pull = torch.func.vjp(again, *rows)[:2]
+            done.append(torch.func.vjp(pull, torch.zeros_like(out))[1](tuple(part))[0])
+        return torch.cat(done), None, None
 
-def _registered(rows: Any, system: System, parts: int, found: Any = (None, None)) -> Any:
-    """Histogram (pixels, bins), and the solutions that lead to it; with `found` only their gradients are needed."""
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return by_rows(_Expected, info, in_dims, given)
+
+
+def _again(ctx: Any, *others: torch.Tensor) -> Iterator[tuple[Any, Any, Any]]:
+    """Block by block: the histogram as a function of its light, that light, and the same rows of `others`."""
+    for rows in _blocks(ctx.system.bins * ctx.parts, *ctx.saved_tensors, *others):
+        light, known, rest = rows[:3], rows[3:5], rows[5:]
+
+        def again(*light: torch.Tensor, known: Any = known) -> torch.Tensor:
+            return _registered(light, ctx.system, ctx.parts, known)[0]
+
+        yield again, light, rest
+
+
+def _registered(rows: Any, system: System, parts: int, known: Any = (None, None)) -> tuple[torch.Tensor, ...]:
+    """Histogram (pixels, bins), and the solutions (pixels, fine bins or none) that lead to it, where not `known`."""
     signal, background, delay_ns = (one.double() for one in rows)
-    photons = bin_photons(signal, background, delay_ns, system, refine=parts)
+    photons = photons_in(signal, background, delay_ns, system, parts)
     delay = Delay(system.dead_time_periods, photons.shape[-1])
     tolerance = max(TOLERANCE, 1e-2 * torch.finfo(rows[0].dtype).eps)
+    nothing = photons.detach()[:, :0]
     if system.dead_time_periods == 0.0:
-        return _summed(photons * system.cycles, parts), (None, None)
+        return _summed(photons * system.cycles, parts).to(rows[0].dtype), nothing, nothing
     p, q = fired(photons)
-    settled = registered(photons, p, delay, tolerance, found[0])
-    fine, more = settled * system.cycles, None
+    settled = registered(photons, p, delay, tolerance, known[0])
+    fine, more = settled * system.cycles, nothing
     if system.start == "armed":
         blind, back = delay.left(settled)
-        more = registered(photons, p * blind - q * back, delay, tolerance, found[1])
+        more = registered(photons, p * blind - q * back, delay, tolerance, known[1])
         fine = fine + more
-    return _summed(fine, parts), (settled.detach(), None if more is None else more.detach())
+    return _summed(fine, parts).to(rows[0].dtype), settled, more
+
+
+def _refuse_nested_forward() -> None:
+    """Raise within two transforms of forward mode: through a function of one's own PyTorch then gives zeros."""
+    functorch = torch._C._functorch
+    levels = functorch.get_interpreter_stack() or []
+    if sum(one.key() == functorch.TransformType.Jvp for one in levels) > 1:
+        raise ValueError(
+            "expected_histogram cannot be differentiated by forward mode within forward mode: for second derivatives "
+            "use torch.func.hessian, or jacrev or grad inside of jvp or jacfwd"
+        )
 
 
 def _summed(fine: torch.Tensor, parts: int) -> torch.Tensor:

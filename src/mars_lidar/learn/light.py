@@ -24,7 +24,14 @@ def bin_photons(
         Parts that each bin is cut into.
     """
     signal, background, delay_ns = inputs(signal, background, delay_ns)
-    bins = system.bins * checks.integer("refine", refine, low=1, high=2**16)
+    return photons_in(signal, background, delay_ns, system, checks.integer("refine", refine, low=1, high=2**16))
+
+
+def photons_in(
+    signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor, system: System, refine: int
+) -> torch.Tensor:
+    """`bin_photons` of what has been checked, also where `torch.vmap` does not let values be looked at."""
+    bins = system.bins * refine
     edges = torch.arange(bins + 1, dtype=signal.dtype, device=signal.device) * (system.period_ns / bins)
     time = edges - torch.remainder(delay_ns, system.period_ns).unsqueeze(-1)
     energy = wrapped_energy(system, time)
@@ -58,11 +65,22 @@ def _cumulative(pulse: Pulse, time: torch.Tensor) -> torch.Tensor:
 
 def inputs(*given: torch.Tensor) -> list[torch.Tensor]:
     """Checked, and of one shape."""
+    found = alike(*given)
+    check_values(*found)
+    return found
+
+
+def check_values(signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> None:
+    """Raise where they are no light and no time."""
+    if not (bool((signal >= 0).all()) and bool((background >= 0).all()) and bool(torch.isfinite(delay_ns).all())):
+        raise ValueError("signal and background must be >= 0 and delay_ns finite")
+
+
+def alike(*given: torch.Tensor) -> list[torch.Tensor]:
+    """Checked for type and shape, and of one shape."""
     for name, one in zip(("signal", "background", "delay_ns"), given, strict=True):
         if not isinstance(one, torch.Tensor) or not one.is_floating_point():
             raise TypeError(f"{name} must be a tensor of floating point numbers, got {one!r}")
-    if not (bool((given[0] >= 0).all()) and bool((given[1] >= 0).all()) and bool(torch.isfinite(given[2]).all())):
-        raise ValueError("signal and background must be >= 0 and delay_ns finite")
     try:
         return list(torch.broadcast_tensors(*given))  # type: ignore[no-untyped-call]
     except RuntimeError:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import TemporarySibling, check_claim, check_target
-from mars_lidar._base.hdf5 import new_file, open_hdf5
+from mars_lidar._base.hdf5 import new_file, open_hdf5, with_checksums
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.io.cube import Cube
 
@@ -187,7 +187,9 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
         for name in old:
             if name != source.name:
                 old.copy(name, new)
-        data = new.create_dataset(source.name, source.shape, np.float32, fillvalue=0.0)
+        data = new.create_dataset(
+            source.name, source.shape, np.float32, fillvalue=0.0, **with_checksums(source.shape, np.float32)
+        )
         for rows in source.bands():
             counts = np.asarray(cube.histogram[0, rows])[..., : source.image[2]]
             source.write(data, rows.start, counts.astype(np.float32))

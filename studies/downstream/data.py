@@ -61,14 +61,13 @@ _ONE, _THREE = (0,), (0, 1, 2)
 _SMALL = Config(
     name="small",
     steps=(150, 150),
-    arms=dict.fromkeys(WORDS, _ONE) | {"mars": _THREE, "exact": _THREE},
+    arms=dict.fromkeys(WORDS, _THREE),
     test=(3000, 6),
 )
 _FULL = replace(
     _SMALL,
     name="full",
     steps=(3000, 3000),
-    arms=dict.fromkeys(WORDS, _THREE),
     train=(1000, 400),
     test=(3000, 40),
     batch=4,

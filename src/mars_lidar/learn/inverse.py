@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from mars_lidar._base.optional import MissingLibraryError
 
@@ -12,6 +12,11 @@ try:
 except ImportError as _error:
     raise MissingLibraryError(
         f"mars_lidar.learn.LidarPhysics needs PyTorch and deepinv: pip install 'mars-lidar[learn]' deepinv ({_error})"
+    ) from _error
+except RuntimeError as _error:  # of torchvision, where its operators are not those of this PyTorch
+    raise MissingLibraryError(
+        f"mars_lidar.learn.LidarPhysics needs deepinv, and deepinv the torchvision that was built for PyTorch "
+        f"{torch.__version__}, from the same index ({_error})"
     ) from _error
 
 from mars_lidar._base import checks
@@ -27,13 +32,13 @@ from mars_lidar.table import Table
 
 
 class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
-    """Histograms (B, bins, H, W) of images (B, 3, H, W), whose channels are signal, background and delay (ns).
+    """Histograms (B, bins, H, W) of images (B, 3, H, W), whose channels `images` names.
 
-    ``A(x)`` is the expected histogram, ``A_vjp`` the product with its Jacobian that deepinv's data fidelities ask for,
-    ``A_dagger(y)`` the estimate of each pixel by itself, from which to start. ``physics(x)`` is a measured histogram:
-    drawn by the engine, for the noise of histograms under dead time is no function of their mean. The first call draws
-    with `seed`, the next with ``seed + 1``, and so on. Signal and background must stay >= 0: project onto that between
-    steps.
+    ``A(x)`` is the expected histogram, ``A_vjp`` and ``A_jvp`` the products with its Jacobian, ``A_dagger(y)`` the
+    estimate of each pixel by itself; ``custom_init=LidarPhysics.custom_init`` starts an algorithm of deepinv from it.
+    ``physics(x)`` is a measured histogram: drawn by the engine, for the noise of histograms under dead time is no
+    function of their mean. The first call draws with `seed`, the next with ``seed + 1``, and so on; ``physics(x,
+    seed=s)`` draws with s. Photons must stay >= 0: project onto that between steps.
 
     Parameters
     ----------
@@ -41,6 +46,10 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         As for `mars_lidar.learn.expected_histogram`.
     table
         A `mars_lidar.Table` of it: ``A`` is then a `mars_lidar.learn.HistogramTable`, some 30 times as fast.
+    images
+        ``"signal"``: signal and background, photons per period, and the delay, ns. ``"depth"``: those of deepinv's own
+        ``SinglePhotonLidar``: depth in bins, an integer in the middle of a bin; intensity, photons of the return in the
+        exposure; background, photons of a bin in the exposure. Without dead time both operators have the same mean.
     engine
         As for `mars_lidar.simulate`.
     seed
@@ -54,6 +63,7 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
         system: System,
         *,
         table: Table | None = None,
+        images: Literal["signal", "depth"] = "signal",
         engine: str | Engine = "exact",
         seed: int = 0,
         threads: int | None = None,
@@ -66,60 +76,86 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
             raise ValueError(f"table must be of this system, got one of {table.system}")
         self.system, self._engine, self._threads = system, find_engine(engine), threads
         self._table = None if table is None else HistogramTable(table, cycles=system.cycles)
+        self._images = checks.choice("images", images, ("signal", "depth"))
         self._seed = checks.integer("seed", seed, low=0, high=2**63 - 1)
 
     def A(self, x: torch.Tensor, **kwargs: Any) -> torch.Tensor:
         """Expected histograms."""
-        _check(x)
-        maps = x[:, 0], x[:, 1], x[:, 2]
+        maps = self._light(x)
         mean = expected_histogram(*maps, self.system) if self._table is None else self._table(*maps)
         return mean.permute(0, 3, 1, 2)
 
     def A_vjp(self, x: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        """``(dA/dx)' v`` (B, 3, H, W), by autograd: deepinv's own takes functions that torch.func can transform."""
-        with torch.enable_grad():
-            at = x.detach().requires_grad_()
-            return torch.autograd.grad(self.A(at), at, v)[0]
+        """``(dA/dx)' v`` (B, 3, H, W) of v (B, bins, H, W)."""
+        _, pull = torch.func.vjp(self.A, x)[:2]
+        moved: torch.Tensor = pull(v)[0]
+        return moved
 
-    def A_dagger(self, y: torch.Tensor, x_init: torch.Tensor | None = None) -> torch.Tensor:
+    def A_jvp(self, x: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        """``(dA/dx) v`` (B, bins, H, W) of v (B, 3, H, W)."""
+        whole = (one.clone(memory_format=torch.contiguous_format) for one in (x, v))  # expanded views have no dual
+        moved: torch.Tensor = torch.func.jvp(self.A, *((one,) for one in whole))[1]
+        return moved
+
+    @staticmethod
+    def custom_init(y: torch.Tensor, physics: LidarPhysics) -> dict[str, Any]:
+        """Where an algorithm of deepinv starts: ``physics.A_dagger(y)``, for it and its auxiliary variable."""
+        start = physics.A_dagger(y)
+        return {"est": (start, start.clone())}
+
+    def A_dagger(self, y: torch.Tensor, x_init: torch.Tensor | None = None, **kwargs: Any) -> torch.Tensor:
         """Maximum likelihood of every pixel by itself (B, 3, H, W), by `mars_lidar.reconstruct`; `x_init` is not used.
 
         Where a pixel shows no return its signal is 0 and its delay half a period.
         """
         cubes = y.detach().cpu().double().permute(0, 2, 3, 1).contiguous().numpy()
         found = reconstruct(cubes, self.system, threads=self._threads)
-        maps = [
+        signal, background, delay_ns = (
             torch.from_numpy(one).nan_to_num(fill)
             for one, fill in (
                 (found.signal, 0.0),
                 (found.background, 0.0),
                 (found.delay_ns, 0.5 * self.system.period_ns),
             )
-        ]
-        return torch.stack(maps, 1).to(y)
+        )
+        if self._images == "signal":
+            return torch.stack([signal, background, delay_ns], 1).to(y)
+        cycles, bins = self.system.cycles, self.system.bins
+        depth = delay_ns / self.system.bin_ns - 0.5
+        return torch.stack([depth, signal * cycles, background * (cycles / bins)], 1).to(y)
 
-    def forward(self, x: torch.Tensor, **kwargs: Any) -> torch.Tensor:
-        """Measured histograms, in the type of `x`; no gradient passes through them."""
-        _check(x)
-        images = x.detach().cpu().double().numpy()
+    def forward(self, x: torch.Tensor, seed: int | None = None, **kwargs: Any) -> torch.Tensor:
+        """Measured histograms, in the type of `x`; no gradient passes through them.
+
+        `seed`: of this draw alone; None: the next one of the operator's own.
+        """
+        own = seed is None
+        number = self._seed if seed is None else checks.integer("seed", seed, low=0, high=2**63 - 1)
+        images = torch.stack(self._light(x), 1).detach().cpu().double().numpy()
         drawn = [
             simulate(
                 Flux(*image),
                 self.system,
                 engine=self._engine,
-                seed=self._seed,
+                seed=number,
                 realizations=1,
-                first_realization=number,
+                first_realization=place,
                 threads=self._threads,
             )[0]
-            for number, image in enumerate(images)
+            for place, image in enumerate(images)
         ]
-        self._seed += 1
+        self._seed += own
         out = torch.stack([torch.from_numpy(cube.astype("float64")) for cube in drawn])
         return out.permute(0, 3, 1, 2).to(x)
 
-
-def _check(x: Any) -> None:
-    if not isinstance(x, torch.Tensor) or x.ndim != 4 or x.shape[1] != 3:
-        told = getattr(x, "shape", x)
-        raise ValueError(f"x must be a tensor (B, 3, H, W) of signal, background and delay in ns, got {told!r}")
+    def _light(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Signal, background and delay in ns (B, H, W) of images."""
+        if not isinstance(x, torch.Tensor) or x.ndim != 4 or x.shape[1] != 3:
+            told = getattr(x, "shape", x)
+            words = "signal, background and delay" if self._images == "signal" else "depth, intensity and background"
+            raise ValueError(f"x must be a tensor (B, 3, H, W) of {words}, got {told!r}")
+        first, second, third = x.unbind(1)
+        if self._images == "signal":
+            return first, second, third
+        cycles = self.system.cycles
+        return second / cycles, third * (self.system.bins / cycles), (first + 0.5) * self.system.bin_ns

@@ -146,17 +146,27 @@ class _Again(torch.autograd.Function):
     """A function whose gradient evaluates it again: else twenty maps as large as the result would be kept for it."""
 
     @staticmethod
-    def forward(ctx: Any, function: Callable[..., torch.Tensor], *given: torch.Tensor) -> torch.Tensor:
-        ctx.function = function
-        ctx.save_for_backward(*given)
+    def forward(function: Callable[..., torch.Tensor], *given: torch.Tensor) -> torch.Tensor:
         return function(*given)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: torch.Tensor) -> None:
+        ctx.function, *given = inputs
+        ctx.save_for_backward(*given)
+        ctx.save_for_forward(*given)
+
+    @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        with torch.enable_grad():
-            leaves = [one.detach().requires_grad_() for one in ctx.saved_tensors]
-            return None, *torch.autograd.grad(ctx.function(*leaves), leaves, gradient)
+        pull = torch.func.vjp(ctx.function, *ctx.saved_tensors)[1]
+        return None, *pull(gradient)
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *moved: torch.Tensor | None) -> torch.Tensor:
+        given = ctx.saved_tensors
+        moves = tuple(torch.zeros_like(one) if move is None else move for one, move in zip(given, moved, strict=True))
+        out, pull = torch.func.vjp(ctx.function, *given)[:2]  # forward mode does not nest: transposed twice
+        along: torch.Tensor = torch.func.vjp(pull, torch.zeros_like(out))[1](moves)[0]
+        return along
 
 
 def _cell(axis: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -101,7 +101,8 @@ def _share_out(
     def given(item: Item) -> Any:
         return client.submit(make_part, path, run, item, threads, pure=False)
 
-    running = distributed.as_completed([given(item) for item in itertools.islice(waiting, _AHEAD * team)])
+    first = [given(item) for item in itertools.islice(waiting, _AHEAD * team)]
+    running = distributed.as_completed(first, loop=client.loop)  # the client is nobody's default
     try:
         for future in running:
             made = future.result()

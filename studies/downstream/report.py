@@ -107,6 +107,13 @@ def _findings(found: Mapping[Run, Any], ratio: float, references: Mapping[str, f
             holds = fall >= limit if arm in LEAST else abs(fall) <= limit
             yield f"{words}, trained on {WORDS[arm]}: reflectivity falls by {fall:.2f} dB ({sign} {limit:g})", holds
     if "exact" in arms:
+        told = {name: float(np.mean(_values(arms["exact"], "gold", name, "reflectivity", "psnr"))) for name in MODELS}
+        for name in ("window", "bins"):
+            gain = told[name] - told["polynomial"]
+            words = (
+                f"{MODELS[name]}, trained on exact: {gain:+.2f} dB on the polynomial's reflectivity (better than it)"
+            )
+            yield words, gain > 0.0
         bins = float(np.mean(_values(arms["exact"], "gold", "bins", "depth", "rmse")))
         best, filtered = references["maximum likelihood"], references["matched filter"]
         yield (

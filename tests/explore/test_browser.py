@@ -9,8 +9,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pytest
+from explorer_page import PAGE, Page, chromium
 from numpy.typing import NDArray
-from pages import PAGE, Page, chromium
 from test_page import golden_of_page
 
 import mars_lidar as ml

@@ -12,7 +12,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from pages import PAGE, ROOT
+from explorer_page import PAGE, ROOT
 from test_detector_bits import GOLDEN as OF_MODES
 from test_reproducibility import GOLDEN
 

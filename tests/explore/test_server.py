@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from pages import Page, chromium
+from explorer_page import Page, chromium
 from typer.testing import CliRunner
 
 import mars_lidar as ml

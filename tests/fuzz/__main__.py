@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import collections
+import datetime
+import platform
 import shutil
 import tempfile
 import time
@@ -18,8 +20,10 @@ parser.add_argument("--examples", type=int, default=500, help="of each format")
 parser.add_argument("--seed", type=int, default=1)
 parser.add_argument("--only", default="", help="names that contain this")
 parser.add_argument("--keep", type=Path, default=Path("fuzz_bad"), help="folder for the inputs that fared badly")
+parser.add_argument("--out", type=Path, help="a Markdown file to write the table to")
 given = parser.parse_args()
 kinds = ("read", "refused", *BAD)
+rows: list[tuple[str, collections.Counter[str]]] = []
 total: collections.Counter[str] = collections.Counter()
 began = time.monotonic()
 with tempfile.TemporaryDirectory() as folder:
@@ -46,7 +50,28 @@ with tempfile.TemporaryDirectory() as folder:
         fuzz(name, good, Path(folder), server, given.examples, given.seed, tell)
         print(f"{name:22}" + "".join(f"{counts[kind]:9}" for kind in kinds), flush=True)
         total += counts
+        rows.append((name, counts))
     print(f"{'all ' + str(sum(total.values())):22}" + "".join(f"{total[kind]:9}" for kind in kinds))
     print(f"{time.monotonic() - began:.0f} s")
     server.close()
+if given.out:
+    words = [
+        "# Mutated files",
+        "",
+        f"Made by `python -m tests.fuzz --examples {given.examples} --seed {given.seed}` on {datetime.date.today()}, "
+        f"Python {platform.python_version()}: {given.examples} mutations of a good file of each format, each read in a "
+        "process of its own with limits of memory and time. *Read*: as a file may be whose mutation changed nothing "
+        "that matters, or numbers without a checksum; *refused*: by one error that names the file. The other columns "
+        "are faults: an error without the file's name, one of a library, the end of the process, more than 10 s, more "
+        "than 1 GiB.",
+        "",
+        "| format | " + " | ".join(kinds) + " |",
+        "|---|" + "--:|" * len(kinds),
+        *(
+            f"| {name} | " + " | ".join(str(counts[kind]) for kind in kinds) + " |"
+            for name, counts in [*rows, (f"all {sum(total.values())}", total)]
+        ),
+        "",
+    ]
+    given.out.write_text("\n".join(words), encoding="utf-8")
 raise SystemExit(1 if any(total[kind] for kind in BAD) else 0)

@@ -20,12 +20,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.mat5 import check_elements
 from mars_lidar._base.memory import check_memory
 
 if TYPE_CHECKING:
     from numpy.lib.npyio import NpzFile
 
 LIMIT = "MARS_LIDAR_READ_GIB"  # of the environment: what the arrays of one file may take in memory
+_FEW_CHUNKS, _CHUNK_ENTRY = 10_000, 4  # of HDF5: so many anywhere; bytes of a file that each of more takes at least
 _LEAST_LIMIT, _TIMES = 512 * 2**20, 512  # without it: so many bytes, or so many times the file
 INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is written to
 
@@ -213,9 +215,22 @@ def read_npy(path: Path) -> NDArray[Any]:
         return np.lib.format.open_memmap(path, mode="r")
 
 
+def check_chunks(path: Path, data: Any) -> None:
+    """Raise where a data set of HDF5 claims more chunks than its file can list, each of which takes some 4 kB to read.
+
+    An array of Zarr, whose chunks are files, passes.
+    """
+    if not (hasattr(data, "file") and data.chunks):
+        return
+    count = math.prod(-(-size // step) for size, step in zip(data.shape, data.chunks, strict=True))
+    if count > max(_FEW_CHUNKS, _size(path) // _CHUNK_ENTRY):
+        raise FileError(f"{path}: {data.name} would have {count} chunks, more than it can list: is it damaged?")
+
+
 def whole(data: Any) -> NDArray[Any]:
     """All of a data set of HDF5 or an array of Zarr, if that is no more than the file can hold."""
     path = Path(data.file.filename) if hasattr(data, "file") else Path(data.store.root) / data.path
+    check_chunks(path, data)
     check_claim(path, math.prod(data.shape) * data.dtype.itemsize, data.name)
     return np.asarray(data[...])
 
@@ -230,6 +245,7 @@ def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
     from scipy.io import loadmat, whosmat
 
     with reading(path, "a .mat of version 5"):
+        check_elements(path)
         wanted = None if names is None else list(names)
         listed = [(math.prod(shape), kind) for name, shape, kind in whosmat(path) if wanted is None or name in wanted]
         check_claim(path, sum(8 * size for size, kind in listed if kind != "sparse"))

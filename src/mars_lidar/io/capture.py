@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_claim, check_target
+from mars_lidar._base.files import TemporarySibling, check_chunks, check_claim, check_target
 from mars_lidar._base.hdf5 import new_file, open_hdf5, with_checksums
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.io.cube import Cube
@@ -129,6 +129,7 @@ def capture_in(path: Path, file: Any) -> Capture | None:
     else:
         return None
     data = file[name]
+    check_chunks(path, data)
     check_claim(path, data.size * data.dtype.itemsize, name, in_parts=True)
     told = [_metres(file, key) for key in _TIMES[name]]
     width, start = (None if one is None else one / SPEED_OF_LIGHT_M_PER_NS for one in told)

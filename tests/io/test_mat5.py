@@ -47,7 +47,7 @@ def test_a_type_that_there_is_not_is_refused(tmp_path: Path):
     at = content.index(b"\t\0\0\0\x60\0\0\0")  # 12 doubles
     content[at + 1] = 4
     path.write_bytes(content)
-    with pytest.raises(FileError, match=r"a\.mat.* no element is of type 1033"):
+    with pytest.raises(FileError, match=r"a\.mat.*no element is of type 1033"):
         read_mat5(path)
     with pytest.raises(FileError, match="no element is of type"):
         io.read_transient(path, bin_ns=1.0)

@@ -230,8 +230,8 @@ def check_chunks(path: Path, data: Any) -> None:
 def whole(data: Any) -> NDArray[Any]:
     """All of a data set of HDF5 or an array of Zarr, if that is no more than the file can hold."""
     path = Path(data.file.filename) if hasattr(data, "file") else Path(data.store.root) / data.path
-    check_chunks(path, data)
     check_claim(path, math.prod(data.shape) * data.dtype.itemsize, data.name)
+    check_chunks(path, data)
     return np.asarray(data[...])
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_chunks, check_claim, check_target
+from mars_lidar._base.files import TemporarySibling, check_chunks, check_claim, check_target, whole
 from mars_lidar._base.hdf5 import new_file, open_hdf5, with_checksums
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.io.cube import Cube
@@ -129,8 +129,8 @@ def capture_in(path: Path, file: Any) -> Capture | None:
     else:
         return None
     data = file[name]
-    check_chunks(path, data)
     check_claim(path, data.size * data.dtype.itemsize, name, in_parts=True)
+    check_chunks(path, data)
     told = [_metres(file, key) for key in _TIMES[name]]
     width, start = (None if one is None else one / SPEED_OF_LIGHT_M_PER_NS for one in told)
     return Capture(path, name, axes, tuple(data.shape), width, start)
@@ -201,7 +201,7 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
 
 
 def _tal_axes(file: Any) -> str:
-    form, shape = int(np.ravel(file["H_format"][()])[0]), file["H"].shape
+    form, shape = int(np.ravel(whole(file["H_format"]))[0]), file["H"].shape
     axes = _TAL.get(form, "")
     if len(axes) != len(shape):
         known = _TAL_NAMES.get(form, str(form))
@@ -218,4 +218,4 @@ def _zaragoza_axes(shape: tuple[int, ...]) -> str:
 def _metres(file: Any, key: str) -> float | None:
     if key not in file or file[key].shape is None:  # tal stores None as an empty data set
         return None
-    return float(np.ravel(file[key][()])[0])
+    return float(np.ravel(whole(file[key]))[0])

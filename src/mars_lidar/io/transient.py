@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import check_chunks, check_claim, open_npz, read_mat5, read_npy, reading
+from mars_lidar._base.files import check_chunks, check_claim, open_npz, read_mat5, read_npy, reading, whole
 from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar._base.mat5 import check_elements
 from mars_lidar.io.capture import Capture, capture_in
@@ -122,8 +122,8 @@ def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
                 f"{path}: no data set {wanted!r} and no capture ('H' and 'H_format', 'data' and 'deltaT'), got {names}"
             )
         data = file[wanted]
-        check_chunks(path, data)
         check_claim(path, data.size * data.dtype.itemsize, wanted, in_parts=True)
+        check_chunks(path, data)
         told = {key: float(data.attrs[key]) for key in _TIMES if key in data.attrs}
         return _Rows(path, wanted, tuple(data.shape), turned=False), told
 
@@ -149,9 +149,9 @@ def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
         with open_hdf5(path) as file:
             if not isinstance(file.get(name), h5py.Dataset) or file[name].ndim != 3:
                 raise ValueError(f"{path}: no variable {name!r} of three axes, got {', '.join(file) or 'nothing'}")
-            told = {key: float(np.ravel(file[key])[0]) for key in _TIMES if key in file}
-            check_chunks(path, file[name])
+            told = {key: float(np.ravel(whole(file[key]))[0]) for key in _TIMES if key in file}
             check_claim(path, file[name].size * file[name].dtype.itemsize, name, in_parts=True)
+            check_chunks(path, file[name])
             bins, width, height = file[name].shape
             return _Rows(path, name, (height, width, bins), turned=True), told
     from scipy.io import whosmat

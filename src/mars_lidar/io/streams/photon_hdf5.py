@@ -184,7 +184,7 @@ def _tcspc_unit(file: Any) -> float:
     """Unit of the nanotimes in s: below the photons, or (format 0.5) one per detector."""
     place = f"{_PHOTONS}/nanotimes_specs/tcspc_unit"
     if place in file:
-        return float(file[place][()])
+        return float(whole(file[place]))
     units = np.unique(whole(file["setup/detectors/tcspc_unit"]))
     if units.size != 1:
         raise ValueError(f"its detectors have {units.size} different TCSPC units, and one is needed")

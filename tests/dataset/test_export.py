@@ -15,7 +15,7 @@ from scipy.io import loadmat
 import mars_lidar as ml
 from mars_lidar import dataset
 from mars_lidar.cli import app
-from mars_lidar.dataset.export import LAYOUTS, export
+from mars_lidar.dataset.network_files import LAYOUTS, export
 
 SYSTEM = ml.System(
     period_ns=100.0,

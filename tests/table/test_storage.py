@@ -75,6 +75,7 @@ def test_files_of_other_formats(tmp_path):
     for number in (2, 1, 3):
         with h5py.File(tmp_path / "t.h5", "a") as file:
             file.attrs["format"] = number
+            file.attrs.pop("sha256", None)  # the sum of what it was
             if number == 1:
                 for name in ("law_row", "law_first", "law_offsets", "law_pmf"):
                     del file[name]

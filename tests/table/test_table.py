@@ -235,7 +235,7 @@ def test_axes():
         ({"signal": (0.1, 1.0, 1)}, ValueError, r"signal\[2\] must be an integer in \[2, 4096\]"),
         ({"background": [1.0, 0.5]}, ValueError, "background must be strictly ascending"),
         ({"background": [-1.0, 0.5]}, ValueError, "background must be strictly ascending"),
-        ({"background": ["a"]}, TypeError, "background must be .* real numbers"),
+        ({"background": ["a"]}, TypeError, "background must be (.* )?real numbers"),
         ({"background": [[1.0]]}, ValueError, r"background must have shape \(n,\)"),
         ({"method": "exact"}, ValueError, "method must be one of"),
         ({"rearm": "edge"}, ValueError, "rearm must be 'centre' for method 'exposure'"),

@@ -34,7 +34,7 @@ def export(
 ) -> None:
     """Write a dataset as the files that depth networks of the field load: one .mat an exposure, and their list."""
     with reported():
-        from mars_lidar.dataset.export import export as exported
+        from mars_lidar.dataset.network_files import export as exported
 
         with progress_bar("exporting") as progress:
             done = exported(dataset, out, layout=layout, fill=fill, progress=progress)

@@ -9,7 +9,7 @@ from mars_lidar.dataset.run import Generated, generate
 if TYPE_CHECKING:
     from mars_lidar.dataset.estimate import Estimate, estimate
     from mars_lidar.dataset.estimate import quick_advice as quick_advice
-    from mars_lidar.dataset.export import Exported, export
+    from mars_lidar.dataset.network_files import Exported, export
     from mars_lidar.dataset.light import Light
     from mars_lidar.dataset.read import read_sparse
     from mars_lidar.dataset.recipe import DatasetRecipe
@@ -22,12 +22,12 @@ _MODULES = {
     "Dataset": "store",
     "DatasetRecipe": "recipe",
     "Estimate": "estimate",
-    "Exported": "export",
+    "Exported": "network_files",
     "Light": "light",
     "Verified": "verify",
     "View": "view",
     "estimate": "estimate",
-    "export": "export",
+    "export": "network_files",
     "json_schema": "schema",
     "open_dataset": "store",
     "quick_advice": "estimate",

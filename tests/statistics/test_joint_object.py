@@ -102,7 +102,7 @@ def test_bad_input(law: ml.JointLaw):
         joint_law(1.0, 1.0, at, tolerance=0)
     with pytest.raises(ValueError, match=r"waveform must be \(T,\) of one pixel, got shape \(2, 3\)"):
         joint_law(None, 1.0, at, waveform=np.ones((2, 3)))
-    with pytest.raises(TypeError, match="system must be a System, got .*str"):
+    with pytest.raises(TypeError, match=r"system must be a System, got .*str"):
         joint_law(1.0, 1.0, "system")
     with pytest.raises(ValueError, match=r"weights must be \(\.\.\., 50\), one for each bin, got shape \(3,\)"):
         law.window(np.ones(3))

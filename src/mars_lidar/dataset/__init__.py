@@ -9,8 +9,8 @@ from mars_lidar.dataset.run import Generated, generate
 if TYPE_CHECKING:
     from mars_lidar.dataset.estimate import Estimate, estimate
     from mars_lidar.dataset.estimate import quick_advice as quick_advice
-    from mars_lidar.dataset.network_files import Exported, export
     from mars_lidar.dataset.light import Light
+    from mars_lidar.dataset.network_files import Exported, export
     from mars_lidar.dataset.read import read_sparse
     from mars_lidar.dataset.recipe import DatasetRecipe
     from mars_lidar.dataset.schema import json_schema

@@ -21,6 +21,7 @@ from mars_lidar._base import manifest
 from mars_lidar._base.files import FileError
 from mars_lidar.cli import app
 from mars_lidar.dataset import open_dataset, verify
+from mars_lidar.dataset.scenes import SceneReader
 from mars_lidar.io.maps import load_maps, save_maps
 from mars_lidar.io.store import OnDisk
 
@@ -191,3 +192,11 @@ generate(None, sys.argv[1], resume=True)
         open_dataset(dataset)
     ml.generate(None, dataset, resume=True)
     assert files(dataset) == whole
+
+
+def test_names_of_scenes_that_are_gone_are_an_error_of_the_file(dataset):
+    """Of a store whose manifest was made anew: a bare KeyError."""
+    group = zarr.open_group(dataset, mode="r+", use_consolidated=False)["scenes"]
+    del group["name"]
+    with pytest.raises(FileError, match=r"set\.zarr: cannot be read as scenes of a dataset"):
+        SceneReader(group, dataset).names()

@@ -216,7 +216,7 @@ def verify(
         if told.good:
             table([("verified", f"{told.chunks} of {told.of} chunks simulated again, every count is the same")])
             return
-        table([("verified", f"NO, as told below; {told.chunks} of {told.of} chunks simulated again")])
+        table([("verified", f"NO: see below; {told.chunks} of {told.of} chunks simulated again")])
         for line in told.different:
             say(line)
         raise typer.Exit(FAILED)

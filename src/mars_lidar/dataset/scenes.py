@@ -184,8 +184,9 @@ class SceneReader:
 
     def names(self) -> list[str]:
         """Names of all scenes."""
-        stored = self._group["name"]
-        return _texts(stored) if stored.ndim > 1 else [str(one) for one in stored[...]]  # of a version before
+        with reading(self._path, "scenes of a dataset"):
+            stored = self._group["name"]
+            return _texts(stored) if stored.ndim > 1 else [str(one) for one in stored[...]]  # of a version before
 
     @cached_property
     def _kinds(self) -> list[str]:

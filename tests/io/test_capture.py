@@ -19,6 +19,7 @@ from mars_lidar.io.capture import read_capture
 C_M_PER_NS = 0.299792458
 BIN_M, START_M, BINS, SIDE = 0.012, 0.6, 200, 4
 HIDDEN = np.array([0.2, -0.1, 0.7])
+OPTIONS = ["--signal", "0.02", "--sbr", "0.5", "--cycles", "20000", "--dead-time-ns", "30", "--pulse-sigma-ns", "0.02"]
 
 
 def grid() -> np.ndarray:
@@ -170,19 +171,7 @@ def test_the_command_and_a_reconstruction(tmp_path, kind):
     """`simulate --like`: photons through a SPAD, in the bins of the render; the hidden point is where it was."""
     render, _ = write(tmp_path / "render.hdf5", f"tal {kind}")
     out = tmp_path / "capture.hdf5"
-    options = [
-        "--signal",
-        "0.02",
-        "--sbr",
-        "0.5",
-        "--cycles",
-        "20000",
-        "--dead-time-ns",
-        "30",
-        "--pulse-sigma-ns",
-        "0.02",
-    ]
-    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *options, "-o", str(out), "--no-picture"])
+    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *OPTIONS, "-o", str(out), "--no-picture"])
     assert told.exit_code == 0, told.output
     assert sorted(one.name for one in tmp_path.iterdir()) == ["capture.hdf5", "render.hdf5"]
     axes = [np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 9), np.linspace(0.4, 1.0, 7)]
@@ -190,7 +179,7 @@ def test_the_command_and_a_reconstruction(tmp_path, kind):
     best = points[int(np.argmax(backprojected(out, points)))]
     assert np.abs(best - HIDDEN).max() < 0.01
     cube = tmp_path / "cube.zarr"  # any other suffix is a cube with those bins
-    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *options, "-o", str(cube), "--no-picture"])
+    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *OPTIONS, "-o", str(cube), "--no-picture"])
     assert told.exit_code == 0, told.output
     counts = io.load(cube).histogram[0]
     assert np.array_equal(io.read_transient(out).rows(slice(0, None)), counts)
@@ -256,19 +245,7 @@ print(int(data.H.sum()), *points[np.unravel_index(found.argmax(), found.shape)])
 def test_tal_reconstructs_what_is_written(tmp_path, layout):
     render, _ = write(tmp_path / "render.hdf5", layout)
     out = tmp_path / "capture.hdf5"
-    options = [
-        "--signal",
-        "0.02",
-        "--sbr",
-        "0.5",
-        "--cycles",
-        "20000",
-        "--dead-time-ns",
-        "30",
-        "--pulse-sigma-ns",
-        "0.02",
-    ]
-    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *options, "--no-picture", "-o", str(out)])
+    told = CliRunner().invoke(app, ["simulate", "--like", str(render), *OPTIONS, "--no-picture", "-o", str(out)])
     assert told.exit_code == 0, told.output
     done = subprocess.run(
         [str(TAL), "-c", BY_TAL, str(out), layout.split()[0]], capture_output=True, text=True, check=False

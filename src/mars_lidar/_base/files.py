@@ -215,23 +215,23 @@ def read_npy(path: Path) -> NDArray[Any]:
         return np.lib.format.open_memmap(path, mode="r")
 
 
-def check_chunks(path: Path, data: Any) -> None:
-    """Raise where a data set of HDF5 claims more chunks than its file can list, each of which takes some 4 kB to read.
+def check_data(path: Path, data: Any, name: str, *, in_parts: bool = False) -> None:
+    """`check_claim` of a data set of HDF5 or an array of Zarr.
 
-    An array of Zarr, whose chunks are files, passes.
+    And, of HDF5, raise where it claims more chunks than its file can list, each of which takes some 4 kB to read.
     """
+    check_claim(path, math.prod(data.shape) * data.dtype.itemsize, name, in_parts=in_parts)
     if not (hasattr(data, "file") and data.chunks):
         return
     count = math.prod(-(-size // step) for size, step in zip(data.shape, data.chunks, strict=True))
     if count > max(_FEW_CHUNKS, _size(path) // _CHUNK_ENTRY):
-        raise FileError(f"{path}: {data.name} would have {count} chunks, more than it can list: is it damaged?")
+        raise FileError(f"{path}: {name} would have {count} chunks, more than it can list: is it damaged?")
 
 
 def whole(data: Any) -> NDArray[Any]:
     """All of a data set of HDF5 or an array of Zarr, if that is no more than the file can hold."""
     path = Path(data.file.filename) if hasattr(data, "file") else Path(data.store.root) / data.path
-    check_claim(path, math.prod(data.shape) * data.dtype.itemsize, data.name)
-    check_chunks(path, data)
+    check_data(path, data, data.name)
     return np.asarray(data[...])
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_chunks, check_claim, check_target, whole
+from mars_lidar._base.files import TemporarySibling, check_data, check_target, whole
 from mars_lidar._base.hdf5 import new_file, open_hdf5, with_checksums
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.io.cube import Cube
@@ -80,8 +80,7 @@ class Capture:
         slab, skipped = self._slab(first, last)
         with open_hdf5(self.path) as file:
             found = np.asarray(file[self.name][slab])
-        order = [self.axes.index(one) for one in self.rows + self.columns + "T"]
-        rest = tuple(k for k in range(len(self.axes)) if k not in order)
+        order, rest = self._order
         image = found.transpose(*order, *rest).reshape(
             -1, self.image[1], self.image[2], *(found.shape[k] for k in rest)
         )
@@ -90,12 +89,17 @@ class Capture:
     def write(self, data: Any, first: int, counts: NDArray[Any]) -> None:
         """Put whole steps of the first axis of the rows, from row `first` on, into a data set of the same shape."""
         slab, _ = self._slab(first, first + len(counts))
-        order = [self.axes.index(one) for one in self.rows + self.columns + "T"]
-        rest = [k for k in range(len(self.axes)) if k not in order]
+        order, rest = self._order
         place = tuple(0 if k in rest else one for k, one in enumerate(slab))  # the first colour and bounce
         kept = [k for k in range(len(self.axes)) if k not in rest]
         sizes = [len(range(*slab[k].indices(self.shape[k]))) for k in order]
         data[place] = counts.reshape(sizes).transpose([order.index(k) for k in kept])
+
+    @property
+    def _order(self) -> tuple[list[int], list[int]]:
+        """Places of the axes of the image, in its order, and of those that are added up."""
+        order = [self.axes.index(one) for one in self.rows + self.columns + "T"]
+        return order, [k for k in range(len(self.axes)) if k not in order]
 
     def _slab(self, first: int, last: int) -> tuple[tuple[slice, ...], int]:
         """Part of the data set that holds some rows, and how many rows of it come before the first."""
@@ -129,8 +133,7 @@ def capture_in(path: Path, file: Any) -> Capture | None:
     else:
         return None
     data = file[name]
-    check_claim(path, data.size * data.dtype.itemsize, name, in_parts=True)
-    check_chunks(path, data)
+    check_data(path, data, name, in_parts=True)
     told = [_metres(file, key) for key in _TIMES[name]]
     width, start = (None if one is None else one / SPEED_OF_LIGHT_M_PER_NS for one in told)
     return Capture(path, name, axes, tuple(data.shape), width, start)

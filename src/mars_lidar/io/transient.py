@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import check_chunks, check_claim, open_npz, read_mat5, read_npy, reading, whole
+from mars_lidar._base.files import check_data, open_npz, read_mat5, read_npy, reading, whole
 from mars_lidar._base.hdf5 import open_hdf5
-from mars_lidar._base.mat5 import check_elements
 from mars_lidar.io.capture import Capture, capture_in
 from mars_lidar.light.transient import Transient
 
@@ -122,8 +121,7 @@ def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
                 f"{path}: no data set {wanted!r} and no capture ('H' and 'H_format', 'data' and 'deltaT'), got {names}"
             )
         data = file[wanted]
-        check_claim(path, data.size * data.dtype.itemsize, wanted, in_parts=True)
-        check_chunks(path, data)
+        check_data(path, data, wanted, in_parts=True)
         told = {key: float(data.attrs[key]) for key in _TIMES if key in data.attrs}
         return _Rows(path, wanted, tuple(data.shape), turned=False), told
 
@@ -137,7 +135,6 @@ def _mat_name(path: Path) -> str:
         with open_hdf5(path) as file:
             found = set(file)
     else:
-        check_elements(path)
         found = {each for each, _, _ in whosmat(path)}
     return next((name for name in (_NAME, *_CONFOCAL) if name in found), _NAME)
 
@@ -150,8 +147,7 @@ def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
             if not isinstance(file.get(name), h5py.Dataset) or file[name].ndim != 3:
                 raise ValueError(f"{path}: no variable {name!r} of three axes, got {', '.join(file) or 'nothing'}")
             told = {key: float(np.ravel(whole(file[key]))[0]) for key in _TIMES if key in file}
-            check_claim(path, file[name].size * file[name].dtype.itemsize, name, in_parts=True)
-            check_chunks(path, file[name])
+            check_data(path, file[name], name, in_parts=True)
             bins, width, height = file[name].shape
             return _Rows(path, name, (height, width, bins), turned=True), told
     from scipy.io import whosmat

@@ -23,9 +23,8 @@ MOST_RADIUS = 12
 _PATCH = 2  # pixels around each, over which left-out photons are summed up
 _NEAR = 3.0  # widths of the pulse, within which other windows speak of the same surface
 _AROUND = 2  # pixels to each side whose planes are heard on the bias
-_MOST_BLIND = (
-    0.05  # of the exposure, on average: above it a pixel's own photons are enough, and planes neglect dead time
-)
+# of the exposure, on average: above it a pixel's own photons are enough, and planes neglect dead time
+_MOST_BLIND = 0.05
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class Neighbourhood(Method):
         parts = [
             self._image(replace(histograms, counts=counts, image=(height, width)), height, width) for counts in images
         ]
-        return Estimates(*(np.concatenate([part[name] for part in parts]) for name in _FIELDS))
+        return Estimates(**{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
     def _image(self, given: Histograms, height: int, width: int) -> dict[str, NDArray[np.generic]]:
         from mars_lidar._base.native import _core
@@ -139,19 +138,6 @@ class Neighbourhood(Method):
             "significance": np.sqrt(gain),
             "radius": (best + 1).astype(np.uint8),
         }
-
-
-_FIELDS = (
-    "signal",
-    "background",
-    "delay",
-    "flags",
-    "signal_error",
-    "background_error",
-    "delay_error",
-    "significance",
-    "radius",
-)
 
 
 def _around(delay: FloatArray, right: FloatArray, down: FloatArray, most: float) -> FloatArray:

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "reconstruct/pixel_likelihood.h"
+#include "reconstruct/pulse_template.h"
 
 namespace mars {
 
@@ -19,14 +20,10 @@ struct Start {
 class DelaySearch {
  public:
     explicit DelaySearch(const HistogramRecord& recording) : r_(recording) {
-        // the template: bins of a pulse whose delay is the centre of bin 0, without the gate, which differs by delay
-        HistogramRecord plain = recording;
-        plain.open.clear();
-        const double n = static_cast<double>(r_.bins), at = 0.5 / n;
-        first_ = static_cast<int64_t>(std::floor((at + r_.pulse.low) * n));
-        for_pulse_bins(plain, at, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
-                       [&](int64_t, int64_t, double s, double) { energy_.push_back(static_cast<float>(s)); });
-        step_ = std::max<int64_t>(1, static_cast<int64_t>(r_.width * n / 3.0));
+        const PulseTemplate pulse(recording);
+        first_ = pulse.first;
+        step_ = pulse.step;
+        for (const double s : pulse.energy) energy_.push_back(static_cast<float>(s));
         points_ = r_.bins / step_;
         gain_.resize(energy_.size());
         score_.resize(points_);

@@ -3,8 +3,10 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
+#include "reconstruct/pulse_template.h"
 #include "reconstruct/returns_likelihood.h"
 #include "reconstruct/solve.h"
 
@@ -20,13 +22,10 @@ struct Hint {
 class ReturnSearch {
  public:
     explicit ReturnSearch(const HistogramRecord& recording) : r_(recording) {
-        HistogramRecord plain = recording;
-        plain.open.clear();
-        const double n = static_cast<double>(r_.bins), at = 0.5 / n;
-        first_ = static_cast<int64_t>(std::floor((at + r_.pulse.low) * n));
-        for_pulse_bins(plain, at, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
-                       [&](int64_t, int64_t, double s, double) { energy_.push_back(s); });
-        step_ = std::max<int64_t>(1, static_cast<int64_t>(r_.width * n / 3.0));
+        PulseTemplate pulse(recording);
+        first_ = pulse.first;
+        step_ = pulse.step;
+        energy_ = std::move(pulse.energy);
         points_ = (r_.bins + step_ - 1) / step_;  // the last step may be a shorter one
         place_.resize(points_ + 1);
         for (int64_t g = 0; g <= points_; ++g) place_[g] = std::min(g * step_, r_.bins);

@@ -3,9 +3,11 @@
 #pragma once
 #include <algorithm>
 #include <cmath>
+#include <utility>
 #include <vector>
 
 #include "reconstruct/histogram_record.h"
+#include "reconstruct/pulse_template.h"
 
 namespace mars {
 
@@ -23,13 +25,10 @@ struct WindowResult {
 class WindowEstimate {
  public:
     WindowEstimate(const HistogramRecord& recording, Locator locator) : r_(recording), locator_(locator) {
-        const double n = static_cast<double>(r_.bins);
-        HistogramRecord plain = recording;
-        plain.open.clear();
-        first_ = static_cast<int64_t>(std::floor((0.5 / n + r_.pulse.low) * n));
-        for_pulse_bins(plain, 0.5 / n, r_.pulse.low, r_.pulse.low + r_.pulse.span(),
-                       [&](int64_t, int64_t, double s, double) { energy_.push_back(s); });
-        step_ = std::max<int64_t>(1, static_cast<int64_t>(r_.width * n / 3.0));
+        PulseTemplate pulse(recording);
+        first_ = pulse.first;
+        step_ = pulse.step;
+        energy_ = std::move(pulse.energy);
         weight_.resize(energy_.size());
     }
 

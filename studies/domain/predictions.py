@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +19,7 @@ from studies.domain.samples import Windows
 TOLERANCE = 1e-4  # of `count_law` and `mean_histogram`: their default
 AGREE = 2e-3  # standard deviations, relative variance, total variation that two predictions may differ by
 _QUICK_JOINT = 8.0  # photons in a dead time up to which `joint_law` takes milliseconds
+_QUICK_SECONDS = 0.1  # of `joint_law`, up to which it is asked for very many windows too
 _WIDEST = 2_000_000  # counts of a pmf that is kept
 
 
@@ -132,13 +134,16 @@ class Predictions:
         return found
 
     def _joint(self) -> list[Check]:
+        began = time.process_time()
         joint = joint_law(system=self.case.system, **self.case.light())
+        took = time.process_time() - began
         self.joint = joint
         if self.windows is None:
             self.windows = Windows.of(self.case, joint.mean)
         weights = self.windows.weights.astype(np.float64)
         self.window_mean, self.window_variance = joint.window(weights)
-        if joint.grid_bins * self.windows.edges.size <= 4_000_000:
+        # a window of many cells takes as long as the law where the exposure is run through: that is not the law's time
+        if took < _QUICK_SECONDS and max(joint.grid_bins, joint.mean.size) * self.windows.edges.size <= 4_000_000:
             self.cell_variance = joint.window(self.windows.cells().astype(np.float64))[1]
         self.echo_covariance = float(joint.covariance_of(weights[1], weights[2]))
         found = [_sane("joint_law", bool(np.isfinite(joint.mean).all() and np.isfinite(self.window_variance).all()))]

@@ -15,6 +15,7 @@ import mars_lidar as ml
 from benchmarks.law_map import disagreements, draw, laws
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
 from mars_lidar.statistics import cells as cells_module
+from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint_pixel as pixel_module
 from mars_lidar.statistics import pmf as pmf_module
 from mars_lidar.statistics.cells import Cells
@@ -247,6 +248,31 @@ def test_one_registration_at_most(cycles: int, dead: float):
     np.testing.assert_allclose(law.pmf[:2], [1.0 - chance, chance], atol=1e-9)
     assert joint.count_mean == pytest.approx(chance, rel=1e-6)
     assert joint.count_variance == pytest.approx(chance * (1.0 - chance), rel=1e-5)
+
+
+# Laws that would take longer than two seconds
+
+
+@pytest.mark.parametrize(
+    ("signal", "dead", "cycles", "sigma", "start"),
+    [(1.0, 1e-6, 1, 1e-6, "stationary"), (1000.0, 1e-6, 2, 1e-6, "armed")],
+)
+def test_work_of_refused_laws(
+    monkeypatch: pytest.MonkeyPatch, signal: float, dead: float, cycles: int, sigma: float, start: str
+):
+    """A refusal comes before the budget is spent: the light of each grid is in it, and the periods run."""
+    done: list[float] = []
+    run = exposure_module._run
+
+    def told(cells: Cells, bins: int, *arguments: Any) -> Any:
+        found = run(cells, bins, *arguments)
+        done.append(float(bins) * (10.0 + min(cycles, max(int(found.settled[0]), 1))))
+        return found
+
+    monkeypatch.setattr(exposure_module, "_run", told)
+    with pytest.raises(ConvergenceError, match="more than a law is to take"):
+        ml.count_law(signal, 0.0, view(dead, cycles, sigma, start))
+    assert sum(done) <= cells_module.LAW_STEPS
 
 
 # The joint law of an exposure that forgets its start long before its end

@@ -19,6 +19,7 @@ from mars_lidar._base.native import _core
 
 _GAUSSIAN_REACH = 8.5  # half support in sigma: what lies outside, 1e-17, is below one photon in any exposure
 _WIDE = 0.3  # periods of sigma from which a train of pulses is summed by frequency
+_BLOCK = 1 << 15  # times at once
 _SMALL = 40.0  # e^-40 is rounding
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _ORIGINS = ("peak", "centroid", "first")
@@ -53,13 +54,22 @@ class Pulse(ABC):
         Differences of it are exact energies of an interval, wrap-around included.
         """
         t = np.asarray(t_ns, dtype=np.float64)
+        flat, total = t.reshape(-1), np.empty(t.size)
+        for start in range(0, t.size, _BLOCK):  # what stays in the processor's own memory
+            some = slice(start, start + _BLOCK)
+            total[some] = self._train(flat[some], period_ns)
+        return total.reshape(t.shape)
+
+    def _train(self, t: NDArray[np.float64], period_ns: float) -> NDArray[np.float64]:
+        """`wrapped_cumulative` of some times (n,)."""
         low, high = self.support_ns()
-        total = np.zeros_like(t)
+        total = np.ones_like(t)
         whole = np.floor((t - high) / period_ns)
-        rest = t - whole * period_ns  # in [high, high + period): pulses k = 0, 1, .. up to those that start before
-        pulses = math.ceil((high - low) / period_ns) + 1
-        for k in range(pulses):
-            total += self.cumulative(rest - k * period_ns)
+        rest = t - whole * period_ns  # in [high, high + period): one pulse is over, later ones may have begun
+        for k in range(1, math.ceil((high - low) / period_ns) + 1):
+            late = rest - k * period_ns
+            begun = late > low
+            total[begun] += self.cumulative(late[begun])
         return total + whole
 
     def bin_energy(self, delay_ns: ArrayLike, period_ns: float, bins: int) -> NDArray[np.float64]:
@@ -112,16 +122,16 @@ class GaussianPulse(Pulse):
 
         return np.asarray(ndtr(np.asarray(t_ns, dtype=np.float64) / self.sigma_ns), dtype=np.float64)
 
-    def wrapped_cumulative(self, t_ns: ArrayLike, period_ns: float) -> NDArray[np.float64]:
+    def _train(self, t: NDArray[np.float64], period_ns: float) -> NDArray[np.float64]:
         """As of any pulse; of a wide one by its Fourier series, two or three terms for ten and more pulses."""
         share = self.sigma_ns / period_ns
         if share < _WIDE:
-            return super().wrapped_cumulative(t_ns, period_ns)
-        turn = np.asarray(t_ns, dtype=np.float64) / period_ns
+            return super()._train(t, period_ns)
+        turn = t / period_ns
         total = turn + 0.5
         for m in range(1, 1 + math.ceil(math.sqrt(_SMALL / (2.0 * (math.pi * share) ** 2)))):
             total += math.exp(-2.0 * (math.pi * m * share) ** 2) / (math.pi * m) * np.sin(2.0 * math.pi * m * turn)
-        return np.asarray(total, dtype=np.float64)
+        return total
 
     def check(self, period_ns: float) -> None:
         """Sigma between 1e-6 and 1 period: narrower is a delta to the sampler, wider is a flat background."""

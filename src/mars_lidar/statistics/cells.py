@@ -27,8 +27,9 @@ _MIN_BINS = 128
 _MAX_FIRST_BINS = 2**14  # finer first grids only where the tolerance asks for them
 _BINS_PER_WIDTH = 4.0 * math.sqrt(math.pi)  # of 1 / integral of s^2, 2 sqrt(pi) sigma: a bin is sigma / 2
 _MAX_STEPS = 4_000_000_000  # bins x periods of one cell before it counts as not settling: minutes
-LAW_STEPS = 40_000_000  # of the laws, which are to take 2 s at most
-_WARM_PERIODS = 400  # sweeps for a warm state; beyond, an equation is solved (_warm.py)
+LAW_STEPS = 26_000_000  # of the laws, which are to take 2 s at most
+# Sweeps for a warm state, and bins x sweeps, if more than the least; beyond, an equation is solved (warm.py)
+_WARM_PERIODS, _WARM_STEPS, _LEAST_WARM = 400, 10_000_000, 4
 _CHUNK_BYTES = 64 << 20
 _MAX_HISTORY_BYTES = 1 << 30  # for each thread
 _NEAR_BYTES, _MIDDLE_BYTES = 1 << 19, 1 << 25  # 15 to 60 ns a step; up to 100 ns; beyond, 100 to 350 ns were measured
@@ -237,7 +238,7 @@ class Cells:
             fraction=fraction,
             stationary=self.system.start == "stationary",
             tolerance=_SETTLED,
-            warm_periods=_WARM_PERIODS,
+            warm_periods=min(_WARM_PERIODS, max(_LEAST_WARM, _WARM_STEPS // bins)),
         )
 
     def chunks(self, bins: int, out_bins: int) -> Iterator[slice]:

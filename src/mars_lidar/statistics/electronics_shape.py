@@ -83,18 +83,21 @@ def _phases(grid: RecordGrid) -> FloatArray:
 
 def _transitions(grid: RecordGrid) -> FloatArray:
     """(bins, bins) probabilities that the next record after one in a bin is in another, whatever the period."""
-    n, columns = grid.bins, grid.kernel.shape[1]
-    place = np.arange(n)
-    matrix = np.zeros((n, n))
-    for first in range(0, columns, n):  # each offset occurs once among n successive ones
-        some = grid.kernel[:, first : first + n]
-        ahead = (place[:, None] + grid.off + first + np.arange(some.shape[1])) % n
-        matrix[place[:, None], ahead] += some
+    n, kernel = grid.bins, grid.kernel
+    if kernel.shape[1] > n:  # bins whole periods apart are one
+        kernel = np.pad(kernel, ((0, 0), (0, -kernel.shape[1] % n))).reshape(n, -1, n).sum(1)
+    width = kernel.shape[1]
     # those armed and ready, with nothing on the way, at the start of bin `begin`: the first photon from there on
     before = np.concatenate([[0.0], np.cumsum(grid.photons)])
-    total = before[-1]
-    begin = (place + grid.steps + 1) % n
-    passed = before[:-1] - before[begin][:, None]
-    passed += np.where(place < begin[:, None], total, 0.0)
-    fires = np.exp(-np.maximum(passed, 0.0)) * -np.expm1(-grid.photons)
-    return np.asarray(matrix + (grid.late / -math.expm1(-total))[:, None] * fires)
+    begin = (np.arange(n) + grid.steps + 1) % n
+    fires, ready = -np.expm1(-grid.photons), grid.late / -math.expm1(-before[-1])
+    matrix = np.empty((n, n))
+    for k, row in enumerate(matrix):  # a row at a time stays in the processor's own memory
+        passed = before[:-1] - before[begin[k]]
+        passed[: begin[k]] += before[-1]
+        np.multiply(ready[k] * np.exp(-np.maximum(passed, 0.0)), fires, out=row)
+        start = (k + grid.off) % n
+        fits = min(width, n - start)
+        row[start : start + fits] += kernel[k, :fits]
+        row[: width - fits] += kernel[k, fits:]
+    return matrix

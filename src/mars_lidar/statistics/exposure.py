@@ -37,6 +37,7 @@ _MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
 MOST_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
 _NATIVE = ("cumulants", "cumulant_rates", "histogram", "histogram_rate", "settled")  # what the native core fills
 UNSETTLED = -2  # the native core's code: gave up
+_ENERGY_STEPS = 10.0  # of the native recursion, that the light of a bin and what follows from it costs
 
 
 def exposure_moments(
@@ -174,7 +175,7 @@ def _spent(done: Exposure, cells: Cells) -> FloatArray:
 
 
 def _before(system: System) -> float:
-    return RATES_STEPS if system.detector.mode == "paralyzable" else 0.0
+    return RATES_STEPS if system.detector.mode == "paralyzable" else _ENERGY_STEPS
 
 
 def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, steps: int | None) -> None:
@@ -182,16 +183,20 @@ def _affordable(cells: Cells, pending: IndexArray, after: FloatArray, steps: int
     beyond = after > (math.inf if steps is None else steps)
     if beyond.any():
         k = int(pending[int(np.argmax(beyond))])
-        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, steps)}")
+        why = f"the next grid would take it beyond {steps:.1g} bins x periods, more than a law is to take"
+        raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {why}; {_instead(cells, steps)}")
 
 
 def _too_long(cells: Cells, steps: int | None) -> str:
-    slower = steps is not None and not meets_itself(cells)
-    instead = cells.alternatives("exposure_moments, which goes on for some minutes") if slower else cells.instead
     return (
         "the state of the pixel does not repeat from period to period for so long that the exposure cannot be run to "
-        f"its end; {instead}"
+        f"its end; {_instead(cells, steps)}"
     )
+
+
+def _instead(cells: Cells, steps: int | None) -> str:
+    slower = steps is not None and not meets_itself(cells)
+    return cells.alternatives("exposure_moments, which goes on for some minutes") if slower else cells.instead
 
 
 def _run(

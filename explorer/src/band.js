@@ -4,7 +4,7 @@
 import { Refused } from "./exposure.js";
 import { PARTS, gridOf, photonsIn } from "./light.js";
 
-const FORGOTTEN = 1e-6, MOST_STEPS = 6e7, SETTLING_STEPS = 4e6;
+const FORGOTTEN = 1e-6, MOST_STEPS = 6e7, SETTLING_STEPS = 4e6, TOGETHER = 64;
 
 /** Variances (bins); `law` is that of exposure(), in as many bins or, with jitter, in its parts. */
 export function binVariances(native, system, pixel, law, jitter) {
@@ -17,14 +17,15 @@ export function binVariances(native, system, pixel, law, jitter) {
   const runs = short === system.cycles ? 1 : 2;
   if (2 * runs * short * law.bins * system.bins > MOST_STEPS) throw new Refused("the variance of these many bins takes too long here");
   const variances = (cycles) => {
-    const found = new Float64Array(system.bins);
-    for (let b = 0; b < system.bins; ++b) {
-      const weights = jitter ? jitter.backward(b) : Float64Array.from({ length: out }, (_, j) => (j === b ? 1 : 0));
-      const one = native.windowVariances({ ...grid, cycles }, photons, weights);
-      if (!one) throw new Refused("the stationary state of this pixel is not found here");
-      found[b] = one[0];
+    const all = new Float64Array(system.bins);
+    for (let first = 0; first < system.bins; first += TOGETHER) {
+      const some = Math.min(TOGETHER, system.bins - first), weights = new Float64Array(some * out);
+      for (let k = 0; k < some; ++k) jitter ? weights.set(jitter.backward(first + k), k * out) : (weights[k * out + first + k] = 1);
+      const found = native.windowVariances({ ...grid, cycles }, photons, weights);
+      if (!found) throw new Refused("the stationary state of this pixel is not found here");
+      all.set(found, first);
     }
-    return found;
+    return all;
   };
   const at = variances(short), next = runs === 2 ? variances(short + 1) : at;
   const total = at.map((x, b) => x + (system.cycles - short) * (next[b] - x));

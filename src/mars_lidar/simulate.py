@@ -145,8 +145,7 @@ def simulate_timestamps(
         records = cuda.records(drawn_by, task)
     else:
         detected = flux.detected(system)
-        share = np.exp(-detected.total * system.dead_time_periods) if system.detector.mode == "paralyzable" else 1.0
-        expected = float((share * _expected_registrations(detected, system)).sum())
+        expected = float((_share_registered(detected, system) * _expected_arrivals(detected, system)).sum())
         _check_memory((math.ceil(0.5 * expected),), Records.BYTES, "timestamps")  # before any work
         records = drawn_by.records(task, expected)
     times_ns = records.times
@@ -241,10 +240,12 @@ def _pixel_index(pixel_index: ArrayLike | None, shape: tuple[int, int]) -> NDArr
 
 
 def _check_registrations(flux: Flux, system: System) -> None:
-    expected = _expected_registrations(flux, system)
+    expected = _expected_arrivals(flux, system)
     most, what = float(expected.max()), "registrations"
     if system.detector.mode == "paralyzable":  # each arrival is drawn, seen or not
         what = "arrivals of mode 'paralyzable'"
+    elif system.detector.recovery_ns > 0.0:
+        what = "arrivals after a dead time, those during recovery_ns included"
     if most > 0.5 * _MAX_REGISTRATIONS:
         photons = float(flux.total.flat[expected.argmax()])
         raise ValueError(
@@ -253,12 +254,23 @@ def _check_registrations(flux: Flux, system: System) -> None:
         )
 
 
-def _expected_registrations(flux: Flux, system: System) -> FloatArray:
-    """Registrations of each pixel (H, W) of detected photons, within a factor of two; if paralyzable, arrivals."""
+def _share_registered(flux: Flux, system: System) -> FloatArray:
+    """Of the arrivals (H, W) that are drawn one by one: in a dead time that each prolongs, or during the recovery."""
+    if system.detector.mode == "paralyzable":
+        return np.exp(-flux.total * system.dead_time_periods)
+    # up to the one that is registered in steady light, by the mean wait r e^a a^-a gamma(a, a), a = r light
+    recovery = system.detector.recovery_ns / system.period_ns
+    return np.asarray(1.0 / (1.0 + np.sqrt(0.5 * np.pi * recovery * flux.total)))
+
+
+def _expected_arrivals(flux: Flux, system: System) -> FloatArray:
+    """Arrivals that are drawn of each pixel (H, W) of detected photons, within a factor of two: registrations, if
+    paralyzable all, with a slow recovery those that it loses too.
+    """
     photons, dead, mode = flux.total, system.dead_time_periods, system.detector.mode
     if mode == "gated":  # what arrives outside of the gate costs one draw a period
         photons = photons - (1.0 - system.detector.gate_periods(system.period_ns)[2]) * flux.background
-    most = photons * system.cycles / (1.0 + photons * dead)
+    most = photons * system.cycles / (1.0 + photons * dead * _share_registered(flux, system))
     if mode == "paralyzable":
         most = photons * (system.cycles + dead)
     elif mode == "synchronous":

@@ -46,6 +46,7 @@ class StreamEffects:
         _option("--afterpulse-delay-ns", panel=_EFFECTS, help="... and their mean delay after the avalanche, ns."),
     ] = None
     twilight_ns: Annotated[float | None, _declared("twilight_ns")] = None
+    recovery_ns: Annotated[float | None, _declared("recovery_ns")] = None
     electronics_dead_time_ns: Annotated[float | None, _declared("electronics_dead_time_ns")] = None
     max_events_per_period: Annotated[int | None, _declared("max_events_per_period")] = None
     jitter_fwhm_ns: Annotated[

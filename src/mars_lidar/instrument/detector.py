@@ -17,6 +17,8 @@ from mars_lidar.instrument.presets import preset
 Mode = Literal["nonparalyzable", "paralyzable", "synchronous", "gated"]
 MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "synchronous", "gated")
 
+_RECOVERING: tuple[Mode, ...] = ("nonparalyzable", "gated")
+_MAX_RECOVERY_PERIODS = 1e6  # beyond it a pixel that has rested would not be told from one that has not
 _GATE = ("gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
 _MAX_GATE_CYCLES = 100_000_000
 _MIN_GATE_PERIODS = 1e-5  # phases have 24 bits: at 1e-6 periods the counts behind a gate were 4 % off
@@ -63,6 +65,14 @@ class Detector:
     twilight_ns
         Arrivals within this time before the end of a dead time, ns, are not lost: the pixel fires at its end (a
         twilight pulse). At most the dead time; mode ``"nonparalyzable"`` only.
+    recovery_ns
+        Time constant r, ns, with which the sensitivity returns after a dead time t_d (Krause and Walenta, *Exponential-
+        recovery model for free-running SPADs with capacity-induced dead-time imperfections*, arXiv 2507.10361, 2025):
+        what arrives at t after a registration at T triggers an avalanche with the probability
+        ``1 - exp(-(t - T - t_d) / r)``, in addition to `detection_efficiency`, each arrival for itself; photons,
+        dark counts, afterpulses and crosstalk alike. One that does not is lost, and changes nothing. Twilight pulses
+        fire all the same. A pixel without a registration before, as at an armed start, is fully sensitive. At most 1e6
+        laser periods; modes ``"nonparalyzable"`` and ``"gated"`` (it recovers whether the gate is open or not).
     crosstalk
         `Crosstalk`: avalanches trigger neighbouring pixels. The pixels of an image then depend on each other.
     electronics_dead_time_ns
@@ -89,6 +99,7 @@ class Detector:
     dark_count_hz: float = 0.0
     afterpulsing: Afterpulsing | None = None
     twilight_ns: float = 0.0
+    recovery_ns: float = 0.0
     crosstalk: Crosstalk | None = None
     electronics_dead_time_ns: float = 0.0
     max_events_per_period: int | None = None
@@ -152,6 +163,11 @@ class Detector:
                 f"twilight_ns must lie in [0, {self.dead_time_ns:g}], the dead time at whose end it is, "
                 f"got {self.twilight_ns:g}"
             )
+        if self.recovery_ns > 0.0 and self.mode not in _RECOVERING:
+            raise ValueError(
+                f"recovery_ns belongs to modes {' and '.join(map(repr, _RECOVERING))}, whose pixel recovers after the dead "
+                f"time of a registration, and must be 0 with mode {self.mode!r}, got {self.recovery_ns:g}"
+            )
         if self.crosstalk is not None and self.dead_time_ns == 0.0:
             raise ValueError(
                 "crosstalk needs dead_time_ns > 0: pixels that are never blind would trigger each other back and "
@@ -188,6 +204,11 @@ class Detector:
             self.jitter.check(period_ns)
         if self.afterpulsing is not None:
             self.afterpulsing.check(period_ns)
+        if self.recovery_ns > _MAX_RECOVERY_PERIODS * period_ns:
+            raise ValueError(
+                f"recovery_ns must be at most {_MAX_RECOVERY_PERIODS * period_ns:g} ns (1e6 periods), "
+                f"got {self.recovery_ns:g}"
+            )
         if self.code_density is not None and bins % len(self.code_density):
             raise ValueError(
                 f"code_density must have a number of codes that divides the {bins} bins of the histogram, "

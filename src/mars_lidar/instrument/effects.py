@@ -147,6 +147,15 @@ afterpulsing:                    # carriers in traps: each that is released is a
         help="Arrivals this long before the end of the dead time fire at its end, ns.",
         default="0",
     ),
+    "recovery_ns": Effect(
+        "avalanche",
+        0.0,
+        lambda v: checks.real("recovery_ns", v, low=0.0),
+        "recovery_ns: 3.0                 # sensitivity 1 - exp(-(t - end of the dead time) / recovery_ns)",
+        native=lambda v, period_ns: {"recovery": v / period_ns},
+        help="Time constant with which the sensitivity returns after the dead time, ns.",
+        default="0: at once",
+    ),
     "crosstalk": Effect(
         "avalanche",
         None,

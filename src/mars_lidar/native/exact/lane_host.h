@@ -4,6 +4,7 @@
 // exact/recorder_clock.h, waveform/recorder_clock.h), what a lane needs of an item, and its step from one arrival to
 // the next.
 #pragma once
+#include <algorithm>
 #include <atomic>
 #include <type_traits>
 
@@ -33,6 +34,9 @@ class LaneHost {
         : job_(job),
           clock_(job),
           twilight_(job.mode == DetectorMode::kNonparalyzable && job.twilight > 0.0),
+          recovers_(job.recovery > 0.0),
+          recovery_{splat(static_cast<float>(std::min(1.0 / job.recovery, 1e30))),
+                    splat(static_cast<float>(job.recovery))},
           log_(output, job),
           last_(last),
           stop_(stop),
@@ -83,7 +87,8 @@ class LaneHost {
     // released before that are lost.
     MARS_INLINE Time search_start(UInt event) {
         Time from = armed_;
-        if (twilight_) from = earlier(event > 0u, clock_.twilight(armed_), armed_);  // no avalanche before the first
+        // no avalanche before the first, and none since an arrival in vain
+        if (twilight_) from = earlier(except(event > 0u, in_vain_), clock_.twilight(armed_), armed_);
         traps_.lose(from);
         return from;
     }
@@ -91,8 +96,23 @@ class LaneHost {
     // Of the next photon `hit` and the next carrier the one that comes first: tells where that is a carrier.
     MARS_INLINE Mask take_earlier(Time& hit, Int& generation) {
         const Mask carriers = traps_.take_earlier(hit, generation);
-        if (twilight_) hit = earlier(before(hit, armed_), armed_, hit);
+        if (twilight_) {
+            at_end_ = before(hit, armed_);
+            hit = earlier(at_end_, armed_, hit);
+        }
         return carriers;
+    }
+
+    // Of the arrivals `hit` that the detector's mode sees, those that trigger nothing, as the pixel has not recovered:
+    // with probability e^(-u / recovery) at a time u after the end of the dead time, that of a wait beyond u. The search
+    // goes on from there. `ready`: the end of the dead time that the others begin.
+    MARS_NOINLINE Mask insensitive(const Mask& unseen, const Time& hit, const Time& ready, const UInt& event) {
+        Wait needed, unused;
+        draw_waits(key0_, key1_, event, kStageRecovery, recovery_, recovery_, needed, unused);
+        in_vain_ = except(except(before(hit, clock_.after(blind_until_, needed)), at_end_), unseen);
+        armed_ = earlier(in_vain_, hit, armed_);
+        blind_until_ = earlier(in_vain_ | unseen, blind_until_, ready);
+        return in_vain_;
     }
 
     // Avalanches of all arrivals but those that the detector's mode does not see.
@@ -102,7 +122,7 @@ class LaneHost {
 
     const Job& job_;
     const Clock clock_;
-    const bool twilight_;
+    const bool twilight_, recovers_;
 
     // the lanes
     UInt key0_, key1_, event_;
@@ -144,9 +164,16 @@ class LaneHost {
         armed_ = times_.load_lanes();
         recorder_.load_lanes();
         traps_.load_lanes();
+        if (recovers_)  // no avalanche before the first arrival of an item
+            blind_until_ = earlier(event_ > 0u, blind_until_, clock_.after(armed_, {splat(-kRested), splat(0.0f)}));
         load_items();
     }
 
+    static constexpr int32_t kRested = 1 << 26;  // periods, 67 of the longest time constant
+
+    const Rate recovery_;
+    Time blind_until_ = Clock::all(Clock::idle());       // end of the last dead time
+    Mask in_vain_ = splat(0) > 0, at_end_ = splat(0) > 0;  // the last arrival triggered nothing; was a twilight pulse
     const int32_t last_;
     const std::atomic<bool>& stop_;
     uint32_t keys0_[kLanes] = {}, keys1_[kLanes] = {};

@@ -97,13 +97,14 @@ struct FreeRunning {
     }
 };
 
-// Every mode and every pulse. Pixels that do not re-arm at the phase of their last arrival have nothing to remember:
-// those of other dead times, synchronous ones, and those whose search may begin in the twilight.
+// Every mode and every pulse. Pixels whose search does not go on at the phase of their last arrival have nothing to
+// remember: those of other dead times, synchronous ones, and those whose search may begin in the twilight.
 struct AnyRule {
     AnyRule(const Job& job, const SystemView& system)
         : mode(job.mode),
-          whole(mode == DetectorMode::kNonparalyzable ? system.dead_fraction == 0.0f && !job.avalanches_matter()
-                                                      : mode != DetectorMode::kSynchronous) {}
+          whole(job.recovery > 0.0                      ? job.twilight == 0.0
+                : mode == DetectorMode::kNonparalyzable ? system.dead_fraction == 0.0f && !job.avalanches_matter()
+                                                        : mode != DetectorMode::kSynchronous) {}
 
     MARS_INLINE Time next(const SystemView& system, const Return* returns, Time from, const Draw& drawn, UInt key0,
                           UInt key1, UInt event, Memory& memory) const {
@@ -156,9 +157,17 @@ class Runner final : ExactLanes<stage> {
         if constexpr (Lanes::kTraps)
             this->memory_.known = except(this->memory_.known, this->take_earlier(hit, generation));
         Mask unseen = splat(0) > 0;
-        const Registration r =
-            rule_.arrive(this->system_, hit, this->delay_, event, this->armed_, this->memory_, unseen);
-        if constexpr (Lanes::kTraps) this->avalanche(unseen, hit, generation);
+        [[maybe_unused]] const Mask known = this->memory_.known;
+        Registration r = rule_.arrive(this->system_, hit, this->delay_, event, this->armed_, this->memory_, unseen);
+        if constexpr (Lanes::kTraps) {
+            if (this->recovers_) {
+                const Mask in_vain = this->insensitive(unseen, hit, rearm(this->system_, hit), event);
+                this->memory_.known = known & in_vain;  // a dead time makes it forget, behind which little is seen
+                r.lost = r.lost | in_vain;
+                unseen = unseen | in_vain;
+            }
+            this->avalanche(unseen, hit, generation);
+        }
         if constexpr (Lanes::kRecords) {
             // field by field: a copy of the whole goes through memory, which costs a tenth of the time with AVX2
             FrameClock::Registration& seen = this->seen_[k];

@@ -9,6 +9,7 @@ constexpr uint32_t kStageArrival = 0;      // background and first return
 constexpr uint32_t kStageArrivalFine = 1;  // fresh fractions for long waits of those two
 constexpr uint32_t kStageStart = 2;        // arrivals before a stationary exposure: waits and components; + 1: phases
 constexpr uint32_t kStageJitter = 4;       // first word of the counter: half the number; + 1: tails
+constexpr uint32_t kStageRecovery = 6;   // what of its sensitivity an arrival asks of the pixel; + 1: fine fractions
 constexpr uint32_t kStageReturns = 16;     // + 2 k: returns 2 k + 1 and 2 k + 2; + 2 k + 1: their fractions
 constexpr uint32_t kStageTails = 64;       // + k: place of an arrival in the tails of return k
 constexpr uint32_t kStageTraps = 0x40000000;  // afterpulses, by the number of the avalanche that leaves carriers (+ k)

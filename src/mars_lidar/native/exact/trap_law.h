@@ -56,13 +56,13 @@ struct WarmStarts {
 
     static bool wanted(const Job& job) { return job.stationary && (job.dead_time > 0.0 || job.avalanches_matter()); }
 
-    // Pixels whose avalanches matter live on from the stationary state without afterpulses and twilight pulses, for as
-    // many periods before the exposure as it takes until their traps are as full as they will be.
+    // Pixels whose avalanches matter live on from the stationary state of the plain pixel, for as many periods before the
+    // exposure as it takes until their traps are as full, and they as far recovered, as they will be.
     void settle(const Job& job, int64_t items) {
         if (!job.avalanches_matter()) return;
         cycle.resize(static_cast<size_t>(items), 0);
         phase.resize(static_cast<size_t>(items), Phase{0});
-        const double periods = std::ceil(64.0 * (job.dead_time + 1.0) + 32.0 * job.traps.mean_delay);
+        const double periods = std::ceil(64.0 * (job.dead_time + 1.0) + 32.0 * job.aftermath());
         for (int32_t& start : cycle) start -= static_cast<int32_t>(periods);
     }
 };

@@ -45,6 +45,7 @@ struct Job {
     Gate gate;  // of kGated
     Traps traps;
     double twilight = 0.0;  // arrivals this long before the end of a dead time fire at its end
+    double recovery = 0.0;  // time constant with which the sensitivity returns after a dead time
     Crosstalk crosstalk;
     const Recording* recording = nullptr;  // of the registrations, or null: as they are
     const double* signal = nullptr;        // (returns, pixels)
@@ -55,7 +56,11 @@ struct Job {
     const uint32_t* pixel_index = nullptr;  // (pixels): names the random streams
 
     // Whether avalanches have consequences beyond the dead time.
-    bool avalanches_matter() const { return traps.mean > 0.0 || twilight > 0.0 || crosstalk.width > 0; }
+    bool avalanches_matter() const {
+        return traps.mean > 0.0 || twilight > 0.0 || recovery > 0.0 || crosstalk.width > 0;
+    }
+    // Of what avalanches leave behind: the longest mean duration.
+    double aftermath() const { return traps.mean_delay > recovery ? traps.mean_delay : recovery; }
     int64_t items() const { return pixels * realizations; }  // item = realization * pixels + pixel
     uint32_t realization(int64_t item) const { return first_realization + static_cast<uint32_t>(item / pixels); }
     int64_t pixel(int64_t item) const { return item % pixels; }

@@ -1,5 +1,5 @@
-// Pixels of the sequential engine whose avalanches have consequences: afterpulses, twilight pulses, and crosstalk to
-// the neighbours. All arrivals of all pixels that influence each other pass one queue, in order of time.
+// Pixels of the sequential engine whose avalanches have consequences: afterpulses, twilight pulses, a slow recovery, and
+// crosstalk to the neighbours. All arrivals of all pixels that influence each other pass one queue, in order of time.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -69,6 +69,7 @@ class EventSimulator {
         std::vector<uint64_t> times;
         size_t next = 0;
         bool fires_again = false;  // at the end of the present dead time
+        bool fired = false;
 
         Member(const Job& job, const PulseShape& pulse, int64_t item)
             : arrivals(job, pulse, job.pixel(item)),
@@ -110,7 +111,7 @@ class EventSimulator {
         if (!job_.stationary) return 0;
         int64_t start = 0;
         for (Member& member : pixels_) {
-            const double settle = job_.dead_time + 1.0 + 0.125 * job_.traps.mean_delay;
+            const double settle = job_.dead_time + 1.0 + 0.125 * job_.aftermath();
             const double photons = member.arrivals.photons_per_period();
             const double length = warm_up_periods(job_.dead_time, settle, photons, member.random.uniform());
             member.pixel.ready = Time{0, 0}.plus(-length);
@@ -157,12 +158,26 @@ class EventSimulator {
             }
             return;
         }
-        if (arrival.kind == Arrival::Kind::recovery) member.fires_again = false;
+        if (arrival.kind == Arrival::Kind::recovery)
+            member.fires_again = false;
+        else if (insensitive(member, now))
+            return;
         one_[0] = now.phase;
         member.pixel.pass(one_, now.cycle, [&](int64_t cycle, double phase) {
             if (cycle >= 0) registered(arrival.pixel, cycle, phase);
+            member.fired = true;
             avalanche(member, arrival);
         });
+    }
+
+    // Whether an arrival at a pixel that is not blind any more finds it too little recovered.
+    bool insensitive(Member& member, Time now) const {
+        const Time ready = member.pixel.ready;
+        if (!(job_.recovery > 0.0) || !member.fired || now < ready) return false;
+        const double since = static_cast<double>(now.cycle - ready.cycle) +
+                             static_cast<double>(static_cast<int64_t>(now.phase) - static_cast<int64_t>(ready.phase)) *
+                                 0x1p-52;
+        return member.random.uniform() < std::exp(-since / job_.recovery);
     }
 
     void avalanche(Member& member, const Arrival& cause) {

@@ -53,8 +53,12 @@ class WaveRunner final : LaneHost<PartClock, stage> {
         if constexpr (Host::kTraps) this->take_earlier(hit, generation);
         // inside the exposure: 0 <= cycle < cycles, one unsigned comparison
         const Mask outside = as_uint(hit.cycle) >= static_cast<uint32_t>(system_.cycles);
-        const Mask unseen = advance(mode_, system_, hit, this->armed_, ready_);
-        if constexpr (Host::kTraps) this->avalanche(unseen, hit, generation);
+        Mask unseen = advance(mode_, system_, hit, this->armed_, ready_);
+        if constexpr (Host::kTraps) {
+            if (this->recovers_)
+                unseen = unseen | this->insensitive(unseen, hit, later(hit, system_.dead, system_.parts), event);
+            this->avalanche(unseen, hit, generation);
+        }
         if constexpr (Host::kRecords) {
             PartClock::Registration& r = this->seen_[k];
             r.hit = hit;

@@ -39,6 +39,7 @@ ALL = dataclasses.replace(
     REAL,
     afterpulsing=Afterpulsing(probability=0.1, delay_ns=30.0),
     twilight_ns=1.0,
+    recovery_ns=2.0,
     crosstalk=Crosstalk(probability=0.1),
 )
 

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.io import Cube
 from mars_lidar.reconstruct import reconstruct
 
-_UNTOLD = ("crosstalk", "max_events_per_period", "max_events_per_exposure", "code_density")
+_TOLD = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "electronics_dead_time_ns", "jitter")
 
 
 def settings_of(system: System) -> tuple[dict[str, Any], str]:
@@ -30,7 +31,7 @@ def settings_of(system: System) -> tuple[dict[str, Any], str]:
         "twilight": detector.twilight_ns,
         "electronics": detector.electronics_dead_time_ns,
     }
-    untold = [name for name in _UNTOLD if getattr(detector, name) is not None]
+    untold = [name for name in detector.effects if name not in _TOLD]
     if isinstance(system.pulse, GaussianPulse):
         told["sigma"] = system.pulse.sigma_ns
     else:

@@ -165,8 +165,8 @@ class Detector:
             )
         if self.recovery_ns > 0.0 and self.mode not in _RECOVERING:
             raise ValueError(
-                f"recovery_ns belongs to modes {' and '.join(map(repr, _RECOVERING))}, whose pixel recovers after the dead "
-                f"time of a registration, and must be 0 with mode {self.mode!r}, got {self.recovery_ns:g}"
+                f"recovery_ns belongs to modes {' and '.join(map(repr, _RECOVERING))}, whose pixel recovers after the "
+                f"dead time of a registration, and must be 0 with mode {self.mode!r}, got {self.recovery_ns:g}"
             )
         if self.crosstalk is not None and self.dead_time_ns == 0.0:
             raise ValueError(

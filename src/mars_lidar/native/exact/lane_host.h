@@ -172,7 +172,7 @@ class LaneHost {
     static constexpr int32_t kRested = 1 << 26;  // periods, 67 of the longest time constant
 
     const Rate recovery_;
-    Time blind_until_ = Clock::all(Clock::idle());       // end of the last dead time
+    Time blind_until_ = Clock::all(Clock::idle());         // end of the last dead time
     Mask in_vain_ = splat(0) > 0, at_end_ = splat(0) > 0;  // the last arrival triggered nothing; was a twilight pulse
     const int32_t last_;
     const std::atomic<bool>& stop_;

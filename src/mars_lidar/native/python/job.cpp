@@ -60,8 +60,9 @@ void bind_job(nb::module_& module) {
                uint32_t first_realization, uint64_t seed, int32_t cycles, int32_t bins, double dead_time,
                bool stationary, int32_t mode, double gate_start, double gate_width, double gate_step,
                int32_t gate_cycles, double traps, double trap_delay, std::optional<Vector<const double>> trap_delays,
-               double trap_sample, int32_t generations, double twilight, double recovery, std::optional<Matrix<const double>> crosstalk,
-               int64_t height, int64_t width, const BoundRecording* recording) {
+               double trap_sample, int32_t generations, double twilight, double recovery,
+               std::optional<Matrix<const double>> crosstalk, int64_t height, int64_t width,
+               const BoundRecording* recording) {
                 const size_t pixels = background.shape(0);
                 if (signal.shape(1) != pixels || delay.shape(0) != signal.shape(0) || delay.shape(1) != pixels ||
                     pixel_index.shape(0) != pixels || (waveform && waveform->shape(0) != pixels))
@@ -111,8 +112,9 @@ void bind_job(nb::module_& module) {
             nb::arg("gate_start") = 0.0, nb::arg("gate_width") = 1.0, nb::arg("gate_step") = 0.0,
             nb::arg("gate_cycles") = 1, nb::arg("traps") = 0.0, nb::arg("trap_delay") = 0.0,
             nb::arg("trap_delays").none() = nb::none(), nb::arg("trap_sample") = 0.0,
-            nb::arg("generations") = INT32_MAX, nb::arg("twilight") = 0.0, nb::arg("recovery") = 0.0, nb::arg("crosstalk").none() = nb::none(),
-            nb::arg("height") = 0, nb::arg("width") = 0, nb::arg("recording").none() = nb::none())
+            nb::arg("generations") = INT32_MAX, nb::arg("twilight") = 0.0, nb::arg("recovery") = 0.0,
+            nb::arg("crosstalk").none() = nb::none(), nb::arg("height") = 0, nb::arg("width") = 0,
+            nb::arg("recording").none() = nb::none())
         .def_prop_ro("items", [](const BoundJob& self) { return self.items(); });
 }
 }  // namespace mars

@@ -174,9 +174,9 @@ class EventSimulator {
     bool insensitive(Member& member, Time now) const {
         const Time ready = member.pixel.ready;
         if (!(job_.recovery > 0.0) || !member.fired || now < ready) return false;
-        const double since = static_cast<double>(now.cycle - ready.cycle) +
-                             static_cast<double>(static_cast<int64_t>(now.phase) - static_cast<int64_t>(ready.phase)) *
-                                 0x1p-52;
+        const double since =
+            static_cast<double>(now.cycle - ready.cycle) +
+            static_cast<double>(static_cast<int64_t>(now.phase) - static_cast<int64_t>(ready.phase)) * 0x1p-52;
         return member.random.uniform() < std::exp(-since / job_.recovery);
     }
 

@@ -61,7 +61,7 @@ class EveryArrival(Engine):
 
     def timestamps(self, task: Task, records: Records) -> None:
         """In order of the items."""
-        item, time = self._registered(task)
+        _, time = self._registered(task)
         records.times[:] = time
         records.cycle[:] = np.floor(time)
         records.bin[:] = np.minimum((time % 1.0 * task.system.bins).astype(np.int64), task.system.bins - 1)
@@ -295,7 +295,7 @@ def test_what_has_no_law_says_so():
     with pytest.raises(ValueError, match="a table does not do recovery_ns"):
         ml.Table.build(system, [0.5, 1.0], [0.5, 1.0])
     with pytest.raises(ValueError, match="cramer_rao does not do recovery_ns"):
-        ml.cramer_rao(1.0, 1.0, system)
+        ml.cramer_rao(1.0, 1.0, system, delay_ns=37.0)
     with pytest.raises(ValueError, match="constant_light_rate does not do recovery_ns"):
         statistics.constant_light_rate(1e6, system.detector)
     with pytest.warns(UserWarning, match="no method of reconstruction knows recovery_ns"):

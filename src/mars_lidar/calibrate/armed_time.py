@@ -7,6 +7,7 @@ time for which each phase was armed (Andersen et al., *Statistical Models Based 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -16,6 +17,44 @@ from numpy.typing import NDArray
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.intervals import CHUNK, Stream
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """A sensitivity 1 - e^(-u / r) at a time u after the end of the dead time: `Detector.recovery_ns`.
+
+    The rate is lambda times that (Krause and Walenta, arXiv 2507.10361), so that the likelihood of the light stays the
+    same with every pass of a phase weighted by it. A stretch of watching from phase x to phase y, of length L, loses
+
+        int_0^L e^(-u / r) 1{x + u in bin j} du = W_j(x) - e^(-L / r) W_j(y)
+
+    of the bin j, with W_j that of an endless stretch, a geometric sum over periods. So all stretches together cost
+    O(n), and a convolution over the bins.
+    """
+
+    dead_ns: float
+    recovery_ns: float
+
+    def at(self, age_ns: FloatArray) -> FloatArray:
+        """Of ages since a registration, beyond the dead time."""
+        return np.asarray(-np.expm1((self.dead_ns - age_ns) / self.recovery_ns), dtype=np.float64)
+
+    def lost(
+        self, opens: FloatArray, closes: FloatArray, hold_off_ns: float, period_ns: float, bins: int
+    ) -> FloatArray:
+        """Passes (bins,) that stretches from `hold_off_ns` after a registration on lose."""
+        r, width = self.recovery_ns, period_ns / bins
+        begin = math.exp((self.dead_ns - hold_off_ns) / r)
+        number, faded = np.zeros(bins), np.zeros(bins)  # weights of phases; as they have faded at the end of their bin
+        for times, weight in ((opens, np.full(opens.size, begin)), (closes, -begin * np.exp((opens - closes) / r))):
+            _, place, part = places(times, period_ns, bins)
+            number += np.bincount(place, weight, bins)
+            faded += np.bincount(place, weight * np.exp((part - 1.0) * (width / r)), bins)
+        # a bin that begins m bins after that of the phase; its own one again after all others
+        later = np.exp(-np.roll(np.arange(bins), 1) * (width / r))
+        later *= r * math.expm1(-width / r) / math.expm1(-period_ns / r)
+        spread = np.fft.irfft(np.fft.rfft(later) * np.fft.rfft(faded), bins)
+        return np.asarray((spread + r * (number - faded)) / width, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +72,8 @@ class ArmedTime:
         a piece that begins in an unknown state.
     hold_off_ns
         After each registration the pixel is not watched for this long.
+    sensitivity
+        By which the passes are weighted, or None.
     """
 
     registrations: FloatArray
@@ -40,6 +81,7 @@ class ArmedTime:
     used: int
     left_out: int
     hold_off_ns: float
+    sensitivity: Sensitivity | None = None
 
     __repr__ = brief
 
@@ -53,19 +95,32 @@ class ArmedTime:
         return np.where(seen, self.registrations / np.where(seen, self.passes, 1.0), 0.0)
 
 
-def armed_time(stream: Stream, hold_off_ns: float, bins: int) -> ArmedTime:
+def armed_time(stream: Stream, hold_off_ns: float, bins: int, sensitivity: Sensitivity | None = None) -> ArmedTime:
     """Registrations and armed passes by phase; the pixel is watched from `hold_off_ns` after a registration on.
 
     Any hold-off of at least the true dead time leaves the estimate unbiased; a longer one forgoes data. O(n).
+    With `sensitivity` passes count by it; a piece that begins armed begins with all of it.
     """
     events = np.zeros(bins)
     passes = np.zeros(bins)
     used = 0
     for opens, closes in _gathered(_waits(stream, hold_off_ns)):
         used += _watch(events, passes, opens, closes, stream.period_ns, closed_by_photon=True)
+        passes -= _lost(sensitivity, opens, closes, hold_off_ns, stream.period_ns, bins)
     for opens, closes in _gathered(_tails(stream, hold_off_ns)):
         _watch(events, passes, opens, closes, stream.period_ns, closed_by_photon=False)
-    return ArmedTime(events, passes, used, stream.registrations - used, hold_off_ns)
+        passes -= _lost(sensitivity, opens, closes, hold_off_ns, stream.period_ns, bins)
+    return ArmedTime(events, passes, used, stream.registrations - used, hold_off_ns, sensitivity)
+
+
+def _lost(
+    law: Sensitivity | None, opens: FloatArray, closes: FloatArray, hold_off_ns: float, period_ns: float, bins: int
+) -> FloatArray | float:
+    """Passes (bins,) that are lost in stretches [opens, closes); those from 0 on have no registration before."""
+    if law is None:
+        return 0.0
+    slow = (closes > opens) & (opens > 0.0)
+    return law.lost(opens[slow], closes[slow], hold_off_ns, period_ns, bins)
 
 
 def _waits(stream: Stream, hold_off_ns: float) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -21,6 +21,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.intervals import Piece, Stream
 from mars_lidar.calibrate.periodicity import other_period
 from mars_lidar.calibrate.shortest_intervals import Ages, Underlying, is_sharp
+from mars_lidar.calibrate.slow_recovery import slow_recovery
 
 _LEAST = 100  # intervals
 _SEED = 3
@@ -122,8 +123,12 @@ def inspect_arrivals(
     probability, spread, until = math.nan, math.nan, math.nan
     if dead == dead:
         found = _departure(sorted_dt, dead, unit, max(unit, 6.0 * jitter), late, rate, rate_error)
-        probability, spread, until, slow = found
-        problems += slow
+        probability, spread, until, low = found
+        if low:  # in light that is constant any period will do
+            alone = Stream((Piece(times - times[0], float(times[-1] - times[0]), False),), late, 1, 1, 0.0, 0)
+            slow = slow_recovery(alone, dead_time_ns)
+            low = low if slow is None else [str(slow)]
+        problems += low
     problems += _not_constant(times, beyond, rate, unit)
     unknown = [
         "without a laser: the light over its period, signal, background, delay and pulse; give --period-ns",

@@ -43,9 +43,9 @@ def calibrate(
     The likelihood is that of the point process itself, sum log lambda(x_k) - integral of lambda over the armed time:
     no assumption on the exposure, the start, or the stationarity, and no correction of pile-up is needed.
 
-    That is exact for a detector with one dead time, and with Gaussian jitter (`estimate.jittered`). For one with other
-    effects (of `system`) the bias is taken off by simulation: the light is sought whose streams by the exact engine
-    give the same estimate.
+    That is exact for a detector with one dead time, with Gaussian jitter (`estimate.jittered`) or with a slow recovery
+    (`armed_time.Sensitivity`). For one with other effects (of `system`) the bias is taken off by simulation: the light
+    is sought whose streams by the exact engine give the same estimate.
 
     Parameters
     ----------
@@ -144,6 +144,7 @@ def _bounded(found: Calibration) -> Calibration:
 def _watch(detector: Detector | None, dead: float | None, hold: float | None, jitter: float | None) -> Watch:
     """Dead time, hold-off and jitter: as given, else those of the detector."""
     rest = 0.0
+    recovery = 0.0 if detector is None else detector.recovery_ns
     if jitter is None:
         jitter = 0.0 if detector is None else jitter_sigma(detector)
     if dead is None:
@@ -152,7 +153,8 @@ def _watch(detector: Detector | None, dead: float | None, hold: float | None, ji
     if hold is not None and hold < dead:
         raise ValueError(f"hold_off_ns must be at least the dead time of {dead:g} ns, got {hold:g}")
     least = dead + CERTAIN * jitter
-    return Watch(dead, max(least, rest + CERTAIN * jitter) if hold is None else max(least, hold), jitter)
+    hold = max(least, rest + CERTAIN * jitter) if hold is None else max(least, hold)
+    return Watch(dead, hold, jitter, recovery_ns=recovery)
 
 
 def _system_of(times: Timestamps | Sequence[Timestamps]) -> System | None:

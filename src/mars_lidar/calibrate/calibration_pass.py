@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibrate.armed_time import armed_time
+from mars_lidar.calibrate.armed_time import Sensitivity, armed_time
 from mars_lidar.calibrate.calibration_fit import covariance, fit, initial
 from mars_lidar.calibrate.calibration_light import Light
 from mars_lidar.calibrate.calibration_rapp import split, total_of
@@ -21,6 +21,7 @@ from mars_lidar.calibrate.stream_summary import Summary
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 
 _CROWDED, _FINER = 0.05, 64  # photons of a bin of a free shape above which light within it matters; parts of it
+_RECOVERED = 10.0  # time constants after which no more than 5e-5 of the sensitivity are missing
 _SHORT = 1e-7  # false-alarm probability of intervals shorter than the dead time
 CERTAIN = 8.5  # jitters behind a dead time after which a pixel is armed for certain: 6 of a difference of two
 
@@ -34,7 +35,7 @@ def _below(intervals: int) -> float:
 
 @dataclass(frozen=True)
 class Watch:
-    """What a calibration takes the detector for: dead time, hold-off, jitter, ns; errors are 0 of what is given."""
+    """What a calibration takes the detector for, ns: dead time, hold-off, jitter, recovery; an error is 0 if given."""
 
     dead_ns: float
     hold_ns: float
@@ -42,6 +43,12 @@ class Watch:
     jitter_error_ns: float = 0.0
     dead_error_ns: float = 0.0
     by: Literal["given", "smallest interval", "edge"] = "given"
+    recovery_ns: float = 0.0
+
+    @property
+    def sensitivity(self) -> Sensitivity | None:
+        """Of ages beyond the dead time; None: at once all of it."""
+        return Sensitivity(self.dead_ns, self.recovery_ns) if self.recovery_ns > 0.0 else None
 
 
 def fitted(
@@ -64,17 +71,18 @@ def fitted(
     short = 0
     if counted.smallest_ns.size and counted.smallest_ns[0] < dead - slack:
         short = sum(int((dt < dead - slack).sum()) for dt in stream.intervals())
-    rapp = total_of(stream, hold)
+    law = watch.sensitivity
+    rapp = total_of(stream, max(hold, dead + _RECOVERED * watch.recovery_ns))
     if shape == "free":
         bins = free_bins(stream.bins)
-        seen = armed_time(stream, hold, bins)
+        seen = armed_time(stream, hold, bins, law)
         rate = seen.rate
         finer = _FINER
         while finer > 1 and stream.units % (finer * bins) and 0 < stream.units < 4 * finer * bins:
             finer //= 2
         bias = 0.0
         if (rate > _CROWDED).any() and finer > 1:  # a pulse within a bin, of which few passes see more than the start
-            fine = fine_light(stream, hold, finer * bins, bins)
+            fine = fine_light(stream, hold, finer * bins, bins, law)
             rate = fine.reshape(bins, finer).sum(1)
             # a registration in the middle of a cell stands for one anywhere: light l is taken for l (1 - l^2 / 12)
             bias = float((fine**3).sum()) / 12.0
@@ -105,7 +113,7 @@ def fitted(
     pulse = GaussianPulse(sigma_ns=0.01 * stream.period_ns) if isinstance(shape, str) else shape
     known = pulse if near is None or near.pulse is None else near.pulse
     bins = fine_bins(stream, None if free_width and near is None else known)
-    seen = armed_time(stream, hold, bins)
+    seen = armed_time(stream, hold, bins, law)
     joint = watch.jitter_error_ns if isinstance(pulse, GaussianPulse) else 0.0
     light = Light(stream.period_ns, bins, pulse, returns, free_width, watch.jitter_ns, joint)
     if near is not None:
@@ -116,7 +124,7 @@ def fitted(
             start = fit(seen, light, start).theta
             finer = fine_bins(stream, light.pulse_of(start))
             if finer > bins:
-                seen = armed_time(stream, hold, finer)
+                seen = armed_time(stream, hold, finer, law)
                 light = replace(light, bins=finer)
     found = fit(seen, light, start)
     pulse, jitter = light.pulse_of(found.theta), light.jitter_of(found.theta)
@@ -141,7 +149,7 @@ def fitted(
         math.sqrt(matrix[-1, -1]) if light.fit_jitter else watch.jitter_error_ns,
         watch.by,
     )
-    return with_division(stream, found_light) if divided else found_light
+    return with_division(stream, found_light) if divided and law is None else found_light
 
 
 def with_division(stream: Stream, found: Calibration) -> Calibration:

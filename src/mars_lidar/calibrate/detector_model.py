@@ -46,8 +46,9 @@ def moves_records(detector: Detector) -> bool:
 
 
 def needs_simulation(detector: Detector) -> bool:
-    """Whether the likelihood of a stream is not known: more than one dead time and Gaussian jitter."""
-    return detector.mode != "nonparalyzable" or bool(set(detector.effects) - {*_IN_THE_LIGHT, "jitter"})
+    """Whether the likelihood of a stream is not known: more than one dead time with Gaussian jitter, or recovery."""
+    beyond = set(detector.effects) - set(_IN_THE_LIGHT)
+    return detector.mode != "nonparalyzable" or not (beyond <= {"jitter"} or beyond == {"recovery_ns"})
 
 
 def jitter_sigma(detector: Detector) -> float:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibrate.armed_time import armed_time
+from mars_lidar.calibrate.armed_time import Sensitivity, armed_time
 from mars_lidar.calibrate.intervals import Stream
 
 _COARSE = 1024
 _ENOUGH = 32  # registrations of a bin that is halved
 
 
-def fine_light(stream: Stream, hold_off_ns: float, bins: int, coarse: int | None = None) -> FloatArray:
+def fine_light(
+    stream: Stream, hold_off_ns: float, bins: int, coarse: int | None = None, sensitivity: Sensitivity | None = None
+) -> FloatArray:
     """Photons per period (bins,): h / D of `coarse` (1024) bins that are halved where photons abound.
 
     `bins` are a power of two times `coarse`.
@@ -20,7 +22,7 @@ def fine_light(stream: Stream, hold_off_ns: float, bins: int, coarse: int | None
     A pulse much narrower than a bin of the coarsest grid is seen as it is, and faint light does not fall apart into
     single photons.
     """
-    seen = armed_time(stream, hold_off_ns, bins)
+    seen = armed_time(stream, hold_off_ns, bins, sensitivity)
     number = min(_COARSE if coarse is None else coarse, bins)
     rate, photons = np.zeros(bins), np.full(number, np.inf)
     while True:

@@ -16,6 +16,7 @@ from mars_lidar.calibrate.departure import departure_of, too_coarse
 from mars_lidar.calibrate.intervals import Stream, stream_of
 from mars_lidar.calibrate.periodicity import other_period
 from mars_lidar.calibrate.recovery import Recovery, recovery_of
+from mars_lidar.calibrate.slow_recovery import SlowRecovery, slow_recovery
 from mars_lidar.light.timestamps import Timestamps
 
 _SURE = 1e-6  # false-alarm probability of what is told
@@ -51,6 +52,9 @@ class Inspection:
         stream, of whatever light, jitter, clock and dead time, is told one with a probability of 1e-4 at most.
     unknown
         What the stream cannot tell, a sentence each.
+    slow
+        The exponential recovery of the sensitivity, where the rate after the dead time is below the light's and such a
+        recovery fits it.
     """
 
     calibration: Calibration
@@ -60,6 +64,7 @@ class Inspection:
     interval_histogram: FloatArray
     problems: tuple[str, ...]
     unknown: tuple[str, ...] = ()
+    slow: SlowRecovery | None = None
 
     __repr__ = brief
 
@@ -100,8 +105,9 @@ def inspect(times: Timestamps, *, dead_time_ns: float | None = None) -> Inspecti
     # a stream that registers nearly as soon as it can repeats with the dead time
     low, middle, _ = free.summary.quantiles_ns
     hurried = middle < 1.2 * max(low, free.summary.smallest_ns[0])
-    problems, unknown = _problems(times, stream, free, found, None if hurried else other_period(stream))
-    return Inspection(free, found, histogram, edges, apart, tuple(problems), tuple(unknown))
+    slow = slow_recovery(stream, dead_time_ns) if found.judged is not None and found.departure_ends_ns else None
+    problems, unknown = _problems(times, stream, free, found, slow, None if hurried else other_period(stream))
+    return Inspection(free, found, histogram, edges, apart, tuple(problems), tuple(unknown), slow)
 
 
 def _with_jitter(times: Timestamps, stream: Stream, free: Calibration) -> Calibration:
@@ -125,7 +131,12 @@ def _bare(times: Timestamps) -> Timestamps:
 
 
 def _problems(
-    times: Timestamps, stream: Stream, free: Calibration, found: Recovery, period_ns: float | None
+    times: Timestamps,
+    stream: Stream,
+    free: Calibration,
+    found: Recovery,
+    slow: SlowRecovery | None,
+    period_ns: float | None,
 ) -> tuple[list[str], list[str]]:
     told = []
     counted = free.summary
@@ -157,6 +168,8 @@ def _problems(
     unknown = list(free.unknown)
     if found.judged is None:
         unknown.append("the recovery is not judged: light of a unit of the clock, which runs free, is too bright")
+    elif slow is not None:
+        told.append(str(slow))
     elif found.departure_ends_ns > _TWICE * counted.smallest_ns[0]:
         unknown.append(
             f"the rate rises slowly up to {found.departure_ends_ns:.4g} ns after a registration, the shortest of which "

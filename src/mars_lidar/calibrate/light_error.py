@@ -60,7 +60,7 @@ class Fitted:
         own = _same(calibration, stream)
         if calibration.pulse is None:
             if own:
-                seen = armed_time(stream, seen.hold_off_ns, _fine(seen.passes.size, seen.used))
+                seen = armed_time(stream, seen.hold_off_ns, _fine(seen.passes.size, seen.used), seen.sensitivity)
             rate = seen.rate
             # variance of h / D: h / D^2, bin by bin
             covariance = np.where(seen.passes > 0, rate / np.maximum(seen.passes, 1e-300), 0.0)

@@ -227,6 +227,28 @@ def cumulated(u: Any, recovery: float) -> Any:
     return recovery * np.where(x < 1e-3, small, x + np.expm1(-x))
 
 
+@pytest.mark.parametrize("photons", [1e-12, 1e-3, 0.4, 30.0, 999.0, 1001.0, 1e6, 1e10])
+@pytest.mark.parametrize("twilight", [0.0, 2.0])
+def test_rate_under_constant_light(photons: float, twilight: float):
+    """Against the integral of the survival e^(-H(u)), for so many photons in a time constant."""
+    rate = min(photons / 8.0, 2.0)
+    recovery = photons / rate
+    detector = ml.Detector(dead_time_ns=5.0, recovery_ns=recovery, twilight_ns=twilight)
+    scale = max(1.0 / rate, np.sqrt(recovery / rate))
+    wait = integrate.quad(lambda x: scale * np.exp(-rate * cumulated(x * scale, recovery)), 0, 60, limit=500)[0]
+    expected = 1e9 / (5.0 + np.exp(-rate * twilight) * wait)
+    assert statistics.constant_light_rate(1e9 * rate, detector) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("engine", BOTH)
+def test_mean_rate_of_the_engines(engine: str):
+    made = case(0.0, 6.0, "stationary", dead_time_ns=24.0, recovery_ns=35.0, twilight_ns=4.0, cycles=300, items=1600)
+    expected = statistics.constant_light_rate(6e9 / PERIOD_NS, made.system.detector) * 1e-9 * made.system.exposure_ns
+    counts = draw(ENGINES[engine], made, 5).counts
+    z = (counts.mean() - expected) / (counts.std(ddof=1) / np.sqrt(counts.size))
+    require({"mean": float(2 * stats.norm.sf(abs(z)))}, engine)
+
+
 def test_a_rested_pixel_is_fully_sensitive():
     """An armed start has no registration before it: the first one comes as it does without recovery."""
     made = case(0.0, 2.0, dead_time_ns=50.0, recovery_ns=500.0, cycles=40, items=4000)
@@ -296,8 +318,9 @@ def test_what_has_no_law_says_so():
         ml.Table.build(system, [0.5, 1.0], [0.5, 1.0])
     with pytest.raises(ValueError, match="cramer_rao does not do recovery_ns"):
         ml.cramer_rao(1.0, 1.0, system, delay_ns=37.0)
-    with pytest.raises(ValueError, match="constant_light_rate does not do recovery_ns"):
-        statistics.constant_light_rate(1e6, system.detector)
+    both = replace(system.detector, afterpulsing=TRAPS)
+    with pytest.raises(ValueError, match="constant_light_rate treats recovery_ns or afterpulsing, not both, got 5 and"):
+        statistics.constant_light_rate(1e6, both)
     with pytest.warns(UserWarning, match="no method of reconstruction knows recovery_ns"):
         ml.reconstruct(np.ones((1, 1, 64), np.uint16), system)
 

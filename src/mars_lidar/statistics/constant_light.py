@@ -1,7 +1,8 @@
-"""Mean registration rate under constant light, with dead time, afterpulses and twilight pulses.
+"""Mean registration rate under constant light, with dead time, recovery, afterpulses and twilight pulses.
 
 Straka, Grygar, Hloušek, Ježek, "Counting statistics of actively quenched SPADs under continuous illumination",
-J. Lightwave Technol. 38, 4765 (2020), arXiv 2001.10036; derived in docs/detectors.md, equations (9) to (11).
+J. Lightwave Technol. 38, 4765 (2020), arXiv 2001.10036; Krause, Walenta, "Exponential-recovery model for free-running
+SPADs with capacity-induced dead-time imperfections", arXiv 2507.10361 (2025); docs/detectors.md, (15), (16), (22), (23).
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from mars_lidar._base import checks
 from mars_lidar.instrument.detector import Detector, require_effects
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 
-_EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", *TIMING_EFFECTS)
+_EFFECTS = (*LIGHT_EFFECTS, "afterpulsing", "twilight_ns", "recovery_ns", *TIMING_EFFECTS)
 _TOLERANCE = 1e-12
 _ROUNDS = 500
+_SMALL, _LARGE = 1e-9, 1e3  # photons in a time constant
 _MOST_CELLS = 2**22
 _MAX_RATE_HZ = 1e12
 
@@ -26,9 +28,10 @@ _MAX_RATE_HZ = 1e12
 def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     """Mean rate of registrations of a free-running pixel under constant light, counts/s.
 
-    Exact without afterpulsing, 1 / (t_d + e^(-lambda alpha) / lambda). With afterpulsing it is the law to first order
-    in the afterpulse probability p: the carriers in the traps are taken to be those of the mean over all histories, so
-    that the error is of the order p^2.
+    Exact without afterpulsing, 1 / (t_d + e^(-lambda alpha) w) with the mean wait w of an armed pixel: 1 / lambda, or
+    r e^a a^-a gamma(a, a), a = lambda r, where its sensitivity returns with the time constant r. With afterpulsing it
+    is the law to first order in the afterpulse probability p: the carriers in the traps are taken to be those of the
+    mean over all histories, so that the error is of the order p^2.
 
     Parameters
     ----------
@@ -36,7 +39,7 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
         Photons per second at the pixel, before its detection efficiency; dark counts come on top.
     detector
         Of mode ``"nonparalyzable"``, without crosstalk or a longer dead time of the electronics, and afterpulses of all
-        generations.
+        generations, not together with `recovery_ns`.
     """
     light = checks.real("rate_hz", rate_hz, low=0.0, high=_MAX_RATE_HZ)
     require_effects("constant_light_rate", detector, _EFFECTS, lambda _: "; simulate it with engine 'sequential'")
@@ -47,7 +50,12 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     if rate == 0.0:
         return 0.0
     if traps is None:
-        return 1e9 / (dead + math.exp(-rate * twilight) / rate)
+        return 1e9 / (dead + math.exp(-rate * twilight) * _wait(rate, detector.recovery_ns))
+    if detector.recovery_ns > 0.0:
+        raise ValueError(
+            "constant_light_rate treats recovery_ns or afterpulsing, not both, "
+            f"got {detector.recovery_ns:g} and {traps!r}"
+        )
     if traps.generations is not None:
         raise ValueError(
             f"constant_light_rate treats afterpulses of all generations, generations=None, got {traps.generations}"
@@ -57,6 +65,18 @@ def constant_light_rate(rate_hz: float, detector: Detector) -> float:
     parts = min(max(1, math.ceil(40 * rate * (traps.bin_ns or 0.0))), max(1, _MOST_CELLS // len(traps.delays or (0,))))
     density = np.repeat(np.diff(traps.edges_below) / parts, parts) * traps.probability
     return 1e9 / _sampled(rate, dead, twilight, density, (traps.bin_ns or 0.0) / parts)
+
+
+def _wait(rate: float, recovery: float) -> float:
+    """Mean wait of an armed pixel, ns: of hazard rate (1 - e^(-u / recovery))."""
+    from scipy.special import gammainc, gammaln
+
+    a = rate * recovery
+    if a < _SMALL:
+        return (1.0 + a) / rate
+    # log of e^a a^-a Gamma(a), by Stirling's series where its terms are large beside it
+    log = a - a * math.log(a) + gammaln(a) if a < _LARGE else 0.5 * math.log(2.0 * math.pi / a) + 1.0 / (12.0 * a)
+    return float(recovery * math.exp(log) * gammainc(a, a))
 
 
 def _exponential(rate: float, dead: float, twilight: float, p: float, delay: float) -> float:

@@ -164,8 +164,10 @@ class LaneHost {
         armed_ = times_.load_lanes();
         recorder_.load_lanes();
         traps_.load_lanes();
-        if (recovers_)  // no avalanche before the first arrival of an item
-            blind_until_ = earlier(event_ > 0u, blind_until_, clock_.after(armed_, {splat(-kRested), splat(0.0f)}));
+        if constexpr (kTraps) {  // no avalanche before the first arrival of an item
+            const Time rested = clock_.after(armed_, {splat(-kRested), splat(0.0f)});
+            blind_until_ = earlier(event_ > 0u, blind_until_, rested);
+        }
         load_items();
     }
 

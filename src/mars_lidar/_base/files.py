@@ -44,6 +44,10 @@ class WriteError(OSError):
     """The file could not be written (a full disk, say); its text says what is left on disk."""
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C while a file was written; its text says what is left on disk."""
+
+
 class TemporarySibling:
     """The file beside the target that is renamed to it when all is written: the rename is atomic."""
 
@@ -168,7 +172,7 @@ def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts
     """
     given = os.environ.get(LIMIT)
     try:
-        limit = max(_LEAST_LIMIT, _TIMES * _size(path)) if given is None else float(given) * 2**30
+        limit = max(_LEAST_LIMIT, _TIMES * size_on_disk(path)) if given is None else float(given) * 2**30
     except ValueError:
         raise ValueError(f"{LIMIT} must be a number of GiB, got {given!r}") from None
     if nbytes > limit:
@@ -224,7 +228,7 @@ def check_data(path: Path, data: Any, name: str, *, in_parts: bool = False) -> N
     if not (hasattr(data, "file") and data.chunks):
         return
     count = math.prod(-(-size // step) for size, step in zip(data.shape, data.chunks, strict=True))
-    if count > max(_FEW_CHUNKS, _size(path) // _CHUNK_ENTRY):
+    if count > max(_FEW_CHUNKS, size_on_disk(path) // _CHUNK_ENTRY):
         raise FileError(f"{path}: {name} would have {count} chunks, more than it can list: is it damaged?")
 
 
@@ -235,9 +239,10 @@ def whole(data: Any) -> NDArray[Any]:
     return np.asarray(data[...])
 
 
-def _size(path: Path) -> int:
+def size_on_disk(path: Path) -> int:
+    """Bytes of a file, or of all files of a folder."""
     parts = path.rglob("*") if path.is_dir() else (path,)
-    return sum(part.stat().st_size for part in parts)
+    return sum(part.stat().st_size for part in parts if part.is_file())
 
 
 def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from typing import TYPE_CHECKING, Any
 
+from mars_lidar.cli.console import grid, screen
 from mars_lidar.compare.sample import SIGNIFICANT, Distance, Estimate, Moments
 
 if TYPE_CHECKING:
@@ -16,15 +16,12 @@ if TYPE_CHECKING:
     from mars_lidar.compare.comparison import Comparison
     from mars_lidar.compare.pixel import PixelStatistics
 
-_PIPE = 160  # columns where nobody is watching: nothing is folded
 _MARK = "!"
 
 
 def show(found: Comparison) -> None:
     """Print all tables on standard output; what is significantly wrong is red and marked."""
-    from rich.console import Console
-
-    console = Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_PIPE)
+    console = screen()
     _scene_table(console, found)
     for pixel in found.pixels:
         _pixel_table(console, found, pixel)
@@ -112,7 +109,7 @@ def _scene_table(console: Console, found: Comparison) -> None:
     known = int(found.expected.known.sum())
     height, width = found.flux.shape
     goal = f"against the exact mean of {known:,} pixels" if known > 1 else f"against {found.against}"
-    grid = _grid(
+    shown = grid(
         f"Whole image, {width} × {height} pixels, {found.threads} threads; bias {goal}",
         (
             "engine",
@@ -129,7 +126,7 @@ def _scene_table(console: Console, found: Comparison) -> None:
     )
     for name, s in found.scenes.items():
         percent = Estimate(100 * s.relative_bias.value, 100 * s.relative_bias.error, s.relative_bias.z)
-        grid.add_row(
+        shown.add_row(
             name,
             _number(1e3 * s.median_s),
             str(len(s.seconds)),
@@ -142,7 +139,7 @@ def _scene_table(console: Console, found: Comparison) -> None:
             _number(100 * s.outliers),
         )
     console.print()
-    console.print(grid)
+    console.print(shown)
     for name, why in found.skipped.items():
         console.print(f"{name} was not run: {why}")
 
@@ -150,7 +147,7 @@ def _scene_table(console: Console, found: Comparison) -> None:
 def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
     y, x = found.pixels[pixel]
     statistics, law = found.statistics[pixel], found.laws[pixel]
-    grid = _grid(
+    shown = grid(
         f"{pixel} pixel (y {y}, x {x}): S = {found.flux.signal[y, x]:.3g}, "
         f"B = {found.flux.background[y, x]:.3g}; {_realizations(statistics)}",
         ("engine", "mean", "variance", "Fano", "window var", f"/ {found.against}", "lag-1", "TV shape", "TV count"),
@@ -160,13 +157,13 @@ def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
         exact = [f"{e.value:.6g}" for e in (known.mean, known.variance)] + [_number(known.fano.value)]
         window = "" if law.window is None else _number(float(law.window[1]))
         lag = "" if math.isnan(law.lag1) else f"{1e3 * law.lag1:.3g}"
-        grid.add_row("predicted", *(f"{words} " for words in (*exact, window, "", lag)), "", "", style="bold")
+        shown.add_row("predicted", *(f"{words} " for words in (*exact, window, "", lag)), "", "", style="bold")
     for name, s in statistics.items():
         relative = cell(s.window_ratio)
         if name == found.against and math.isfinite(s.window_ratio.value):
             relative = cell(Estimate(1.0))
         lag1 = Estimate(1e3 * s.lag1.value, 1e3 * s.lag1.error, s.lag1_error.z)
-        grid.add_row(
+        shown.add_row(
             name,
             cell(s.counts.mean),
             cell(s.counts.variance),
@@ -178,7 +175,7 @@ def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
             cell(s.law),
         )
     console.print()
-    console.print(grid)
+    console.print(shown)
     if pixel in found.unpredicted:
         console.print(f"{pixel} pixel has no prediction: {found.unpredicted[pixel]}")
 
@@ -188,23 +185,6 @@ def _realizations(statistics: dict[str, PixelStatistics]) -> str:
     most = max(drawn.values())
     fewer = "".join(f", {name} {n:,}" for name, n in drawn.items() if n < most)
     return f"{most:,} exposures{fewer}"
-
-
-def _grid(title: str, columns: tuple[str, ...]) -> Any:
-    from rich.table import Table
-    from rich.text import Text
-
-    grid = Table(
-        title=Text(title, style="bold"),
-        title_justify="left",
-        box=None,
-        padding=(0, 1, 0, 0),
-        pad_edge=False,
-        header_style="dim",
-    )
-    for k, name in enumerate(columns):
-        grid.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")
-    return grid
 
 
 def cell(found: Estimate | Distance) -> Text:

@@ -6,7 +6,7 @@ import contextlib
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,11 @@ from mars_lidar.cli.groups import OPTIONS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from rich.console import Console
+    from rich.table import Table
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+_PIPE = 250  # columns where nobody is watching
 _FIELDS = {  # of the package, where an option has another name
     "sigma_ns": "pulse_sigma_ns",
     "fwhm_ns": "pulse_fwhm_ns",
@@ -83,14 +86,31 @@ def progress_bar(label: str) -> Iterator[Bar]:
 
 def check_picture(out: Path | None, overwrite: bool) -> None:
     """Raise, before any work, what `save_picture` would raise."""
-    if out is None:
-        return
-    if out.suffix not in (".png", ".pdf", ".svg"):
+    if out is not None and out.suffix not in (".png", ".pdf", ".svg"):
         raise ValueError(f"--out must end in .png, .pdf or .svg, got {str(out)!r}")
-    if out.exists() and not overwrite:
-        raise FileExistsError(f"{out} exists already; choose another name or give --overwrite")
-    if not out.parent.is_dir():
+    check_new(out, overwrite)
+
+
+def check_new(out: Path | None, overwrite: bool) -> None:
+    """Raise, before any work, unless a file can be written there."""
+    refuse_existing(out, overwrite)
+    if out is not None and not out.parent.is_dir():
         raise FileNotFoundError(f"{out} cannot be written: there is no folder {out.parent}")
+
+
+def refuse_existing(out: Path | None, overwrite: bool, ways: str = "--overwrite or another name") -> None:
+    """Raise where a file would be replaced unasked."""
+    if out is not None and out.exists() and not overwrite:
+        raise FileExistsError(f"{out} exists already; give {ways}")
+
+
+def two_integers(option: str, text: str, form: str = "Y,X (row, column)") -> tuple[int, int]:
+    """What an option of this form gives, such as the pixel (y, x) of ``--pixel Y,X``."""
+    try:
+        first, second = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"{option} must be two integers {form}, got {text!r}") from None
+    return first, second
 
 
 def save_picture(figure: Figure, out: Path) -> None:
@@ -108,16 +128,40 @@ def table(rows: list[tuple[str, str]]) -> None:
         for label, text in rows:
             print(f"{label:<14} {text}")
         return
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column(style="bold", no_wrap=True)
-    grid.add_column(overflow="fold")
+    both = Table.grid(padding=(0, 2))
+    both.add_column(style="bold", no_wrap=True)
+    both.add_column(overflow="fold")
     for label, text in rows:
-        grid.add_row(label, Text(text))
-    Console(highlight=False).print(grid)
+        both.add_row(label, Text(text))
+    screen().print(both)
+
+
+def screen() -> Console:
+    """Standard output; where nobody is watching nothing is folded."""
+    from rich.console import Console
+
+    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=_PIPE)
+
+
+def grid(title: str, columns: Sequence[str]) -> Table:
+    """A table for `screen`: names on the left, numbers on the right."""
+    from rich.table import Table
+    from rich.text import Text
+
+    shown = Table(
+        title=Text(title, style="bold") if title else None,
+        title_justify="left",
+        box=None,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+        header_style="dim",
+    )
+    for k, name in enumerate(columns):
+        shown.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")
+    return shown
 
 
 def _with_options(message: str) -> str:

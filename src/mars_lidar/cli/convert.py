@@ -3,73 +3,50 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from mars_lidar.cli.console import progress_bar, reported, table
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.groups import argument, examples, option
+from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.simulate import tell_time
 
 if TYPE_CHECKING:
     from mars_lidar.io import Converted
 
-CONVERT_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar convert room.zarr room.h5",
-        "mars-lidar convert set.zarr first.mat --realization 0",
-        "mars-lidar convert lab.ptu lab.h5 --bins 1024",
-        "mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml",
-        "Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
-        "pip install 'mars-lidar[io]'. docs/formats.md tells what is in each.",
-    )
+CONVERT_EPILOG = examples(
+    "mars-lidar convert room.zarr room.h5",
+    "mars-lidar convert set.zarr first.mat --realization 0",
+    "mars-lidar convert lab.ptu lab.h5 --bins 1024",
+    "mars-lidar convert face.mat face.zarr --variable counts --system camera.yaml",
+    "Cubes: .zarr .h5 .npz .mat .ptu. Photon streams: .npz .ptu .h5 (Photon-HDF5). .ptu and Photon-HDF5 need "
+    "pip install 'mars-lidar[io]'. docs/formats.md tells what is in each.",
 )
-TIMESTAMPS_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar simulate --scene room -o room.zarr",
-        "mars-lidar timestamps room.zarr -o room.ptu",
-        "mars-lidar timestamps set.zarr --realization 3 -o photons.h5",
-    )
+TIMESTAMPS_EPILOG = examples(
+    "mars-lidar simulate --scene room -o room.zarr",
+    "mars-lidar timestamps room.zarr -o room.ptu",
+    "mars-lidar timestamps set.zarr --realization 3 -o photons.h5",
 )
 
 _LARGE_IMAGE = 5e8
-_ClockPs = Annotated[
-    float | None,
-    typer.Option(
-        "--clock-ps",
-        help="Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for "
-        "each. [dim]Default: the finest, 32768 to a period.[/dim]",
-        show_default=False,
-    ),
-]
-_Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+_CLOCK_PS = option(
+    "Of a stream in a .ptu: least unit of its times, ps. Programs that make an image of it have a bin for each.",
+    "the finest, 32768 to a period",
+)
+_OVERWRITE = option("Replace an existing file.", default=False)
 
 
-@grouped
 def convert(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="A cube, a photon stream (of a lab, too: .ptu, Photon-HDF5), or histograms of another program.",
-            show_default=False,
-        ),
-    ],
-    target: Annotated[Path, typer.Argument(help="The new file; its suffix names the format.", show_default=False)],
-    realization: Annotated[
-        int | None,
-        typer.Option("--realization", help="Of a cube, this exposure alone, from 0; a .mat holds one."),
-    ] = None,
+    source: Path = argument(
+        "A cube, a photon stream (of a lab, too: .ptu, Photon-HDF5), or histograms of another program."
+    ),
+    target: Path = argument("The new file; its suffix names the format."),
+    realization: int | None = option("Of a cube, this exposure alone, from 0; a .mat holds one."),
     *,
     foreign: ForeignOptions,
-    bins: Annotated[
-        int | None,
-        typer.Option("--bins", help="Histogram bins of a recorded stream. [dim]Default: its finest clock.[/dim]"),
-    ] = None,
-    clock_ps: _ClockPs = None,
-    overwrite: _Overwrite = False,
+    bins: int | None = option("Histogram bins of a recorded stream.", "its finest clock"),
+    clock_ps: float | None = _CLOCK_PS,
+    overwrite: bool = _OVERWRITE,
 ) -> None:
     """Write a cube or a photon stream in another format, and tell what the other format cannot hold."""
     with reported():
@@ -105,17 +82,12 @@ def _imported(foreign: ForeignOptions, source: Path, target: Path, overwrite: bo
 
 
 def timestamps(
-    cube: Annotated[Path, typer.Argument(help="A cube written by mars-lidar.", show_default=False)],
-    out: Annotated[
-        Path,
-        typer.Option("-o", "--out", help="The stream: .npz, .ptu or .h5 (Photon-HDF5).", show_default=False),
-    ],
-    realization: Annotated[int, typer.Option("--realization", help="Which exposure, from 0 in the file.")] = 0,
-    threads: Annotated[
-        int | None, typer.Option("--threads", help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
-    ] = None,
-    clock_ps: _ClockPs = None,
-    overwrite: _Overwrite = False,
+    cube: Path = argument("A cube written by mars-lidar."),
+    out: Path = out_option("The stream: .npz, .ptu or .h5 (Photon-HDF5).", panel=None),
+    realization: int = option("Which exposure, from 0 in the file.", default=0),
+    threads: int | None = option("Threads.", "all cores"),
+    clock_ps: float | None = _CLOCK_PS,
+    overwrite: bool = _OVERWRITE,
 ) -> None:
     """Write the photons of a stored cube, one by one, with their times: the cube is simulated again.
 

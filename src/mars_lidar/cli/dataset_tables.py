@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from mars_lidar._base import manifest
+from mars_lidar._base.files import size_on_disk
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import BAD_INPUT, say, table
 
@@ -39,7 +40,10 @@ def dataset_rows(path: Path) -> list[tuple[str, str]] | None:
         *rows,
         ("complete", f"NO: {total - len(left)} of {total} parts are there; continue with --resume" if left else whole),
         ("counts", f"{_shape(array.shape)} {array.dtype}, {recipe.layout}"),
-        ("size", f"{_bytes(math.prod(array.shape) * array.dtype.itemsize)} dense, {_bytes(_on_disk(path))} on disk"),
+        (
+            "size",
+            f"{_bytes(math.prod(array.shape) * array.dtype.itemsize)} dense, {_bytes(size_on_disk(path))} on disk",
+        ),
         ("chunk", f"{_size(array.chunks)} of a shard of {_size(array.shards)}"),
         ("engine", f"{recipe.engine}, seed {recipe.seed}"),
         *((f"system {k}", one.to_json()) for k, one in enumerate(recipe.systems)),
@@ -62,7 +66,7 @@ def tell(done: Generated) -> None:
             ("generated", _shape(done.shape)),
             ("parts", f"{done.parts} made{before}"),
             ("time", f"{done.seconds:.3g} s for {exposures:,} pixel exposures{share}"),
-            ("dataset", f"{done.path}, {_bytes(_on_disk(done.path))}"),
+            ("dataset", f"{done.path}, {_bytes(size_on_disk(done.path))}"),
             ("open with", f"xarray.open_zarr({str(done.path)!r})"),
             ("left out", files(len(done.problems))),
         ]
@@ -101,10 +105,6 @@ def _shape(shape: tuple[int, ...]) -> str:
 
 def _size(shape: tuple[int, ...]) -> str:
     return " × ".join(map(str, shape))
-
-
-def _on_disk(path: Path) -> int:
-    return sum(part.stat().st_size for part in path.rglob("*") if part.is_file())
 
 
 def files(number: int) -> str:

@@ -2,81 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from mars_lidar._base import checks
-from mars_lidar.cli.options import _option
+from mars_lidar.cli.groups import group, panel
 from mars_lidar.instrument.effects import FIELDS
 
-_EFFECTS = "Effects of the detector (off by default)"
+_effect = panel("Effects of the detector (off by default)")
 
 
-def _declared(name: str, *also: str) -> Any:
+def _declared(name: str, *names: str) -> Any:
     """The option of an effect that is one number, as `mars_lidar.instrument.effects.FIELDS` declares it."""
     effect = FIELDS[name]
     assert effect.help is not None
-    return _option(f"--{name.replace('_', '-')}", *also, panel=_EFFECTS, help=effect.help, default=effect.default)
+    return _effect(effect.help, effect.default, *names)
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class LightEffects:
     """What changes the light that a pixel counts; None: as in the file."""
 
-    detection_efficiency: Annotated[float | None, _declared("detection_efficiency")] = None
-    dark_count_hz: Annotated[float | None, _declared("dark_count_hz", "--dark-counts")] = None
+    detection_efficiency: float | None = _declared("detection_efficiency")
+    dark_count_hz: float | None = _declared("dark_count_hz", "--dark-count-hz", "--dark-counts")
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class StreamEffects:
     """Effects of the detector that the stream of one pixel shows; None: as in the file."""
 
-    afterpulse_probability: Annotated[
-        float | None,
-        _option(
-            "--afterpulse-probability",
-            panel=_EFFECTS,
-            help="Mean number of trapped carriers that an avalanche leaves, those lost in the dead time included ...",
-            default="0",
-        ),
-    ] = None
-    afterpulse_delay_ns: Annotated[
-        float | None,
-        _option("--afterpulse-delay-ns", panel=_EFFECTS, help="... and their mean delay after the avalanche, ns."),
-    ] = None
-    twilight_ns: Annotated[float | None, _declared("twilight_ns")] = None
-    recovery_ns: Annotated[float | None, _declared("recovery_ns")] = None
-    electronics_dead_time_ns: Annotated[float | None, _declared("electronics_dead_time_ns")] = None
-    max_events_per_period: Annotated[int | None, _declared("max_events_per_period")] = None
-    jitter_fwhm_ns: Annotated[
-        float | None,
-        _option("--jitter-fwhm-ns", panel=_EFFECTS, help="Gaussian timing jitter: full width at half maximum, ns."),
-    ] = None
-    jitter_tail_ns: Annotated[
-        float | None,
-        _option("--jitter-tail-ns", panel=_EFFECTS, help="Mean of the exponential tail of the jitter, ns ..."),
-    ] = None
-    jitter_tail_fraction: Annotated[
-        float | None,
-        _option("--jitter-tail-fraction", panel=_EFFECTS, help="... and share of the events that are in it."),
-    ] = None
-    jitter_file: Annotated[
-        Path | None,
-        _option("--jitter-file", panel=_EFFECTS, help="Measured jitter instead: 1-D .npy array of its density."),
-    ] = None
-    jitter_bin_ns: Annotated[
-        float | None,
-        _option("--jitter-bin-ns", panel=_EFFECTS, help="Sample width of --jitter-file, ns."),
-    ] = None
-    code_density_file: Annotated[
-        Path | None,
-        _option(
-            "--code-density-file",
-            panel=_EFFECTS,
-            help="TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins.",
-        ),
-    ] = None
+    afterpulse_probability: float | None = _effect(
+        "Mean number of trapped carriers that an avalanche leaves, those lost in the dead time included ...", "0"
+    )
+    afterpulse_delay_ns: float | None = _effect("... and their mean delay after the avalanche, ns.")
+    twilight_ns: float | None = _declared("twilight_ns")
+    recovery_ns: float | None = _declared("recovery_ns")
+    electronics_dead_time_ns: float | None = _declared("electronics_dead_time_ns")
+    max_events_per_period: int | None = _declared("max_events_per_period")
+    jitter_fwhm_ns: float | None = _effect("Gaussian timing jitter: full width at half maximum, ns.")
+    jitter_tail_ns: float | None = _effect("Mean of the exponential tail of the jitter, ns ...")
+    jitter_tail_fraction: float | None = _effect("... and share of the events that are in it.")
+    jitter_file: Path | None = _effect("Measured jitter instead: 1-D .npy array of its density.")
+    jitter_bin_ns: float | None = _effect("Sample width of --jitter-file, ns.")
+    code_density_file: Path | None = _effect(
+        "TDC non-linearity: 1-D .npy array of relative code widths; their number divides the bins."
+    )
 
     def given(self) -> dict[str, Any]:
         """Fields of `Detector`, as plain data."""
@@ -113,24 +83,15 @@ class StreamEffects:
         return {"kind": "gaussian", **gaussian} if gaussian else None
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class Effects(StreamEffects, LightEffects):
     """Effects of the detector; None: as in the file."""
 
-    crosstalk: Annotated[
-        float | None,
-        _option(
-            "--crosstalk",
-            panel=_EFFECTS,
-            default="0",
-            help="Mean number of neighbours that an avalanche triggers; with --engine sequential.",
-        ),
-    ] = None
-    crosstalk_kernel: Annotated[
-        str | None,
-        _option("--crosstalk-kernel", panel=_EFFECTS, help="Which neighbours: 4 or 8.", default="8"),
-    ] = None
-    max_events_per_exposure: Annotated[int | None, _declared("max_events_per_exposure")] = None
+    crosstalk: float | None = _effect(
+        "Mean number of neighbours that an avalanche triggers; with --engine sequential.", "0"
+    )
+    crosstalk_kernel: str | None = _effect("Which neighbours: 4 or 8.", "8")
+    max_events_per_exposure: int | None = _declared("max_events_per_exposure")
 
     def given(self) -> dict[str, Any]:
         """Fields of `Detector`, as plain data."""

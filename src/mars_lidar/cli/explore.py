@@ -4,46 +4,31 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from mars_lidar.cli.console import reported, say, table
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.groups import argument, examples, option
 
-EXPLORE_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar explore",
-        "mars-lidar explore room.zarr",
-        "mars-lidar explore room.zarr --no-browser --port 8000",
-    )
+EXPLORE_EPILOG = examples(
+    "mars-lidar explore",
+    "mars-lidar explore room.zarr",
+    "mars-lidar explore room.zarr --no-browser --port 8000",
 )
 
 
-@grouped
 def explore(
-    file: Annotated[
-        Path | None,
-        typer.Argument(
-            help="A cube, a sample of a dataset, or histograms of others, as `view` takes them. "
-            "[dim]Default: the page's own picture.[/dim]",
-            show_default=False,
-        ),
-    ] = None,
+    file: Path | None = argument(
+        "A cube, a sample of a dataset, or histograms of others, as `view` takes them. "
+        "[dim]Default: the page's own picture.[/dim]",
+        None,
+    ),
     *,
     foreign: ForeignOptions,
-    sample: Annotated[
-        int | None,
-        typer.Option("--sample", help="Of a dataset: which sample. [dim]Default: 0.[/dim]", show_default=False),
-    ] = None,
-    port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="Port on the loopback address; 0: one that is free.")
-    ] = 0,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the page in the browser of this machine.")
-    ] = True,
+    sample: int | None = option("Of a dataset: which sample.", "0"),
+    port: int = option("Port on the loopback address.", "0, one that is free", default=0, min=0, max=65535),
+    browser: bool = option(
+        "Open the page in the browser of this machine.", "yes", "--browser/--no-browser", default=True
+    ),
 ) -> None:
     """Show pixels with their exact laws in a browser: what dead time does, with sliders; and a cube, pixel by pixel.
 

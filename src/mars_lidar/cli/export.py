@@ -3,34 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.groups import argument, examples, option
+from mars_lidar.cli.options import out as out_option
 
-EXPORT_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar generate room --size 64 --scene-seeds 20 -o rooms.zarr",
-        "mars-lidar export rooms.zarr --layout lindell --fill -o lindell",
-        "docs/formats.md tells what is in each file.",
-    )
+EXPORT_EPILOG = examples(
+    "mars-lidar generate room --size 64 --scene-seeds 20 -o rooms.zarr",
+    "mars-lidar export rooms.zarr --layout lindell --fill -o lindell",
+    "docs/formats.md tells what is in each file.",
 )
 
 
 def export(
-    dataset: Annotated[Path, typer.Argument(help="A dataset that mars-lidar generate wrote.", show_default=False)],
-    out: Annotated[Path, typer.Option("-o", "--out", help="A new folder.", show_default=False)],
-    layout: Annotated[
-        str,
-        typer.Option(
-            "--layout", help="Whose loader reads it: lindell, deepsensorfusion, sun or gutierrez.", show_default=False
-        ),
-    ],
-    fill: Annotated[
-        bool, typer.Option("--fill", help="Pixels without a return take depth and rates of the nearest with one.")
-    ] = False,
+    dataset: Path = argument("A dataset that mars-lidar generate wrote."),
+    out: Path = out_option("A new folder.", panel=None),
+    layout: str = option("Whose loader reads it: lindell, deepsensorfusion, sun or gutierrez.", default=...),
+    fill: bool = option("Pixels without a return take depth and rates of the nearest with one.", default=False),
 ) -> None:
     """Write a dataset as the files that depth networks of the field load: one .mat an exposure, and their list."""
     with reported():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from mars_lidar.cli import options
-from mars_lidar.cli.options import _option
+from mars_lidar.cli.console import two_integers
+from mars_lidar.cli.groups import group, panel
+from mars_lidar.cli.options import DETECTOR, SYSTEM
 from mars_lidar.cli.pulse_options import PulseOptions
 
 if TYPE_CHECKING:
@@ -15,53 +16,32 @@ if TYPE_CHECKING:
     from mars_lidar.io import Cube
     from mars_lidar.io.recorder import Recorded
 
-_PANEL = "A file of another program"
+_of_file = panel("A file of another program")
 _BINS = 1e-6  # relative difference by which a period may miss a whole number of bins
 _NEEDED = "--system, or --bin-ps (or --period-ns), --cycles, --dead-time-ns (or --detector) and --pulse-sigma-ns"
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class ForeignOptions:
     """What a file of another program does not tell of its histograms; nothing is needed for one of mars-lidar."""
 
-    system: options.System = None
-    bin_ns: Annotated[float | None, _option("--bin-ns", panel=_PANEL, help="Width of a histogram bin, ns ...")] = None
-    bin_ps: Annotated[float | None, _option("--bin-ps", panel=_PANEL, help="... or ps.")] = None
-    period_ns: Annotated[
-        float | None,
-        _option("--period-ns", panel=_PANEL, help="Laser period, ns.", default="the histogram's length"),
-    ] = None
-    cycles: Annotated[
-        int | None, _option("--cycles", panel=_PANEL, help="Laser periods that each histogram was accumulated over.")
-    ] = None
-    detector: options.DetectorPreset = None
-    dead_time_ns: Annotated[
-        float | None, _option("--dead-time-ns", panel=_PANEL, help="Dead time after a registration, ns.")
-    ] = None
-    pulse: PulseOptions = field(default_factory=PulseOptions)
-    start_ns: Annotated[
-        float,
-        _option(
-            "--start-ns", panel=_PANEL, help="Time from the laser pulse to the first bin (a gate), ns.", default="0"
-        ),
-    ] = 0.0
-    variable: Annotated[
-        str | None, _option("--variable", panel=_PANEL, help="Name of the array, of a file with several.")
-    ] = None
-    axes: Annotated[
-        str | None,
-        _option(
-            "--axes",
-            panel=_PANEL,
-            metavar="NYXT",
-            help="What its dimensions are, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
-            default="time last, or where the system's bins fit",
-        ),
-    ] = None
-    image: Annotated[
-        str | None, _option("--image", panel=_PANEL, metavar="H,W", help="Height and width of (yx) or (xy).")
-    ] = None
-    unit_ns: Annotated[float | None, _option("--unit-ns", panel=_PANEL, help="Unit of photon times, ns.")] = None
+    system: Path | None = SYSTEM
+    bin_ns: float | None = _of_file("Width of a histogram bin, ns ...")
+    bin_ps: float | None = _of_file("... or ps.")
+    period_ns: float | None = _of_file("Laser period, ns.", "the histogram's length")
+    cycles: int | None = _of_file("Laser periods that each histogram was accumulated over.")
+    detector: str | None = DETECTOR
+    dead_time_ns: float | None = _of_file("Dead time after a registration, ns.")
+    pulse: PulseOptions = PulseOptions()
+    start_ns: float = _of_file("Time from the laser pulse to the first bin (a gate), ns.", default=0.0)
+    variable: str | None = _of_file("Name of the array, of a file with several.")
+    axes: str | None = _of_file(
+        "What its dimensions are, e.g. tyx; n exposures, (yx) or (xy) pixels row by row or column by column.",
+        "time last, or where the system's bins fit",
+        metavar="NYXT",
+    )
+    image: str | None = _of_file("Height and width of (yx) or (xy).", metavar="H,W")
+    unit_ns: float | None = _of_file("Unit of photon times, ns.")
 
     @property
     def given(self) -> bool:
@@ -101,7 +81,7 @@ class ForeignOptions:
             path,
             variable=self.variable,
             axes=self.axes,
-            image=None if self.image is None else _pair(self.image),
+            image=None if self.image is None else two_integers("--image", self.image, "H,W"),
             bins=None if base is None else base.bins,
         )
         length = None if found.counts is None else found.counts.shape[-1]
@@ -231,11 +211,3 @@ def _recorder_rows(path: Path) -> list[tuple[str, str]]:
         if found is None
         else [*rows, ("a channel's stream", "mars-lidar inspect, calibrate, validate --pixel 0,C")]
     )
-
-
-def _pair(text: str) -> tuple[int, int]:
-    try:
-        height, width = (int(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"--image must be two integers H,W, got {text!r}") from None
-    return height, width

@@ -3,152 +3,80 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mars_lidar.cli import options
 from mars_lidar.cli.console import FAILED, progress_bar, reported, say, table
 from mars_lidar.cli.dataset_tables import tell, tell_estimate
 from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.options import _option
-from mars_lidar.cli.scene_options import Ambient, Attenuation
-from mars_lidar.cli.system_options import SystemChanges
+from mars_lidar.cli.groups import argument, examples, option, panel
+from mars_lidar.cli.options import THREADS, of_output, of_run, of_system
+from mars_lidar.cli.options import out as out_option
+from mars_lidar.cli.scene_options import AMBIENT, ATTENUATION, of_light
+from mars_lidar.cli.system_options import DEFAULT_SYSTEM, SystemChanges
 
 if TYPE_CHECKING:
     from mars_lidar.dataset import DatasetRecipe
 
-GENERATE_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar generate recipe.yaml -o set.zarr --dry-run",
-        "mars-lidar generate recipe.yaml -o set.zarr --resume",
-        "mars-lidar generate room --size 64 --scene-seeds 100 --signal 0.1 --signal 1 --sbr 0.5 -o rooms.zarr",
-        "mars-lidar generate nyu_depth_v2_labeled.mat --focal-px 519 --crop 64 --crops 4 -o nyu.zarr",
-        "mars-lidar generate recipe.yaml -o set.zarr --scheduler tcp://10.0.0.1:8786",
-        "Recipes: docs/generate.md. Clusters: docs/scale.md.",
-    )
+GENERATE_EPILOG = examples(
+    "mars-lidar generate recipe.yaml -o set.zarr --dry-run",
+    "mars-lidar generate recipe.yaml -o set.zarr --resume",
+    "mars-lidar generate room --size 64 --scene-seeds 100 --signal 0.1 --signal 1 --sbr 0.5 -o rooms.zarr",
+    "mars-lidar generate nyu_depth_v2_labeled.mat --focal-px 519 --crop 64 --crops 4 -o nyu.zarr",
+    "mars-lidar generate recipe.yaml -o set.zarr --scheduler tcp://10.0.0.1:8786",
+    "Recipes: docs/generate.md. Clusters: docs/scale.md.",
 )
-
-
 _RECIPES = (".yaml", ".yml")
 _TRANSIENTS = (".h5", ".hdf5")  # a depth is never in one; the other files of transients need a recipe
-
-
-_SCENES, _LIGHT, _RUN, _OUTPUT = "Scenes", "Light", "Simulation", "Output"
+_of_scenes = panel("Scenes")
 
 
 def generate(
     *,
-    source: Annotated[
-        Path | None,
-        typer.Argument(
-            help="A recipe (.yaml, .yml), a built-in scene (room), RGB-D (a file or a folder), or a rendered transient "
-            "(.h5, .hdf5).",
-            show_default=False,
-        ),
-    ] = None,
-    size: Annotated[
-        str | None,
-        _option(
-            "--size",
-            panel=_SCENES,
-            metavar="SIDE",
-            default="as it is; room: 128",
-            help="Resample every scene: the longer side, or HEIGHT,WIDTH.",
-        ),
-    ] = None,
-    crop: Annotated[
-        str | None,
-        _option("--crop", panel=_SCENES, metavar="SIDE", help="Cut out parts at random places: side, or HEIGHT,WIDTH."),
-    ] = None,
-    crops: Annotated[int | None, _option("--crops", panel=_SCENES, help="Parts per scene.", default="1")] = None,
-    scene_seeds: Annotated[
-        int | None,
-        _option("--scene-seeds", panel=_SCENES, help="Built-in scene: that many, of seeds 0, 1, ...", default="1"),
-    ] = None,
-    depth_unit_m: Annotated[
-        float | None,
-        _option(
-            "--depth-unit-m",
-            panel=_SCENES,
-            help="RGB-D: metres per stored unit of depth.",
-            default="0.001 for images, 1 for arrays",
-        ),
-    ] = None,
-    focal_px: Annotated[
-        float | None,
-        _option(
-            "--focal-px",
-            panel=_SCENES,
-            default="depth as it is",
-            help="RGB-D: focal length, pixels of the file: turns depth along the axis into range along the ray.",
-        ),
-    ] = None,
-    max_depth_m: Annotated[
-        float | None,
-        _option("--max-depth-m", panel=_SCENES, help="RGB-D: depths beyond this are no return, m.", default="none"),
-    ] = None,
-    system: Annotated[
-        list[Path] | None,
-        _option(
-            "--system",
-            panel="System",
-            help="YAML or JSON file (see mars-lidar init), repeated for several; single options replace its values.",
-        ),
-    ] = None,
+    source: Path | None = argument(
+        "A recipe (.yaml, .yml), a built-in scene (room), RGB-D (a file or a folder), or a rendered transient "
+        "(.h5, .hdf5).",
+        None,
+    ),
+    size: str | None = _of_scenes(
+        "Resample every scene: the longer side, or HEIGHT,WIDTH.", "as it is; room: 128", metavar="SIDE"
+    ),
+    crop: str | None = _of_scenes("Cut out parts at random places: side, or HEIGHT,WIDTH.", metavar="SIDE"),
+    crops: int | None = _of_scenes("Parts per scene.", "1"),
+    scene_seeds: int | None = _of_scenes("Built-in scene: that many, of seeds 0, 1, ...", "1"),
+    depth_unit_m: float | None = _of_scenes(
+        "RGB-D: metres per stored unit of depth.", "0.001 for images, 1 for arrays"
+    ),
+    focal_px: float | None = _of_scenes(
+        "RGB-D: focal length, pixels of the file: turns depth along the axis into range along the ray.",
+        "depth as it is",
+    ),
+    max_depth_m: float | None = _of_scenes("RGB-D: depths beyond this are no return, m.", "none"),
+    system: list[Path] | None = of_system(
+        "YAML or JSON file (see mars-lidar init), repeated for several; single options replace its values."
+    ),
     changes: SystemChanges,
     effects: Effects,
-    signal: Annotated[
-        list[float] | None,
-        _option(
-            "--signal",
-            panel=_LIGHT,
-            default="1",
-            help="Mean signal photons per laser period, repeated for several levels.",
-        ),
-    ] = None,
-    sbr: Annotated[
-        list[float] | None,
-        _option(
-            "--sbr",
-            panel=_LIGHT,
-            default="1",
-            help="Mean signal / mean ambient photons, repeated for several: each with each signal.",
-        ),
-    ] = None,
-    attenuation: Attenuation = None,
-    ambient: Ambient = None,
-    engine: Annotated[
-        str | None, _option("--engine", panel=_RUN, help="As for mars-lidar simulate.", default="exact")
-    ] = None,
-    realizations: Annotated[
-        int | None, _option("--realizations", panel=_RUN, help="Exposures of each sample.", default="1")
-    ] = None,
-    seed: Annotated[int | None, _option("--seed", panel=_RUN, help="Seed of the dataset.", default="0")] = None,
-    threads: options.Threads = None,
-    workers: Annotated[
-        int | None, _option("--workers", panel=_RUN, help="Worker processes on this machine (extra cluster).")
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        _option("--scheduler", panel=_RUN, help="Address of a dask scheduler whose workers see --out (extra cluster)."),
-    ] = None,
-    out: Annotated[Path, _option("-o", "--out", panel=_OUTPUT, help="The dataset, NAME.zarr.")],
-    layout: Annotated[
-        str | None,
-        _option(
-            "--layout",
-            panel=_OUTPUT,
-            default="dense",
-            help="dense (any Zarr library reads it) or sparse (bins that are not zero, packed: smaller in dim light).",
-        ),
-    ] = None,
-    resume: Annotated[bool, _option("--resume", panel=_OUTPUT, help="Continue what was stopped.")] = False,
-    overwrite: Annotated[bool, _option("--overwrite", panel=_OUTPUT, help="Replace an existing dataset.")] = False,
-    dry_run: Annotated[
-        bool, _option("--dry-run", panel=_OUTPUT, help="Tell size, time and memory; write nothing.")
-    ] = False,
+    signal: list[float] | None = of_light("Mean signal photons per laser period, repeated for several levels.", "1"),
+    sbr: list[float] | None = of_light(
+        "Mean signal / mean ambient photons, repeated for several: each with each signal.", "1"
+    ),
+    attenuation: str | None = ATTENUATION,
+    ambient: str | None = AMBIENT,
+    engine: str | None = of_run("As for mars-lidar simulate.", "exact"),
+    realizations: int | None = of_run("Exposures of each sample.", "1"),
+    seed: int | None = of_run("Seed of the dataset.", "0"),
+    threads: int | None = THREADS,
+    workers: int | None = of_run("Worker processes on this machine (extra cluster)."),
+    scheduler: str | None = of_run("Address of a dask scheduler whose workers see --out (extra cluster)."),
+    out: Path = out_option("The dataset, NAME.zarr."),
+    layout: str | None = of_output(
+        "dense (any Zarr library reads it) or sparse (bins that are not zero, packed: smaller in dim light).", "dense"
+    ),
+    resume: bool = of_output("Continue what was stopped.", default=False),
+    overwrite: bool = of_output("Replace an existing dataset.", default=False),
+    dry_run: bool = of_output("Tell size, time and memory; write nothing.", default=False),
 ) -> None:
     """Simulate a dataset: scenes x systems x levels of light x realizations, into one Zarr store.
 
@@ -199,13 +127,11 @@ def generate(
 
 
 def verify(
-    path: Annotated[Path, typer.Argument(help="A dataset that generate wrote.", show_default=False)],
-    chunks: Annotated[int, typer.Option("--chunks", help="How many, chosen at random.")] = 16,
-    every: Annotated[bool, typer.Option("--all", help="All of them.")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the choice.")] = 0,
-    threads: Annotated[
-        int | None, typer.Option("--threads", help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
-    ] = None,
+    path: Path = argument("A dataset that generate wrote."),
+    chunks: int = option("How many, chosen at random.", default=16),
+    every: bool = option("All of them.", None, "--all", default=False),
+    seed: int = option("Seed of the choice.", default=0),
+    threads: int | None = option("Threads.", "all cores"),
 ) -> None:
     """Simulate random chunks of a dataset again and compare every count; exit code 1 if they differ."""
     with reported():
@@ -251,13 +177,7 @@ def _recipe(
             if rgbd:
                 raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
             scene = {"transient": str(source)}
-    return DatasetRecipe.from_dict({"systems": _default_systems(), **replaced, "scenes": scene})
-
-
-def _default_systems() -> list[Any]:
-    from mars_lidar.cli.system_options import DEFAULT_SYSTEM
-
-    return [DEFAULT_SYSTEM]
+    return DatasetRecipe.from_dict({"systems": [DEFAULT_SYSTEM], **replaced, "scenes": scene})
 
 
 def _systems(files: list[Path] | None, changes: SystemChanges, effects: Effects) -> list[Any] | None:
@@ -276,9 +196,7 @@ def _size(option: str, text: str | None) -> Any:
     if text is None:
         return None
     try:
-        numbers = [int(part) for part in text.split(",")]
+        numbers = [int(part) for part in text.split(",", 1)]
     except ValueError:
-        numbers = []
-    if len(numbers) not in (1, 2):
-        raise ValueError(f"{option} must be one integer or HEIGHT,WIDTH, got {text!r}")
+        raise ValueError(f"{option} must be one integer or HEIGHT,WIDTH, got {text!r}") from None
     return numbers[0] if len(numbers) == 1 else numbers

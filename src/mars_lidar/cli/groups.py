@@ -1,46 +1,82 @@
-"""Options that several commands take, defined once: dataclasses whose fields are options."""
+"""Options of commands: each a default made by `option`, alone or as a field of a group that several commands take."""
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import dataclasses
 import inspect
 from collections.abc import Callable
 from contextvars import ContextVar
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, TypeVar, dataclass_transform, get_args, get_type_hints
 
 import typer
+from typer.models import OptionInfo
 
 from mars_lidar._base import checks
 
+T = TypeVar("T")
 OPTIONS: ContextVar[dict[str, str]] = ContextVar("OPTIONS", default={})  # noqa: B039  # never changed in place
 """Options given on the command line that is run, by the name of their parameter: what an error is to name."""
 
 
+def option(help: str, told: str | None = None, *names: str, default: Any = None, **more: Any) -> Any:
+    """An option, called after its parameter where it is given no `names`; `told`: its default, where that says more."""
+    if told is None and isinstance(default, int | float | str) and default is not False:
+        told = default if isinstance(default, str) else f"{default:g}"
+    text = help if told is None else f"{help} [dim]Default: {told}.[/dim]"
+    return typer.Option(default, *names, help=text, show_default=False, **more)
+
+
+def argument(help: str, default: Any = ...) -> Any:
+    """A positional argument."""
+    return typer.Argument(default, help=help, show_default=False)
+
+
+def panel(name: str) -> Callable[..., Any]:
+    """`option` for those that stand together under a heading of the help."""
+    return partial(option, rich_help_panel=name)
+
+
+def examples(*lines: str) -> str:
+    """The end of a command's help."""
+    return "\n\n".join(("[bold]Examples[/bold]", *lines))
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def group(kind: type[T]) -> type[T]:
+    """A dataclass of options, and of groups of them, that a command takes as one keyword."""
+    for name in inspect.get_annotations(kind):
+        info = getattr(kind, name)
+        if isinstance(info, OptionInfo):
+            setattr(kind, name, dataclasses.field(default=info.default, metadata={"option": info}))
+    return dataclasses.dataclass(frozen=True, kw_only=True)(kind)
+
+
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """`command` for typer: each keyword that is a dataclass of options stands for the options that are its fields.
+    """`command` for typer: each keyword that is a group stands for the options that are its fields.
 
     ``def compare(*, instrument: SystemOptions, ...)`` has an option for each field of `SystemOptions`, at that place,
-    and is called with an instance of it. A field may be such a dataclass itself. Integers may be written 1e6.
+    and is called with an instance of it. Integers may be written 1e6.
     """
-    hints = get_type_hints(command, include_extras=True)
+    hints = get_type_hints(command)
     parameters: list[inspect.Parameter] = []
     groups: dict[str, type] = {}
     for name, parameter in inspect.signature(command).parameters.items():
         kind = hints[name]
-        if _is_group(kind):
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
             groups[name] = kind
             parameters += _options(kind)
         else:
-            parameters.append(parameter.replace(annotation=kind))
-    for parameter in parameters:
-        _read_whole_numbers(parameter.annotation)
+            parameters.append(_declared(name, kind, parameter.default))
 
     @wraps(command)
     def run(**given: Any) -> None:
-        OPTIONS.set({p.name: _option_name(p) for p in parameters if given[p.name] not in (p.default, None, False, [])})
-        _refuse_empty({_option_name(p): given[p.name] for p in parameters})
+        said = [p for p in parameters if given[p.name] not in (p.default.default, None, False, [])]
+        OPTIONS.set({p.name: _shown(p) for p in said})
+        _refuse_empty({_shown(p): given[p.name] for p in parameters})
         built = {name: _taken(kind, given) for name, kind in groups.items()}
         command(**given, **built)
 
@@ -50,6 +86,32 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+def _declared(name: str, kind: Any, info: Any) -> inspect.Parameter:
+    """What typer reads of an option or argument: with its name, and a reader of integers."""
+    info = copy.copy(info)
+    if isinstance(info, OptionInfo):
+        info.param_decls = info.param_decls or (f"--{name.replace('_', '-')}",)
+    if int in (get_args(kind) or (kind,)) and info.parser is None:
+        info.parser, info.metavar = partial(_whole, low=info.min, high=info.max), info.metavar or "INTEGER"
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=info, annotation=kind)
+
+
+def _options(group: Any) -> list[inspect.Parameter]:
+    """An option for each field, groups among them in their place."""
+    hints = get_type_hints(group)
+    found: list[inspect.Parameter] = []
+    for field in dataclasses.fields(group):
+        kind = hints[field.name]
+        told = field.metadata.get("option")
+        found += _options(kind) if told is None else [_declared(field.name, kind, told)]
+    return found
+
+
+def _shown(parameter: inspect.Parameter) -> str:
+    names = parameter.default.param_decls
+    return str(max(names, key=len)).partition("/")[0] if names else parameter.name.upper()
+
+
 def _refuse_empty(given: dict[str, Any]) -> None:
     """A shell makes an empty text of a variable that is not set; as a path that is the folder one is in."""
     for option, value in given.items():
@@ -57,23 +119,13 @@ def _refuse_empty(given: dict[str, Any]) -> None:
             raise typer.BadParameter("it is empty, or the folder that this runs in.", param_hint=option)
 
 
-def _option_name(parameter: inspect.Parameter) -> str:
-    info = parameter.annotation.__metadata__[0]
-    names = [name for name in (info.default, *(info.param_decls or ())) if str(name).startswith("-")]
-    return str(max(names, key=len)).partition("/")[0] if names else parameter.name.upper()
-
-
-def _read_whole_numbers(annotation: Any) -> None:
-    kinds, info = get_args(annotation.__origin__) or (annotation.__origin__,), annotation.__metadata__[0]
-    if int in kinds and info.parser is None:
-        info.parser, info.metavar = partial(_whole, low=info.min, high=info.max), info.metavar or "INTEGER"
-
-
 def _whole(text: str, low: float | None, high: float | None) -> int:
+    number: Any = None
     try:
         number = int(text)
     except ValueError:
-        number = checks.whole(_number(text))
+        with contextlib.suppress(ValueError):
+            number = checks.whole(float(text))
     if not isinstance(number, int):
         raise typer.BadParameter(f"{text!r} is not an integer.")
     if (low is not None and number < low) or (high is not None and number > high):
@@ -82,37 +134,12 @@ def _whole(text: str, low: float | None, high: float | None) -> int:
     return number
 
 
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
-
-
-def _is_group(kind: Any) -> bool:
-    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
-
-
-def _options(group: type) -> list[inspect.Parameter]:
-    """An option for each field, groups among them in their place."""
-    hints = get_type_hints(group, include_extras=True)
-    found: list[inspect.Parameter] = []
-    for field in dataclasses.fields(group):
-        kind = hints[field.name]
-        if _is_group(kind):
-            found += _options(kind)
-            continue
-        found.append(
-            inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=kind)
-        )
-    return found
-
-
-def _taken(group: type, given: dict[str, Any]) -> Any:
+def _taken(group: Any, given: dict[str, Any]) -> Any:
     """An instance of the group, of the options that are its own, which are taken out of what is given."""
-    hints = get_type_hints(group, include_extras=True)
-    values = {
-        field.name: _taken(hints[field.name], given) if _is_group(hints[field.name]) else given.pop(field.name)
-        for field in dataclasses.fields(group)
-    }
-    return group(**values)
+    hints = get_type_hints(group)
+    return group(
+        **{
+            field.name: given.pop(field.name) if field.metadata else _taken(hints[field.name], given)
+            for field in dataclasses.fields(group)
+        }
+    )

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from mars_lidar._base import manifest
+from mars_lidar._base.files import size_on_disk
 from mars_lidar._version import other_version
-from mars_lidar.cli.console import check_picture, reported, save_picture, table
+from mars_lidar.cli.console import check_picture, reported, save_picture, table, two_integers
 from mars_lidar.cli.foreign import ForeignOptions, foreign_rows, is_foreign
-from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.groups import argument, option
+from mars_lidar.cli.options import out as out_option
 
 if TYPE_CHECKING:
     from mars_lidar.instrument.detector import Detector
@@ -20,17 +22,8 @@ if TYPE_CHECKING:
 
 
 def info(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            help="A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of others.",
-            show_default=False,
-        ),
-    ],
-    verify: Annotated[
-        bool,
-        typer.Option("--verify", help="Simulate again and compare every count; exit code 1 if they differ."),
-    ] = False,
+    file: Path = argument("A cube: .zarr (also a URL), .h5, .hdf5, .npz, .mat or .ptu; a dataset; a file of others."),
+    verify: bool = option("Simulate again and compare every count; exit code 1 if they differ.", default=False),
 ) -> None:
     """Say what is in a cube or a dataset: system, flux, engine, size, whether it is complete, how to open it."""
     from mars_lidar.io import IncompleteFileError, load
@@ -72,33 +65,19 @@ def info(
                 raise typer.Exit(FAILED)
 
 
-@grouped
 def view(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            help="A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of others: also .npy, .tif, .csv.",
-            show_default=False,
-        ),
-    ],
+    file: Path = argument(
+        "A cube: .zarr, .h5, .hdf5, .npz, .mat, .ptu; a dataset; histograms of others: also .npy, .tif, .csv."
+    ),
     *,
     foreign: ForeignOptions,
-    out: Annotated[Path, typer.Option("-o", "--out", help="The picture: .png, .pdf or .svg.", show_default=False)],
-    pixel: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--pixel",
-            metavar="Y,X",
-            help="Pixel whose histogram is drawn; up to 6 times. "
-            "[dim]Default: a bright, a dim and an edge pixel.[/dim]",
-        ),
-    ] = None,
-    realization: Annotated[int, typer.Option("--realization", help="Which exposure, counted from 0 in this file.")] = 0,
-    sample: Annotated[
-        int | None,
-        typer.Option("--sample", help="Of a dataset: which sample. [dim]Default: 0.[/dim]", show_default=False),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
+    out: Path = out_option("The picture: .png, .pdf or .svg.", panel=None),
+    pixel: list[str] | None = option(
+        "Pixel whose histogram is drawn; up to 6 times.", "a bright, a dim and an edge pixel", metavar="Y,X"
+    ),
+    realization: int = option("Which exposure, counted from 0 in this file.", default=0),
+    sample: int | None = option("Of a dataset: which sample.", "0"),
+    overwrite: bool = option("Replace an existing picture.", default=False),
 ) -> None:
     """Draw depth, reflectivity, total counts, peak-bin depth, and the histograms of a few pixels.
 
@@ -107,7 +86,7 @@ def view(
     """
     with reported():
         check_picture(out, overwrite)
-        pixels = None if not pixel else [parsed_pixel(text) for text in pixel]
+        pixels = None if not pixel else [two_integers("--pixel", text) for text in pixel]
         with opened(file, sample, foreign) as cube:
             from mars_lidar.plot import overview
 
@@ -127,15 +106,6 @@ def opened(file: Path, sample: int | None, foreign: ForeignOptions) -> Cube:
     return foreign.opened(file)
 
 
-def parsed_pixel(text: str) -> tuple[int, int]:
-    """The (y, x) of an option ``--pixel Y,X``."""
-    try:
-        y, x = (int(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"--pixel must be two integers Y,X (row, column), got {text!r}") from None
-    return y, x
-
-
 def _rows(cube: Cube) -> list[tuple[str, str]]:
     system, recipe = cube.system, cube.recipe
     count, height, width, bins = cube.shape
@@ -144,7 +114,7 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
         complete += f"; {manifest.told(cube.path)}"
     if cube.progress:
         complete += f"; {cube.progress}"
-    stored = "elsewhere" if cube.url else f"{_on_disk(cube) / 1e6:,.4g} MB on disk"
+    stored = "elsewhere" if cube.path is None else f"{size_on_disk(cube.path) / 1e6:,.4g} MB on disk"
     rows = [
         ("file", f"{cube.url or cube.path} (mars-lidar {cube.version})"),
         ("complete", complete),
@@ -218,15 +188,6 @@ def _gate(detector: Detector) -> list[tuple[str, str]]:
 def _effects(detector: Detector) -> list[tuple[str, str]]:
     told = [f"{name} {_short(getattr(detector, name))}" for name in detector.effects]
     return [("effects", ", ".join(told))] if told else []
-
-
-def _on_disk(cube: Cube) -> int:
-    path = cube.path
-    if path is None:
-        return 0
-    if path.is_file():
-        return path.stat().st_size
-    return sum(part.stat().st_size for part in path.rglob("*") if part.is_file())
 
 
 def _short(value: Any) -> str:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from mars_lidar.cli.console import reported, table
+from mars_lidar.cli.console import refuse_existing, reported, table
+from mars_lidar.cli.groups import argument, option
+from mars_lidar.cli.options import out as out_option
 from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.instruments import INSTRUMENTS, sourced
 
@@ -84,10 +83,8 @@ def of_instrument(name: str) -> str:
 
 
 def schema(
-    file: Annotated[str, typer.Argument(help="Of which file: scene, recipe or system.")] = "recipe",
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="A .json file, else standard output.", show_default=False)
-    ] = None,
+    file: str = argument("Of which file: scene, recipe or system. [dim]Default: recipe.[/dim]", "recipe"),
+    out: Path | None = out_option("A .json file, else standard output.", None, panel=None),
 ) -> None:
     """Write the JSON Schema of a scene file, a recipe or a system file, with which editors complete and check keys.
 
@@ -105,15 +102,10 @@ def schema(
 
 
 def init(
-    file: Annotated[Path, typer.Argument(help="Where to write it: .yaml or .yml.")] = _FILE,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="The same, as with the other commands.", show_default=False)
-    ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option("--preset", help=f"An instrument: {', '.join(INSTRUMENTS)}.", show_default=False),
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    file: Path = argument("Where to write it: .yaml or .yml. [dim]Default: system.yaml.[/dim]", _FILE),
+    out: Path | None = out_option("The same, as with the other commands.", None, panel=None),
+    preset: str | None = option(f"An instrument: {', '.join(INSTRUMENTS)}."),
+    overwrite: bool = option("Replace an existing file.", default=False),
 ) -> None:
     """Write a commented YAML file that describes a system: laser, detector, histogram.
 
@@ -126,7 +118,6 @@ def init(
             file = out
         if file.suffix not in (".yaml", ".yml"):
             raise ValueError(f"FILE must end in .yaml or .yml, got {str(file)!r}")
-        if file.exists() and not overwrite:
-            raise FileExistsError(f"{file} exists already; choose another name or give --overwrite")
+        refuse_existing(file, overwrite)
         file.write_text(commented(file) if preset is None else of_instrument(preset))
         table([("wrote", str(file))])

@@ -3,77 +3,51 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from mars_lidar._base import checks
-from mars_lidar.cli.console import FAILED, check_picture, reported, save_picture, table
+from mars_lidar.cli.console import FAILED, check_picture, refuse_existing, reported, save_picture, table
 from mars_lidar.cli.effect_options import StreamEffects
+from mars_lidar.cli.groups import argument, examples
 from mars_lidar.cli.measured_tables import clock_rows, interval_rows, light_rows
-from mars_lidar.cli.options import _OUTPUT, _option
-from mars_lidar.cli.stream_options import STREAM, DeadTimeNs, FitOptions, StreamOptions
+from mars_lidar.cli.options import of_output
+from mars_lidar.cli.options import out as out_option
+from mars_lidar.cli.stream_options import DEAD_TIME_NS, FitOptions, StreamOptions, of_stream
 from mars_lidar.instrument.system import MAX_CYCLES
 
 _RECIPE = "docs/calibration.md has the whole recipe."
-INSPECT_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar inspect lab.ptu -o lab.png",
-        "mars-lidar inspect photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048",
-        _RECIPE,
-    )
+INSPECT_EPILOG = examples(
+    "mars-lidar inspect lab.ptu -o lab.png",
+    "mars-lidar inspect photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048",
+    _RECIPE,
 )
-CALIBRATE_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar calibrate lab.ptu --dead-time-ns 85 -o lab.yaml",
-        "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008",
-        "mars-lidar calibrate lab.ptu --returns 2 --hold-off-ns 120",
-        "mars-lidar calibrate lab.ptu --dead-time-ns 85 --pulse-sigma-ns 0.5 --jitter-fwhm-ns 0.1",
-        _RECIPE,
-    )
+CALIBRATE_EPILOG = examples(
+    "mars-lidar calibrate lab.ptu --dead-time-ns 85 -o lab.yaml",
+    "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008",
+    "mars-lidar calibrate lab.ptu --returns 2 --hold-off-ns 120",
+    "mars-lidar calibrate lab.ptu --dead-time-ns 85 --pulse-sigma-ns 0.5 --jitter-fwhm-ns 0.1",
+    _RECIPE,
 )
-VALIDATE_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar validate lab.ptu --cycles 9975 --dead-time-ns 85 -o validation.png",
-        "mars-lidar validate decay.ptu --cycles 1000 --free",
-        "mars-lidar validate lab.ptu --cycles 9975 --system lab.yaml --afterpulse-probability 0.01 "
-        "--afterpulse-delay-ns 50",
-        "Exit code 1 where the model does not fit the stream. " + _RECIPE,
-    )
+VALIDATE_EPILOG = examples(
+    "mars-lidar validate lab.ptu --cycles 9975 --dead-time-ns 85 -o validation.png",
+    "mars-lidar validate decay.ptu --cycles 1000 --free",
+    "mars-lidar validate lab.ptu --cycles 9975 --system lab.yaml --afterpulse-probability 0.01 "
+    "--afterpulse-delay-ns 50",
+    "Exit code 1 where the model does not fit the stream. " + _RECIPE,
 )
-
-Stream = Annotated[
-    Path,
-    typer.Argument(
-        help="Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat or .npz.", show_default=False
-    ),
-]
-Cycles = Annotated[
-    int,
-    _option("--cycles", panel=STREAM, help="Laser periods of a realization: the stream is cut into such pieces."),
-]
-Simulated = Annotated[
-    int,
-    _option("--simulated", panel=STREAM, help="Realizations to simulate for what no law predicts of a detector."),
-]
-Picture = Annotated[Path | None, _option("-o", "--out", panel=_OUTPUT, help="A picture: .png, .pdf or .svg.")]
-SystemOut = Annotated[
-    Path | None,
-    _option("-o", "--out", panel=_OUTPUT, help="The calibrated system, .yaml or .json, to simulate with."),
-]
-Overwrite = Annotated[bool, _option("--overwrite", panel=_OUTPUT, help="Replace an existing file.")]
+_STREAM = argument("Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat or .npz.")
+_PICTURE = out_option("A picture: .png, .pdf or .svg.", None)
+_OVERWRITE = of_output("Replace an existing file.", default=False)
 
 
 def inspect(
-    stream: Stream,
+    stream: Path = _STREAM,
     *,
     source: StreamOptions,
-    dead_time_ns: DeadTimeNs = None,
-    out: Picture = None,
-    overwrite: Overwrite = False,
+    dead_time_ns: float | None = DEAD_TIME_NS,
+    out: Path | None = _PICTURE,
+    overwrite: bool = _OVERWRITE,
 ) -> None:
     """Look at a photon stream: rates, intervals, dead time, recovery after a photon, and what does not fit.
 
@@ -114,22 +88,16 @@ def inspect(
 
 
 def calibrate(
-    stream: Stream,
+    stream: Path = _STREAM,
     *,
     source: StreamOptions,
     light: FitOptions,
     effects: StreamEffects,
-    out: SystemOut = None,
-    cycles: Annotated[
-        int | None,
-        _option(
-            "--cycles",
-            panel=_OUTPUT,
-            help="Laser periods of an exposure of the calibrated system.",
-            default="those of the stream, at most 1e8",
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
+    out: Path | None = out_option("The calibrated system, .yaml or .json, to simulate with.", None),
+    cycles: int | None = of_output(
+        "Laser periods of an exposure of the calibrated system.", "those of the stream, at most 1e8"
+    ),
+    overwrite: bool = _OVERWRITE,
 ) -> None:
     """Signal, background and delay of a photon stream, by maximum likelihood, with standard errors."""
     with reported():
@@ -157,15 +125,15 @@ def calibrate(
 
 
 def validate(
-    stream: Stream,
+    stream: Path = _STREAM,
     *,
-    cycles: Cycles,
+    cycles: int = of_stream("Laser periods of a realization: the stream is cut into such pieces.", default=...),
     source: StreamOptions,
     light: FitOptions,
     effects: StreamEffects,
-    simulated: Simulated = 4000,
-    out: Picture = None,
-    overwrite: Overwrite = False,
+    simulated: int = of_stream("Realizations to simulate for what no law predicts of a detector.", default=4000),
+    out: Path | None = _PICTURE,
+    overwrite: bool = _OVERWRITE,
 ) -> None:
     """Does the model predict the stream? Calibrates, cuts into realizations, compares counts, shape, joint statistics.
 
@@ -225,5 +193,4 @@ def _check_system_out(out: Path | None, free: bool, overwrite: bool) -> None:
         raise ValueError("a free shape is no system: leave out --out or --free")
     if out.suffix not in (".yaml", ".yml", ".json"):
         raise ValueError(f"--out must end in .yaml, .yml or .json, got {str(out)!r}")
-    if out.exists() and not overwrite:
-        raise FileExistsError(f"{out} exists already; choose another name or give --overwrite")
+    refuse_existing(out, overwrite)

@@ -2,48 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from mars_lidar.cli.effect_options import read_array
-from mars_lidar.cli.options import _SYSTEM, _option
+from mars_lidar.cli.groups import group
+from mars_lidar.cli.options import of_system
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 
-Sigma = Annotated[
-    float | None,
-    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse: standard deviation, ns.", default="0.5"),
-]
-FittedSigma = Annotated[
-    float | None,
-    _option("--pulse-sigma-ns", panel=_SYSTEM, help="Gaussian pulse: standard deviation, ns.", default="fitted"),
-]
+_SIGMA = "Gaussian pulse: standard deviation, ns."
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class PulseOptions:
     """A Gaussian pulse or a measured one; None: not given."""
 
-    pulse_sigma_ns: Sigma = None
-    pulse_fwhm_ns: Annotated[
-        float | None,
-        _option("--pulse-fwhm-ns", panel=_SYSTEM, help="Gaussian pulse: full width at half maximum, ns."),
-    ] = None
-    pulse_file: Annotated[
-        Path | None, _option("--pulse-file", panel=_SYSTEM, help="Measured impulse response: 1-D .npy array.")
-    ] = None
-    pulse_bin_ns: Annotated[
-        float | None, _option("--pulse-bin-ns", panel=_SYSTEM, help="Sample width of --pulse-file, ns.")
-    ] = None
-    pulse_origin: Annotated[
-        str | None,
-        _option(
-            "--pulse-origin",
-            panel=_SYSTEM,
-            help="What a delay refers to in --pulse-file: peak, centroid or first.",
-            default="peak",
-        ),
-    ] = None
+    pulse_sigma_ns: float | None = of_system(_SIGMA, "0.5")
+    pulse_fwhm_ns: float | None = of_system("Gaussian pulse: full width at half maximum, ns.")
+    pulse_file: Path | None = of_system("Measured impulse response: 1-D .npy array.")
+    pulse_bin_ns: float | None = of_system("Sample width of --pulse-file, ns.")
+    pulse_origin: str | None = of_system("What a delay refers to in --pulse-file: peak, centroid or first.", "peak")
 
     def build(self) -> Pulse | None:
         """The pulse that is meant, or None where none is given."""
@@ -68,11 +45,11 @@ class PulseOptions:
         return _measured(self.pulse_file, self.pulse_bin_ns, self.pulse_origin or "peak")
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class FittedPulseOptions(PulseOptions):
     """Options of the pulse of a stream: a Gaussian is fitted if none is given."""
 
-    pulse_sigma_ns: FittedSigma = None
+    pulse_sigma_ns: float | None = of_system(_SIGMA, "fitted")
 
 
 def _measured(file: Path, bin_ns: float, origin: str) -> SampledPulse:

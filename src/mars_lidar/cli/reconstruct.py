@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
-import typer
 
+from mars_lidar._base import checks
+from mars_lidar._base.files import check_target
 from mars_lidar._base.progress import span
-from mars_lidar.cli.console import progress_bar, reported, save_picture, say, table
+from mars_lidar.cli.console import (
+    grid,
+    progress_bar,
+    refuse_existing,
+    reported,
+    save_picture,
+    say,
+    screen,
+    table,
+)
 from mars_lidar.cli.foreign import ForeignOptions
-from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.groups import argument, examples, option
+from mars_lidar.cli.options import out as out_option
 from mars_lidar.reconstruct import METHODS
 
 if TYPE_CHECKING:
@@ -22,92 +32,54 @@ if TYPE_CHECKING:
     from mars_lidar.reconstruct import Reconstruction
     from mars_lidar.reconstruct.stored import Timed
 
-RECONSTRUCT_EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar reconstruct room.zarr -o maps.zarr",
-        "mars-lidar reconstruct room.zarr --method all -o maps.h5",
-        "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
-        "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
-        "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",
-        "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
-        f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
-    )
+RECONSTRUCT_EPILOG = examples(
+    "mars-lidar reconstruct room.zarr -o maps.zarr",
+    "mars-lidar reconstruct room.zarr --method all -o maps.h5",
+    "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
+    "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
+    "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",
+    "mars-lidar reconstruct room.zarr --method maximum_likelihood,peak --no-picture -o maps.npz",
+    f"Methods: {', '.join(METHODS)}. docs/reconstruction.md says what each assumes, and for which detectors.",
 )
 
 
-@grouped
 def reconstruct(
-    cube: Annotated[
-        Path,
-        typer.Argument(
-            help="A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of others: also .npy, .tif, .csv.",
-            show_default=False,
-        ),
-    ],
+    cube: Path = argument(
+        "A cube: .zarr, .h5, .hdf5, .npz, .mat or .ptu; or histograms of others: also .npy, .tif, .csv."
+    ),
     *,
     foreign: ForeignOptions,
-    out: Annotated[Path, typer.Option("-o", "--out", help="The maps: .zarr, .h5, .hdf5 or .npz.", show_default=False)],
-    method: Annotated[
-        str,
-        typer.Option("--method", help="One or more methods, separated by commas, or all that suit the detector."),
-    ] = "maximum_likelihood",
-    level: Annotated[
-        float | None,
-        typer.Option(
-            "--level",
-            help="Signal photons per period of a surface of reflectivity 1. "
-            "[dim]Default: that of the cube's scene, or mean reflectivity 1.[/dim]",
-            show_default=False,
-        ),
-    ] = None,
-    attenuation: Annotated[
-        str | None,
-        typer.Option(
-            "--attenuation",
-            help="none or inverse_square: reflectivity is signal times depth squared. "
-            "[dim]Default: as the cube was simulated.[/dim]",
-            show_default=False,
-        ),
-    ] = None,
-    returns: Annotated[
-        int,
-        typer.Option(
-            "--returns",
-            min=1,
-            max=8,
-            help="Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood.",
-        ),
-    ] = 1,
-    neighbourhood: Annotated[
-        int | None,
-        typer.Option(
-            "--neighbourhood",
-            min=1,
-            max=12,
-            help="For dim cubes: take neighbours within up to so many pixels together, on a plane; such as 4. "
-            "[dim]Default: each pixel alone.[/dim]",
-            show_default=False,
-        ),
-    ] = None,
-    threads: Annotated[
-        int | None, typer.Option("--threads", min=1, help="Threads. [dim]Default: all cores.[/dim]", show_default=False)
-    ] = None,
-    cloud: Annotated[
-        Path | None,
-        typer.Option(
-            "--cloud",
-            help="Points of the first method and exposure, .ply, with reflectivity (of --returns: signal, every "
-            "return a point) and standard error of depth.",
-            show_default=False,
-        ),
-    ] = None,
-    focal_px: Annotated[
-        float | None,
-        typer.Option("--focal-px", help="Focal length of the image in pixels, for --cloud.", show_default=False),
-    ] = None,
-    picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Draw the maps beside OUT, as .png.")] = True,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
+    out: Path = out_option("The maps: .zarr, .h5, .hdf5 or .npz.", panel=None),
+    method: str = option(
+        "One or more methods, separated by commas, or all that suit the detector.",
+        default="maximum_likelihood",
+    ),
+    level: float | None = option(
+        "Signal photons per period of a surface of reflectivity 1.", "that of the cube's scene, or mean reflectivity 1"
+    ),
+    attenuation: str | None = option(
+        "none or inverse_square: reflectivity is signal times depth squared.", "as the cube was simulated"
+    ),
+    returns: int = option(
+        "Returns to look for in each pixel, each tested (glass, foliage). Needs maximum_likelihood.",
+        default=1,
+        min=1,
+        max=8,
+    ),
+    neighbourhood: int | None = option(
+        "For dim cubes: take neighbours within up to so many pixels together, on a plane; such as 4.",
+        "each pixel alone",
+        min=1,
+        max=12,
+    ),
+    threads: int | None = option("Threads.", "all cores", min=1),
+    cloud: Path | None = option(
+        "Points of the first method and exposure, .ply, with reflectivity (of --returns: signal, every return a point) "
+        "and standard error of depth."
+    ),
+    focal_px: float | None = option("Focal length of the image in pixels, for --cloud."),
+    picture: bool = option("Draw the maps beside OUT, as .png.", "yes", "--picture/--no-picture", default=True),
+    overwrite: bool = option("Replace existing files.", default=False),
 ) -> None:
     """Reconstruct depth and reflectivity of every pixel of a cube, and compare them with the truth where it is known.
 
@@ -115,20 +87,19 @@ def reconstruct(
     """
     with reported():
         began = time.perf_counter()
-        from mars_lidar._base import checks
-        from mars_lidar._base.files import check_target
         from mars_lidar.io.maps import check_maps_output, save_maps
         from mars_lidar.reconstruct.reconstruction import ATTENUATIONS
         from mars_lidar.reconstruct.stored import reconstruct_stored
 
         png = out.with_suffix(".png")
         check_maps_output(out, overwrite=overwrite)
-        if picture and png.exists() and not overwrite:
-            raise FileExistsError(f"{png} exists already; give --overwrite, --no-picture or another --out")
+        refuse_existing(png, overwrite or not picture, "--overwrite, --no-picture or another --out")
         if out.resolve() == cube.resolve():
             raise ValueError(f"--out must not be the cube itself, got {str(out)!r}")
         if (cloud is None) != (focal_px is None):
             raise ValueError("--cloud and --focal-px belong together: points need the camera's focal length")
+        if picture:
+            from mars_lidar.plot.reconstruction import reconstruction
         if cloud is not None:
             check_target(cloud, folder=False, overwrite=overwrite)
         if attenuation is not None:
@@ -153,14 +124,12 @@ def reconstruct(
             if cloud is not None and focal_px is not None:
                 rows.append(("cloud", f"{cloud}, {_save_cloud(cloud, results, focal_px, overwrite):,} points"))
             if picture:
-                _draw(stored, results, png)
+                save_picture(reconstruction(stored, results), png)
                 rows.append(("picture", str(png)))
         table([*rows, ("time", f"{span(time.perf_counter() - began)} in all")])
 
 
 def _methods(text: str, cube: Cube) -> list[str]:
-    from mars_lidar._base import checks
-
     if text == "all":
         names = []
         for name, each in METHODS.items():
@@ -219,26 +188,10 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
         lines.append(line)
     told = ", errors against the cube's own truth" if kinds else ""
     print(f"{realizations} × {height} × {width} pixels{told}")
-    _grid(head, lines)
-
-
-def _grid(head: list[str], lines: list[list[str]]) -> None:
-    if not sys.stdout.isatty():
-        widths = [max(len(row[k]) for row in (head, *lines)) for k in range(len(head))]
-        for row in (head, *lines):
-            first, *rest = (f"{text:>{n}}" for text, n in zip(row, widths, strict=True))
-            print("  ".join([f"{first.strip():<{widths[0]}}", *rest]))
-        return
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    grid = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for k, name in enumerate(head):
-        grid.add_column(name, justify="left" if k == 0 else "right", overflow="fold")
-    for row in lines:
-        grid.add_row(*row)
-    Console(highlight=False).print(grid)
+    shown = grid("", head)
+    for line in lines:
+        shown.add_row(*line)
+    screen().print(shown)
 
 
 def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:
@@ -257,9 +210,3 @@ def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float,
     depth, share = np.where(found.seen, found.depth_m, np.nan)[0], found.reflectivity[0]
     error = None if found.depth_error_m is None else found.depth_error_m[0]
     return save_cloud(path, depth, focal_px, intensity=share, error_m=error, overwrite=overwrite)
-
-
-def _draw(cube: Cube, results: dict[str, Reconstruction], png: Path) -> None:
-    from mars_lidar.plot.reconstruction import reconstruction
-
-    save_picture(reconstruction(cube, results), png)

@@ -6,15 +6,16 @@ import contextlib
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from mars_lidar._base.progress import span
-from mars_lidar.cli import options
-from mars_lidar.cli.console import progress_bar, reported, save_picture, say
+from mars_lidar.cli.console import progress_bar, refuse_existing, reported, save_picture, say
 from mars_lidar.cli.console import table as print_table
 from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.options import _option
-from mars_lidar.cli.scene_options import _SCENE, LightOptions, SceneOptions
+from mars_lidar.cli.groups import examples
+from mars_lidar.cli.options import SEED, THREADS, of_output, of_run
+from mars_lidar.cli.options import out as out_option
+from mars_lidar.cli.scene_options import LightOptions, SceneOptions, of_scene
 from mars_lidar.cli.scene_view import alike, seen
 from mars_lidar.cli.system_options import SystemOptions
 
@@ -25,23 +26,20 @@ if TYPE_CHECKING:
     from mars_lidar.light.flux import Flux
     from mars_lidar.table import Table
 
-EPILOG = "\n\n".join(
-    (
-        "[bold]Examples[/bold]",
-        "mars-lidar simulate --scene room -o room.zarr",
-        "mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr",
-        "mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr",
-        "mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5",
-        "mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr",
-        "mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr",
-        "mars-lidar simulate --transient render.hdf5 --signal 0.5 --sbr 5 -o transient.zarr",
-        "mars-lidar simulate --like render.hdf5 --signal 0.5 --sbr 5 -o capture.hdf5",
-        "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
-        "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
-        "mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr",
-        "S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the pixel. "
-        "Dead time bends histograms where S + B is not small.",
-    )
+EPILOG = examples(
+    "mars-lidar simulate --scene room -o room.zarr",
+    "mars-lidar simulate --scene room --signal 0.1 --sbr 0.2 --dead-time-ns 30 --cycles 5000 -o dim.zarr",
+    "mars-lidar simulate --depth depth.png --image colour.png --realizations 10 --seed 7 -o set.zarr",
+    "mars-lidar simulate --depth art/ --system spad.yaml --attenuation inverse_square -o art.h5",
+    "mars-lidar simulate --scene room --mode gated --gate-start-ns 30 --gate-width-ns 20 -o gated.zarr",
+    "mars-lidar simulate --scene room --engine mars --table room.h5 --cycles 100000 -o long.zarr",
+    "mars-lidar simulate --transient render.hdf5 --signal 0.5 --sbr 5 -o transient.zarr",
+    "mars-lidar simulate --like render.hdf5 --signal 0.5 --sbr 5 -o capture.hdf5",
+    "mars-lidar simulate --scene room --pulse-file irf.npy --pulse-bin-ns 0.008 -o measured.npz",
+    "mars-lidar simulate --scene room --jitter-fwhm-ns 0.1 --electronics-dead-time-ns 100 -o real.zarr",
+    "mars-lidar simulate --scene room --detector excelitas-spcm-aqrh -o module.zarr",
+    "S and B are expected detectable photons per laser period; with --detection-efficiency, photons on the pixel. "
+    "Dead time bends histograms where S + B is not small.",
 )
 
 
@@ -51,28 +49,38 @@ def simulate(
     instrument: SystemOptions,
     effects: Effects,
     light: LightOptions,
-    engine: options.Engine = "exact",
-    table: options.Table = None,
-    count: options.Count = None,
-    interpolation: options.Interpolation = None,
-    table_outside: options.TableOutside = None,
-    realizations: options.Realizations = 1,
-    seed: options.Seed = 0,
-    threads: options.Threads = None,
-    device: options.Device = "cpu",
-    out: options.Out,
-    overwrite: options.Overwrite = False,
-    resume: options.Resume = False,
-    like: Annotated[
-        Path | None,
-        _option(
-            "--like",
-            panel=_SCENE,
-            help="A capture (tal, mitransient, Zaragoza's HDF5): its light, in its bins; to -o of .hdf5 or .h5 a "
-            "capture of the same layout is written.",
-        ),
-    ] = None,
-    picture: options.Picture = True,
+    engine: str = of_run(
+        "exact; feedback (long exposures, at a cost independent of them); auto (the faster of these, pixel by pixel); "
+        "mars (count law x mean histogram); sequential (slow, independent gold standard); renewal, poisson "
+        "(baselines).",
+        default="exact",
+    ),
+    table: Path | None = of_run(
+        "For --engine mars and renewal: a table of this system (mars-lidar table build), or none: every distinct pixel "
+        "is evaluated by itself, some ms each.",
+        "one over the image's range, built and kept in the cache",
+    ),
+    count: str | None = of_run(
+        "For --engine mars: the law of the count: exact, matched (to four cumulants, faster with --table) or gaussian "
+        "(the paper's).",
+        "exact",
+    ),
+    interpolation: str | None = of_run("Of --table: bilinear or nearest.", "bilinear"),
+    table_outside: str | None = of_run(
+        "Of --table, for pixels beyond its range: error, or exact (each is evaluated by itself, some ms).", "error"
+    ),
+    realizations: int = of_run("Independent exposures of the image.", default=1),
+    seed: int = SEED,
+    threads: int | None = THREADS,
+    device: str = of_run("cpu, or cuda: the current GPU, with the same counts.", default="cpu"),
+    out: Path = out_option("The cube: .zarr (any size, written as it is simulated), .h5, .hdf5, .npz, .mat or .ptu."),
+    overwrite: bool = of_output("Replace an existing cube and picture.", default=False),
+    resume: bool = of_output("Continue a .zarr that was interrupted: the same command, the same bits.", default=False),
+    like: Path | None = of_scene(
+        "A capture (tal, mitransient, Zaragoza's HDF5): its light, in its bins; to -o of .hdf5 or .h5 a capture of the "
+        "same layout is written."
+    ),
+    picture: bool = of_output("A PNG overview beside the cube.", "yes", "--picture/--no-picture", default=True),
 ) -> None:
     """Simulate histograms of a scene under dead time, and write the cube with a picture of it.
 
@@ -85,10 +93,9 @@ def simulate(
     with reported(), contextlib.ExitStack() as after:
         began = time.perf_counter()
         png = out.with_suffix(".png")
-        if picture and png.exists() and not overwrite and not resume:
-            raise FileExistsError(f"{png} exists already; give --overwrite, --no-picture or another --out")
-        if out.exists() and not overwrite and not resume:
-            raise FileExistsError(f"{out} exists already; give --overwrite or another --out")
+        kept = not (overwrite or resume)
+        refuse_existing(png, not (picture and kept), "--overwrite, --no-picture or another --out")
+        refuse_existing(out, not kept)
         system, capture = instrument.build(effects), None
         if like is not None:
             capture, system, scene = alike(like, instrument, system, scene)

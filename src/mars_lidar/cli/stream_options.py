@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from mars_lidar.cli import options
-from mars_lidar.cli.console import say
+from mars_lidar.cli.console import say, two_integers
 from mars_lidar.cli.effect_options import StreamEffects
-from mars_lidar.cli.info import parsed_pixel
-from mars_lidar.cli.options import _SYSTEM, _option
+from mars_lidar.cli.groups import group, panel
+from mars_lidar.cli.options import DETECTOR, of_system
 from mars_lidar.cli.pulse_options import FittedPulseOptions
 
 if TYPE_CHECKING:
@@ -20,75 +18,21 @@ if TYPE_CHECKING:
     from mars_lidar.instrument.system import System as SystemObject
     from mars_lidar.light.timestamps import Timestamps
 
-STREAM = "Stream"
-
-Pixel = Annotated[
-    str | None,
-    _option("--pixel", panel=STREAM, metavar="Y,X", help="Pixel (channel c is 0,c).", default="the brightest"),
-]
-PeriodNs = Annotated[
-    float | None, _option("--period-ns", panel=STREAM, help="Laser period, ns, where the file does not tell it.")
-]
-Bins = Annotated[
-    int | None, _option("--bins", panel=STREAM, help="Histogram bins of the period.", default="the file's clock")
-]
-UnitNs = Annotated[float | None, _option("--unit-ns", panel=STREAM, help="Unit of the times in a .mat or .npz, ns.")]
-Variable = Annotated[
-    str | None, _option("--variable", panel=STREAM, help="Variable of a .mat or .npz that holds the times.")
-]
-
-DeadTimeNs = Annotated[
-    float | None,
-    _option(
-        "--dead-time-ns",
-        panel=_SYSTEM,
-        help="Dead time of the pixel, ns.",
-        default="of --system or a simulated stream, else by the edge of the recovery",
-    ),
-]
-HoldOffNs = Annotated[
-    float | None,
-    _option(
-        "--hold-off-ns",
-        panel=_SYSTEM,
-        default="the dead time; with dead electronics the sum of both",
-        help="Leave out this long after each photon, ns: keeps out afterpulses and dead electronics.",
-    ),
-]
-System = Annotated[
-    Path | None,
-    _option(
-        "--system",
-        panel=_SYSTEM,
-        help="YAML or JSON file with pulse and detector; single options replace its values.",
-        default="that of a simulated stream",
-    ),
-]
-Mode = Annotated[
-    str | None,
-    _option(
-        "--mode",
-        panel=_SYSTEM,
-        default="nonparalyzable",
-        help="nonparalyzable, or paralyzable: every arrival restarts the dead time.",
-    ),
-]
-Free = Annotated[
-    bool,
-    _option("--free", panel=_SYSTEM, help="Any shape of light, bin by bin: fluorescence, haze, many surfaces."),
-]
-Returns = Annotated[int, _option("--returns", panel=_SYSTEM, help="Returns (surfaces) in the pixel.", default="1")]
+of_stream = panel("Stream")
+DEAD_TIME_NS = of_system(
+    "Dead time of the pixel, ns.", "of --system or a simulated stream, else by the edge of the recovery"
+)
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class StreamOptions:
     """One pixel of a photon stream; None: as the file tells it."""
 
-    pixel: Pixel = None
-    period_ns: PeriodNs = None
-    bins: Bins = None
-    unit_ns: UnitNs = None
-    variable: Variable = None
+    pixel: str | None = of_stream("Pixel (channel c is 0,c).", "the brightest", metavar="Y,X")
+    period_ns: float | None = of_stream("Laser period, ns, where the file does not tell it.")
+    bins: int | None = of_stream("Histogram bins of the period.", "the file's clock")
+    unit_ns: float | None = of_stream("Unit of the times in a .mat or .npz, ns.")
+    variable: str | None = of_stream("Variable of a .mat or .npz that holds the times.")
 
     def arrivals(self, stream: Path, dead_time_ns: float | None) -> list[tuple[str, str]]:
         """The rows of a recording without a laser."""
@@ -102,7 +46,7 @@ class StreamOptions:
         channels, counts = np.unique(found.detector[found.detector >= 0], return_counts=True)
         if not channels.size:
             raise ValueError(f"{stream} holds no photons")
-        y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else parsed_pixel(self.pixel)
+        y, x = (0, int(channels[counts.argmax()])) if self.pixel is None else two_integers("--pixel", self.pixel)
         if y != 0 or x not in channels:
             raise ValueError(f"--pixel must be 0,C with a channel C of {', '.join(map(str, channels))}, got ({y}, {x})")
         times = found.clock[found.detector == x].astype(np.float64) * found.clock_ns
@@ -115,7 +59,7 @@ class StreamOptions:
 
         from mars_lidar.light.timestamps import Timestamps as Times
 
-        asked = None if self.pixel is None else parsed_pixel(self.pixel)
+        asked = None if self.pixel is None else two_integers("--pixel", self.pixel)
         times = Times.load(
             stream, period_ns=self.period_ns, bins=self.bins, unit_ns=self.unit_ns, variable=self.variable
         )
@@ -134,18 +78,25 @@ class StreamOptions:
         return one, rows
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class FitOptions:
     """What is known of pulse and detector, and what light is fitted; None: of the file, or found from the stream."""
 
-    system: System = None
-    detector: options.DetectorPreset = None
-    dead_time_ns: DeadTimeNs = None
-    mode: Mode = None
-    hold_off_ns: HoldOffNs = None
-    pulse: FittedPulseOptions = field(default_factory=FittedPulseOptions)
-    free: Free = False
-    returns: Returns = 1
+    system: Path | None = of_system(
+        "YAML or JSON file with pulse and detector; single options replace its values.", "that of a simulated stream"
+    )
+    detector: str | None = DETECTOR
+    dead_time_ns: float | None = DEAD_TIME_NS
+    mode: str | None = of_system(
+        "nonparalyzable, or paralyzable: every arrival restarts the dead time.", "nonparalyzable"
+    )
+    hold_off_ns: float | None = of_system(
+        "Leave out this long after each photon, ns: keeps out afterpulses and dead electronics.",
+        "the dead time; with dead electronics the sum of both",
+    )
+    pulse: FittedPulseOptions = FittedPulseOptions()
+    free: bool = of_system("Any shape of light, bin by bin: fluorescence, haze, many surfaces.", default=False)
+    returns: int = of_system("Returns (surfaces) in the pixel.", default=1)
 
     def _told(self, times: Timestamps, given: dict[str, Any], pulse: Pulse | None) -> SystemObject | None:
         """The system that file, stream and options tell, of the light's own pulse; None where they tell no detector.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mars_lidar.cli import options
 from mars_lidar.cli.effect_options import Effects
+from mars_lidar.cli.groups import group
+from mars_lidar.cli.options import DETECTOR, SYSTEM, of_system
 from mars_lidar.cli.pulse_options import PulseOptions
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import Detector, System
@@ -23,22 +23,28 @@ DEFAULT_SYSTEM = System(
 _DETECTOR = ("dead_time_ns", "mode", "gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class SystemChanges:
     """Single values of a system, in place of those of a file or of the default one; None: as there."""
 
-    period_ns: options.PeriodNs = None
-    detector: options.DetectorPreset = None
-    dead_time_ns: options.DeadTimeNs = None
-    mode: options.Mode = None
-    gate_start_ns: options.GateStartNs = None
-    gate_width_ns: options.GateWidthNs = None
-    gate_step_ns: options.GateStepNs = None
-    gate_cycles: options.GateCycles = None
-    cycles: options.Cycles = None
-    bins: options.Bins = None
-    pulse: PulseOptions = field(default_factory=PulseOptions)
-    start: options.Start = None
+    period_ns: float | None = of_system("Laser period, ns.", "133.33, 7.5 MHz")
+    detector: str | None = DETECTOR
+    dead_time_ns: float | None = of_system("Dead time after a registration, ns.", "75")
+    mode: str | None = of_system(
+        "When the pixel registers: nonparalyzable, paralyzable (every arrival restarts the dead time), synchronous "
+        "(armed at each pulse, first photon only) or gated (with --gate-start-ns, --gate-width-ns).",
+        "nonparalyzable",
+    )
+    gate_start_ns: float | None = of_system("Mode gated: opening of the gate in each period, ns.")
+    gate_width_ns: float | None = of_system("Mode gated: width of the gate, at most the period, ns.")
+    gate_step_ns: float | None = of_system("Mode gated: the opening advances by this, ns ...", "0")
+    gate_cycles: int | None = of_system("... every so many periods.", "1")
+    cycles: int | None = of_system("Laser periods per exposure.", "1000")
+    bins: int | None = of_system("Histogram bins per period.", "1024")
+    pulse: PulseOptions = PulseOptions()
+    start: str | None = of_system(
+        "Pixel at the start of an exposure: armed (ready) or stationary (warmed up).", "armed"
+    )
 
     def of(self, file: Path | None, effects: Effects | None = None) -> System:
         """The system of a file, or the default one, so changed."""
@@ -55,12 +61,12 @@ class SystemChanges:
         return base.replace(**{name: value for name, value in changes.items() if value is not None})
 
 
-@dataclass(frozen=True, kw_only=True)
+@group
 class SystemOptions:
     """A system: a file or the default one, and single options in place of its values."""
 
-    system: options.System = None
-    changes: SystemChanges = field(default_factory=SystemChanges)
+    system: Path | None = SYSTEM
+    changes: SystemChanges = SystemChanges()
 
     def build(self, effects: Effects | None = None) -> System:
         """The system that is meant."""

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from mars_lidar._base.progress import span
-from mars_lidar.cli import options
-from mars_lidar.cli.console import progress_bar, reported, table
+from mars_lidar.cli.console import progress_bar, refuse_existing, reported, table
 from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.groups import argument, grouped, option, panel
+from mars_lidar.cli.options import THREADS, of_output
+from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.system_options import SystemOptions
 
 if TYPE_CHECKING:
@@ -20,66 +21,10 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Lookup tables over (S, B).")
 
-_GRID = "Grid"
+_of_grid = panel("Grid")
 _ALLOWED = 0.05  # standard deviations of the mean count, up to which a table is told to be good
 _DEPTHS = 1024  # values of a delay axis, where there had to be one: the paper's 108 GB
 _PAPER_BYTES = "105 MB, 108 GB with delays"
-
-Signal = Annotated[
-    str,
-    typer.Option(
-        "--signal",
-        metavar="LOW,HIGH,POINTS",
-        rich_help_panel=_GRID,
-        show_default=False,
-        help="Signal axis, photons per period, log-spaced; 0 is added. [dim]Default: 0.01,10,256.[/dim]",
-    ),
-]
-Background = Annotated[
-    str,
-    typer.Option(
-        "--background",
-        metavar="LOW,HIGH,POINTS",
-        rich_help_panel=_GRID,
-        show_default=False,
-        help="Background axis, likewise. [dim]Default: 0.01,10,100.[/dim]",
-    ),
-]
-Method = Annotated[
-    str,
-    typer.Option(
-        "--method",
-        rich_help_panel=_GRID,
-        show_default=False,
-        help="exposure (exact, start-up included) or mars (the paper's). [dim]Default: exposure.[/dim]",
-    ),
-]
-Rearm = Annotated[
-    str,
-    typer.Option(
-        "--rearm",
-        rich_help_panel=_GRID,
-        show_default=False,
-        help="For mars: re-arming at the centre or the edge of a bin. [dim]Default: centre.[/dim]",
-    ),
-]
-Refine = Annotated[
-    float | None,
-    typer.Option(
-        "--refine",
-        rich_help_panel=_GRID,
-        show_default=False,
-        help="Insert points until the error between them, in total variation, is below this.",
-    ),
-]
-CheckLaw = Annotated[
-    bool,
-    typer.Option("--check-law", rich_help_panel=_GRID, help="Compare count laws with exact ones at the end."),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option("-o", "--out", show_default=False, help="The table: .h5 or .hdf5. [dim]Default: the cache.[/dim]"),
-]
 
 
 @app.command()
@@ -88,21 +33,27 @@ def build(
     *,
     instrument: SystemOptions,
     effects: Effects,
-    signal: Signal = "0.01,10,256",
-    background: Background = "0.01,10,100",
-    method: Method = "exposure",
-    rearm: Rearm = "centre",
-    refine: Refine = None,
-    check_law: CheckLaw = False,
-    threads: options.Threads = None,
-    out: Out = None,
-    overwrite: options.Overwrite = False,
+    signal: str = _of_grid(
+        "Signal axis, photons per period, log-spaced; 0 is added.",
+        "0.01,10,256",
+        default="0.01,10,256",
+        metavar="LOW,HIGH,POINTS",
+    ),
+    background: str = _of_grid(
+        "Background axis, likewise.", "0.01,10,100", default="0.01,10,100", metavar="LOW,HIGH,POINTS"
+    ),
+    method: str = _of_grid("exposure (exact, start-up included) or mars (the paper's).", default="exposure"),
+    rearm: str = _of_grid("For mars: re-arming at the centre or the edge of a bin.", default="centre"),
+    refine: float | None = _of_grid("Insert points until the error between them, in total variation, is below this."),
+    check_law: bool = _of_grid("Compare count laws with exact ones at the end.", default=False),
+    threads: int | None = THREADS,
+    out: Path | None = out_option("The table: .h5 or .hdf5. [dim]Default: the cache.[/dim]", None, panel=None),
+    overwrite: bool = of_output("Replace an existing table.", default=False),
 ) -> None:
     """Build the table of a system and write it to a file, or to the cache, where it may be already."""
     with reported():
         began = time.perf_counter()
-        if out is not None and out.exists() and not overwrite:
-            raise FileExistsError(f"{out} exists already; give --overwrite or another --out")
+        refuse_existing(out, overwrite)
         system = instrument.build(effects)
         axes = _grid("--signal", signal), _grid("--background", background)
         from mars_lidar.table import Table, cache
@@ -126,9 +77,7 @@ def build(
 @app.command()
 @grouped
 def info(
-    file: Annotated[
-        Path | None, typer.Argument(help="A table: .h5 or .hdf5. Without it: the cache.", show_default=False)
-    ] = None,
+    file: Path | None = argument("A table: .h5 or .hdf5. Without it: the cache.", None),
 ) -> None:
     """Say what is in a table, or which tables the cache holds."""
     with reported():
@@ -146,7 +95,7 @@ def info(
 @app.command()
 @grouped
 def clear(
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    yes: bool = option("Do not ask.", None, "--yes", "-y", default=False),
 ) -> None:
     """Remove the tables in the cache."""
     with reported():

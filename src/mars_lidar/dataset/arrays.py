@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.io.zarr_store import blosc, consolidated
 
 FORMAT = "mars-lidar dataset"
 FORMAT_VERSION = 1  # of datasets whose scenes are one surface each, in clear air
@@ -95,13 +95,6 @@ def packing(layout: str, dtype: np.dtype[Any]) -> dict[str, Any]:
     return {"compressors": blosc(dtype, "lz4", 5, "bitshuffle")}
 
 
-def blosc(dtype: np.dtype[Any], name: Any, level: int, shuffle: Any) -> Any:
-    """Blosc for elements of this type, and a CRC-32C of what it makes; benchmarks/storage.py tells why which one."""
-    from zarr.codecs import BloscCodec, Crc32cCodec
-
-    return BloscCodec(cname=name, clevel=level, shuffle=shuffle, typesize=dtype.itemsize), Crc32cCodec()
-
-
 def create_maps(
     group: Any, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], dims: tuple[str, ...], told: str, unit: str
 ) -> Any:
@@ -156,10 +149,6 @@ def with_zeros(array: Any) -> Any:
 
 
 def mark(group: Any, attrs: dict[str, Any]) -> None:
-    """Put attributes into the root document, with a copy of all others (consolidated, for quick opening)."""
-    import zarr
-
+    """Put attributes into the root document, with a copy of all others."""
     group.update_attributes(attrs)
-    with warnings.catch_warnings():  # that other Zarr libraries may ignore the copy
-        warnings.filterwarnings("ignore", "Consolidated metadata", category=UserWarning)
-        zarr.consolidate_metadata(group.store)
+    consolidated(group)

@@ -88,7 +88,7 @@ class Exposure:
     @property
     def bin_hr(self) -> NDArray[np.float64]:
         """The same as a real number, at 8 times the size."""
-        return _larger(self._bins[1])
+        return mat.larger(self._bins[1])
 
     @property
     def intensity(self) -> NDArray[np.float64]:
@@ -98,7 +98,7 @@ class Exposure:
     @property
     def intensity_hr(self) -> NDArray[np.uint8]:
         """Reflectivity in 0 ... 255, at 8 times the size."""
-        return _larger(np.round(255.0 * self._reflectivity).astype(np.uint8))
+        return mat.larger(np.round(255.0 * self._reflectivity).astype(np.uint8))
 
     @property
     def level_depth(self) -> NDArray[np.float64]:
@@ -173,10 +173,6 @@ def psf(system: System) -> NDArray[np.float64]:
     half = max(system.bins // 2 - held[0], held[-1] - system.bins // 2)
     first, last = max(0, system.bins // 2 - half), min(system.bins, system.bins // 2 + half + 1)
     return np.asarray(energy[first:last, None])
-
-
-def _larger(image: NDArray[Any]) -> NDArray[Any]:
-    return image.repeat(mat.UPSAMPLING, axis=0).repeat(mat.UPSAMPLING, axis=1)
 
 
 def check_size(name: str, size: int) -> None:

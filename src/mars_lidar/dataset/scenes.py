@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import reading
 from mars_lidar.dataset import samples
-from mars_lidar.dataset.arrays import blosc, create_list, create_maps, create_texts
+from mars_lidar.dataset.arrays import create_list, create_maps, create_texts
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
 from mars_lidar.instrument.system import System
-from mars_lidar.io.store import OnDisk
+from mars_lidar.io.store import OnDisk, Rows
+from mars_lidar.io.zarr_store import blosc
 from mars_lidar.light.fog import Fog
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import MOST, LayeredScene
@@ -158,8 +159,9 @@ class SceneReader:
         depth, reflectivity, background = self._first_layer(number)
         told = self.kind(number)
         if "transient" in told:
-            light = told["transient"]
-            rates = _Rates(self._group["transient"], number, light["bins"])
+            light, array = told["transient"], self._group["transient"]
+            bins = light["bins"]
+            rates = Rows((*array.shape[1:3], bins), lambda rows: np.asarray(array[number, rows, :, :bins]))
             totals = np.asarray(self._group["total"][number])
             transient = Transient(rates, light["bin_ns"], start_ns=light["start_ns"], totals=totals)
             return Rendered(transient, depth, reflectivity, light["pulse"])
@@ -206,17 +208,6 @@ class SceneReader:
             maps = tuple(np.asarray(array[first : first + count]) for array in self._maps)
             self._block = first, maps  # together: several threads read
         return tuple(values[number - first] for values in maps)
-
-
-class _Rates:
-    """Rendered light of one scene (H, W, T) on disk."""
-
-    def __init__(self, array: Any, number: int, bins: int) -> None:
-        self._array, self._number = array, number
-        self.shape = (*array.shape[1:3], bins)
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        return np.asarray(self._array[self._number, rows, :, : self.shape[2]])
 
 
 def _kind(scene: Shown) -> str:

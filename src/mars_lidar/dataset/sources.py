@@ -18,8 +18,7 @@ from mars_lidar.dataset.renders import transient_files
 from mars_lidar.dataset.sample_content import Shown, Surfaces
 from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
-from mars_lidar.io.rgbd.layered import read_layers
-from mars_lidar.io.rgbd.stack import is_stack
+from mars_lidar.io.rgbd.layered import is_layered, read_layers
 from mars_lidar.io.scan import Problem, SceneFile, scan
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
@@ -201,7 +200,7 @@ def _resized(load: Callable[[], Shown], size: Any) -> Shown:
 
 def _surfaces(file: SceneFile) -> Shown:
     """A scene, or the layers of an ``.npz``."""
-    if is_stack(file.depth):
+    if is_layered(file.depth):
         options = {name: getattr(file, name) for name in ("depth_unit_m", "focal_px", "max_depth_m")}
         return Surfaces(read_layers(file.depth, **options))
     return Surfaces(file.load())

@@ -3,7 +3,7 @@
 Every library is imported when its format is first used.
 """
 
-from mars_lidar._base.files import IncompleteFileError
+from mars_lidar._base.files import IncompleteFileError, Interrupted, WriteError
 from mars_lidar._base.optional import MissingLibraryError
 from mars_lidar.io.capture import save_capture
 from mars_lidar.io.cloud import points, save_cloud
@@ -14,7 +14,7 @@ from mars_lidar.io.labelled import to_xarray
 from mars_lidar.io.measured import from_histograms, from_photon_times
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.scan import Problem, SceneFile, scan
-from mars_lidar.io.simulate_to import Interrupted, WriteError, Written, regenerate, simulate_to, verify
+from mars_lidar.io.simulate_to import Written, regenerate, simulate_to, verify
 from mars_lidar.io.spad_mat import SpadMat, read_mat, save_mat
 from mars_lidar.io.transient import read_transient
 from mars_lidar.light.transient import Transient

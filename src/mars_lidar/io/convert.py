@@ -10,7 +10,7 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import Progress
-from mars_lidar.io.cube import SUFFIXES, Cube, load, save
+from mars_lidar.io.cube import SUFFIXES, Cube, load, one_exposure, save
 from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
 from mars_lidar.light.timestamps import Timestamps
 
@@ -149,10 +149,7 @@ def _cube(cube: Cube, old: Path, new: Path, realization: int | None, overwrite: 
         raise ValueError(f"{old} is a cube, which goes into one of {', '.join(SUFFIXES)}, not {str(new)!r}")
     lost = []
     if realization is not None:
-        count = cube.shape[0]
-        k = checks.integer("realization", realization, low=0, high=count - 1)
-        recipe = cube.recipe.replace(realizations=1, first_realization=cube.recipe.first_realization + k)
-        cube = Cube(histogram=np.asarray(cube.histogram[k : k + 1]), recipe=recipe, version=cube.version)
+        count, cube = cube.shape[0], one_exposure(cube, realization)
         if count > 1:
             lost.append(f"{count - 1} of {count} realizations")
     if cube.version not in ("", __version__):

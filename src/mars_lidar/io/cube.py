@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import (
     INCOMPLETE_SUFFIX,
     FileError,
     IncompleteFileError,
-    WriteError,
     check_target,
     reading,
-    reason,
 )
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.notebook import as_html
@@ -28,14 +28,18 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.remote import Elsewhere, open_url, url_of
-from mars_lidar.io.store import CountArray, OnDisk, OpenedStore, Writer
+from mars_lidar.io.store import CountArray, OnDisk, OpenedStore, Writer, writing
 from mars_lidar.light.flux import Flux
 
-SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz", ".mat", ".ptu")
-
-
-def _nothing() -> None:
-    pass
+_MODULES = {
+    ".zarr": "zarr_store",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".npz": "npz",
+    ".mat": "mat",
+    ".ptu": "streams.ptu",
+}
+SUFFIXES = tuple(_MODULES)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,7 +73,7 @@ class Cube:
     path: Path | None = None
     url: str = ""
     progress: str = ""
-    _close: Callable[[], None] = field(default=_nothing, repr=False)
+    _close: Callable[[], None] = field(default=lambda: None, repr=False)
 
     __repr__ = brief
 
@@ -111,12 +115,12 @@ class Cube:
     @property
     def engine(self) -> str:
         """Name of the engine; "measured" where there is none."""
-        return layout.MEASURED if isinstance(self.recipe, Recording) else self.recipe.engine
+        return self.recipe.engine
 
     @property
     def settings(self) -> dict[str, Any]:
         """Settings of the engine that the counts depend on; empty for most engines."""
-        return {} if isinstance(self.recipe, Recording) else self.recipe.settings
+        return self.recipe.settings
 
     @property
     def seed(self) -> int:
@@ -126,12 +130,12 @@ class Cube:
     @property
     def depth_m(self) -> NDArray[np.float64]:
         """True depth (H, W), m; NaN where there is no return, or where it is not known."""
-        return np.full(self.recipe.pixels, np.nan) if isinstance(self.recipe, Recording) else self.recipe.depth_m
+        return self.recipe.depth_m
 
     @property
     def reflectivity(self) -> NDArray[np.float64] | None:
         """Reflectivity (H, W), or None where no scene is behind the flux."""
-        return None if isinstance(self.recipe, Recording) else self.recipe.reflectivity
+        return self.recipe.reflectivity
 
     @property
     def time_ns(self) -> NDArray[np.float64]:
@@ -145,11 +149,9 @@ class Cube:
 
     def __reduce__(self) -> Any:
         """Pickled as its path, for another process to open; without one, with its counts."""
-        if self.url:
-            return _opened_again, (self.url, not self.complete)
-        if self.path is None:
+        if self.path is None and not self.url:
             return super().__reduce__()
-        return _opened_again, (self.path.absolute(), not self.complete)
+        return partial(load, allow_incomplete=not self.complete), (self.url or Path(self.path or "").absolute(),)
 
     def close(self) -> None:
         """Close the file; the histogram cannot be read from it afterwards."""
@@ -160,10 +162,6 @@ class Cube:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _opened_again(path: Path | str, incomplete: bool) -> Cube:
-    return load(path, allow_incomplete=incomplete)
 
 
 @checked
@@ -178,24 +176,27 @@ def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
         `path` exists and `overwrite` is false, or cannot be written.
     """
     check_output(path, cube.recipe, overwrite=overwrite)
-    try:
-        writer = create(path, cube.recipe, overwrite=overwrite)
-    except OSError as error:
-        raise WriteError(error.errno, f"{reason(error)}; nothing was left at {path}") from error
-    try:
-        registrations = 0
-        for realizations, rows in cube.recipe.blocks(writer.chunks):
-            block = np.asarray(cube.histogram[realizations, rows])
-            if block.dtype != cube.recipe.dtype:
-                raise TypeError(f"histogram must be {cube.recipe.dtype} for this system, got {block.dtype}")
-            writer.write(realizations, rows, block)
-            registrations += int(block.sum(dtype=np.uint64))
-        writer.finish(registrations)
-    except OSError as error:
-        raise WriteError(error.errno, f"{reason(error)}; {writer.abandon()}") from error
-    except BaseException:
-        writer.abandon()
-        raise
+    with writing(path, lambda: create(path, cube.recipe, overwrite=overwrite)) as writer:
+        copy_counts(cube, writer)
+
+
+def copy_counts(cube: Cube, writer: Writer) -> None:
+    """Write the counts of a cube, block by block."""
+    registrations = 0
+    for realizations, rows in cube.recipe.blocks(writer.chunks):
+        block = np.asarray(cube.histogram[realizations, rows])
+        if block.dtype != cube.recipe.dtype:
+            raise TypeError(f"histogram must be {cube.recipe.dtype} for this system, got {block.dtype}")
+        writer.write(realizations, rows, block)
+        registrations += int(block.sum(dtype=np.uint64))
+    writer.finish(registrations)
+
+
+def one_exposure(cube: Cube, realization: int) -> Cube:
+    """Exposure `realization` of a cube, in memory."""
+    k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
+    recipe = cube.recipe.replace(realizations=1, first_realization=cube.recipe.first_realization + k)
+    return Cube(histogram=np.asarray(cube.histogram[k : k + 1]), recipe=recipe, version=cube.version)
 
 
 @checked
@@ -223,7 +224,7 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
     if url is not None:
         return _opened(open_url(url), Path(url), allow_incomplete, url)
     source = Path(path)
-    form = _format(source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX)), "path")
+    form = format_of(source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX)), "path")
     if not source.exists():
         leftover = source.with_name(source.name + INCOMPLETE_SUFFIX)
         if leftover.exists():
@@ -247,6 +248,8 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
         if not (complete or allow_incomplete):
             told = f" ({store.progress})" if store.progress else ""
             raise IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{told}")
+        if store.histogram is None:
+            raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped at the very start")
         rows_of = store.rows_of
         rows = None if rows_of is None else lambda name: lazy(rows_of(name), source)
         recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]), rows)
@@ -270,9 +273,9 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
 def check_output(path: str | Path, recipe: Recipe | Recording, *, overwrite: bool = False) -> None:
     """Raise what `create` would raise, without touching anything."""
     target = Path(path)
-    form = _format(target, "out")
+    form = format_of(target, "out")
     check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
-    if form.__name__.endswith(".npz"):  # it could be written, but never read back here
+    if target.suffix == ".npz":  # it could be written, but never read back here
         what = f"the counts of {target}, which NumPy reads whole,"
         check_memory(recipe.nbytes, what, "a .zarr or .h5 is read in parts")
     if target.suffix in (".mat", ".ptu"):  # formats with limits of their own
@@ -284,22 +287,12 @@ def check_output(path: str | Path, recipe: Recipe | Recording, *, overwrite: boo
 def create(path: str | Path, recipe: Recipe | Recording, *, overwrite: bool = False) -> Writer:
     """A writer for the format that the suffix names."""
     check_output(path, recipe, overwrite=overwrite)
-    writer: Writer = _format(Path(path), "out").open_writer(Path(path), recipe)
+    writer: Writer = format_of(Path(path), "out").open_writer(Path(path), recipe)
     return writer
 
 
-def _format(path: Path, argument: str) -> Any:
-    module: ModuleType
-    if path.suffix == ".zarr":
-        from mars_lidar.io import zarr_store as module
-    elif path.suffix in (".h5", ".hdf5"):
-        from mars_lidar.io import hdf5 as module
-    elif path.suffix == ".npz":
-        from mars_lidar.io import npz as module
-    elif path.suffix == ".mat":
-        from mars_lidar.io import mat as module
-    elif path.suffix == ".ptu":
-        from mars_lidar.io.streams import ptu as module
-    else:
+def format_of(path: Path, argument: str) -> Any:
+    """The module for files of this suffix."""
+    if path.suffix not in _MODULES:
         raise ValueError(f"{argument} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
-    return module
+    return import_module(f"mars_lidar.io.{_MODULES[path.suffix]}")

@@ -30,6 +30,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,8 +41,9 @@ from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import BAND_BYTES, StoredFlux, Waveforms
 
+Check = Callable[[Path, Mapping[str, Any]], None]  # of the attributes of a file, before anything else of it is read
 FORMAT = "mars-lidar cube"
-MEASURED = "measured"  # attribute `engine` of counts that no engine drew
+MEASURED = Recording.engine  # attribute of counts that no engine drew
 _OTHERS = {  # attribute `format` of what is no cube, `kind` of a table: what it is, what reads it
     "mars-lidar maps": "reconstructed maps, not a cube: mars_lidar.io.maps.load_maps reads them",
     "mars-lidar dataset": "a dataset, not a cube: mars_lidar.dataset.open_dataset reads it",
@@ -131,12 +133,12 @@ def attributes(recipe: Recipe | Recording) -> dict[str, str | int]:
         "system": recipe.system.to_json(),
         "source": recipe.source,
         "version": __version__,
+        "engine": recipe.engine,
     }
     if isinstance(recipe, Recording):
-        return {**both, "engine": MEASURED}
+        return both
     return {
         **both,
-        "engine": recipe.engine,
         "engine_settings": json.dumps(recipe.settings),
         "seed": recipe.seed,
         "first_realization": recipe.first_realization,
@@ -204,7 +206,7 @@ def _stored_flux(waveforms: Any, signal: NDArray[Any], background: NDArray[Any],
     return StoredFlux(signal, background, int(waveforms.shape[-1]), make, info)
 
 
-def check_format(path: object, attrs: Mapping[str, Any]) -> None:
+def check_format(path: Path, attrs: Mapping[str, Any]) -> None:
     """Raise ValueError unless these are the attributes of a cube that this version can read."""
     kind = attrs.get("kind", attrs.get("format"))
     if isinstance(kind, str) and kind in _OTHERS:

@@ -11,23 +11,28 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_target, open_npz, reading, whole
-from mars_lidar._base.hdf5 import new_file, open_hdf5, seal, with_checksums
+from mars_lidar._base.files import TemporarySibling, check_target, reading
+from mars_lidar._base.hdf5 import new_file, seal
 from mars_lidar.instrument.system import System
+from mars_lidar.io import hdf5, npz, zarr_store
+from mars_lidar.io.cube import format_of
+from mars_lidar.io.layout import Variable
 
 FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")
 DIMS = ("method", "realization", "y", "x")
 RETURN = "return"
+_UNITS, _WORDS = ("1", "pixel", "pixel"), ("number in the cube", "image row", "image column")  # of `DIMS[1:]`
 _PHOTONS = "photons per laser period"
 _VARIABLES = {  # name in the file: attribute, unit, in words
     "depth": ("depth_m", "m", "depth"),
@@ -55,52 +60,38 @@ _OF_RETURNS = {  # the same of each return
 }
 
 
-class Maps(Protocol):
-    """What is written of a `mars_lidar.Reconstruction`: its maps (realizations, H, W) and its system."""
-
-    @property
-    def depth_m(self) -> NDArray[np.float64]:
-        """Depth, m."""
-
-    @property
-    def system(self) -> System:
-        """The system that the cube was recorded with."""
-
-    @property
-    def returns(self) -> Any:
-        """Every return, or None where one was looked for."""
-
-    @property
-    def level(self) -> float:
-        """Signal, photons per period, of a surface of reflectivity 1."""
-
-
 def check_maps_output(path: str | Path, *, overwrite: bool = False) -> None:
     """Raise what `save_maps` would raise for this path, without touching anything."""
     target = Path(path)
-    if target.suffix not in SUFFIXES:
-        raise ValueError(f"out must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
+    _check_suffix("out", target)
     check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
 
 
 @checked
-def save_maps(path: str | Path, results: Mapping[str, Maps], *, source: str = "", overwrite: bool = False) -> Path:
-    """Write reconstructions (realizations, H, W) of one cube, by method; the file is whole or not there at all."""
+def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "", overwrite: bool = False) -> Path:
+    """Write each `mars_lidar.Reconstruction` (realizations, H, W) of a cube by method; whole or not at all."""
     target = Path(path)
     check_maps_output(target, overwrite=overwrite)
     variables, attrs = _contents(results, source)
     with TemporarySibling(target).writing() as unfinished:
         if target.suffix == ".zarr":
             shutil.rmtree(unfinished, ignore_errors=True)
-            _write_zarr(unfinished, variables)
-            manifest.seal(unfinished, dict(attrs))
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "The data type")  # of the methods' names: fixed-length text
+                zarr_store.consolidated(zarr_store.new_store(unfinished, {}, variables))
+                manifest.seal(unfinished, attrs)
             if target.exists():
                 (target / "zarr.json").unlink(missing_ok=True)
                 shutil.rmtree(target)
         elif target.suffix == ".npz":
-            _write_npz(unfinished, variables, attrs)
+            with npz.archive(unfinished) as archive:
+                npz.add_attributes(archive, {**attrs, "variables": npz.add(archive, variables)})
         else:
-            _write_hdf5(unfinished, variables, attrs)
+            with new_file(unfinished) as file:
+                file.attrs.update(attrs)
+                hdf5.add(file, variables, compression="gzip", shuffle=True)
+                hdf5.name_axes(file, {v.name: v.dims for v in variables})
+                seal(file)
     return target
 
 
@@ -111,28 +102,26 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
     if not source.exists():
         raise FileNotFoundError(f"{source} does not exist")
     with reading(source, "maps of mars-lidar"):
-        found, attrs = _read(source)
-        if attrs.get("format") != FORMAT:
-            raise ValueError(f"{source} is not a file of maps of mars-lidar (no attribute format = {FORMAT!r})")
-        _check(found, attrs)
-        return found, attrs
+        _check_suffix("path", source)
+        store = format_of(source, "path").open_store(source, _check_format)
+        try:
+            found = {name: store.read(name) for name in store.names}
+        finally:
+            store.close()
+        if found.get("method", np.empty(0)).dtype.kind == "S":
+            found["method"] = found["method"].astype(str)
+        _check(found, store.attrs)
+        return found, dict(store.attrs)
 
 
-def _read(source: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    if source.suffix == ".zarr":
-        import zarr
+def _check_suffix(name: str, path: Path) -> None:
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"{name} must end in one of {', '.join(SUFFIXES)}, got {str(path)!r}")
 
-        manifest.require(source)
-        group: Any = zarr.open_group(source, mode="r")
-        return {name: whole(group[name]) for name in group.array_keys()}, dict(group.attrs)
-    if source.suffix == ".npz":
-        with open_npz(source) as archive:
-            attrs = json.loads(archive["attributes"].item()) if "attributes" in archive.files else {}
-            return {name: archive[name] for name in archive.files if name != "attributes"}, attrs
-    with open_hdf5(source) as file:
-        found = {name: whole(file[name]) for name in file}
-        found["method"] = found["method"].astype(str) if "method" in found else np.empty(0)
-        return found, dict(file.attrs)
+
+def _check_format(path: Path, attrs: Mapping[str, Any]) -> None:
+    if attrs.get("format") != FORMAT:
+        raise ValueError(f"{path} is not a file of maps of mars-lidar (no attribute format = {FORMAT!r})")
 
 
 def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
@@ -155,30 +144,26 @@ def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
             raise ValueError(f"{name} must not be negative, got {np.nanmin(values):g}")
 
 
-def _contents(
-    results: Mapping[str, Maps], source: str
-) -> tuple[dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, str]]], dict[str, Any]]:
+def _contents(results: Mapping[str, Any], source: str) -> tuple[list[Variable], dict[str, Any]]:
     from mars_lidar._version import __version__
 
     first = next(iter(results.values()))
-    if first.depth_m.ndim != 3:
-        raise ValueError(f"maps must be (realizations, H, W), got shape {first.depth_m.shape}")
-    variables: dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, str]]] = {
-        "method": (("method",), np.array(list(results)), {"long_name": "reconstruction method"})
-    }
-    for dim, size in zip(DIMS[1:], first.depth_m.shape, strict=True):
-        variables[dim] = ((dim,), np.arange(size), {"units": "1" if dim == "realization" else "pixel"})
+    shape: tuple[int, ...] = first.depth_m.shape
+    if len(shape) != 3:
+        raise ValueError(f"maps must be (realizations, H, W), got shape {shape}")
+    variables = [Variable("method", ("method",), np.array(list(results)), "1", "reconstruction method")]
+    for dim, size, unit, words in zip(DIMS[1:], shape, _UNITS, _WORDS, strict=True):
+        variables.append(Variable(dim, (dim,), np.arange(size), unit, words))
     for name, (attribute, unit, words) in _VARIABLES.items():
         given = [_find(each, attribute) for each in results.values()]
         if any(values is not None for values in given):
-            variables[name] = (DIMS, _stacked(given, first.depth_m.shape), {"units": unit, "long_name": words})
+            variables.append(Variable(name, DIMS, _stacked(given, shape), unit, words))
     most = max((each.returns.depth_m.shape[-1] for each in results.values() if each.returns is not None), default=0)
     if most:
-        variables[RETURN] = ((RETURN,), np.arange(most), {"units": "1", "long_name": "return, nearest first"})
+        variables.append(Variable(RETURN, (RETURN,), np.arange(most), "1", "return, nearest first"))
         for name, (attribute, unit, words) in _OF_RETURNS.items():
             given = [_find(each, f"returns.{attribute}") for each in results.values()]
-            stack = _stacked(given, (*first.depth_m.shape, most))
-            variables[name] = ((*DIMS, RETURN), stack, {"units": unit, "long_name": words})
+            variables.append(Variable(name, (*DIMS, RETURN), _stacked(given, (*shape, most)), unit, words))
     attrs = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -190,8 +175,8 @@ def _contents(
     return variables, attrs
 
 
-def _find(of: Maps, attribute: str) -> NDArray[Any] | None:
-    value: Any = of
+def _find(of: Any, attribute: str) -> NDArray[Any] | None:
+    value = of
     for name in attribute.split("."):
         value = None if value is None else getattr(value, name)
     return None if value is None else np.asarray(value)
@@ -202,52 +187,3 @@ def _stacked(given: list[NDArray[Any] | None], shape: tuple[int, ...]) -> NDArra
     whole_numbers = all(values is None or values.dtype.kind == "u" for values in given)
     blank = np.zeros(shape, np.uint8) if whole_numbers else np.full(shape, np.nan)
     return np.stack([blank if values is None else values for values in given])
-
-
-def _write_zarr(path: Path, variables: Mapping[str, Any]) -> None:
-    import warnings
-
-    import xarray
-    from zarr.codecs import Crc32cCodec, ZstdCodec
-
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Consolidated metadata", category=UserWarning)
-        warnings.filterwarnings("ignore", "The data type")  # of the methods' names: fixed-length text
-        xarray.Dataset(
-            {name: value for name, value in variables.items() if name not in (*DIMS, RETURN)},
-            coords={name: variables[name] for name in (*DIMS, RETURN) if name in variables},
-        ).to_zarr(
-            path,
-            mode="w",
-            zarr_format=3,
-            encoding={name: {"compressors": (ZstdCodec(), Crc32cCodec())} for name in variables},
-        )
-
-
-def _write_npz(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
-    labels = {name: {"dims": dims, **more} for name, (dims, _, more) in variables.items()}
-    text = np.asarray(json.dumps({**attrs, "variables": labels}))
-    with path.open("wb") as file:
-        np.savez_compressed(file, attributes=text, **{name: data for name, (_, data, _) in variables.items()})
-
-
-def _write_hdf5(path: Path, variables: Mapping[str, Any], attrs: Mapping[str, Any]) -> None:
-    with new_file(path) as file:
-        file.attrs.update(attrs)
-        for name, (dims, data, more) in variables.items():
-            if data.dtype.kind == "U":
-                data = np.char.encode(data)
-            packed = {"compression": "gzip", "shuffle": True} if data.ndim > 1 else {}
-            packed |= with_checksums(data.shape, data.dtype)
-            stored = file.create_dataset(name, data=data, **packed)
-            stored.attrs.update(more)
-            for k, dim in enumerate(dims):
-                stored.dims[k].label = dim
-        scales = [dim for dim in (*DIMS, RETURN) if dim in variables]
-        for dim in scales:
-            file[dim].make_scale(dim)
-        for name, (dims, _, _) in variables.items():
-            if name not in scales:
-                for k, dim in enumerate(dims):
-                    file[name].dims[k].attach_scale(file[dim])
-        seal(file)

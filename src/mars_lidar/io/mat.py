@@ -19,7 +19,6 @@ so `scipy.io.loadmat` returns it as uint16. ``rates`` is zero where there is no 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import struct
 import zlib
@@ -31,12 +30,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base.files import FileError, TemporarySibling, read_mat5
+from mars_lidar._base.files import FileError, read_mat5
 from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
-from mars_lidar.io.store import OpenedStore, Writer
+from mars_lidar.io.store import FileWriter, LazyCounts, OpenedStore
 from mars_lidar.light.flux import Flux
 
 UPSAMPLING = 8  # bin_hr over bin: 512 x 512 and 64 x 64 in the files that the networks were trained on
@@ -60,8 +59,8 @@ def check(recipe: Recipe) -> None:
         )
 
 
-class MatWriter(Writer):
-    """Keeps the counts sparse until the end, writes a sibling of the target, and renames it."""
+class MatWriter(FileWriter):
+    """Keeps the counts sparse until the end."""
 
     def __init__(self, path: Path, recipe: Recipe, bin_hr: NDArray[np.float64] | None = None) -> None:
         check(recipe)
@@ -69,52 +68,50 @@ class MatWriter(Writer):
         check_memory(size, f"the rates of {path}", "a .zarr or .h5 is written in parts")
         self._recipe, self._bin_hr = recipe, bin_hr
         self.chunks = recipe.chunks(BLOCK_BYTES)
-        self._parts: list[Any] = []
-        self._sibling = TemporarySibling(path)
+        self._counts: list[Any] = []
+        super().__init__(path, recipe)
+
+    def _begin(self, recipe: Recipe) -> None:
         self._file = open(self._sibling.path, "wb")  # noqa: SIM115  # closed by `finish` and `abandon`
+        self._parts.append(self._file)
 
     def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
         """Keep the non-zero counts of the rows."""
         y, x, k = np.nonzero(block[0])
-        self._parts.append((y + rows.start, x, k, block[0][y, x, k]))
+        self._counts.append((y + rows.start, x, k, block[0][y, x, k]))
 
-    def finish(self, registrations: int) -> None:
-        """Write the variables, one after the other, close the file, and put it in its place."""
+    def _end(self, registrations: int) -> None:
+        """Write the variables, one after the other."""
         from scipy import sparse
 
         recipe = self._recipe
         _, height, width, bins = recipe.shape
-        y, x, k, counts = (np.concatenate(part) for part in zip(*self._parts, strict=True))
+        y, x, k, counts = (np.concatenate(part) for part in zip(*self._counts, strict=True))
         spad = sparse.csc_matrix((counts.astype(np.float64), (y + height * x, k)), shape=(height * width, bins))
         first, fine = return_bins(recipe.flux, recipe.system)
-        if self._bin_hr is None:
-            fine = fine.repeat(UPSAMPLING, axis=0).repeat(UPSAMPLING, axis=1)
-        else:
-            fine = self._bin_hr
         flux = recipe.flux.detected(recipe.system)
         background = float(flux.background.mean())
-        sbr = float(flux.signal.mean()) / background if background > 0 else np.inf
         attrs: dict[str, Any] = {**layout.attributes(recipe), "complete": True, "registrations": registrations}
         ours: dict[str, Any] = {v.name: v.data for v in layout.variables(recipe)}
         attrs["shapes"] = {name: list(array.shape) for name, array in ours.items()}
         variables = {
             "spad": spad,
-            "SBR": sbr,
+            "SBR": float(flux.signal.mean()) / background if background > 0 else np.inf,
             "bin": first,
-            "bin_hr": fine,
+            "bin_hr": larger(fine) if self._bin_hr is None else self._bin_hr,
             "photons": float(flux.signal.mean()) * recipe.system.cycles,
             "rates": rates(flux, recipe.system),
             "mars_lidar": {"attributes": json.dumps(attrs), **ours},
         }
         write_variables(self._file, variables)
-        self._file.close()
-        self._sibling.publish()
 
-    def abandon(self) -> str:
-        """Remove the unfinished sibling."""
-        with contextlib.suppress(Exception):
-            self._file.close()
-        return self._sibling.discard()
+
+open_writer = MatWriter
+
+
+def larger(image: NDArray[Any]) -> NDArray[Any]:
+    """At the size of the network's colour image."""
+    return image.repeat(UPSAMPLING, axis=0).repeat(UPSAMPLING, axis=1)
 
 
 def write_variables(file: BinaryIO, variables: Mapping[str, Any]) -> None:
@@ -190,37 +187,8 @@ def _rate_bands(flux: Flux, system: System) -> Iterator[NDArray[np.float64]]:
         yield band
 
 
-class _MatCounts:
-    """The counts of a file, sparse in memory; dense when they are indexed."""
-
-    def __init__(self, path: Path, spad: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        self._path = path
-        self._spad = spad
-        self.shape = shape
-        self.dtype = dtype
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        _, height, width, bins = self.shape
-        size = height * width * bins * self.dtype.itemsize
-        check_memory(2 * size, f"the counts of {self._path}", "mars-lidar convert makes a .zarr of it elsewhere")
-        dense = self._spad.astype(self.dtype).toarray(order="C")
-        image = dense.reshape(width, height, bins).transpose(1, 0, 2)
-        return np.ascontiguousarray(image, dtype=dtype)[None]
-
-    def __getitem__(self, key: Any) -> Any:
-        return self.__array__()[key]
-
-    def __len__(self) -> int:
-        return 1
-
-
-def open_writer(path: Path, recipe: Recipe) -> Writer:
-    """Begin a file; an existing one is replaced."""
-    return MatWriter(path, recipe)
-
-
 def open_store(path: Path) -> OpenedStore:
-    """Open a file for reading; its variables are read at once, its counts stay sparse."""
+    """Open a file for reading; its variables are read at once, its counts stay sparse until they are used."""
     found = read_variables(path)
     if "mars_lidar" not in found:
         raise ValueError(
@@ -236,10 +204,17 @@ def open_store(path: Path) -> OpenedStore:
         return np.ascontiguousarray(np.asarray(ours[name]).reshape(shapes[name]))  # sums keep their bits
 
     recipe = layout.recipe_from(attrs, frozenset(shapes), read, 1)
-    counts = _MatCounts(path, found["spad"], recipe.shape, recipe.dtype)
-    if found["spad"].shape != (counts.shape[1] * counts.shape[2], counts.shape[3]):
-        raise ValueError(f"{path}: spad must be (H W, bins) of {counts.shape[1:]}, got {found['spad'].shape}")
-    return OpenedStore(attrs, frozenset(shapes), read, counts, True, "", lambda: None)
+    _, height, width, bins = recipe.shape
+    spad = found["spad"]
+    if spad.shape != (height * width, bins):
+        raise ValueError(f"{path}: spad must be (H W, bins) of {(height, width, bins)}, got {spad.shape}")
+
+    def counts() -> NDArray[Any]:
+        check_memory(2 * recipe.nbytes, f"the counts of {path}", "mars-lidar convert makes a .zarr of it elsewhere")
+        dense = spad.astype(recipe.dtype).toarray(order="C")
+        return np.ascontiguousarray(dense.reshape(width, height, bins).transpose(1, 0, 2))[None]
+
+    return OpenedStore(attrs, frozenset(shapes), read, LazyCounts(recipe.shape, recipe.dtype, counts))
 
 
 def read_variables(path: Path) -> dict[str, Any]:

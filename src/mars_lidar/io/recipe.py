@@ -112,6 +112,9 @@ class Recording(_Blocks):
     __repr__ = brief
 
     first_realization: ClassVar[int] = 0
+    engine: ClassVar[str] = "measured"
+    settings: ClassVar[dict[str, Any]] = {}
+    reflectivity: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, System):
@@ -127,6 +130,11 @@ class Recording(_Blocks):
     def image(self) -> tuple[int, int]:
         """(H, W)."""
         return self.pixels
+
+    @property
+    def depth_m(self) -> NDArray[np.float64]:
+        """NaN everywhere (H, W): it is not known."""
+        return np.full(self.pixels, np.nan)
 
     def replace(self, **changes: Any) -> Recording:
         """A copy with some fields changed."""

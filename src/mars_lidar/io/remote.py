@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +35,8 @@ def url_of(path: str | Path) -> str | None:
 class Elsewhere(OnDisk):
     """An array of a store at a URL: what goes wrong when it is read names the URL."""
 
-    def _read(self, read: Callable[[], Any]) -> Any:
-        try:
-            return read()
-        except (IndexError, TypeError):  # of the key
-            raise
-        except Exception as error:
-            raise _told(str(self._path), error) from error
+    def _naming(self) -> contextlib.AbstractContextManager[Any]:
+        return _naming(str(self._path))
 
 
 def open_url(url: str) -> OpenedStore:
@@ -56,27 +52,22 @@ def open_url(url: str) -> OpenedStore:
     if not url.rstrip("/").endswith(".zarr"):
         raise FileError(f"{url}: only a .zarr is opened from a URL; fetch other files first")
     core = needed("fsspec.core", url, "remote")
-    try:
+    with _naming(url):
         system, root = core.url_to_fs(url)
-        document = json.loads(system.cat_file(f"{root}/zarr.json"))
-        attrs = document.get("attributes", {})
+        attrs = json.loads(system.cat_file(f"{root}/zarr.json")).get("attributes", {})
         layout.check_format(Path(url), attrs)
-        complete = attrs.get("complete") is True
-        if complete:
+        if attrs.get("complete") is True:
             _require(url, system, root)
         group = _group(url)
         names = frozenset(group.array_keys())
-        if "histogram" not in names:
-            raise ValueError("it has no variable 'histogram': its writing stopped at the very start")
-    except Exception as error:
-        raise _told(url, error) from error
+        histogram = group["histogram"] if "histogram" in names else None
 
     def read(name: str) -> NDArray[Any]:
         array = group[name]
         check_memory(math.prod(array.shape) * array.dtype.itemsize, f"{name} of {url}", "read it on a larger machine")
         return np.asarray(Elsewhere(array, Path(url))[...])
 
-    return OpenedStore(attrs, names, read, group["histogram"], complete, "", lambda: None, group.__getitem__)
+    return OpenedStore(attrs, names, read, histogram, rows_of=group.__getitem__)
 
 
 def _group(url: str) -> Any:
@@ -106,12 +97,17 @@ def _require(url: str, system: Any, root: str) -> None:
         raise ValueError(f"is damaged: {', '.join(wrong[:3])}")
 
 
-def _told(url: str, error: Exception) -> Exception:
-    if isinstance(error, MissingLibraryError | MemoryError):
-        return error
-    text = " ".join(str(error).split()) or type(error).__name__
-    if isinstance(error, ImportError):
-        return MissingLibraryError(f"{url}: {text}")
-    if isinstance(error, FileNotFoundError | KeyError):
-        return FileError(f"{url}: there is no Zarr store ({text[:200]})")
-    return FileError(text if url in text else f"{url}: {text[:400]}")
+@contextlib.contextmanager
+def _naming(url: str) -> Iterator[None]:
+    """What goes wrong inside names the URL."""
+    try:
+        yield
+    except (MissingLibraryError, MemoryError):
+        raise
+    except Exception as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, ImportError):
+            raise MissingLibraryError(f"{url}: {text}") from error
+        if isinstance(error, FileNotFoundError | KeyError):
+            raise FileError(f"{url}: there is no Zarr store ({text[:200]})") from error
+        raise FileError(text if url in text else f"{url}: {text[:400]}") from error

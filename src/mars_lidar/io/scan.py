@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from mars_lidar._base import checks
@@ -37,15 +37,8 @@ class SceneFile:
 
     def load(self, *, size: int | tuple[int, int] | None = None) -> Scene:
         """Read the scene, at `size` as in `mars_lidar.Scene.resize`."""
-        return Scene.from_rgbd(
-            self.depth,
-            self.image,
-            size=size,
-            depth_unit_m=self.depth_unit_m,
-            focal_px=self.focal_px,
-            index=self.index,
-            max_depth_m=self.max_depth_m,
-        )
+        told = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Scene.from_rgbd(told.pop("depth"), told.pop("image"), size=size, **told)
 
 
 @dataclass(frozen=True)
@@ -122,7 +115,8 @@ def scan(
     if manifest is None and pattern is None and (root / MANIFEST).is_file():
         manifest = root / MANIFEST
     if manifest is not None:
-        found = _listed(Path(manifest), depth_unit_m, focal_px, max_depth_m, problems)
+        shared = {"depth_unit_m": depth_unit_m, "focal_px": focal_px, "max_depth_m": max_depth_m}
+        found = _listed(Path(manifest), shared, problems)
     elif pattern is not None:
         found = _matching(root, pattern, image, problems)
     else:
@@ -130,8 +124,10 @@ def scan(
     candidates = list(found)
     if manifest is None:
         _tell_images(root, candidates)
-    if manifest is None:
-        candidates = [_with(one, depth_unit_m, focal_px, max_depth_m) for one in candidates]
+        for k, one in enumerate(candidates):
+            own_unit = one.depth.is_dir() or one.depth.suffix.lower() == ".mat"  # these are in metres
+            unit = None if own_unit else depth_unit_m
+            candidates[k] = replace(one, depth_unit_m=unit, focal_px=focal_px, max_depth_m=max_depth_m)
     if not check:
         return candidates, problems
     scenes = []
@@ -147,21 +143,7 @@ def scan(
     return scenes, problems
 
 
-def _with(one: SceneFile, unit: float | None, focal: float | None, most: float | None) -> SceneFile:
-    own_unit = one.depth.is_dir() or one.depth.suffix.lower() == ".mat"  # these are in metres
-    return SceneFile(
-        depth=one.depth,
-        image=one.image,
-        index=one.index,
-        depth_unit_m=None if own_unit else unit,
-        focal_px=focal,
-        max_depth_m=most,
-    )
-
-
-def _listed(
-    path: Path, unit: float | None, focal: float | None, most: float | None, problems: list[Problem]
-) -> Iterator[SceneFile]:
+def _listed(path: Path, shared: dict[str, float | None], problems: list[Problem]) -> Iterator[SceneFile]:
     if not path.exists():
         raise ValueError(f"{path}: no such file")
     with reading(path, "CSV"), open(path, newline="", encoding="utf-8-sig") as lines:
@@ -180,9 +162,7 @@ def _listed(
                 depth=path.parent / row["depth"],
                 image=path.parent / row["image"] if row.get("image") else None,
                 index=int(row["index"]) if row.get("index") else None,
-                depth_unit_m=float(row["depth_unit_m"]) if row.get("depth_unit_m") else unit,
-                focal_px=float(row["focal_px"]) if row.get("focal_px") else focal,
-                max_depth_m=float(row["max_depth_m"]) if row.get("max_depth_m") else most,
+                **{name: float(row[name]) if row.get(name) else of_all for name, of_all in shared.items()},
             )
         except ValueError as error:
             problems.append(Problem(path, f"line {number}: {error}"))

@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks, manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import WriteError as WriteError
-from mars_lidar._base.files import reason
 from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
@@ -23,7 +21,8 @@ from mars_lidar.engines.options import given
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube, check_output, create, load
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.zarr_store import ZarrWriter, continue_writer
+from mars_lidar.io.store import writing
+from mars_lidar.io.zarr_store import continue_writer
 from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
@@ -56,10 +55,6 @@ class Written:
     def ns_per_registration(self) -> float:
         """Engine time per registration, all threads together; NaN without registrations."""
         return 1e9 * self.simulate_s / self.registrations if self.registrations else math.nan
-
-
-class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during `simulate_to`; its text says what is left on disk."""
 
 
 @checked
@@ -120,7 +115,6 @@ def simulate_to(
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
     progress = shown(progress, "simulating")
-    chosen = given(options)
     recipe = Recipe(
         system=system,
         flux=flux,
@@ -132,8 +126,8 @@ def simulate_to(
         depth_m=system.depth_m(flux.delay_ns) if depth_m is None else np.asarray(depth_m),
         reflectivity=None if reflectivity is None else np.asarray(reflectivity),
         source=source,
-        options=chosen,
-        settings=_settings(engine, chosen),
+        options=given(options),
+        settings=find_engine(engine, **options).settings,
     )
     target = Path(path)
     if resume and overwrite:
@@ -143,26 +137,21 @@ def simulate_to(
         check_output(target, recipe, overwrite=overwrite)
     elif target.suffix != ".zarr":
         raise ValueError(f"resume is for a .zarr, the only format that an interruption leaves, got {str(target)!r}")
-    if isinstance(engine, str):  # every pixel, before the blocks one by one
-        find_engine(engine, **options).check(flux, system)
+    find_engine(engine, **options).check(flux, system)  # every pixel, before the blocks one by one
     _try_brightest_pixel(recipe, threads, device)
-    try:
-        writer = continue_writer(target, recipe) if going_on else create(target, recipe, overwrite=overwrite)
-    except OSError as error:
-        raise WriteError(error.errno, f"{reason(error)}; nothing was left at {target}") from error
-    if writer is None:
+    continued = continue_writer(target, recipe) if going_on else None
+    if going_on and continued is None:
         return Written(target, int(load(target).registrations or 0), 0.0, 0.0, {})
-    blocks, begun, registrations = list(recipe.blocks(writer.chunks)), 0, 0
-    if isinstance(writer, ZarrWriter) and going_on:
-        begun, registrations = writer.begun(blocks)
     simulate_s = write_s = 0.0
     report: dict[str, float] = {}
-    try:
+    with writing(target, lambda: continued or create(target, recipe, overwrite=overwrite)) as writer:
+        blocks = list(recipe.blocks(writer.chunks))
+        begun, registrations = continued.begun(blocks) if continued else (0, 0)
         for images, rows in blocks[begun:]:
             began = time.perf_counter()
             told: dict[str, float] = {}
             tell = _of_the_whole(progress, recipe, images, rows)
-            block = _simulate(recipe, images, rows, threads, tell, told, device)
+            block = _simulate(recipe, images, rows, threads=threads, progress=tell, report=told, device=device)
             ended = time.perf_counter()
             writer.write(images, rows, block)
             registrations += int(block.sum(dtype=np.uint64))
@@ -171,13 +160,6 @@ def simulate_to(
             for name, value in told.items():
                 report[name] = report.get(name, 0.0) + value
         writer.finish(registrations)
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {writer.abandon()}") from None
-    except OSError as error:
-        raise WriteError(error.errno, f"{reason(error)}; {writer.abandon()}") from error
-    except BaseException:
-        writer.abandon()
-        raise
     return Written(target, registrations, simulate_s, write_s, report)
 
 
@@ -216,7 +198,7 @@ def regenerate(
         if step != 1 or first >= last:
             raise ValueError(f"{name} must select a run of at least one of {size}, got {part!r}")
         parts.append(slice(first, last))
-    return _simulate(recipe, parts[0], parts[1], threads, None)
+    return _simulate(recipe, *parts, threads=threads)
 
 
 @checked
@@ -233,32 +215,20 @@ def verify(
     if cube.path is not None and cube.path.suffix == ".zarr" and any(manifest.damage(cube.path)):
         return False
     for images, rows in recipe.blocks(recipe.chunks(4 * 2**20)):
-        again = _simulate(recipe, images, rows, threads, _of_the_whole(progress, recipe, images, rows))
+        tell = _of_the_whole(progress, recipe, images, rows)
+        again = _simulate(recipe, images, rows, threads=threads, progress=tell)
         if not np.array_equal(again, np.asarray(cube.histogram[images, rows])):
             return False
     return True
 
 
-def _simulate(
-    recipe: Recipe,
-    images: slice,
-    rows: slice,
-    threads: int | None,
-    progress: Progress | None,
-    report: dict[str, float] | None = None,
-    device: Literal["cpu", "cuda"] = "cpu",
-) -> NDArray[Any]:
+def _simulate(recipe: Recipe, images: slice, rows: slice, **how: Any) -> NDArray[Any]:
+    """A part of a cube; `how` are further arguments of `mars_lidar.simulate`."""
     from mars_lidar import simulate
 
-    part = recipe.part(images, rows)
-    counts: Any = simulate(**part, threads=threads, device=device, progress=progress, report=report)
-    here: NDArray[Any] = counts if device == "cpu" else counts.get()
+    counts: Any = simulate(**recipe.part(images, rows), **how)
+    here: NDArray[Any] = counts.get() if how.get("device") == "cuda" else counts
     return here
-
-
-def _settings(engine: str, options: dict[str, Any]) -> dict[str, Any]:
-    """What a cube of this engine depends on, as plain data; checks the options on the way."""
-    return find_engine(engine, **options).settings if isinstance(engine, str) else {}
 
 
 def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
@@ -277,7 +247,7 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
             "outside": None if table is None else "exact",  # no count depends on it
         }
     )
-    settings = _settings(recipe.engine, options)
+    settings = find_engine(recipe.engine, **options).settings
     if table is not None and settings.get("table") != recorded.get("table"):
         was = _grid(recorded["table"]) if "table" in recorded else "none"
         raise ValueError(f"table must be the one that the cube was made with ({was}), got {_grid(settings['table'])}")
@@ -316,7 +286,7 @@ def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["c
         depth_m=recipe.depth_m[:1, :1],
         reflectivity=None,
     )
-    _simulate(one, slice(0, 1), slice(0, 1), threads, None, device=device)
+    _simulate(one, slice(0, 1), slice(0, 1), threads=threads, device=device)
 
 
 def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:

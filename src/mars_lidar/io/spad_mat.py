@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_target, reading
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import mat
-from mars_lidar.io.cube import Cube
+from mars_lidar.io.cube import Cube, copy_counts, one_exposure
+from mars_lidar.io.store import writing
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +121,9 @@ def save_mat(
     target = Path(path)
     if target.suffix != ".mat":
         raise ValueError(f"path must end in .mat, got {str(path)!r}")
-    k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
-    whole = cube.simulation("a .mat")
-    recipe = whole.replace(realizations=1, first_realization=whole.first_realization + k)
+    cube.simulation("a .mat")
+    one = one_exposure(cube, realization)
+    recipe = one.simulation()
     fine = None
     if depth_hr_m is not None:
         depth = np.asarray(depth_hr_m)
@@ -135,14 +135,5 @@ def save_mat(
         fine = mat.bins_of_delay(recipe.system.delay_ns(depth), recipe.system)
     mat.check(recipe)
     check_target(target, folder=False, overwrite=overwrite)
-    writer = mat.MatWriter(target, recipe, fine)
-    try:
-        total = 0
-        for _, rows in recipe.blocks(writer.chunks):
-            block = np.asarray(cube.histogram[k : k + 1, rows])
-            writer.write(slice(0, 1), rows, block)
-            total += int(block.sum(dtype=np.uint64))
-        writer.finish(total)
-    except BaseException:
-        writer.abandon()
-        raise
+    with writing(target, lambda: mat.MatWriter(target, recipe, fine)) as writer:
+        copy_counts(one, writer)

@@ -1,23 +1,26 @@
-"""What the three formats have in common: a writer, an opened file, and the rules for the place to write to.
+"""What the formats have in common: a writer, and an opened file.
 
-A format is one module with a `Writer` and a function `open_store`. The rule for all of them: what is half
-written never looks complete, whatever stops the process.
+A format is one module with a `Writer`, called `open_writer` there, and a function `open_store`. The rule for all of
+them: what is half written never looks complete, whatever stops the process.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import reading
+from mars_lidar._base.files import Interrupted, TemporarySibling, WriteError, reading, reason
 from mars_lidar._base.memory import check_memory
+from mars_lidar.io.recipe import Recipe, Recording
 
 
 class CountArray(Protocol):
@@ -35,29 +38,37 @@ class CountArray(Protocol):
         """The selected counts, in memory."""
 
 
-class LazyCounts(ABC):
-    """Counts of a file that can only be read whole: shape and type at once, the counts on first use."""
+class LazyCounts:
+    """Counts of a file that can only be read whole: shape and type at once, the counts on first use.
 
-    shape: tuple[int, ...]
-    dtype: Any
-    _loaded: NDArray[Any] | None = None
+    `read` returns them all; a MemoryError before any work where they do not fit.
+    """
 
-    @abstractmethod
-    def _read(self) -> NDArray[Any]:
-        """All counts; a MemoryError before any work where they do not fit."""
+    def __init__(self, shape: tuple[int, ...], dtype: Any, read: Callable[[], NDArray[Any]]) -> None:
+        self.shape, self.dtype, self._read = shape, dtype, read
+
+    @cached_property
+    def _counts(self) -> NDArray[Any]:
+        return self._read()
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        if self._loaded is None:
-            self._loaded = self._read()
-        if copy:
-            return np.array(self._loaded, dtype=dtype)
-        return np.asarray(self._loaded, dtype=dtype)
+        return np.array(self._counts, dtype) if copy else np.asarray(self._counts, dtype)
 
     def __getitem__(self, key: Any) -> Any:
-        return self.__array__()[key]
+        return self._counts[key]
 
     def __len__(self) -> int:
         return self.shape[0]
+
+
+class Rows:
+    """An array of a file whose rows are read when it is sliced."""
+
+    def __init__(self, shape: tuple[int, ...], read: Callable[[slice], NDArray[Any]]) -> None:
+        self.shape, self._read = shape, read
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        return self._read(rows)
 
 
 class OnDisk:
@@ -92,8 +103,11 @@ class OnDisk:
         except (IndexError, TypeError):  # of the key
             raise
         except Exception as error:
-            with reading(self._path, "an array"):
+            with self._naming():
                 raise error
+
+    def _naming(self) -> contextlib.AbstractContextManager[Any]:
+        return reading(self._path, "an array")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +117,15 @@ class OpenedStore:
     attrs: Mapping[str, Any]
     names: frozenset[str]
     read: Callable[[str], NDArray[Any]]
-    histogram: CountArray
-    complete: bool
-    progress: str  # how far an incomplete file got, for people; empty where that is not known
-    close: Callable[[], None]
+    histogram: CountArray | None = None  # None where its writing stopped before, or of a file of maps
+    progress: str = ""  # how far an incomplete file got, for people; empty where that is not known
+    close: Callable[[], None] = lambda: None
     rows_of: Callable[[str], Any] | None = None  # a variable that is read when it is sliced
+
+    @property
+    def complete(self) -> bool:
+        """Whether it was written to its end."""
+        return bool(self.attrs.get("complete", True))
 
 
 class Writer(ABC):
@@ -129,3 +147,56 @@ class Writer(ABC):
     @abstractmethod
     def abandon(self) -> str:
         """Stop early; returns a sentence that says what is left on disk."""
+
+
+class FileWriter(Writer):
+    """Writes a sibling of the target and renames it at the end; given up, it leaves nothing."""
+
+    def __init__(self, path: Path, recipe: Recipe | Recording) -> None:
+        self._path, self._sibling = path, TemporarySibling(path)
+        self._parts: list[Any] = []  # what is open, closed from the last one on
+        try:
+            self._begin(recipe)
+        except BaseException:
+            self.abandon()
+            raise
+
+    @abstractmethod
+    def _begin(self, recipe: Any) -> None:
+        """Open the sibling and write all but the counts."""
+
+    @abstractmethod
+    def _end(self, registrations: int) -> None:
+        """Write what is left."""
+
+    def finish(self, registrations: int) -> None:
+        """Write what is left, close the file, and put it in its place."""
+        self._end(registrations)
+        for part in reversed(self._parts):
+            part.close()
+        self._sibling.publish()
+
+    def abandon(self) -> str:
+        """Remove the unfinished sibling."""
+        for part in reversed(self._parts):
+            with contextlib.suppress(Exception):  # closing flushes, which fails again on a full disk
+                part.close()
+        return self._sibling.discard()
+
+
+@contextlib.contextmanager
+def writing(path: str | Path, begin: Callable[[], Writer]) -> Iterator[Writer]:
+    """The writer that `begin` makes, abandoned where it is not finished; errors tell what is left on disk."""
+    try:
+        writer = begin()
+    except OSError as error:
+        raise WriteError(error.errno, f"{reason(error)}; nothing was left at {path}") from error
+    try:
+        yield writer
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {writer.abandon()}") from None
+    except OSError as error:
+        raise WriteError(error.errno, f"{reason(error)}; {writer.abandon()}") from error
+    except BaseException:
+        writer.abandon()
+        raise

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_data, open_npz, read_mat5, read_npy, reading, whole
 from mars_lidar._base.hdf5 import open_hdf5
-from mars_lidar.io.capture import Capture, capture_in
+from mars_lidar.io.capture import capture_in
+from mars_lidar.io.store import Rows
 from mars_lidar.light.transient import Transient
 
 SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
@@ -92,7 +93,8 @@ def _read(
     if len(values.shape) == 4:
         if channel is None or not 0 <= channel < values.shape[3]:
             raise ValueError(f"{source}: has {values.shape[3]} channels: give channel from 0, got {channel!r}")
-        values = _Channel(values, channel)
+        every, place = values, channel
+        values = Rows(tuple(every.shape[:3]), lambda rows: np.asarray(every[rows])[..., place])
     elif channel is not None:
         raise ValueError(f"{source}: channel is for (H, W, T, C) arrays, got shape {tuple(values.shape)}")
     return Transient(values, width, start_ns=start, source=str(source))
@@ -113,7 +115,7 @@ def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
         capture = capture_in(path, file) if name is None else None
         if capture is not None:
             times = {"bin_ns": capture.bin_ns, "start_ns": capture.start_ns}
-            return _Captured(capture), {key: value for key, value in times.items() if value is not None}
+            return Rows(capture.image, capture.read), {key: value for key, value in times.items() if value is not None}
         wanted = name or _NAME
         if not isinstance(file.get(wanted), h5py.Dataset):
             names = ", ".join(file) or "nothing"
@@ -123,7 +125,7 @@ def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
         data = file[wanted]
         check_data(path, data, wanted, in_parts=True)
         told = {key: float(data.attrs[key]) for key in _TIMES if key in data.attrs}
-        return _Rows(path, wanted, tuple(data.shape), turned=False), told
+        return _rows(path, wanted, tuple(data.shape), turned=False), told
 
 
 def _mat_name(path: Path) -> str:
@@ -149,7 +151,7 @@ def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
             told = {key: float(np.ravel(whole(file[key]))[0]) for key in _TIMES if key in file}
             check_data(path, file[name], name, in_parts=True)
             bins, width, height = file[name].shape
-            return _Rows(path, name, (height, width, bins), turned=True), told
+            return _rows(path, name, (height, width, bins), turned=True), told
     from scipy.io import whosmat
 
     found = read_mat5(path, (name, *_TIMES))
@@ -159,37 +161,12 @@ def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
     return found[name], {key: float(np.ravel(found[key])[0]) for key in _TIMES if key in found}
 
 
-class _Captured:
-    """Rows of a capture."""
+def _rows(path: Path, name: str, shape: tuple[int, ...], *, turned: bool) -> Rows:
+    """A data set (H, W, T), or one (T, W, H) where it is turned; the file is open only while rows are read."""
 
-    def __init__(self, capture: Capture) -> None:
-        self._capture = capture
-        self.shape = capture.image
+    def read(rows: slice) -> NDArray[Any]:
+        with open_hdf5(path) as file:
+            data = file[name]
+            return np.asarray(data[:, :, rows]).transpose(2, 1, 0) if turned else np.asarray(data[rows])
 
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        return self._capture.read(rows)
-
-
-class _Rows:
-    """Rows of a data set (H, W, T), or of one (T, W, H) where it is turned; the file is open only while read."""
-
-    def __init__(self, path: Path, name: str, shape: tuple[int, ...], *, turned: bool) -> None:
-        self._path, self._name, self._turned = path, name, turned
-        self.shape = shape
-
-    def __getitem__(self, key: Any) -> NDArray[Any]:
-        with open_hdf5(self._path) as file:
-            if self._turned:
-                return np.asarray(file[self._name][:, :, key]).transpose(2, 1, 0)
-            return np.asarray(file[self._name][key])
-
-
-class _Channel:
-    """One channel of (H, W, T, C)."""
-
-    def __init__(self, values: Any, channel: int) -> None:
-        self._values, self._channel = values, channel
-        self.shape = tuple(values.shape[:3])
-
-    def __getitem__(self, key: Any) -> NDArray[Any]:
-        return np.asarray(self._values[key])[..., self._channel]
+    return Rows(shape, read)

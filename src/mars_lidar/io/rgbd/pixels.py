@@ -93,8 +93,3 @@ def describe(array: NDArray[Any]) -> str:
 def size(array: NDArray[Any]) -> str:
     """Height x width, for messages."""
     return f"{array.shape[0]} x {array.shape[1]}"
-
-
-def reason(error: Exception) -> str:
-    """The first line of what a decoder said."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

@@ -83,18 +83,32 @@ def measured(
     number = max(1, math.ceil(period_ns / unit_ns - 1e-6)) if bins is None else bins
     width = unit_ns if bins is None else period_ns / bins
     bin_ = np.minimum((phase / width).astype(np.int64), number - 1)
-    times_ns = cycle * period_ns + phase
-    order = np.lexsort((times_ns, detector))
-    counts = np.bincount(detector, minlength=pixels)
+    info = {"source": source, "unit_ns": unit_ns if clock_ns is None else clock_ns}
+    return of_pixels(cycle * period_ns + phase, cycle, bin_, detector, (1, pixels), number, period_ns, info)
+
+
+def of_pixels(
+    times_ns: NDArray[np.float64],
+    cycle: NDArray[Any],
+    bin_: NDArray[Any],
+    pixel: NDArray[Any],
+    shape: tuple[int, int],
+    bins: int,
+    period_ns: float,
+    info: dict[str, Any],
+) -> Timestamps:
+    """Timestamps of photons in any order, whose `pixel` counts through the rows of an image of `shape`."""
+    order = np.lexsort((times_ns, pixel))
+    counts = np.bincount(pixel, minlength=math.prod(shape))
     cycles = int(cycle.max()) + 1 if cycle.size else 1
     if cycles >= 2**31:
-        raise ValueError(f"{source}: a stream may span 2^31 laser periods at most, got {cycles}")
+        raise ValueError(f"{info['source']}: a stream may span 2^31 laser periods at most, got {cycles:.4g}")
     attrs = {
-        "shape": (1, pixels),
-        "bins": number,
-        "dtype": "uint16" if counts.size == 0 or counts.max() < 2**16 else "uint32",
+        "shape": shape,
+        "bins": bins,
+        "dtype": "uint16" if counts.max(initial=0) < 2**16 else "uint32",
         "period_ns": period_ns,
         "cycles": cycles,
-        "info": {"source": source, "unit_ns": unit_ns if clock_ns is None else clock_ns},
+        "info": info,
     }
     return from_attributes(attrs, times_ns[order], cycle[order], bin_[order], counts)

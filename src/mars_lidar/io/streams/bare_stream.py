@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import open_npz, read_mat5, whole
 from mars_lidar._base.hdf5 import open_hdf5
+from mars_lidar.io.streams.attributes import of_pixels
 from mars_lidar.io.streams.photons import NoLaserError, Photons
 from mars_lidar.light.timestamps import Timestamps
 
@@ -35,21 +36,44 @@ def read(
         period_ns = _period(found, unit)
     if period_ns is None:
         raise NoLaserError(f"{path} does not tell the laser period: give period_ns")
-    return _timestamps(path, name, cells, unit, period_ns, bins)
+    raw, pixel, clocked = _flat(path, name, cells)
+    # a whole number of units is known to a unit: its middle
+    times_ns = (raw + 0.5 * clocked) * unit
+    if raw.size > cells.size and times_ns.max() < period_ns:
+        raise ValueError(
+            f"{path}: all times of {name!r} lie within one laser period of {period_ns:g} ns: these are phases, and "
+            "without the period that each photon fell into there are no intervals; give absolute times"
+        )
+    cycle = np.floor(times_ns / period_ns)
+    if bins is None:
+        bins = max(1, round(period_ns / unit)) if clocked and period_ns / unit <= _MOST_BINS else _BINS
+    place = np.minimum(((times_ns / period_ns - cycle) * bins).astype(np.int64), bins - 1)
+    info: dict[str, Any] = {"source": str(path)}
+    if clocked:
+        info["unit_ns"] = unit
+    if disordered := int(((np.diff(raw) < 0) & (np.diff(pixel) == 0)).sum()):
+        info["disordered"] = disordered
+    return of_pixels(times_ns, cycle, place, pixel, cells.shape, bins, period_ns, info)
 
 
 def photons(path: Path, unit_ns: float | None, variable: str | None) -> Photons:
     """The absolute times alone, each cell a channel; of a clock where they are whole numbers."""
     _, name, cells, unit = _times(path, unit_ns, variable)
-    raw = np.concatenate([np.empty(0), *(np.asarray(cell, np.float64).ravel() for cell in cells.ravel())])
-    if not (np.isfinite(raw) & (raw >= 0)).all():
-        raise ValueError(f"{path}: times of {name!r} must be finite and >= 0")
-    channel = np.repeat(np.arange(cells.size), [cell.size for cell in cells.ravel()])
-    clocked = bool((raw == np.floor(raw)).all())
+    raw, channel, clocked = _flat(path, name, cells)
     tick = unit if clocked else _FINEST_NS
     if raw.size and raw.max() * unit / tick >= 2**62:
         raise ValueError(f"{path}: times of {name!r} span more than {2**62:.2g} units of {tick:g} ns")
     return Photons((raw * (unit / tick)).astype(np.int64), tick, channel, str(path))
+
+
+def _flat(path: Path, name: str, cells: _Cells) -> tuple[NDArray[np.float64], NDArray[np.int64], bool]:
+    """All times, the number of the cell of each, and whether they are whole numbers."""
+    raw = np.concatenate([np.empty(0), *(np.asarray(cell, np.float64).ravel() for cell in cells.ravel())])
+    bad = ~(np.isfinite(raw) & (raw >= 0))
+    if bad.any():
+        raise ValueError(f"{path}: times of {name!r} must be finite and >= 0, got {raw[int(np.argmax(bad))]}")
+    cell = np.repeat(np.arange(cells.size), [cell.size for cell in cells.ravel()])
+    return raw, cell, raw.size > 0 and bool((raw == np.floor(raw)).all())
 
 
 def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dict[str, _Cells], str, _Cells, float]:
@@ -62,50 +86,6 @@ def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dic
     if unit is None:
         raise ValueError(f"{path}: nothing tells the unit of {name!r}: give unit_ns (1 if its times are in ns)")
     return found, name, cells, unit
-
-
-def _timestamps(path: Path, name: str, cells: _Cells, unit: float, period_ns: float, bins: int | None) -> Timestamps:
-    from mars_lidar.io.streams.attributes import from_attributes
-
-    height, width = cells.shape
-    counts = np.array([cell.size for cell in cells.ravel()], np.int64)
-    total = int(counts.sum())
-    raw = np.concatenate([np.empty(0), *(np.asarray(cell).ravel() for cell in cells.ravel())])
-    bad = ~(np.isfinite(raw) & (raw >= 0))
-    if bad.any():
-        raise ValueError(f"{path}: times of {name!r} must be finite and >= 0, got {raw[int(np.argmax(bad))]}")
-    pixel = np.repeat(np.arange(counts.size), counts)
-    disordered = int(((np.diff(raw) < 0) & (np.diff(pixel) == 0)).sum())
-    clocked = total > 0 and bool((raw == np.floor(raw)).all())
-    # a whole number of units is known to a unit: its middle
-    times_ns = (raw + 0.5) * unit if clocked else raw * unit
-    if total > counts.size and times_ns.max() < period_ns:
-        raise ValueError(
-            f"{path}: all times of {name!r} lie within one laser period of {period_ns:g} ns: these are phases, and "
-            "without the period that each photon fell into there are no intervals; give absolute times"
-        )
-    order = np.lexsort((times_ns, pixel))
-    times_ns = times_ns[order]
-    cycle = np.floor(times_ns / period_ns)
-    if total and cycle.max() >= 2**31:
-        raise ValueError(f"{path}: a stream may span 2^31 laser periods at most, got {cycle.max():.4g}")
-    if bins is None:
-        bins = max(1, round(period_ns / unit)) if clocked and period_ns / unit <= _MOST_BINS else _BINS
-    place = np.minimum(((times_ns / period_ns - cycle) * bins).astype(np.int64), bins - 1)
-    info: dict[str, Any] = {"source": str(path)}
-    if clocked:
-        info["unit_ns"] = unit
-    if disordered:
-        info["disordered"] = disordered
-    attrs = {
-        "shape": (height, width),
-        "bins": bins,
-        "dtype": "uint16" if total < 2**16 else "uint32",
-        "period_ns": period_ns,
-        "cycles": int(cycle.max()) + 1 if total else 1,
-        "info": info,
-    }
-    return from_attributes(attrs, times_ns, cycle, place, counts)
 
 
 def _chosen(path: Path, found: dict[str, _Cells], variable: str | None) -> tuple[str, _Cells]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import math
-import zipfile
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -160,13 +159,13 @@ def _module(path: Path) -> Any:
 
 
 def _write_npz(path: Path, times: Timestamps) -> None:
-    arrays = {name: getattr(times, name) for name in ("times_ns", "cycle", "bin", "offsets")}
-    arrays["attributes"] = np.asarray(json.dumps(attributes(times)))
+    from mars_lidar.io import npz
+
     # 14 million photons: 10 s and 132 MB; NumPy's own level takes 36 s for 114 MB
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+    with npz.archive(path) as archive:
+        for name in ("times_ns", "cycle", "bin", "offsets"):
+            npz.add_array(archive, name, getattr(times, name))
+        npz.add_attributes(archive, attributes(times))
 
 
 def _npz_attributes(path: Path) -> dict[str, Any]:

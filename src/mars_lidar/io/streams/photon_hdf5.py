@@ -15,6 +15,7 @@ import os
 import re
 import shutil
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, whole
 from mars_lidar._base.hdf5 import open_hdf5, seal
 from mars_lidar._base.optional import needed
+from mars_lidar.io.streams.attributes import attributes, from_attributes
 from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
 
@@ -39,8 +41,6 @@ def check() -> None:
 
 def write(path: Path, times: Timestamps) -> None:
     """Write a stream; the caller renames the file when it is whole."""
-    from mars_lidar.io.streams.attributes import attributes
-
     save_photon_hdf5 = needed("phconvert.hdf5", "Photon-HDF5").save_photon_hdf5
     fine = units_per_bin(times.bins)
     kind = np.uint16 if times.bins * fine <= 2**16 else np.uint32
@@ -112,36 +112,35 @@ def write(path: Path, times: Timestamps) -> None:
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     """Read a stream; `period_ns` and `bins` are for files of others."""
-    from mars_lidar.io.streams.attributes import from_attributes
-
-    with open_hdf5(path) as file:
-        if _PHOTONS not in file:
-            raise ValueError(f"{path} is not Photon-HDF5 of one spot: it has no group 'photon_data'")
-        data = file[_PHOTONS]
-        timestamps = whole(data["timestamps"])
-        detectors = whole(data["detectors"]) if "detectors" in data else np.zeros(timestamps.shape, np.uint8)
+    with _opened(path) as file:
+        found = _photons(path, file)
         own = file.get(f"user/{_GROUP}/{_ATTRIBUTES}")
         attrs = {} if own is None else json.loads(_text(own[()]))
-        if not attrs:
-            return _photons(path, file).timestamps(period_ns, bins)
-        nanotimes = whole(data["nanotimes"])
+    if not attrs or found.fine is None:
+        return found.timestamps(period_ns, bins)
     if period_ns is not None or bins is not None:
         raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
     fine, number = units_per_bin(int(attrs["bins"])), int(attrs["bins"])
-    order = np.argsort(detectors, kind="stable")
-    nano, cycle = nanotimes[order].astype(np.int64), timestamps[order]
+    order = np.argsort(found.detector, kind="stable")
+    nano, cycle = found.fine[order].astype(np.int64), found.clock[order]
     times_ns = (cycle + (nano + 0.5) / (number * fine)) * float(attrs["period_ns"])
     height, width = attrs["shape"]
-    counts = np.bincount(detectors, minlength=height * width)
+    counts = np.bincount(found.detector, minlength=height * width)
     return from_attributes(attrs, times_ns, cycle, nano // fine, counts)
 
 
 def photons(path: Path) -> Photons:
     """The photons of a file of others, of one spot."""
+    with _opened(path) as file:
+        return _photons(path, file)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     with open_hdf5(path) as file:
         if _PHOTONS not in file:
             raise ValueError(f"{path} is not Photon-HDF5 of one spot: it has no group 'photon_data'")
-        return _photons(path, file)
+        yield file
 
 
 def _photons(path: Path, file: Any) -> Photons:

@@ -7,7 +7,6 @@ came is not in it; `mars_lidar.io.streams.ptu_stream` writes photons with their 
 
 from __future__ import annotations
 
-import contextlib
 import math
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import TemporarySibling
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.optional import needed
 from mars_lidar.io import layout
-from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.store import LazyCounts, OpenedStore, Writer
+from mars_lidar.io.recipe import Recipe
+from mars_lidar.io.store import FileWriter, LazyCounts, OpenedStore
 from mars_lidar.io.streams import ptu_header
 
 KIND = "cube"
@@ -37,41 +35,27 @@ def check(recipe: Recipe) -> None:
         raise ValueError(f"a pixel of a .ptu must span fewer than 2^31 laser periods, got {_pixel_periods(recipe)}")
 
 
-class PtuWriter(Writer):
-    """Writes a sibling of the target, image by image, and renames it at the end."""
+class PtuWriter(FileWriter):
+    """Writes a cube image by image."""
 
-    def __init__(self, path: Path, recipe: Recipe) -> None:
+    def _begin(self, recipe: Recipe) -> None:
         check(recipe)
-        ptufile = needed("ptufile", "a .ptu")
-        system = recipe.system
         _, height, width, bins = recipe.shape
         size = height * width * bins * recipe.dtype.itemsize
-        check_memory(3 * size, f"the images of {path}, which are written whole,", "a .zarr or .h5 is written in parts")
+        what = f"the images of {self._path}, which are written whole,"
+        check_memory(3 * size, what, "a .zarr or .h5 is written in parts")
         self.chunks = recipe.chunks(size)
         self._image = np.empty((height, width, bins), recipe.dtype)
         self._rows = 0
         self._periods = _pixel_periods(recipe)
-        self._sibling = TemporarySibling(path)
-        self._ptu: Any = None
-        period_s = 1e-9 * system.period_ns
         self._file = open(self._sibling.path, "w+b")  # noqa: SIM115  # closed by `finish` and `abandon`
-        try:
-            attrs = {"kind": KIND, "complete": True, **layout.attributes(recipe)}
-            arrays = {v.name: v.data for v in layout.variables(recipe)}
-            spanned = period_s * self._periods * math.prod(recipe.shape[:3])
-            self._ptu = ptufile.PtuWriter(
-                self._file,
-                (1, height, width, 1, bins),
-                period_s,
-                period_s / bins,
-                period_s * self._periods,
-                record_type=ptufile.PtuRecordType.GenericT3,
-                tags=ptu_header.tags(attrs, arrays, spanned),
-            )
-            self._header_bytes = self._file.tell()
-        except BaseException:
-            self.abandon()
-            raise
+        self._parts.append(self._file)
+        attrs = {"kind": KIND, "complete": True, **layout.attributes(recipe)}
+        arrays = {v.name: v.data for v in layout.variables(recipe)}
+        self._ptu = ptu_header.new_file(
+            self._file, (height, width, bins), recipe.system.period_ns, self._periods, attrs, arrays, recipe.shape[0]
+        )
+        self._header_bytes = self._file.tell()
 
     def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
         """Take rows of an image, or whole images; an image is written when its last row has come."""
@@ -87,59 +71,24 @@ class PtuWriter(Writer):
             self._ptu.write(self._image[None, :, :, None])
             self._file.write(_OVERFLOW)  # the next image begins with its time at 0: time must not run backwards
 
-    def finish(self, registrations: int) -> None:
-        """Put the number of records into the header, close the file, and put it in its place."""
+    def _end(self, registrations: int) -> None:
+        """Put the number of records into the header."""
         records = (self._file.tell() - self._header_bytes) // 4
         self._ptu.close()
         ptu_header.set_integer(self._file, self._header_bytes, b"TTResult_NumberOfRecords", records)
         ptu_header.set_integer(self._file, self._header_bytes, ptu_header.PHOTONS.encode(), registrations)
-        self._file.close()
-        self._sibling.publish()
-
-    def abandon(self) -> str:
-        """Remove the unfinished sibling."""
-        with contextlib.suppress(Exception):
-            self._file.close()
-        return self._sibling.discard()
 
 
-class _PtuCounts(LazyCounts):
-    """The counts of a file."""
-
-    def __init__(self, path: Path, recipe: Recipe | Recording) -> None:
-        self._path, self._recipe = path, recipe
-        self.shape = recipe.shape
-        self.dtype = recipe.dtype
-
-    def _read(self) -> NDArray[Any]:
-        whole = self._recipe.nbytes + self._path.stat().st_size
-        check_memory(whole, f"the counts of {self._path}", "mars-lidar convert makes a .zarr of it elsewhere")
-        ptu = ptu_header.opened(self._path)
-        try:
-            image = ptu.decode_image(channel=0, dtime=self.shape[-1], dtype=self.dtype)
-        finally:
-            ptu.close()
-        if image.shape != (*self.shape[:3], 1, self.shape[3]):
-            told = f"{image.shape[:3]} instead of {self.shape[:3]} (realization, y, x)"
-            raise ValueError(f"{self._path} is damaged: its records make an image of {told}")
-        return np.ascontiguousarray(image[:, :, :, 0])
-
-
-def open_writer(path: Path, recipe: Recipe) -> Writer:
-    """Begin a file; an existing one is replaced."""
-    return PtuWriter(path, recipe)
+open_writer = PtuWriter
 
 
 def open_store(path: Path) -> OpenedStore:
     """Open a file for reading."""
-    ptu = ptu_header.opened(path)
-    try:
+    with ptu_header.opened(path) as ptu:
         attrs = ptu_header.attributes(ptu.tags)
         arrays = ptu_header.variables(path, ptu.tags)
         told = int(ptu.tags.get("ImgHdr_MaxFrames", 0))
         attrs["registrations"] = int(ptu.tags.get(ptu_header.PHOTONS, 0))
-    finally:
-        ptu.close()
     if attrs.get("kind") != KIND:
         raise ValueError(
             f"{path} is not a cube written by mars-lidar; mars_lidar.Timestamps.load reads photon streams, "
@@ -147,7 +96,19 @@ def open_store(path: Path) -> OpenedStore:
         )
     layout.check_format(path, attrs)
     recipe = layout.recipe_from(attrs, frozenset(arrays), arrays.__getitem__, told)
-    return OpenedStore(attrs, frozenset(arrays), arrays.__getitem__, _PtuCounts(path, recipe), True, "", lambda: None)
+    shape = recipe.shape
+
+    def counts() -> NDArray[Any]:
+        whole = recipe.nbytes + path.stat().st_size
+        check_memory(whole, f"the counts of {path}", "mars-lidar convert makes a .zarr of it elsewhere")
+        with ptu_header.opened(path) as ptu:
+            image = ptu.decode_image(channel=0, dtime=shape[-1], dtype=recipe.dtype)
+        if image.shape != (*shape[:3], 1, shape[3]):
+            made = f"{image.shape[:3]} instead of {shape[:3]} (realization, y, x)"
+            raise ValueError(f"{path} is damaged: its records make an image of {made}")
+        return np.ascontiguousarray(image[:, :, :, 0])
+
+    return OpenedStore(attrs, frozenset(arrays), arrays.__getitem__, LazyCounts(shape, recipe.dtype, counts))
 
 
 def _pixel_periods(recipe: Recipe) -> int:

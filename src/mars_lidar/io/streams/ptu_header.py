@@ -28,30 +28,51 @@ _MAGIC = b"PQTTTR\0\0"
 _MAX_BLOB = 2**31 - 1
 
 
-def tags(attrs: Mapping[str, Any], variables: Mapping[str, NDArray[Any]], acquisition_s: float) -> dict[str, Any]:
-    """Header tags beside those that the record format asks for.
+def new_file(
+    file: Any,
+    shape: tuple[int, int, int],
+    period_ns: float,
+    cycles: int,
+    attrs: Mapping[str, Any],
+    variables: Mapping[str, NDArray[Any]],
+    frames: int = 1,
+) -> Any:
+    """A `ptufile.PtuWriter` of generic T3 records, with our tags, for images of shape (H, W, bins).
 
-    `acquisition_s` is the time that all records span; phconvert and PicoQuant's own software ask for it.
+    `cycles` are the laser periods of a pixel; the time that all records span is asked for by phconvert and PicoQuant's
+    own software.
     """
     from mars_lidar._version import __version__
 
+    ptufile = needed("ptufile", "a .ptu")
     packed = BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(array) for name, array in variables.items()}
     np.savez_compressed(packed, **arrays)
     if packed.tell() > _MAX_BLOB:
         raise ValueError(f"the maps of a .ptu must take less than 2 GiB, got {packed.tell()} bytes; use .h5")
     text = json.dumps(attrs)
-    return {
+    height, width, bins = shape
+    period_s = 1e-9 * period_ns
+    tags = {
         "File_GUID": f"{{{uuid.uuid5(uuid.NAMESPACE_OID, text)}}}",
         "File_Comment": f"simulated by mars-lidar {__version__}: {attrs.get('source', '')}"[:200],
         "CreatorSW_Name": "mars-lidar",
         "CreatorSW_Version": __version__,
         "HW_Type": "mars-lidar",
-        "MeasDesc_AcquisitionTime": round(1e3 * acquisition_s),
+        "MeasDesc_AcquisitionTime": round(1e3 * period_s * cycles * height * width * frames),
         PHOTONS: 0,
         _ATTRIBUTES: text,
         _VARIABLES: packed.getvalue(),
     }
+    return ptufile.PtuWriter(
+        file,
+        (1, height, width, 1, bins),
+        period_s,
+        period_s / bins,
+        period_s * cycles,
+        record_type=ptufile.PtuRecordType.GenericT3,
+        tags=tags,
+    )
 
 
 def attributes(found: Mapping[str, Any]) -> dict[str, Any]:

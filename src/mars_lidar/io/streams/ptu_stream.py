@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.files import IncompleteFileError
 from mars_lidar._base.optional import needed
 from mars_lidar.io.streams import ptu_header
+from mars_lidar.io.streams.attributes import attributes, from_attributes
 from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
 
@@ -42,29 +43,15 @@ def write(path: Path, times: Timestamps, clock_ps: float | None = None) -> None:
     `clock_ps`: least unit of the fine time. Programs that make images of the file have a bin for each of its codes:
     at the finest one, 32768 a period, an image of 128 x 128 pixels takes 1 GB there.
     """
-    from mars_lidar.io.streams.attributes import attributes
-
-    ptufile = needed("ptufile", "a .ptu")
     if times.bins > ptu_header.MAX_BINS:
         raise ValueError(f"bins must be at most {ptu_header.MAX_BINS} in a .ptu, got {times.bins}; use .h5 or .npz")
     height, width = times.shape
     if not times.cycles < 2**31:
         raise ValueError(f"cycles must be below 2^31 in a .ptu, got {times.cycles}")
     fine = units_per_bin(times.bins, times.period_ns, clock_ps)
-    period_s = 1e-9 * times.period_ns
-    exposure_s = period_s * times.cycles
     attrs = {"kind": KIND, **attributes(times)}
-    tags = ptu_header.tags(attrs, {}, exposure_s * height * width)
     with open(path, "w+b") as file:
-        ptufile.PtuWriter(
-            file,
-            (1, height, width, 1, times.bins * fine),
-            period_s,
-            period_s / (times.bins * fine),
-            exposure_s,
-            record_type=ptufile.PtuRecordType.GenericT3,
-            tags=tags,
-        )
+        ptu_header.new_file(file, (height, width, times.bins * fine), times.period_ns, times.cycles, attrs, {})
         begin = file.tell()
         number = 0
         last = np.int64(0)  # overflows written so far
@@ -85,10 +72,7 @@ def write(path: Path, times: Timestamps, clock_ps: float | None = None) -> None:
 
 def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     """Read a stream; `period_ns` and `bins` are for files of others."""
-    from mars_lidar.io.streams.attributes import from_attributes
-
-    ptu = ptu_header.opened(path)
-    try:
+    with ptu_header.opened(path) as ptu:
         attrs = ptu_header.attributes(ptu.tags)
         if attrs.get("kind") == "cube":
             raise ValueError(f"{path} is a cube, not a stream: mars_lidar.io.load reads it")
@@ -102,8 +86,6 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
             return _photons(ptu, path).timestamps(period_ns, bins)
         decoded = ptu.decode_records()
         unit_ns = 1e9 * ptu.tcspc_resolution
-    finally:
-        ptu.close()
     photons = decoded[decoded["channel"] >= 0]
     height, width = (int(n) for n in attrs["shape"])
     cycles, number = int(attrs["cycles"]), int(attrs["bins"])
@@ -121,11 +103,8 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
 
 def photons(path: Path) -> Photons:
     """The photons of a file: T3, or T2, absolute times; markers are passed over."""
-    ptu = ptu_header.opened(path)
-    try:
+    with ptu_header.opened(path) as ptu:
         return _photons(ptu, path)
-    finally:
-        ptu.close()
 
 
 def _photons(ptu: Any, path: Path) -> Photons:
@@ -151,12 +130,9 @@ def units_per_bin(bins: int, period_ns: float = 0.0, clock_ps: float | None = No
 
 def is_stream(path: Path) -> bool:
     """Whether the file holds a stream: ours, or of others but no image."""
-    ptu = ptu_header.opened(path)
-    try:
+    with ptu_header.opened(path) as ptu:
         attrs = ptu_header.attributes(ptu.tags)
         return attrs.get("kind") == KIND if attrs else not ptu.is_image
-    finally:
-        ptu.close()
 
 
 def _row(times: Timestamps, row: int, fine: int) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:

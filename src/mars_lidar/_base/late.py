@@ -7,6 +7,8 @@ module calls one above it: docs/architecture.md lists them, tests/test_package.p
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -15,3 +17,21 @@ def late(name: str) -> Any:
     """The object called ``module:name`` in this package, such as ``"io.rgbd:read_rgbd"``."""
     module, _, attribute = name.partition(":")
     return getattr(import_module(f"mars_lidar.{module}"), attribute)
+
+
+def names_of(package: str, homes: dict[str, str]) -> Callable[[str], Any]:
+    """The ``__getattr__`` of a package: names by the modules of it that have them, each loaded when it is asked for.
+
+    All names of a module are put into the package at once, for one of them may be called like the module.
+    """
+
+    def get(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module = import_module(f"{package}.{homes[name]}")
+        for each, home in homes.items():
+            if home == homes[name]:
+                setattr(sys.modules[package], each, getattr(module, each))
+        return getattr(module, name)
+
+    return get

@@ -2,68 +2,39 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from mars_lidar.dataset.run import Generated, generate
+from mars_lidar._base.late import names_of
+from mars_lidar.dataset.run import Generated as Generated
+from mars_lidar.dataset.run import generate as generate
 
 if TYPE_CHECKING:
-    from mars_lidar.dataset.estimate import Estimate, estimate
+    from mars_lidar.dataset.estimate import Estimate as Estimate
+    from mars_lidar.dataset.estimate import estimate as estimate
     from mars_lidar.dataset.estimate import quick_advice as quick_advice
-    from mars_lidar.dataset.light import Light
-    from mars_lidar.dataset.network_files import Exported, export
-    from mars_lidar.dataset.read import read_sparse
-    from mars_lidar.dataset.recipe import DatasetRecipe
-    from mars_lidar.dataset.schema import json_schema
-    from mars_lidar.dataset.store import Dataset, open_dataset
-    from mars_lidar.dataset.verify import Verified, verify
-    from mars_lidar.dataset.view import View, read_view
+    from mars_lidar.dataset.light import Light as Light
+    from mars_lidar.dataset.network_files import Exported as Exported
+    from mars_lidar.dataset.network_files import export as export
+    from mars_lidar.dataset.read import read_sparse as read_sparse
+    from mars_lidar.dataset.recipe import DatasetRecipe as DatasetRecipe
+    from mars_lidar.dataset.schema import json_schema as json_schema
+    from mars_lidar.dataset.store import Dataset as Dataset
+    from mars_lidar.dataset.store import open_dataset as open_dataset
+    from mars_lidar.dataset.verify import Verified as Verified
+    from mars_lidar.dataset.verify import verify as verify
+    from mars_lidar.dataset.view import View as View
+    from mars_lidar.dataset.view import read_view as read_view
 
-_MODULES = {
-    "Dataset": "store",
+_HOMES = {
+    **dict.fromkeys(("Dataset", "open_dataset"), "store"),
+    **dict.fromkeys(("Estimate", "estimate", "quick_advice"), "estimate"),
+    **dict.fromkeys(("Exported", "export"), "network_files"),
+    **dict.fromkeys(("Verified", "verify"), "verify"),
+    **dict.fromkeys(("View", "read_view"), "view"),
     "DatasetRecipe": "recipe",
-    "Estimate": "estimate",
-    "Exported": "network_files",
     "Light": "light",
-    "Verified": "verify",
-    "View": "view",
-    "estimate": "estimate",
-    "export": "network_files",
     "json_schema": "schema",
-    "open_dataset": "store",
-    "quick_advice": "estimate",
     "read_sparse": "read",
-    "read_view": "view",
-    "verify": "verify",
 }
-
-
-def __getattr__(name: str) -> Any:  # `import mars_lidar` loads no Zarr
-    if name in _MODULES:
-        from importlib import import_module
-
-        module = import_module(f"mars_lidar.dataset.{_MODULES[name]}")
-        for each, home in _MODULES.items():  # all of them: `verify` is the function, not the module of the same name
-            if home == _MODULES[name]:
-                globals()[each] = getattr(module, each)
-        return globals()[name]
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-__all__ = [
-    "Dataset",
-    "DatasetRecipe",
-    "Estimate",
-    "Exported",
-    "Generated",
-    "Light",
-    "Verified",
-    "View",
-    "estimate",
-    "export",
-    "generate",
-    "json_schema",
-    "open_dataset",
-    "read_sparse",
-    "read_view",
-    "verify",
-]
+__getattr__ = names_of(__name__, _HOMES)  # `import mars_lidar` loads no Zarr
+__all__ = ["Generated", "generate", *(name for name in _HOMES if name != "quick_advice")]

@@ -32,13 +32,7 @@ _COORDINATES = "scene scene_name system signal_level sbr period_ns seed"  # for 
 def histogram_blocks(
     recipe: DatasetRecipe, number: int, shape: tuple[int, int]
 ) -> tuple[tuple[int, ...], np.dtype[Any], tuple[int, ...], tuple[int, ...]]:
-    """Shape, type, chunk and shard of the histogram.
-
-    Raises
-    ------
-    ValueError
-        Pixels depend on each other (crosstalk) and an image does not fit in a chunk.
-    """
+    """Shape, type, chunk and shard of the histogram; ValueError for an image with crosstalk larger than a chunk."""
     dtype = np.result_type(*(one.histogram_dtype for one in recipe.systems))
     whole = (number, recipe.realizations, *shape, recipe.systems[0].bins)
     chunk = samples.fitting(whole, (1, 1, 1, 1, whole[-1]), dtype.itemsize, recipe.chunk_mib * 2**20)

@@ -14,31 +14,21 @@ import uuid
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.optional import needed
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.store import Dataset, Item
     from mars_lidar.dataset.write import Made, Maker
 
+_LIBRARY = "distributed", "making parts by workers", "cluster"
 _AHEAD = 3  # parts given out per worker thread: none waits for the scheduler, and a million are not queued at once
 TIMEOUT_S = 20.0  # for a scheduler to answer
 _local = threading.local()
 
 
-def needed() -> Any:
-    """The library, or an error that says how to install it."""
-    try:
-        import distributed
-    except ImportError as error:
-        raise MissingLibraryError(
-            f"workers and scheduler need dask.distributed: pip install 'mars-lidar[cluster]' ({error})"
-        ) from error
-    return distributed
-
-
 def reach(scheduler: str | None) -> None:
     """Raise ValueError unless the library is there and a scheduler answers at this address, if one is given."""
-    distributed = needed()
+    distributed = needed(*_LIBRARY)
     if scheduler is not None:
         _client(distributed, scheduler).close()
 
@@ -52,7 +42,7 @@ def make_all(
     scheduler: str | None,
 ) -> None:
     """Make parts on `workers` processes of this machine, or on the workers of the `scheduler` at that address."""
-    distributed = needed()
+    distributed = needed(*_LIBRARY)
     if not todo:
         return
     if scheduler is not None:

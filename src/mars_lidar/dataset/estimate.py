@@ -102,7 +102,7 @@ def estimate(
     maps = 4 * len(MAPS) * pixels * total + sum(map(_scene_bytes, looked)) // len(looked) * number
     parts = max(one.waveform_parts(system) for one in looked for system in plan.systems)
     block = making_bytes(chunk, dtype.itemsize, parts)
-    shards = math.prod(math.ceil(a / b) for a, b in zip(shape, shard, strict=True))
+    shards = math.prod(samples.grid(shape, shard))
     teams = max(1, min(team, shards, BUFFER_BYTES // block))
     return Estimate(
         scenes=number,

@@ -33,10 +33,7 @@ from mars_lidar.io.scan import Problem
 def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
     """Begin a store: every scene read, checked, and written; every array laid out.
 
-    Raises
-    ------
-    ValueError
-        No scene can be used; the text says why. Nothing is left at `path` then.
+    Where no scene can be used a ValueError says why, and nothing is left at `path`.
     """
     found, problems = candidates(recipe.scenes, folder)
     group = writer = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,8 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar.dataset.samples import grid
+from mars_lidar.dataset.shard import is_good
 from mars_lidar.dataset.store import Dataset, open_dataset
 
 
@@ -45,7 +46,7 @@ def read_sparse(dataset: Dataset | str | Path, sample: int, realization: int = 0
 
     _, _, rows, columns, _ = chunk = array.chunks
     parts = []
-    for y, x in itertools.product(range(math.ceil(height / rows)), range(math.ceil(width / columns))):
+    for y, x in np.ndindex(grid((height, width), (rows, columns))):
         position, count = events(_packed(source, (sample // chunk[0], realization // chunk[1], y, x, 0)))
         first, second, row, column, time = np.unravel_index(position, chunk)
         mine = (first == sample % chunk[0]) & (second == realization % chunk[1])
@@ -62,8 +63,6 @@ def _packed(dataset: Dataset, place: tuple[int, ...]) -> NDArray[np.uint8]:
 
     Zarr v3, sharding codec: the file ends in the index, offset and length of each chunk in C order, and its checksum.
     """
-    import google_crc32c
-
     array: Any = dataset.histogram
     each = tuple(shard // chunk for shard, chunk in zip(array.shards, array.chunks, strict=True))
     shard = tuple(p // n for p, n in zip(place, each, strict=True))
@@ -74,6 +73,6 @@ def _packed(dataset: Dataset, place: tuple[int, ...]) -> NDArray[np.uint8]:
         offset, length = (int(n) for n in np.frombuffer(stream.read(16), "<u8"))
         stream.seek(offset)
         packed = stream.read(length)
-    if len(packed) != length or google_crc32c.value(packed[:-4]) != int.from_bytes(packed[-4:], "little"):
+    if len(packed) != length or not is_good(packed):
         raise ValueError(f"{path}: chunk {inside} is damaged (its checksum differs)")
     return np.frombuffer(packed, np.uint8)[:-4]

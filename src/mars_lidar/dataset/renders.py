@@ -15,13 +15,7 @@ _OPTIONS = ("bin_ns", "start_ns", "name", "channel")
 
 
 def transient_files(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, partial[Rendered]]]:
-    """The files of an entry in the order of their paths, and what opens each.
-
-    Raises
-    ------
-    ValueError
-        No file at all.
-    """
+    """The files of an entry in the order of their paths, and what opens each; ValueError where there is none."""
     root = folder / entry["transient"]
     options = {name: entry[name] for name in _OPTIONS if name in entry}
     files = [root]

@@ -203,7 +203,7 @@ def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None
     Simulator and compressors run without Python's lock. Where so many chunks would not fit in `BUFFER_BYTES`, fewer
     parts are made at a time, each on several threads.
     """
-    from mars_lidar.dataset.write import Maker, Stopped
+    from mars_lidar.dataset.write import Maker
 
     team = thread_count(threads or None)
     array = dataset.histogram
@@ -211,31 +211,22 @@ def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None
     chunk = making_bytes(array.chunks, array.dtype.itemsize, parts)
     teams = max(1, min(team, len(todo), BUFFER_BYTES // chunk))
     stop = threading.Event()
-    makers = [Maker(dataset, max(1, team // teams), stop) for _ in range(teams)]
-    idle = list(makers)
-
-    def one(maker: Maker, item: Item) -> tuple[Maker, Made]:
-        return maker, maker.make(item)
-
+    idle = [Maker(dataset, max(1, team // teams), stop) for _ in range(teams)]
     waiting: Iterator[Item] = iter(todo)
     with ThreadPoolExecutor(teams) as pool:
-        running: set[Future[tuple[Maker, Made]]] = set()
+        running: dict[Future[Made], Maker] = {}
         try:
             while True:
                 while idle and (item := next(waiting, None)) is not None:
-                    running.add(pool.submit(one, idle.pop(), item))
+                    maker = idle.pop()
+                    running[pool.submit(maker.make, item)] = maker
                 if not running:
                     return
-                done, running = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    maker, made = future.result()
-                    idle.append(maker)
-                    add(made)
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    idle.append(running.pop(future))
+                    add(future.result())
         except BaseException:
-            stop.set()  # the simulator looks at it every 50 ms
-            for future in running:
-                with contextlib.suppress(Stopped, Exception):
-                    future.result()
+            stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
 
 

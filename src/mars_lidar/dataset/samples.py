@@ -35,3 +35,14 @@ def fitting(shape: Sequence[int], unit: Sequence[int], itemsize: int, most_bytes
         if parts > 1:
             break
     return tuple(block)
+
+
+def grid(shape: Sequence[int], steps: Sequence[int]) -> tuple[int, ...]:
+    """How many blocks of `steps` there are along each axis."""
+    return tuple(math.ceil(n / step) for n, step in zip(shape, steps, strict=True))
+
+
+def block(place: Sequence[int], steps: Sequence[int], shape: Sequence[int]) -> tuple[slice, ...]:
+    """The part of an array that is the block at a place of the grid."""
+    every = zip(place, steps, shape, strict=True)
+    return tuple(slice(k * step, min((k + 1) * step, n)) for k, step, n in every)

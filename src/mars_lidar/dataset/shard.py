@@ -35,8 +35,6 @@ def chunks_of(region: Region, chunk: tuple[int, ...], shard: tuple[int, ...]) ->
 
 def packer(layout: str, dtype: np.dtype[Any]) -> Callable[[NDArray[Any]], bytes]:
     """From a chunk to its bytes: what the codecs of `mars_lidar.dataset.arrays.packing` do."""
-    from google_crc32c import value as crc32c
-
     if layout == "sparse":
         pack: Callable[[NDArray[Any]], bytes] = _core.pack_counts
     else:
@@ -45,16 +43,25 @@ def packer(layout: str, dtype: np.dtype[Any]) -> Callable[[NDArray[Any]], bytes]
         pack = Blosc("lz4", 5, Blosc.BITSHUFFLE).encode
 
     def packed(counts: NDArray[Any]) -> bytes:
-        data = pack(np.ascontiguousarray(counts, dtype).reshape(-1))
-        return data + int(crc32c(data)).to_bytes(4, "little")
+        return with_sum(pack(np.ascontiguousarray(counts, dtype).reshape(-1)))
 
     return packed
 
 
+def with_sum(data: bytes) -> bytes:
+    """With a CRC-32C at the end, as Zarr's codec has it."""
+    from google_crc32c import value
+
+    return data + int(value(data)).to_bytes(4, "little")
+
+
+def is_good(data: bytes) -> bool:
+    """Whether the sum at the end is that of the rest."""
+    return with_sum(data[:-4]) == data
+
+
 def write_shard(path: Path, chunks: Iterator[bytes | None]) -> None:
     """Write the chunks of a shard, in C order, None for those beyond the array; the file appears by a rename."""
-    from google_crc32c import value as crc32c
-
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.partial")
     places: list[int] = []
@@ -68,8 +75,7 @@ def write_shard(path: Path, chunks: Iterator[bytes | None]) -> None:
                 stream.write(data)
                 places += [offset, len(data)]
                 offset += len(data)
-            index = np.array(places, "<u8").tobytes()
-            stream.write(index + int(crc32c(index)).to_bytes(4, "little"))
+            stream.write(with_sum(np.array(places, "<u8").tobytes()))
         os.replace(unfinished, path)
     except BaseException:
         unfinished.unlink(missing_ok=True)

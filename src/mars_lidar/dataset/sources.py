@@ -50,10 +50,7 @@ class Named:
 def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Candidate], list[Problem]]:
     """All scenes that the entries of a recipe name, in its order, and entries of manifests that are no scenes.
 
-    Raises
-    ------
-    ValueError, TypeError
-        A source that does not exist or holds no scene at all.
+    A source that does not exist, or holds no scene at all, is a ValueError.
     """
     found: list[Candidate] = []
     problems: list[Problem] = []

@@ -30,8 +30,9 @@ from mars_lidar._base.files import FileError, IncompleteFileError, reading
 from mars_lidar.dataset.arrays import FORMAT, FORMAT_VERSION, MAPS, MORE_VERSION, mark, with_zeros
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.sample_content import Rendered
-from mars_lidar.dataset.samples import sample_parts
+from mars_lidar.dataset.samples import block, grid, sample_parts
 from mars_lidar.dataset.scenes import SceneReader
+from mars_lidar.dataset.shard import is_good
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.io.scan import Problem
@@ -150,13 +151,8 @@ class Dataset:
         yield from self._grid("histogram", self.histogram)
 
     def _grid(self, kind: str, array: Any) -> Iterator[Item]:
-        steps = array.shards
-        counts = [math.ceil(n / step) for n, step in zip(array.shape, steps, strict=True)]
-        for place in np.ndindex(*counts):
-            region = tuple(
-                slice(k * step, min((k + 1) * step, n)) for k, step, n in zip(place, steps, array.shape, strict=True)
-            )
-            yield Item(kind, place, region)
+        for place in np.ndindex(grid(array.shape, array.shards)):
+            yield Item(kind, place, block(place, array.shards, array.shape))
 
     def files(self, item: Item) -> list[Path]:
         """The files of a part."""
@@ -180,6 +176,10 @@ class Dataset:
 
         return [item for item in self.items() if not whole(item)]
 
+    def gone(self) -> list[Path]:
+        """Files that are not there."""
+        return [file for item in self.items() for file in self.files(item) if not file.is_file()]
+
     def tidy(self) -> None:
         """Remove what a writer that was killed left behind: files that were not renamed yet."""
         for name in ("", "histogram", *MAPS):
@@ -188,8 +188,7 @@ class Dataset:
 
     def finish(self) -> None:
         """Mark the store complete, with one replacement of its root document, after its manifest."""
-        gone = [str(file) for item in self.items() for file in self.files(item) if not file.is_file()]
-        if gone:
+        if gone := self.gone():
             raise FileNotFoundError(f"{gone[0]} was taken away while the others were made, the first of {len(gone)}")
         if "consolidated_metadata" not in manifest.root_document(self.path):  # stopped just before it
             mark(self.group, {})
@@ -199,15 +198,12 @@ class Dataset:
 
 def _whole(file: Path, chunks: int) -> bool:
     """Whether a shard ends in a good index: 16 bytes a chunk and their CRC-32C (Zarr v3, sharding codec)."""
-    import google_crc32c
-
     length = 16 * chunks + 4
     with open(file, "rb") as stream:
         if stream.seek(0, 2) < length:
             return False
         stream.seek(-length, 2)
-        index = stream.read(length)
-    return int(google_crc32c.value(index[:-4])) == int.from_bytes(index[-4:], "little")
+        return is_good(stream.read(length))
 
 
 def is_dataset(path: str | Path) -> bool:
@@ -233,8 +229,7 @@ def open_dataset(path: str | Path, *, allow_incomplete: bool = False) -> Dataset
         dataset = Dataset(source)
         if not (dataset.complete or allow_incomplete):
             raise IncompleteFileError(f"{path} is incomplete: its generation did not finish; continue it with --resume")
-        if dataset.complete and not manifest.is_sealed(source):  # of an earlier version: all of its parts have names
-            gone = [str(file) for item in dataset.items() for file in dataset.files(item) if not file.is_file()]
-            if gone:
-                raise FileError(f"{path} is damaged: {gone[0]} is missing, the first of {len(gone)}")
+        sealed = not dataset.complete or manifest.is_sealed(source)  # of an earlier version: all parts have names
+        if not sealed and (gone := dataset.gone()):
+            raise FileError(f"{path} is damaged: {gone[0]} is missing, the first of {len(gone)}")
         return dataset

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mars_lidar._base import checks
+from mars_lidar._base.resample import MAX_SIDE
 from mars_lidar._base.yaml import Key, RecipeError
-
-MAX_SIDE = 1 << 13
 
 
 @dataclass(frozen=True)

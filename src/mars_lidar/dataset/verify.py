@@ -18,6 +18,7 @@ from mars_lidar._base.types import Progress
 from mars_lidar._version import other_version
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.ingest import coordinates, scene_names
+from mars_lidar.dataset.samples import block, grid
 from mars_lidar.dataset.store import Dataset, open_dataset
 from mars_lidar.dataset.write import Maker
 
@@ -73,8 +74,8 @@ def verify(
     progress = shown(progress, "verifying")
     dataset = open_dataset(path)
     array = dataset.histogram
-    grid = tuple(math.ceil(n / step) for n, step in zip(array.shape, array.chunks, strict=True))
-    total = math.prod(grid)
+    places = grid(array.shape, array.chunks)
+    total = math.prod(places)
     number = total if chunks is None else min(total, checks.integer("chunks", chunks, low=1, high=2**62))
     if threads is not None:
         threads = checks.integer("threads", threads, low=1, high=1024)
@@ -84,12 +85,7 @@ def verify(
     with reading(dataset.path, "a dataset of mars-lidar"):
         different = [*manifest.damage(dataset.path), *_labels(dataset)]
     for k, flat in enumerate(chosen):
-        place = np.unravel_index(int(flat), grid)
-        region = tuple(
-            slice(int(p) * step, min((int(p) + 1) * step, n))
-            for p, step, n in zip(place, array.chunks, array.shape, strict=True)
-        )
-        wrong = _compare(maker, region)
+        wrong = _compare(maker, block([int(k) for k in np.unravel_index(int(flat), places)], array.chunks, array.shape))
         if wrong:
             different.append(wrong + other_version(dataset.attrs.get("version")))
         if progress is not None:

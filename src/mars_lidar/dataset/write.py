@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, TypeVar
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.dataset.arrays import with_zeros
+from mars_lidar.dataset.arrays import MAPS, with_zeros
 from mars_lidar.dataset.sample_content import Shown
 from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.shard import chunks_of, packer, write_shard
 from mars_lidar.dataset.store import Dataset, Item
+from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
-_T = TypeVar("_T")
 _KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
 
 
@@ -33,7 +31,6 @@ class Stopped(Exception):
 class Made:
     """What making a part took."""
 
-    exposures: int  # of pixels
     simulate_s: float
     write_s: float
 
@@ -47,8 +44,8 @@ class Maker:
         self._stop = stop
         self._buffer: NDArray[Any] | None = None
         self._simulate_s = 0.0
-        self._scenes: OrderedDict[int, Shown] = OrderedDict()
-        self._fluxes: OrderedDict[int, Flux] = OrderedDict()
+        self._scene = lru_cache(_KEPT)(lambda number: dataset.scenes.read(number))
+        self.flux = lru_cache(_KEPT)(self._lit)  # photons of a sample
         self._last: tuple[tuple[int, ...], Flux] | None = None
 
     def make(self, item: Item) -> Made:
@@ -57,12 +54,11 @@ class Maker:
         if item.kind == "maps":
             for name, values in self.maps(item.region[0]).items():
                 with_zeros(self.dataset.group[name])[item.region] = values
-            return Made(0, 0.0, time.perf_counter() - began)
+            return Made(0.0, time.perf_counter() - began)
         self._simulate_s = 0.0
         (path,) = self.dataset.files(item)
         write_shard(path, self._packed(item))
-        exposures = math.prod(part.stop - part.start for part in item.region[:4])
-        return Made(exposures, self._simulate_s, time.perf_counter() - began - self._simulate_s)
+        return Made(self._simulate_s, time.perf_counter() - began - self._simulate_s)
 
     def _packed(self, item: Item) -> Iterator[bytes | None]:
         """The chunks of a shard, one after the other."""
@@ -101,17 +97,14 @@ class Maker:
 
     def maps(self, some: slice) -> dict[str, NDArray[np.float32]]:
         """Maps of some samples (samples, H, W)."""
-        stacks: dict[str, list[Any]] = {"depth": [], "reflectivity": [], "signal": [], "background": [], "delay": []}
+        rows = []
         for sample in range(some.start, some.stop):
             self._check()
             scene, flux = self.scene(sample), self.flux(sample)
-            stacks["depth"].append(scene.depth_m)
-            stacks["reflectivity"].append(scene.reflectivity)
-            stacks["signal"].append(flux.signal)
-            stacks["background"].append(flux.background)
-            system = self.dataset.recipe.systems[sample_parts(self.dataset.recipe, sample)[1]]
-            stacks["delay"].append(system.delay_ns(scene.depth_m))  # of waveforms the flux has none
-        return {name: np.stack(values).astype(np.float32) for name, values in stacks.items()}
+            delay = self._system(sample).delay_ns(scene.depth_m)  # of waveforms the flux has none
+            rows.append((scene.depth_m, scene.reflectivity, flux.signal, flux.background, delay))
+        stacks = zip(MAPS, zip(*rows, strict=True), strict=True)
+        return {name: np.stack(values).astype(np.float32) for name, values in stacks}
 
     def counts(self, region: tuple[slice, ...]) -> NDArray[Any]:
         """Counts of a region (samples, realizations, rows, columns, all bins); good until the next call."""
@@ -124,7 +117,7 @@ class Maker:
         pixels = np.arange(rows.start, rows.stop)[:, None] * width + np.arange(columns.start, columns.stop)
         for k, sample in enumerate(range(samples.start, samples.stop)):
             self._check()
-            system = recipe.systems[sample_parts(recipe, sample)[1]]
+            system = self._system(sample)
             direct = system.histogram_dtype == dtype
             drawn = simulate(
                 self._part(sample, rows, columns),
@@ -142,15 +135,13 @@ class Maker:
                 out[k] = drawn
         return out
 
-    def flux(self, sample: int) -> Flux:
-        """Photons of a sample."""
+    def _lit(self, sample: int) -> Flux:
         recipe = self.dataset.recipe
         _, system, signal, sbr = sample_parts(recipe, sample)
-        return _remembered(
-            self._fluxes,
-            sample,
-            lambda: self.scene(sample).flux(recipe.systems[system], recipe.light, signal, sbr),
-        )
+        return self.scene(sample).flux(recipe.systems[system], recipe.light, signal, sbr)
+
+    def _system(self, sample: int) -> System:
+        return self.dataset.recipe.systems[sample_parts(self.dataset.recipe, sample)[1]]
 
     def _part(self, sample: int, rows: slice, columns: slice) -> Flux:
         """Part of the flux; the last one is kept: of waveforms it takes longer to make than to simulate."""
@@ -162,8 +153,7 @@ class Maker:
 
     def scene(self, sample: int) -> Shown:
         """What a sample shows."""
-        number = sample_parts(self.dataset.recipe, sample)[0]
-        return _remembered(self._scenes, number, lambda: self.dataset.scenes.read(number))
+        return self._scene(sample_parts(self.dataset.recipe, sample)[0])
 
     def _room(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
         """An array of this shape in the buffer, whose pages need not be asked for again."""
@@ -178,11 +168,3 @@ class Maker:
 
     def _progress(self, done: int, total: int) -> None:
         self._check()
-
-
-def _remembered(kept: OrderedDict[int, _T], key: int, make: Callable[[], _T]) -> _T:
-    if key not in kept:
-        kept[key] = make()
-        while len(kept) > _KEPT:
-            kept.popitem(last=False)
-    return kept[key]

@@ -73,7 +73,7 @@ class Cube:
     path: Path | None = None
     url: str = ""
     progress: str = ""
-    _close: Callable[[], None] = field(default=lambda: None, repr=False)
+    _close: Callable[[], None] | None = field(default=None, repr=False)
 
     __repr__ = brief
 
@@ -155,7 +155,8 @@ class Cube:
 
     def close(self) -> None:
         """Close the file; the histogram cannot be read from it afterwards."""
-        self._close()
+        if self._close is not None:
+            self._close()
 
     def __enter__(self) -> Cube:
         return self

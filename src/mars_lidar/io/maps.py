@@ -9,6 +9,7 @@ methods that give them (NaN for the others), ``significance`` and ``flags``. Whe
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import warnings
@@ -103,11 +104,8 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
         raise FileNotFoundError(f"{source} does not exist")
     with reading(source, "maps of mars-lidar"):
         _check_suffix("path", source)
-        store = format_of(source, "path").open_store(source, _check_format)
-        try:
+        with contextlib.closing(format_of(source, "path").open_store(source, _check_format)) as store:
             found = {name: store.read(name) for name in store.names}
-        finally:
-            store.close()
         if found.get("method", np.empty(0)).dtype.kind == "S":
             found["method"] = found["method"].astype(str)
         _check(found, store.attrs)

@@ -203,7 +203,9 @@ class Recipe(_Blocks):
         if self.reflectivity is not None:
             object.__setattr__(self, "reflectivity", self._map("reflectivity", self.reflectivity))
         if self.pixel_index is not None:
-            index = np.ascontiguousarray(checks.numbers("pixel_index", self.pixel_index))
+            index = np.ascontiguousarray(
+                checks.numbers("pixel_index", checks.unmasked("pixel_index", self.pixel_index))
+            )
             pixels = math.prod(self.flux.shape)
             if index.dtype.kind not in "iu" or index.size != pixels:
                 raise ValueError(

@@ -42,12 +42,7 @@ class Elsewhere(OnDisk):
 def open_url(url: str) -> OpenedStore:
     """Open a store for reading; its documents and coordinates are compared with its manifest, and its names if listed.
 
-    Raises
-    ------
-    FileError
-        Nothing there, no cube, or damaged; the message names the URL.
-    MissingLibraryError
-        fsspec, or what it needs for this kind of URL, is not installed.
+    Every error names the URL; MissingLibraryError where fsspec, or what it needs for this kind of URL, is missing.
     """
     if not url.rstrip("/").endswith(".zarr"):
         raise FileError(f"{url}: only a .zarr is opened from a URL; fetch other files first")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import checks, manifest
+from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
@@ -115,6 +115,7 @@ def simulate_to(
         Stopped half way. A Zarr store is left marked incomplete; the other formats leave nothing.
     """
     progress = shown(progress, "simulating")
+    drawn_by = find_engine(engine, **options)
     recipe = Recipe(
         system=system,
         flux=flux,
@@ -122,12 +123,12 @@ def simulate_to(
         seed=seed,
         realizations=realizations,
         first_realization=first_realization,
-        pixel_index=None if pixel_index is None else np.asarray(checks.unmasked("pixel_index", pixel_index)),
-        depth_m=system.depth_m(flux.delay_ns) if depth_m is None else np.asarray(depth_m),
-        reflectivity=None if reflectivity is None else np.asarray(reflectivity),
+        pixel_index=pixel_index,  # type: ignore[arg-type]  # it makes arrays of them
+        depth_m=depth_m,  # type: ignore[arg-type]
+        reflectivity=reflectivity,  # type: ignore[arg-type]
         source=source,
         options=given(options),
-        settings=find_engine(engine, **options).settings,
+        settings=drawn_by.settings,
     )
     target = Path(path)
     if resume and overwrite:
@@ -137,7 +138,7 @@ def simulate_to(
         check_output(target, recipe, overwrite=overwrite)
     elif target.suffix != ".zarr":
         raise ValueError(f"resume is for a .zarr, the only format that an interruption leaves, got {str(target)!r}")
-    find_engine(engine, **options).check(flux, system)  # every pixel, before the blocks one by one
+    drawn_by.check(flux, system)  # every pixel, before the blocks one by one
     _try_brightest_pixel(recipe, threads, device)
     continued = continue_writer(target, recipe) if going_on else None
     if going_on and continued is None:
@@ -235,9 +236,7 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
     """The recipe with the options that its settings ask for, of which only the table is not in a file."""
     recorded = recipe.settings
     table = recipe.options.get("table") if table is None else table
-    if table is None and "table" in recorded:
-        table = _from_cache(recipe.system, recorded["table"])
-    if table is None and "table" in recorded:
+    if table is None and "table" in recorded and (table := _from_cache(recipe.system, recorded["table"])) is None:
         raise ValueError(f"table must be the one that the cube was made with, got None: {_grid(recorded['table'])}")
     options = given(
         {
@@ -262,11 +261,8 @@ def _from_cache(system: System, record: dict[str, Any]) -> Table | None:
     for path in cache.files():
         with contextlib.suppress(OSError, ValueError):
             table = Table.load(path, system)
-            sizes = [table.signal.size, table.background.size]
-            if (
-                sizes == [record["signal"][2], record["background"][2]]
-                and table_record(table)["hash"] == record["hash"]
-            ):
+            same = [table.signal.size, table.background.size] == [record["signal"][2], record["background"][2]]
+            if same and table_record(table)["hash"] == record["hash"]:
                 return table
     return None
 

@@ -83,7 +83,7 @@ def _read(
     elif suffix in (".h5", ".hdf5"):
         values, told = _from_hdf5(source, name)
     elif suffix == ".mat":
-        values, told = _from_mat(source, name or _mat_name(source))
+        values, told = _from_mat(source, name)
     else:
         raise ValueError(f"{source}: a transient must be one of {', '.join(SUFFIXES)}")
     width = told.get("bin_ns") if bin_ns is None else bin_ns
@@ -128,37 +128,29 @@ def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
         return _rows(path, wanted, tuple(data.shape), turned=False), told
 
 
-def _mat_name(path: Path) -> str:
-    """The name of the light, by those that there are."""
+def _from_mat(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
     import h5py
     from scipy.io import whosmat
 
-    if h5py.is_hdf5(path):
+    turned = h5py.is_hdf5(path)  # version 7.3; MATLAB's first axis comes last
+    if turned:
         with open_hdf5(path) as file:
-            found = set(file)
+            there = list(file)
     else:
-        found = {each for each, _, _ in whosmat(path)}
-    return next((name for name in (_NAME, *_CONFOCAL) if name in found), _NAME)
-
-
-def _from_mat(path: Path, name: str) -> tuple[Any, dict[str, float]]:
-    import h5py
-
-    if h5py.is_hdf5(path):  # version 7.3; MATLAB's first axis comes last
-        with open_hdf5(path) as file:
-            if not isinstance(file.get(name), h5py.Dataset) or file[name].ndim != 3:
-                raise ValueError(f"{path}: no variable {name!r} of three axes, got {', '.join(file) or 'nothing'}")
-            told = {key: float(np.ravel(whole(file[key]))[0]) for key in _TIMES if key in file}
-            check_data(path, file[name], name, in_parts=True)
-            bins, width, height = file[name].shape
-            return _rows(path, name, (height, width, bins), turned=True), told
-    from scipy.io import whosmat
-
-    found = read_mat5(path, (name, *_TIMES))
-    if name not in found:
-        there = ", ".join(each for each, _, _ in whosmat(path))
-        raise ValueError(f"{path}: cannot be read (no variable {name!r}, got {there or 'nothing'})")
-    return found[name], {key: float(np.ravel(found[key])[0]) for key in _TIMES if key in found}
+        there = [each for each, _, _ in whosmat(path)]
+    name = name or next((one for one in (_NAME, *_CONFOCAL) if one in there), _NAME)
+    if name not in there:
+        raise ValueError(f"{path}: cannot be read (no variable {name!r}, got {', '.join(there) or 'nothing'})")
+    if not turned:
+        found = read_mat5(path, (name, *_TIMES))
+        return found[name], {key: float(np.ravel(found[key])[0]) for key in _TIMES if key in found}
+    with open_hdf5(path) as file:
+        data = file[name]
+        if not isinstance(data, h5py.Dataset) or data.ndim != 3:
+            raise ValueError(f"{path}: no variable {name!r} of three axes, got {', '.join(there)}")
+        check_data(path, data, name, in_parts=True)
+        told = {key: float(np.ravel(whole(file[key]))[0]) for key in _TIMES if key in file}
+        return _rows(path, name, data.shape[::-1], turned=True), told
 
 
 def _rows(path: Path, name: str, shape: tuple[int, ...], *, turned: bool) -> Rows:

@@ -17,27 +17,10 @@ NAMES = ("depth", "reflectivity")
 
 
 def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray]:
-    """Depth and reflectivity beside a transient.
+    """Depth and reflectivity beside a transient of `shape` (H, W), float64, those that are there.
 
     Arrays ``depth`` (m; 0, NaN and inf mean "no return", which becomes NaN) and ``reflectivity`` ([0, 1]), (H, W), of
-    ``.npz``, ``.h5``, ``.hdf5`` and ``.mat`` (there turned by MATLAB, as the transient is).
-
-    Parameters
-    ----------
-    path
-        The file, which `mars_lidar.io.read_transient` has opened before.
-    shape
-        (H, W) of the transient.
-
-    Returns
-    -------
-    dict
-        Those that are there, float64.
-
-    Raises
-    ------
-    ValueError
-        Another shape, or values that cannot be: the message starts with the file.
+    ``.npz``, ``.h5``, ``.hdf5`` and ``.mat`` (turned, as the transient is). A ValueError begins with the file.
     """
     with reading(path, "a transient with depth and reflectivity") as source:
         return _checked(source, _read(source), shape)

@@ -91,13 +91,7 @@ open_writer = ZarrWriter
 
 
 def continue_writer(path: Path, recipe: Recipe) -> ZarrWriter | None:
-    """The writer of a store that was left incomplete; None for a complete one.
-
-    Raises
-    ------
-    ValueError
-        A store of another recipe or version.
-    """
+    """The writer of a store that was left incomplete, by this recipe and version; None for a complete one."""
     import zarr
 
     if not (path / "zarr.json").is_file():

@@ -5,19 +5,25 @@ Needs the extra ``learn``: pip install 'mars-lidar[learn]'.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mars_lidar._base.late import names_of
 
 if TYPE_CHECKING:
-    from mars_lidar.learn.forward import expected_histogram
+    from mars_lidar.learn.forward import expected_histogram as expected_histogram
     from mars_lidar.learn.inverse import LidarPhysics as LidarPhysics
-    from mars_lidar.learn.light import bin_photons
-    from mars_lidar.learn.likelihood import armed_periods, histogram_log_likelihood
-    from mars_lidar.learn.ranges import Choice, LogUniform, SystemRange, Uniform
-    from mars_lidar.learn.stored import StoredDataset
-    from mars_lidar.learn.stream import CubeStream
-    from mars_lidar.learn.tabulated import HistogramTable
+    from mars_lidar.learn.light import bin_photons as bin_photons
+    from mars_lidar.learn.likelihood import armed_periods as armed_periods
+    from mars_lidar.learn.likelihood import histogram_log_likelihood as histogram_log_likelihood
+    from mars_lidar.learn.ranges import Choice as Choice
+    from mars_lidar.learn.ranges import LogUniform as LogUniform
+    from mars_lidar.learn.ranges import SystemRange as SystemRange
+    from mars_lidar.learn.ranges import Uniform as Uniform
+    from mars_lidar.learn.stored import StoredDataset as StoredDataset
+    from mars_lidar.learn.stream import CubeStream as CubeStream
+    from mars_lidar.learn.tabulated import HistogramTable as HistogramTable
 
-_MODULES = {
+_HOMES = {
     "Choice": "ranges",
     "CubeStream": "stream",
     "HistogramTable": "tabulated",
@@ -31,26 +37,5 @@ _MODULES = {
     "expected_histogram": "forward",
     "histogram_log_likelihood": "likelihood",
 }
-
-
-def __getattr__(name: str) -> Any:  # PyTorch is loaded by whoever uses it
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module
-
-    return getattr(import_module(f"mars_lidar.learn.{_MODULES[name]}"), name)
-
-
-__all__ = [  # but LidarPhysics: `import *` would ask for deepinv
-    "Choice",
-    "CubeStream",
-    "HistogramTable",
-    "LogUniform",
-    "StoredDataset",
-    "SystemRange",
-    "Uniform",
-    "armed_periods",
-    "bin_photons",
-    "expected_histogram",
-    "histogram_log_likelihood",
-]
+__getattr__ = names_of(__name__, _HOMES)  # PyTorch is loaded by whoever uses it
+__all__ = [name for name in _HOMES if name != "LidarPhysics"]  # `import *` would ask for deepinv

@@ -18,11 +18,7 @@ _DEPTHS = ("Z", "V", "Depth", "depth")  # last part of a channel's name in a lay
 def read_exr(path: Path) -> NDArray[Any]:
     """The depth (H, W): the channel Z, else that of a layer (``*.Depth.Z``), Y, the only one, or grey written as RGB.
 
-    Raises
-    ------
-    ValueError
-        Not an EXR that can be read, several channels of which none is depth, or colours; the message starts with the
-        file. `mars_lidar.io.MissingLibraryError` where OpenEXR is not installed.
+    A ValueError begins with the file: several channels of which none is depth, colours, or no EXR that can be read.
     """
     openexr = needed("OpenEXR", f"{path}: depth in .exr")
     check_source(path)

@@ -16,13 +16,7 @@ from numpy.typing import NDArray
 
 
 def read_pfm(path: Path) -> NDArray[np.float32]:
-    """Values (H, W), or (H, W, 3), float32, the top row first.
-
-    Raises
-    ------
-    ValueError
-        Not a PFM, or cut short; the message starts with the file.
-    """
+    """Values (H, W), or (H, W, 3), float32, the top row first; a ValueError begins with the file."""
     content = path.read_bytes()
     lines = content.split(b"\n", 3)
     if len(lines) < 4 or lines[0].strip() not in (b"Pf", b"PF"):

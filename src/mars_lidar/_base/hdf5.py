@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import math
 from collections.abc import Callable, Iterator
@@ -32,7 +33,7 @@ _HEAP = b"GCOL\1\0\0\0"  # begins a collection of texts in HDF5
 _SCALES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "DIMENSION_LABELS"}
 
 
-class ForgivingFile:
+class ForgivingFile(io.FileIO):
     """A file that keeps the first error of writing to itself, for `check` to raise.
 
     The HDF5 library cannot live with a disk that fills up: it holds on to what it could not write, fails to
@@ -40,8 +41,8 @@ class ForgivingFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = open(path, "w+b", buffering=0)  # noqa: SIM115  # closed by `close`
         self._error: OSError | None = None
+        super().__init__(path, "w+")
 
     def check(self) -> None:
         """Raise the first error there was."""
@@ -54,44 +55,25 @@ class ForgivingFile:
         size = rest.nbytes
         while rest.nbytes and self._error is None:
             try:
-                rest = rest[self._file.write(rest) :]
+                rest = rest[super().write(rest) :]
             except OSError as error:
                 self._error = error
         return size
 
-    def truncate(self, size: int) -> int:
+    def truncate(self, size: int | None = None) -> int:
         """Set the length of the file."""
         try:
-            return self._file.truncate(size)
+            return super().truncate(size)
         except OSError as error:
             self._error = self._error or error
-            return size
+            return size or 0
 
     def close(self) -> None:
         """Close the file."""
         try:
-            self._file.close()
+            super().close()
         except OSError as error:
             self._error = self._error or error
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """As for any file."""
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        """As for any file."""
-        return self._file.tell()
-
-    def read(self, size: int = -1) -> bytes:
-        """As for any file."""
-        return self._file.read(size)
-
-    def readinto(self, buffer: Any) -> int:
-        """As for any file; only HDF5's own book-keeping is ever read back."""
-        return self._file.readinto(buffer)
-
-    def flush(self) -> None:
-        """Nothing is buffered here."""
 
 
 @contextlib.contextmanager
@@ -187,16 +169,12 @@ def _sum(file: h5py.File, read: Callable[[Any], NDArray[Any]]) -> str:
                     total.update(np.ascontiguousarray(values).data)
         total.update(json.dumps(told, sort_keys=True, default=repr).encode())
 
-    add(file)
-    for node in _nodes(file):
-        add(node)
-    return total.hexdigest()
-
-
-def _nodes(file: h5py.File) -> list[Any]:
     names: list[str] = []
     file.visit(names.append)
-    return [file[name] for name in sorted(names)]
+    add(file)
+    for name in sorted(names):
+        add(file[name])
+    return total.hexdigest()
 
 
 def _plain(value: Any) -> Any:

@@ -37,7 +37,8 @@ def seal(store: Path, attrs: dict[str, Any]) -> None:
     with ThreadPoolExecutor(_THREADS) as pool:
         told = dict(zip(names, pool.map(lambda name: _hash(store / name), names), strict=True))
     told[_ROOT] = hashlib.sha256(root).hexdigest()
-    for name, content in ((NAME, _lines(told).encode()), (_ROOT, root)):
+    lines = "".join(f"{told[name]}  {name}\n" for name in sorted(told))
+    for name, content in ((NAME, lines.encode()), (_ROOT, root)):
         unfinished = store / f"{name}.partial"
         unfinished.write_bytes(content)
         os.replace(unfinished, store / name)
@@ -86,25 +87,25 @@ def damage(store: Path, *, every: bool = True) -> Iterator[str]:
         return
     with reading(path, "lines of sha256sum"):
         check_claim(path, 4 * path.stat().st_size)
-        lines = [line.partition("  ") for line in path.read_text("utf-8").splitlines()]
+        told = lines_of(path.read_text("utf-8"))
     there = _files(store)
-    looked_at = [one for one in lines if one[2] in there and (every or _SMALL.search(one[2]))]
-    with ThreadPoolExecutor(_THREADS) as pool:
-        hashes = list(pool.map(lambda one: _hash(store / one[2]), looked_at))
-    yield from (f"{name} is missing" for _, _, name in lines if name not in there)
-    yield from (
-        f"{one[2]} is not as it was written" for one, now in zip(looked_at, hashes, strict=True) if one[0] != now
-    )
+    yield from (f"{name} is missing" for name in told if name not in there)
+    yield from changed({name: told[name] for name in told if name in there}, lambda name: _hash(store / name), every)
     documents = {name for name in there if name.rpartition("/")[2] == _ROOT}
-    yield from (f"{name} is not in its {NAME}" for name in sorted(documents - {name for _, _, name in lines}))
+    yield from (f"{name} is not in its {NAME}" for name in sorted(documents - set(told)))
 
 
-def changed(told: Mapping[str, str], read: Callable[[str], bytes]) -> list[str]:
-    """Names of documents and coordinates that are not as `told`, the lines of a manifest by name, has them."""
-    small = sorted(name for name in told if _SMALL.search(name))
+def lines_of(text: str) -> dict[str, str]:
+    """The sums of a manifest by the name of the file."""
+    return {name: digest for digest, _, name in (line.partition("  ") for line in text.splitlines())}
+
+
+def changed(told: Mapping[str, str], digest: Callable[[str], str], every: bool = False) -> Iterator[str]:
+    """A sentence for each file that is not as `told`; without `every`, only documents and coordinates are read."""
+    names = sorted(name for name in told if every or _SMALL.search(name))
     with ThreadPoolExecutor(_THREADS) as pool:
-        contents = list(pool.map(read, small))
-    return [n for n, one in zip(small, contents, strict=True) if hashlib.sha256(one).hexdigest() != told[n]]
+        found = list(pool.map(digest, names))
+    yield from (f"{name} is not as it was written" for name, now in zip(names, found, strict=True) if told[name] != now)
 
 
 def _files(store: Path) -> set[str]:
@@ -120,7 +121,3 @@ def _files(store: Path) -> set[str]:
 def _hash(path: Path) -> str:
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def _lines(told: dict[str, str]) -> str:
-    return "".join(f"{told[name]}  {name}\n" for name in sorted(told))

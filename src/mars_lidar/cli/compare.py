@@ -60,10 +60,13 @@ def compare(
     signal window and the covariance of neighbouring bins: what count x shape models get wrong.
     """
     with reported():
+        from mars_lidar.engines import ENGINES
+
         began = time.perf_counter()
         check_picture(out, overwrite)
         check_new(numbers, overwrite)
-        names = _names(engines)
+        asked = [] if engines is None else engines.split(",")
+        names = [checks.choice("--engines", name.strip(), tuple(ENGINES)) for name in asked]
         places = {text.replace(" ", ""): two_integers("--pixel", text) for text in pixel or ()}
         system = instrument.build(effects)
         view = seen(scene, light, system)
@@ -95,11 +98,3 @@ def compare(
         rows = [("table", found.table)] if found.table else []
         rows += [("picture", str(out)), ("time", f"{span(time.perf_counter() - began)} in all")]
         table(rows if numbers is None else [*rows, ("numbers", str(numbers))])
-
-
-def _names(engines: str | None) -> list[str]:
-    from mars_lidar.engines import ENGINES
-
-    if engines is None:
-        return []
-    return [checks.choice("--engines", name.strip(), tuple(ENGINES)) for name in engines.split(",")]

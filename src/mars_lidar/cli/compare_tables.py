@@ -135,7 +135,7 @@ def _scene_table(console: Console, found: Comparison) -> None:
             cell(s.bias),
             cell(percent),
             cell(s.dispersion),
-            _length(1e3 * s.depth_error_m),
+            _number(1e3 * s.depth_error_m),
             _number(100 * s.outliers),
         )
     console.print()
@@ -218,10 +218,6 @@ def with_error(value: float, error: float) -> str:
 
 def _short(value: float) -> str:
     return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}"
-
-
-def _length(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.0f}" if value >= 99.5 else f"{value:.3g}"
 
 
 def _number(value: float) -> str:

@@ -6,7 +6,7 @@ import contextlib
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,8 +122,9 @@ def save_picture(figure: Figure, out: Path) -> None:
         figure.savefig(unfinished, format=out.suffix[1:], **options)
 
 
-def table(rows: list[tuple[str, str]]) -> None:
+def table(told: Mapping[str, str] | Sequence[tuple[str, str]]) -> None:
     """Two columns on standard output: a label, and text that is never cut; plain where it is piped."""
+    rows = told.items() if isinstance(told, Mapping) else told
     if not sys.stdout.isatty():
         for label, text in rows:
             print(f"{label:<14} {text}")

@@ -109,10 +109,5 @@ def timestamps(
         image = 2 * height * width * times.period_ns / unit if out.suffix == ".ptu" else 0.0
         if image > _LARGE_IMAGE:
             told += f"; other programs make an image of {image / 1e9:.2g} GB of it, --clock-ps a smaller one"
-        table(
-            [
-                ("wrote", str(out)),
-                ("content", f"{len(times):,} photons of {height} × {width} pixels"),
-                ("times", told),
-            ]
-        )
+        content = f"{len(times):,} photons of {height} × {width} pixels"
+        table({"wrote": str(out), "content": content, "times": told})

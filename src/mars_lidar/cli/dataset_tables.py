@@ -62,14 +62,14 @@ def tell(done: Generated) -> None:
     share = f"; {100 * done.simulate_s / busy:.0f} % of the threads' time simulating" if busy else ""
     before = f", {done.parts_before} were there" if done.parts_before else ""
     table(
-        [
-            ("generated", _shape(done.shape)),
-            ("parts", f"{done.parts} made{before}"),
-            ("time", f"{done.seconds:.3g} s for {exposures:,} pixel exposures{share}"),
-            ("dataset", f"{done.path}, {_bytes(size_on_disk(done.path))}"),
-            ("open with", f"xarray.open_zarr({str(done.path)!r})"),
-            ("left out", files(len(done.problems))),
-        ]
+        {
+            "generated": _shape(done.shape),
+            "parts": f"{done.parts} made{before}",
+            "time": f"{done.seconds:.3g} s for {exposures:,} pixel exposures{share}",
+            "dataset": f"{done.path}, {_bytes(size_on_disk(done.path))}",
+            "open with": f"xarray.open_zarr({str(done.path)!r})",
+            "left out": files(len(done.problems)),
+        }
     )
     _tell_problems(done.problems)
 

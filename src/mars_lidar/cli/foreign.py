@@ -44,11 +44,6 @@ class ForeignOptions:
     unit_ns: float | None = _of_file("Unit of photon times, ns.")
 
     @property
-    def given(self) -> bool:
-        """Whether any option was given."""
-        return bool(self._given)
-
-    @property
     def _given(self) -> list[str]:
         return [f.name for f in fields(self) if getattr(self, f.name) not in (None, 0.0, PulseOptions())]
 
@@ -64,7 +59,7 @@ class ForeignOptions:
         from mars_lidar.io import SUFFIXES, load
         from mars_lidar.io.foreign import FOREIGN_SUFFIXES, read_counts
 
-        if not self.given and (path.suffix in SUFFIXES or path.suffix not in FOREIGN_SUFFIXES):
+        if not self._given and (path.suffix in SUFFIXES or path.suffix not in FOREIGN_SUFFIXES):
             try:
                 return load(path)
             except ValueError as error:
@@ -184,30 +179,26 @@ def _recorder_rows(path: Path) -> list[tuple[str, str]]:
     from mars_lidar.io.streams.files import recorded as photons_of
 
     rows = [("file", f"{path} (not written by mars-lidar)")]
-    scan, found = None, None
+    scan, streams = None, []
     if path.suffix == ".sdt":
         scan = recorded(path)
     else:
         found = photons_of(path)
+        streams = [("a channel's stream", "mars-lidar inspect, calibrate, validate --pixel 0,C")]
         clock = f"{1e3 * found.clock_ns:.7g} ps"
         if found.fine is None:
             rows.append(("clock", f"absolute times in units of {clock} (T2)"))
         else:
             laser = "laser periods" if found.period_ns else "its own, not the laser's"
-            rows.append(
-                ("clock", f"{laser}, {clock}; photons in units of {1e3 * found.fine_ns:.5g} ps after the pulse")
-            )
+            fine = f"{1e3 * found.fine_ns:.5g} ps"
+            rows.append(("clock", f"{laser}, {clock}; photons in units of {fine} after the pulse"))
             scan = recorded(path)
         for channel, number in zip(*np.unique(found.detector, return_counts=True), strict=True):
             told = f"{channel}: {number:,} photons" if channel >= 0 else f"sync: {number:,} pulses"
             rows.append(("channel", told))
-    for name, array in () if scan is None else scan.arrays.items():
-        rows.append(("histograms", f"{name}: {' × '.join(map(str, array.shape))}, {int(array.sum()):,} photons"))
-    rows += [("left out", text) for text in (() if scan is None else scan.told)]
     if scan is not None:
+        for name, array in scan.arrays.items():
+            rows.append(("histograms", f"{name}: {' × '.join(map(str, array.shape))}, {int(array.sum()):,} photons"))
+        rows += [("left out", text) for text in scan.told]
         rows.append(("reconstruct with", _NEEDED + "; bins and cycles as far as the file tells them"))
-    return (
-        rows
-        if found is None
-        else [*rows, ("a channel's stream", "mars-lidar inspect, calibrate, validate --pixel 0,C")]
-    )
+    return rows + streams

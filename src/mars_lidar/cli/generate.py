@@ -87,10 +87,11 @@ def generate(
     with reported():
         from mars_lidar import dataset
 
+        of_systems = bool(system) or changes != SystemChanges() or effects != Effects()
         replaced = {
             "size": _size("--size", size),
             "crop": None if crop is None else {"size": _size("--crop", crop), "count": crops or 1},
-            "systems": _systems(system, changes, effects),
+            "systems": [changes.of(file, effects) for file in system or (None,)] if of_systems else None,
             "light": _given(signal=signal or None, sbr=sbr or None, attenuation=attenuation, ambient=ambient) or None,
             "engine": engine,
             "realizations": realizations,
@@ -178,14 +179,6 @@ def _recipe(
                 raise ValueError("--depth-unit-m and --focal-px belong to RGB-D")
             scene = {"transient": str(source)}
     return DatasetRecipe.from_dict({"systems": [DEFAULT_SYSTEM], **replaced, "scenes": scene})
-
-
-def _systems(files: list[Path] | None, changes: SystemChanges, effects: Effects) -> list[Any] | None:
-    """Systems of the command line: each file with the single options in place of its values."""
-    if not files and changes == SystemChanges() and effects == Effects():
-        return None
-    bases: list[Path | None] = [*files] if files else [None]
-    return [changes.of(file, effects) for file in bases]
 
 
 def _given(**values: Any) -> dict[str, Any]:

@@ -106,7 +106,7 @@ def opened(file: Path, sample: int | None, foreign: ForeignOptions) -> Cube:
     return foreign.opened(file)
 
 
-def _rows(cube: Cube) -> list[tuple[str, str]]:
+def _rows(cube: Cube) -> dict[str, str]:
     system, recipe = cube.system, cube.recipe
     count, height, width, bins = cube.shape
     complete = "yes" if cube.complete else "NO: the simulation did not finish"
@@ -115,79 +115,66 @@ def _rows(cube: Cube) -> list[tuple[str, str]]:
     if cube.progress:
         complete += f"; {cube.progress}"
     stored = "elsewhere" if cube.path is None else f"{size_on_disk(cube.path) / 1e6:,.4g} MB on disk"
-    rows = [
-        ("file", f"{cube.url or cube.path} (mars-lidar {cube.version})"),
-        ("complete", complete),
-        (
-            "counts",
-            f"{count} × {height} × {width} × {bins} (realization, y, x, time) {recipe.dtype}, "
-            f"{recipe.nbytes / 1e6:,.4g} MB in memory, {stored}",
-        ),
-    ]
+    rows = {
+        "file": f"{cube.url or cube.path} (mars-lidar {cube.version})",
+        "complete": complete,
+        "counts": f"{count} × {height} × {width} × {bins} (realization, y, x, time) {recipe.dtype}, "
+        f"{recipe.nbytes / 1e6:,.4g} MB in memory, {stored}",
+    }
     if cube.registrations is not None:
         pixels = count * height * width
         each = cube.registrations / pixels
-        rows.append(("registrations", f"{cube.registrations:,}, {each:,.4g} per pixel and exposure"))
+        rows["registrations"] = f"{cube.registrations:,}, {each:,.4g} per pixel and exposure"
     first = recipe.first_realization
     numbers = f"{first}" if count == 1 else f"{first} to {first + count - 1}"
     dead = system.detector.dead_time_ns
+    effects = [f"{name} {_short(getattr(system.detector, name))}" for name in system.detector.effects]
     made = "".join(f", {name} {_short(value)}" for name, value in cube.settings.items() if name != "table")
     engine = "none: measured" if cube.measured else f"{cube.engine}{made}, seed {cube.seed}, realization {numbers}"
-    rows += [
-        ("engine", engine),
-        (
-            "laser",
-            f"period {system.period_ns:.6g} ns ({1e3 / system.period_ns:.4g} MHz, unambiguous to "
-            f"{system.unambiguous_range_m:.4g} m), {system.cycles:,} cycles",
-        ),
-        ("pulse", repr(system.pulse)),
-        (
-            "detector",
-            f"dead time {dead:.6g} ns ({system.dead_time_periods:.4g} periods), {system.detector.mode}, "
-            f"start {system.start}",
-        ),
-        *_gate(system.detector),
-        *_effects(system.detector),
-        ("bins", f"{1e3 * system.bin_ns:.5g} ps, {system.depth_m(system.bin_ns):.3g} m of depth each"),
-        *([] if cube.measured else _light(cube.flux)),
-    ]
+    rows |= {
+        "engine": engine,
+        "laser": f"period {system.period_ns:.6g} ns ({1e3 / system.period_ns:.4g} MHz, unambiguous to "
+        f"{system.unambiguous_range_m:.4g} m), {system.cycles:,} cycles",
+        "pulse": repr(system.pulse),
+        "detector": f"dead time {dead:.6g} ns ({system.dead_time_periods:.4g} periods), {system.detector.mode}, "
+        f"start {system.start}",
+        **_gate(system.detector),
+        **({"effects": ", ".join(effects)} if effects else {}),
+        "bins": f"{1e3 * system.bin_ns:.5g} ps, {system.depth_m(system.bin_ns):.3g} m of depth each",
+        **({} if cube.measured else _light(cube.flux)),
+    }
     if "table" in cube.settings:
-        rows.append(("table", ", ".join(f"{name} {value}" for name, value in cube.settings["table"].items())))
+        rows["table"] = ", ".join(f"{name} {value}" for name, value in cube.settings["table"].items())
     if recipe.source:
-        rows.append(("source" if cube.measured else "scene", recipe.source))
+        rows["source" if cube.measured else "scene"] = recipe.source
     place = cube.url or str(cube.path)
-    opener = f"xarray.open_zarr({place!r})" if place.endswith(".zarr") else ""
     mine = f"mars_lidar.io.load({place!r})"
     if not cube.complete:
-        rows.append(("open with", f"{mine[:-1]}, allow_incomplete=True)"))
-    else:
-        rows.append(("open with", f"{mine}  or  {opener}" if opener else mine))
+        mine = f"{mine[:-1]}, allow_incomplete=True)"
+    elif place.endswith(".zarr"):
+        mine += f"  or  xarray.open_zarr({place!r})"
+    rows["open with"] = mine
     return rows
 
 
-def _light(flux: Flux) -> list[tuple[str, str]]:
+def _light(flux: Flux) -> dict[str, str]:
     photons = f"mean S {flux.signal.mean():.4g}, B {flux.background.mean():.4g} photons per laser period"
     if flux.waveform is not None:
         photons += f"; waveform of {flux.waveform.shape[-1]} parts"
     elif len(flux.returns_signal) > 1:
         photons += f"; {len(flux.returns_signal)} returns"
     made_of = [f"{k} {_short(v)}" for k, v in flux.info.items() if not k.endswith("_definition")]
-    return [("flux", photons), *([("flux made of", ", ".join(made_of))] if made_of else [])]
+    return {"flux": photons} | ({"flux made of": ", ".join(made_of)} if made_of else {})
 
 
-def _gate(detector: Detector) -> list[tuple[str, str]]:
+def _gate(detector: Detector) -> dict[str, str]:
     if detector.gate_start_ns is None:
-        return []
+        return {}
     told = f"{detector.gate_width_ns:.6g} ns from {detector.gate_start_ns:.6g} ns of each period"
     if detector.gate_moves:
         every = "every period" if detector.gate_cycles == 1 else f"every {detector.gate_cycles} periods"
         told += f", moved by {detector.gate_step_ns:.6g} ns {every}"
-    return [("gate", told)]
-
-
-def _effects(detector: Detector) -> list[tuple[str, str]]:
-    told = [f"{name} {_short(getattr(detector, name))}" for name in detector.effects]
-    return [("effects", ", ".join(told))] if told else []
+    return {"gate": told}
 
 
 def _short(value: Any) -> str:

@@ -14,24 +14,12 @@ if TYPE_CHECKING:
     from mars_lidar.instrument.system import System
     from mars_lidar.io.capture import Capture
 
-# options by the kind of scene, and the keys of a description that they give (`mars_lidar.dataset.scene_entries`)
-_KEYS: dict[str, dict[str, str]] = {
-    "scene": {"size": "size", "scene_seed": "seed"},
-    "depth": {
-        "size": "size",
-        "image": "image",
-        "depth_unit_m": "depth_unit_m",
-        "focal_px": "focal_px",
-        "index": "index",
-        "max_depth_m": "max_depth_m",
-    },
-    "transient": {
-        "transient_bin_ns": "bin_ns",
-        "transient_start_ns": "start_ns",
-        "transient_name": "name",
-        "transient_channel": "channel",
-        "transient_pulse": "pulse",
-    },
+# options by the kind of scene; the keys of a description that they give (`mars_lidar.dataset.scene_entries`) are theirs
+# without the kind
+_OPTIONS = {
+    "scene": ("size", "scene_seed"),
+    "depth": ("size", "image", "depth_unit_m", "focal_px", "index", "max_depth_m"),
+    "transient": ("transient_bin_ns", "transient_start_ns", "transient_name", "transient_channel", "transient_pulse"),
 }
 _SUFFIXES = (".yaml", ".yml")
 
@@ -71,7 +59,7 @@ def seen(scene: SceneOptions, light: LightOptions, system: System, *, in_parts: 
     """What the options mean under `system`; a transient is read when it is used, in bands, where `in_parts`."""
     from mars_lidar.dataset.view import read_view
 
-    kinds = [name for name in _KEYS if getattr(scene, name) is not None]
+    kinds = [name for name in _OPTIONS if getattr(scene, name) is not None]
     if len(kinds) != 1:
         got = " and ".join(f"--{name}" for name in kinds) or "none of them"
         raise ValueError(f"the scene is one of --scene, --depth and --transient, got {got}")
@@ -79,18 +67,15 @@ def seen(scene: SceneOptions, light: LightOptions, system: System, *, in_parts: 
     given["photons_per_unit"] = scene.photons_per_unit
     kind, what = kinds[0], str(getattr(scene, kinds[0]))
     from_file = kind == "scene" and Path(what).suffix in _SUFFIXES
-    keys: dict[str, str] = {}
-    for of, options in _KEYS.items():
-        if from_file or of == kind:
-            keys |= options
-    for of, options in _KEYS.items():
-        for option in options:
-            if option not in keys and getattr(scene, option) is not None:
-                raise ValueError(f"--{option.replace('_', '-')} belongs to --{of}, which is not given")
-    told = {key: _plain(getattr(scene, option)) for option, key in keys.items() if getattr(scene, option) is not None}
+    told: dict[str, Any] = {}
+    for option in dict.fromkeys(option for options in _OPTIONS.values() for option in options):
+        value = getattr(scene, option)
+        if value is None:
+            continue
+        if not (from_file or option in _OPTIONS[kind]):
+            of = next(of for of, options in _OPTIONS.items() if option in options)
+            raise ValueError(f"--{option.replace('_', '-')} belongs to --{of}, which is not given")
+        key = option.removeprefix("transient_").removeprefix("scene_")
+        told[key] = str(value) if isinstance(value, Path) else value
     described = what if from_file else {"example" if kind == "scene" else kind: what}
     return read_view(described, system, whole=not in_parts, light=given, **told)
-
-
-def _plain(value: Any) -> Any:
-    return str(value) if isinstance(value, Path) else value

@@ -200,23 +200,17 @@ def _summary(written: Written, png: Path | None, began: float, out: Path) -> Non
     with load(written.path) as cube:
         count, height, width, bins = cube.shape
         each = f", {each_ns(written.ns_per_registration)} per registration" if written.registrations else ""
-        rows = [
-            (
-                "simulated",
-                f"{count} × {height} × {width} × {bins} (realization, y, x, time) {cube.recipe.dtype}, "
-                f"{written.registrations:,} registrations, engine {cube.engine}, seed {cube.seed}",
-            ),
-            (
-                "time",
-                f"{span(written.simulate_s)} simulating{each}; {span(written.write_s)} writing; "
-                f"{span(time.perf_counter() - began)} in all",
-            ),
-            ("cube" if written.path == out else "capture", str(out)),
-        ]
-        if written.report:
-            rows.insert(2, ("engine", _told(written.report)))
+        rows = {
+            "simulated": f"{count} × {height} × {width} × {bins} (realization, y, x, time) {cube.recipe.dtype}, "
+            f"{written.registrations:,} registrations, engine {cube.engine}, seed {cube.seed}",
+            "time": f"{span(written.simulate_s)} simulating{each}; {span(written.write_s)} writing; "
+            f"{span(time.perf_counter() - began)} in all",
+        }
+    if written.report:
+        rows["engine"] = _told(written.report)
+    rows["cube" if written.path == out else "capture"] = str(out)
     if png is not None:
-        rows.append(("picture", str(png)))
+        rows["picture"] = str(png)
     print_table(rows)
 
 

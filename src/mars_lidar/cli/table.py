@@ -71,7 +71,7 @@ def build(
             else:
                 Table.build(system, *axes, progress=progress, **chosen).save(out, overwrite=overwrite)
                 path = out
-        table([*_rows(path), ("time", f"{span(time.perf_counter() - began)} in all")])
+        table(_rows(path) | {"time": f"{span(time.perf_counter() - began)} in all"})
 
 
 @app.command()
@@ -122,7 +122,7 @@ def _grid(name: str, text: str) -> tuple[float, float, int]:
         raise ValueError(f"{name} must be LOW,HIGH,POINTS, such as 0.01,10,256, got {text!r}") from None
 
 
-def _rows(path: Path) -> list[tuple[str, str]]:
+def _rows(path: Path) -> dict[str, str]:
     from mars_lidar.table.storage import read_header
 
     header = read_header(path)
@@ -135,35 +135,26 @@ def _rows(path: Path) -> list[tuple[str, str]]:
     else:
         serves = f"any number from {later:,} on (made for {system.cycles:,})"
     method = header["method"] + (f", re-arming at the {header['rearm']}" if header["method"] == "mars" else "")
-    rows = [
-        ("table", f"{path} (mars-lidar {told['version']}, built in {told['build_s']:.3g} s)"),
-        ("method", method),
-        ("signal", told["signal"]),
-        ("background", told["background"]),
-        (
-            "size",
-            f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of {_DEPTHS} values "
-            f"{shapes * _DEPTHS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
-        ),
-        ("cycles", serves),
-        ("exact laws", _laws(header)),
-        (
-            "system",
-            f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
-            f"{system.detector.dead_time_ns:.6g} ns, start {system.start}",
-        ),
-        ("start phases", f"{header['phases']}" if header["phases"] else "none: nothing depends on the delay"),
-        (f"error at {made['cycles']:,} cycles", _error(made)),
-        ("error at any", _any_error(told.get("error_longest"), never)),
-    ]
+    rows = {
+        "table": f"{path} (mars-lidar {told['version']}, built in {told['build_s']:.3g} s)",
+        "method": method,
+        "signal": told["signal"],
+        "background": told["background"],
+        "size": f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of {_DEPTHS} values "
+        f"{shapes * _DEPTHS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
+        "cycles": serves,
+        "exact laws": _laws(header),
+        "system": f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
+        f"{system.detector.dead_time_ns:.6g} ns, start {system.start}",
+        "start phases": f"{header['phases']}" if header["phases"] else "none: nothing depends on the delay",
+        f"error at {made['cycles']:,} cycles": _error(made),
+        "error at any": _any_error(told.get("error_longest"), never),
+    }
     law = told.get("law")
     if law is not None:
-        rows.append(
-            (
-                "count law",
-                f"{law['samples']} random pixels: total variation {law['mean']:.2g}, at most {law['largest']:.2g}; "
-                f"{100 * law['within']:.3g} % within 0.002",
-            )
+        rows["count law"] = (
+            f"{law['samples']} random pixels: total variation {law['mean']:.2g}, at most {law['largest']:.2g}; "
+            f"{100 * law['within']:.3g} % within 0.002"
         )
     return rows
 

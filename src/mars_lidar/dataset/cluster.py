@@ -45,17 +45,15 @@ def make_all(
     distributed = needed(*_LIBRARY)
     if not todo:
         return
-    if scheduler is not None:
-        with _client(distributed, scheduler) as client:
-            _share_out(distributed, client, dataset, todo, add, threads)
-        return
-    # one part at a time in a worker: its memory is that of a chunk
-    with (
-        distributed.LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
+    with contextlib.ExitStack() as after:
+        if scheduler is not None:
+            client = after.enter_context(_client(distributed, scheduler))
+        else:  # one part at a time in a worker: its memory is that of a chunk
+            cluster = distributed.LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+            )
+            client = distributed.Client(after.enter_context(cluster), set_as_default=False)
+            after.enter_context(client)
         _share_out(distributed, client, dataset, todo, add, threads)
 
 

@@ -49,14 +49,10 @@ class SparseCodec(ArrayBytesCodec):
         return chunk_spec.prototype.buffer.from_bytes(packed)
 
     async def _decode_single(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
-        packed = _bytes(chunk_data)
+        packed = np.ascontiguousarray(chunk_data.as_numpy_array()).view(np.uint8).reshape(-1)
         out: NDArray[Any] = np.empty(chunk_spec.shape, chunk_spec.dtype.to_native_dtype())
         await asyncio.to_thread(lambda: _core.unpack_counts(packed, out.reshape(-1)))
         return chunk_spec.prototype.nd_buffer.from_numpy_array(out)
-
-
-def _bytes(data: Any) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(data.as_numpy_array()).view(np.uint8).reshape(-1)
 
 
 def events(packed: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:

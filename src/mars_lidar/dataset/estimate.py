@@ -19,7 +19,7 @@ from mars_lidar.dataset.arrays import MAPS, histogram_array, histogram_blocks
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
 from mars_lidar.dataset.sample_content import Rendered, Shown
-from mars_lidar.dataset.sources import Candidate, Named, candidates, scenes
+from mars_lidar.dataset.sources import Candidate, candidates, scenes
 from mars_lidar.io.advice import Advice, advice
 from mars_lidar.io.scan import Problem
 
@@ -86,10 +86,7 @@ def estimate(
     parent = None if out is None else Path(out).absolute().parent
     if parent is not None and not parent.is_dir():
         raise FileNotFoundError(f"out must lie in an existing folder, got {str(out)!r}")
-    plan, folder = read_recipe(recipe)
-    assert plan is not None
-    found, problems = candidates(plan.scenes, folder)
-    looked, each_s = _looked_at(found, plan, problems)
+    plan, found, problems, looked, each_s = _looked_at(recipe)
     if not looked:
         raise ValueError("none of the scenes looked at can be used:\n" + "\n".join(f"  {one}" for one in problems[:5]))
     number = len(found) * (plan.crops if plan.crop else 1)
@@ -121,12 +118,9 @@ def estimate(
 
 def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: int | None = None) -> Advice:
     """How long `generate` will take about, from one scene: quick also where a chunk takes minutes."""
-    plan, folder = read_recipe(recipe)
-    assert plan is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # generate itself tells them
-        found, problems = candidates(plan.scenes, folder)
-        looked, each_s = _looked_at(found[:1], plan, problems)
+        plan, found, _, looked, each_s = _looked_at(recipe, 1)
         if not looked:
             return Advice(0.0)
         total = samples.count_samples(plan, len(found) * (plan.crops if plan.crop else 1))
@@ -141,18 +135,23 @@ def quick_advice(recipe: DatasetRecipe | dict[str, Any] | str | Path, threads: i
     return Advice(*(reading + float(np.mean([getattr(one, name) for one in told])) for name in ("seconds", "auto_s")))
 
 
-def _looked_at(found: list[Candidate], plan: DatasetRecipe, problems: list[Problem]) -> tuple[list[Shown], float]:
-    """Some scenes of one size, and the seconds that reading one took."""
+def _looked_at(
+    recipe: Any, most: int = _SCENES
+) -> tuple[DatasetRecipe, list[Candidate], list[Problem], list[Shown], float]:
+    """The recipe, its scenes, what is bad, some scenes of one size, and the seconds that reading one took."""
+    plan, folder = read_recipe(recipe)
+    assert plan is not None
+    found, problems = candidates(plan.scenes, folder)
     began = time.perf_counter()
-    chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, _SCENES)})
+    chosen = sorted({round(k) for k in np.linspace(0, len(found) - 1, most)})
     good: list[Shown] = []
     for k in chosen:
         for one in scenes(found[k], plan, good[0].shape if good else None):
-            if isinstance(one, Named):
-                good.append(one.scene)
-            else:
+            if isinstance(one, Problem):
                 problems.append(one)
-    return good, (time.perf_counter() - began) / max(1, len(chosen))
+            else:
+                good.append(one[1])
+    return plan, found, problems, good, (time.perf_counter() - began) / max(1, len(chosen))
 
 
 def _scene_bytes(shown: Shown) -> int:

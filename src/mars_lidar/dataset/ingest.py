@@ -42,11 +42,12 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
             if isinstance(one, Problem):
                 problems.append(one)
                 continue
+            name, scene = one
             if writer is None:  # nothing on the disk is touched before there is something to put on it
-                histogram_blocks(recipe, 1, one.scene.shape)
+                histogram_blocks(recipe, 1, scene.shape)
                 group = begin(path, recipe)
                 writer = SceneWriter(group, len(found) * (recipe.crops if recipe.crop else 1))
-            writer.add(one.name, one.scene)
+            writer.add(name, scene)
     if writer is None:
         told = "\n".join(f"  {problem}" for problem in problems[:5])
         more = f"\n  and {len(problems) - 5} more" if len(problems) > 5 else ""

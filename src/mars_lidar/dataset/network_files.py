@@ -156,9 +156,9 @@ def export(
             for pattern, keys in chosen.files.items():
                 file = folder / pattern.format(**place)
                 if not file.exists():  # the intensity of all levels of light is one file
-                    _save(file, {_NAMES.get(key, key): getattr(exposure, key) for key in keys})
+                    _save(file, {_NAMES.get(key, key): exposure[key] for key in keys})
             for pattern, key in (chosen.pictures or {}).items():
-                _save_depth(folder / pattern.format(**place), getattr(exposure, key))
+                _save_depth(folder / pattern.format(**place), exposure[key])
             line = chosen.lists.format(**place)
             entry = line if chosen.pictures else str(folder / line)
             if entry not in listed:

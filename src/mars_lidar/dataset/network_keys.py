@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -38,14 +39,9 @@ class Exposure:
 
             self._place = tuple(distance_transform_edt(~lit, return_distances=False, return_indices=True))
         shown = maker.scene(sample)
-        self.depth: FloatArray = np.nan_to_num(np.where(lit, shown.depth_m, 0.0)[self._place])  # m; 0: no return
+        self._depth: FloatArray = np.nan_to_num(np.where(lit, shown.depth_m, 0.0)[self._place])
         reflectivity = np.nan_to_num(shown.reflectivity)
         self._reflectivity: FloatArray = reflectivity / max(1.0, float(reflectivity.max(initial=0.0)))
-
-    @property
-    def rates(self) -> NDArray[np.float32]:
-        """(H, W, bins), signal before dead time, largest bin of a pixel 1."""
-        return np.asarray(mat.rates(self._flux, self._system).astype(np.float32)[self._place])
 
     @cached_property
     def _bins(self) -> tuple[NDArray[Any], FloatArray]:
@@ -57,9 +53,7 @@ class Exposure:
         """(H W, bins), pixel y W + x."""
         return read_sparse(self._dataset, self._sample, self._realization)
 
-    @property
-    def spad(self) -> Any:
-        """Sparse (H W, bins), pixel y + H x as MATLAB counts."""
+    def _spad(self) -> Any:
         from scipy import sparse
 
         counts = self._counts
@@ -68,9 +62,7 @@ class Exposure:
         check_size("spad", 12 * counts.nnz)
         return sparse.csc_matrix((counts.data.astype(np.float64), (row, counts.col)), shape=counts.shape)
 
-    @property
-    def est_range_bins_argmax(self) -> NDArray[Any]:
-        """Fullest bin, from 1; the first of equals."""
+    def _fullest(self) -> NDArray[Any]:
         counts = self._counts
         order = np.lexsort((counts.col, -counts.data.astype(np.int64), counts.row))
         pixels, first = np.unique(counts.row[order], return_index=True)
@@ -78,72 +70,46 @@ class Exposure:
         out[pixels] = counts.col[order][first] + 1
         return out.reshape(self._flux.shape)
 
-    @property
-    def bin(self) -> NDArray[Any]:
-        """Bin of the return from 1; 0 without one."""
-        return self._bins[0]
+    def _pulse(self) -> NDArray[np.float64]:
+        delay = np.where(self._flux.signal > 0, self._flux.delay_ns, 0.0)
+        return np.asarray(pulse_in_bins(self._system, delay, self._flux.signal)[self._place])
 
-    range_bins = bin
+    def _median(self) -> NDArray[np.float64]:
+        seen = self._depth[self._depth > 0]
+        return np.full(self._depth.shape, np.median(seen) if seen.size else 0.0)
 
-    @property
-    def bin_hr(self) -> NDArray[np.float64]:
-        """The same as a real number, at 8 times the size."""
-        return mat.larger(self._bins[1])
+    def _photons(self, per_period: NDArray[np.float64]) -> float:
+        """Of an exposure before dead time, mean over pixels."""
+        return float(per_period.mean()) * self._system.cycles
 
-    @property
-    def intensity(self) -> NDArray[np.float64]:
-        """Reflectivity in [0, 1]."""
-        return self._reflectivity
+    def _ratio(self) -> float:
+        background = self._photons(self._flux.background)
+        return self._photons(self._flux.signal) / background if background else np.inf
 
-    @property
-    def intensity_hr(self) -> NDArray[np.uint8]:
-        """Reflectivity in 0 ... 255, at 8 times the size."""
-        return mat.larger(np.round(255.0 * self._reflectivity).astype(np.uint8))
+    def __getitem__(self, key: str) -> Any:
+        return KEYS[key](self)
 
-    @property
-    def level_depth(self) -> NDArray[np.float64]:
-        """The scene's median depth, m, in every pixel."""
-        seen = self.depth[self.depth > 0]
-        return np.full(self.depth.shape, np.median(seen) if seen.size else 0.0)
 
-    @property
-    def signal_ppp(self) -> NDArray[np.float64]:
-        """Signal photons per laser pulse."""
-        return self._flux.signal
-
-    @property
-    def ambient_ppp(self) -> NDArray[np.float64]:
-        """Background photons per laser pulse and bin."""
-        return self._flux.background / self._system.bins
-
-    @property
-    def pulse(self) -> NDArray[np.float64]:
-        """(H, W, 16), energy of the pulse in bins around that of the return, which is the seventh."""
-        flux = self._flux
-        delay = np.where(flux.signal > 0, flux.delay_ns, 0.0)
-        return np.asarray(pulse_in_bins(self._system, delay, flux.signal)[self._place])
-
-    @property
-    def mean_signal_photons(self) -> float:
-        """Signal photons of an exposure before dead time, mean over pixels."""
-        return float(self._flux.signal.mean()) * self._system.cycles
-
-    photons = mean_signal_photons
-
-    @property
-    def mean_background_photons(self) -> float:
-        """Background photons of an exposure before dead time, mean over pixels."""
-        return float(self._flux.background.mean()) * self._system.cycles
-
-    @property
-    def SBR(self) -> float:
-        """Ratio of these two."""
-        return self.mean_signal_photons / self.mean_background_photons if self.mean_background_photons else np.inf
-
-    @property
-    def bin_size(self) -> float:
-        """Width of a bin, s."""
-        return 1e-9 * self._system.bin_ns
+KEYS: dict[str, Callable[[Exposure], Any]] = {  # maps are (H, W)
+    "spad": Exposure._spad,  # sparse (H W, bins), pixel y + H x as MATLAB counts
+    "rates": lambda e: mat.rates(e._flux, e._system).astype(np.float32)[e._place],  # (H, W, bins), largest bin 1
+    "bin": lambda e: e._bins[0],  # of the return, from 1; 0 without one
+    "range_bins": lambda e: e._bins[0],
+    "bin_hr": lambda e: mat.larger(e._bins[1]),  # the same as a real number, at 8 times the size
+    "est_range_bins_argmax": Exposure._fullest,  # bin, from 1; the first of equals
+    "depth": lambda e: e._depth,  # m; 0 without a return
+    "level_depth": Exposure._median,  # of the scene, m, in every pixel
+    "intensity": lambda e: e._reflectivity,  # in [0, 1]
+    "intensity_hr": lambda e: mat.larger(np.round(255.0 * e._reflectivity).astype(np.uint8)),  # at 8 times the size
+    "signal_ppp": lambda e: e._flux.signal,  # photons per laser pulse
+    "ambient_ppp": lambda e: e._flux.background / e._system.bins,  # photons per laser pulse and bin
+    "pulse": Exposure._pulse,  # (H, W, 16), its energy in bins around that of the return, which is the seventh
+    "mean_signal_photons": lambda e: e._photons(e._flux.signal),
+    "photons": lambda e: e._photons(e._flux.signal),
+    "mean_background_photons": lambda e: e._photons(e._flux.background),
+    "SBR": Exposure._ratio,  # of these two
+    "bin_size": lambda e: 1e-9 * e._system.bin_ns,  # s
+}
 
 
 def pulse_in_bins(system: System, delay_ns: NDArray[Any], signal: NDArray[Any]) -> NDArray[np.float64]:

@@ -7,7 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mars_lidar.dataset.sample_content import Rendered, unknown
+import numpy as np
+
+from mars_lidar.dataset.sample_content import Rendered
 from mars_lidar.io.transient import SUFFIXES, read_transient
 from mars_lidar.io.transient_truth import read_truth
 
@@ -35,5 +37,5 @@ def transient_files(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path,
 def _open(file: Path, options: dict[str, Any], pulse: bool) -> Rendered:
     transient = read_transient(file, **options)
     truth = read_truth(file, transient.shape)
-    nothing = unknown(transient.shape)
+    nothing = np.full(transient.shape, np.nan)
     return Rendered(transient, truth.get("depth", nothing), truth.get("reflectivity", nothing), pulse)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.resample import area_mean, nearest, new_size, window
 from mars_lidar._base.types import FloatArray
@@ -133,8 +132,3 @@ class Rendered:
 
 
 Shown = Surfaces | Rendered
-
-
-def unknown(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """A map that nobody tells."""
-    return np.full(shape, np.nan)

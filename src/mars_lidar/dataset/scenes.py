@@ -95,12 +95,13 @@ class SceneWriter:
     def _flush(self) -> None:
         part = slice(self._written, self._written + len(self._held))
         if self._held:
-            self._arrays["depth"][part] = np.stack([one.depth_m for one in self._held])
-            self._arrays["reflectivity"][part] = np.stack([one.reflectivity for one in self._held])
-            light = [_background(one) for one in self._held]
+            nothing = np.full(self._held[0].shape, np.nan)
+            light = [None if isinstance(one, Rendered) else one.scene.background for one in self._held]
+            maps = {"depth": [one.depth_m for one in self._held], "reflectivity": [o.reflectivity for o in self._held]}
             if any(one is not None for one in light):
-                nothing = np.full(self._held[0].shape, np.nan)
-                self._arrays["background"][part] = np.stack([nothing if one is None else one for one in light])
+                maps["background"] = [nothing if one is None else one for one in light]
+            for name, values in maps.items():
+                self._arrays[name][part] = np.stack(values)
         self._written = part.stop
         self._held.clear()
 
@@ -226,10 +227,6 @@ def _kind(scene: Shown) -> str:
         if scene.fog is not None:
             told["fog"] = asdict(scene.fog)
     return json.dumps(told) if told else ""
-
-
-def _background(scene: Shown) -> NDArray[np.float64] | None:
-    return None if isinstance(scene, Rendered) else scene.scene.background
 
 
 def _rows(texts: Sequence[str]) -> NDArray[np.uint8]:

@@ -18,8 +18,9 @@ from mars_lidar.dataset.renders import transient_files
 from mars_lidar.dataset.sample_content import Shown, Surfaces
 from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
+from mars_lidar.io.rgbd import middlebury, nyu
 from mars_lidar.io.rgbd.layered import is_layered, read_layers
-from mars_lidar.io.scan import Problem, SceneFile, scan
+from mars_lidar.io.scan import BAD_FILE, Problem, SceneFile, scan
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
 from mars_lidar.scene.layers import LayeredScene
@@ -37,14 +38,6 @@ class Candidate:
     path: Path
     load: Callable[[], Shown]
     place: str
-
-
-@dataclass(frozen=True)
-class Named:
-    """A scene as the dataset has it."""
-
-    name: str
-    scene: Shown
 
 
 def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Candidate], list[Problem]]:
@@ -76,8 +69,10 @@ def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Ca
     return found, problems
 
 
-def scenes(candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] | None) -> Iterator[Named | Problem]:
-    """What a candidate gives: itself or its crops, checked against all levels and systems; or what is wrong.
+def scenes(
+    candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] | None
+) -> Iterator[tuple[str, Shown] | Problem]:
+    """What a candidate gives: itself or its crops by name, checked against all levels and systems; or what is wrong.
 
     `shape` is that of the dataset, None while it is not known.
     """
@@ -85,8 +80,8 @@ def scenes(candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] |
         whole = candidate.load()
         if recipe.size is not None:
             whole = whole.resize(recipe.size)
-    except (ValueError, TypeError, OSError, MemoryError) as error:
-        yield Problem(candidate.path, " ".join(str(error).split()) or type(error).__name__)
+    except BAD_FILE as error:
+        yield Problem.of(candidate.path, error)
         return
     for number in range(recipe.crops if recipe.crop else 1):
         name = candidate.name if recipe.crop is None else f"{candidate.name}, crop {number}"
@@ -100,11 +95,11 @@ def scenes(candidate: Candidate, recipe: DatasetRecipe, shape: tuple[int, int] |
                     "give size or crop"
                 )
             _check_levels(scene, recipe)
-        except (ValueError, TypeError, OSError, MemoryError) as error:
+        except BAD_FILE as error:
             yield Problem(candidate.path, f"{name}: {error}")
         else:
             shape = scene.shape
-            yield Named(name, scene)
+            yield name, scene
 
 
 def seed_of(recipe: DatasetRecipe, scene: str, system: str, signal: float, sbr: float) -> int:
@@ -122,8 +117,6 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
     options = {name: entry[name] for name in ("depth_unit_m", "focal_px", "max_depth_m") if name in entry}
     image = entry.get("image")
     if path.is_dir():
-        from mars_lidar.io.rgbd import middlebury
-
         manifest = folder / entry["manifest"] if "manifest" in entry else None
         if not middlebury.is_scene(path) or "pattern" in entry or manifest is not None:
             if image is not None and not (isinstance(image, list) and len(image) == 2):
@@ -144,8 +137,6 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
     if path.suffix.lower() != ".mat" or not path.is_file():
         yield from _chosen([own], entry)
         return
-    from mars_lidar.io.rgbd import nyu
-
     frames = range(nyu.frames(path))
     options.pop("depth_unit_m", None)
     yield from _chosen([SceneFile(depth=path, image=own.image, index=k, **options) for k in frames], entry)
@@ -175,11 +166,11 @@ def _examples(entry: dict[str, Any]) -> Iterator[Candidate]:
     name, size = entry["example"], entry["size"]
     for seed in listed_numbers(entry["seeds"]):
         called = f"{name}, size {size}, seed {seed}"
-        yield Candidate(called, Path(called), partial(_example, name, size, seed), called)
 
+        def load(seed: int = seed) -> Shown:
+            return Surfaces(Scene.example(name, _side(size), seed))
 
-def _example(name: str, size: Any, seed: int) -> Shown:
-    return Surfaces(Scene.example(name, tuple(size) if isinstance(size, list) else size, seed))
+        yield Candidate(called, Path(called), load, called)
 
 
 def _sized(whole: Candidate, entry: dict[str, Any]) -> Candidate:
@@ -188,11 +179,11 @@ def _sized(whole: Candidate, entry: dict[str, Any]) -> Candidate:
     if size is None:
         return whole
     name, place = (f"{text}, size {size}" for text in (whole.name, whole.place))
-    return Candidate(name, whole.path, partial(_resized, whole.load, size), place)
+    return Candidate(name, whole.path, lambda: whole.load().resize(_side(size)), place)
 
 
-def _resized(load: Callable[[], Shown], size: Any) -> Shown:
-    return load().resize(tuple(size) if isinstance(size, list) else size)
+def _side(size: Any) -> Any:
+    return tuple(size) if isinstance(size, list) else size
 
 
 def _surfaces(file: SceneFile) -> Shown:
@@ -208,19 +199,18 @@ def _behind_all(clear: Candidate, entry: dict[str, Any]) -> Iterator[Candidate]:
 
     Crops of a scene are at the same places whatever stands before it.
     """
-    pane, fogs = entry.get("pane"), entry.get("fog") or [None]
-    for fog in fogs:
+    pane = entry.get("pane")
+    for fog in entry.get("fog") or [None]:
         told = [] if pane is None else [f"pane {pane['depth_m']!r} {pane['reflectivity']!r} {pane['transmission']!r}"]
         told += [] if fog is None else [f"fog {fog['extinction_per_m']!r} {fog['backscatter']!r} {fog['nearest_m']!r}"]
-        name = ", ".join([clear.name, *told])
-        yield Candidate(name, clear.path, partial(_behind, clear.load, pane, fog), clear.place)
 
+        def load(fog: Any = fog) -> Shown:
+            shown = clear.load()
+            assert isinstance(shown, Surfaces)
+            scene = shown.scene if pane is None else LayeredScene.behind_pane(shown.scene, **pane)
+            return Surfaces(scene, None if fog is None else Fog(**fog))
 
-def _behind(load: Callable[[], Shown], pane: dict[str, float] | None, fog: dict[str, float] | None) -> Shown:
-    shown = load()
-    assert isinstance(shown, Surfaces)
-    scene = shown.scene if pane is None else LayeredScene.behind_pane(shown.scene, **pane)
-    return Surfaces(scene, None if fog is None else Fog(**fog))
+        yield Candidate(", ".join([clear.name, *told]), clear.path, load, clear.place)
 
 
 def _cropped(scene: Shown, size: tuple[int, int], name: str, seed: int) -> Shown:

@@ -161,18 +161,11 @@ class Dataset:
 
     def missing(self) -> list[Item]:
         """Parts that are not there, or whose files were cut short."""
-        written: dict[Path, set[str]] = {}
-
-        def there(file: Path) -> bool:
-            if file.parent not in written:
-                entries = file.parent.iterdir() if file.parent.is_dir() else ()
-                written[file.parent] = {one.name for one in entries}
-            return file.name in written[file.parent]
 
         def whole(item: Item) -> bool:
             array = self.histogram if item.kind == "histogram" else self.maps["depth"]
             chunks = math.prod(n // step for n, step in zip(array.shards, array.chunks, strict=True))
-            return all(there(file) and _whole(file, chunks) for file in self.files(item))
+            return all(file.is_file() and _whole(file, chunks) for file in self.files(item))
 
         return [item for item in self.items() if not whole(item)]
 

@@ -69,24 +69,21 @@ def choice(told: str, allowed: tuple[str, ...]) -> Field:
 
 def text(told: str) -> Field:
     """A text that is not empty."""
-
-    def read(key: Key, value: Any) -> str:
-        if not isinstance(value, str) or not value:
-            raise RecipeError(key, f"{key[-1]} must be a text, got {value!r}")
-        return value
-
-    return _field(told, read, type="string", minLength=1)
+    return _field(told, _kind(str, "a text"), type="string", minLength=1)
 
 
 def flag(told: str) -> Field:
     """True or false."""
+    return _field(told, _kind(bool, "true or false"), type="boolean")
 
-    def read(key: Key, value: Any) -> bool:
-        if not isinstance(value, bool):
-            raise RecipeError(key, f"{key[-1]} must be true or false, got {value!r}")
+
+def _kind(kind: type, words: str) -> Callable[[Key, Any], Any]:
+    def read(key: Key, value: Any) -> Any:
+        if not isinstance(value, kind) or value == "":
+            raise RecipeError(key, f"{key[-1]} must be {words}, got {value!r}")
         return value
 
-    return _field(told, read, type="boolean")
+    return read
 
 
 _SIDE = integer("", low=1, high=MAX_SIDE)

@@ -58,7 +58,7 @@ def read_view(scene: dict[str, Any] | str | Path, system: System, *, whole: bool
     changes = {name: value for name, value in replaced.items() if value is not None and name != "light"}
     shining = {name: value for name, value in (replaced.get("light") or {}).items() if value is not None}
     if isinstance(scene, dict):
-        return _view(_merged(scene, changes, shining), Path(), system, whole)
+        return _view(_merged(scene, changes, shining), system, whole)
     file = Path(scene)
     if not file.is_file():
         raise ValueError(f"{file}: no such file")
@@ -66,14 +66,9 @@ def read_view(scene: dict[str, Any] | str | Path, system: System, *, whole: bool
     given = {(name,) for name in changes} | {("light", name) for name in shining}
     own: Lines = {key: line for key, line in lines.items() if key[:1] not in given and key[:2] not in given}
     with located(file, own, lambda key: key[:1] in given or key[:2] in given):
-        located_data = _at(data, file.parent) if isinstance(data, dict) else data
-        return _view(_merged(located_data, changes, shining), Path(), system, whole)
-
-
-def _at(data: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Files of a description, which are relative to it."""
-    paths = {name: str(folder / data[name]) for name in _PATHS if isinstance(data.get(name), str)}
-    return data | paths
+        if isinstance(data, dict):  # files of a description are relative to it
+            data |= {name: str(file.parent / data[name]) for name in _PATHS if isinstance(data.get(name), str)}
+        return _view(_merged(data, changes, shining), system, whole)
 
 
 def _merged(data: Any, changes: dict[str, Any], shining: dict[str, Any]) -> Any:
@@ -87,7 +82,7 @@ def _merged(data: Any, changes: dict[str, Any], shining: dict[str, Any]) -> Any:
     return data | changes | {"light": light}
 
 
-def _view(data: Any, folder: Path, system: System, whole: bool) -> View:
+def _view(data: Any, system: System, whole: bool) -> View:
     shown = {name: value for name, value in data.items() if name != "light"} if isinstance(data, dict) else data
     entry = read_scene((), shown)
     key: Key = ("light",)
@@ -98,7 +93,7 @@ def _view(data: Any, folder: Path, system: System, whole: bool) -> View:
         raise RecipeError((*key, "photons_per_unit"), "photons_per_unit belongs to a transient")
     if len(light.levels) > 1:
         raise RecipeError(key, f"light must be one level of one scene, got {len(light.levels)}; generate takes several")
-    found, problems = candidates([entry], folder)
+    found, problems = candidates([entry], Path())
     if problems or len(found) != 1:
         told = (
             "; ".join(map(str, problems))

@@ -129,7 +129,7 @@ class Maker:
                 seed=int(self.dataset.seeds[sample]),
                 threads=self._threads,
                 out=out[k] if direct else None,
-                progress=self._progress,
+                progress=lambda *_: self._check(),
             )
             if not direct:
                 out[k] = drawn
@@ -165,6 +165,3 @@ class Maker:
     def _check(self) -> None:
         if self._stop is not None and self._stop.is_set():
             raise Stopped
-
-    def _progress(self, done: int, total: int) -> None:
-        self._check()

@@ -10,7 +10,6 @@ import json
 import secrets
 import threading
 import warnings
-from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -64,7 +63,8 @@ class CubeServer:
         self._page = text.encode()
         self._server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
         self._server.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self._server.server_port}{self._word}/"
+        self.hosts = tuple(f"{name}:{self._server.server_port}" for name in ("127.0.0.1", "localhost"))  # that may ask
+        self.url = f"http://{self.hosts[0]}{self._word}/"
 
     def serve(self) -> None:
         """Answer until the process is interrupted, or `stop` is called by another thread."""
@@ -78,12 +78,6 @@ class CubeServer:
         """Give the port back."""
         self._server.server_close()
 
-    @property
-    def hosts(self) -> tuple[str, str]:
-        """Names by which this machine may ask."""
-        port = self._server.server_port
-        return f"127.0.0.1:{port}", f"localhost:{port}"
-
     def answer(self, target: str) -> tuple[str, bytes]:
         """Type and content of what `target`, path and query, asks for; KeyError where that is nothing."""
         asked = urlsplit(target)
@@ -93,15 +87,11 @@ class CubeServer:
         if what == "/":
             return "text/html; charset=utf-8", self._page
         given = {name: values[-1] for name, values in parse_qs(asked.query).items()}
-        answers: dict[str, Callable[[Cube, dict[str, str]], tuple[str, bytes]]] = {
-            "/pixel": self._pixel,
-            "/rows": self._rows,
-        }
         if self.cube is None:
             raise KeyError(target)
         with self._lock, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return answers[what](self.cube, given)
+            return {"/pixel": self._pixel, "/rows": self._rows}[what](self.cube, given)
 
     def _told(self, cube: Cube, name: str) -> dict[str, Any]:
         settings, reason = settings_of(cube.system)
@@ -129,9 +119,9 @@ class CubeServer:
         """Counts of the pixels of some rows, and their delays in ns, NaN for none: float64."""
         images, height, width, _ = cube.shape
         image, first = _whole("image", given, images), _whole("first", given, height)
-        rows = 1 + _whole(
-            "rows", {"rows": str(int(given["rows"]) - 1)}, min(height - first, max(1, _MOST_PIXELS // width))
-        )
+        rows, most = int(given["rows"]), min(height - first, max(1, _MOST_PIXELS // width))
+        if not 1 <= rows <= most:
+            raise ValueError(f"rows must lie in [1, {most}], got {rows}")
         counts = np.asarray(cube.histogram[image, first : first + rows])
         totals = counts.sum(-1, dtype=np.float64)
         if given["method"] == "truth":

@@ -35,29 +35,20 @@ _BAND_BYTES = 64 * 2**20
 
 @dataclass(frozen=True)
 class Capture:
-    """Where the light of a capture is, and how it becomes an image.
-
-    Attributes
-    ----------
-    path, name, axes, shape
-        The file, its data set, a letter for each axis, and its shape.
-    bin_ns, start_ns
-        Width of a time bin and travel time at the first one, ns; None where the file does not tell.
-    """
+    """Where the light of a capture is, and how it becomes an image."""
 
     path: Path
-    name: str
-    axes: str
+    name: str  # of its data set
+    axes: str  # a letter for each
     shape: tuple[int, ...]
-    bin_ns: float | None
-    start_ns: float | None
+    bin_ns: float | None  # width of a time bin; None where the file does not tell
+    start_ns: float | None  # travel time at the first one
 
     @property
     def rows(self) -> str:
         """Axes of the image's rows: the laser's points where there are several, else y of the sensor's."""
-        size = dict(zip(self.axes, self.shape, strict=True))
-        several = math.prod(size.get(one, 1) for one in "XYl") > 1
-        return "".join(one for one in ("XYl" if several else "y") if one in size)
+        several = math.prod(self._size.get(one, 1) for one in "XYl") > 1
+        return "".join(one for one in ("XYl" if several else "y") if one in self.axes)
 
     @property
     def columns(self) -> str:
@@ -67,12 +58,12 @@ class Capture:
     @property
     def image(self) -> tuple[int, int, int]:
         """(H, W, T)."""
-        size = dict(zip(self.axes, self.shape, strict=True))
-        return (
-            math.prod(size[one] for one in self.rows),
-            math.prod(size[one] for one in self.columns),
-            size["T"],
-        )
+        height, width = (math.prod(self._size[one] for one in axes) for axes in (self.rows, self.columns))
+        return height, width, self._size["T"]
+
+    @property
+    def _size(self) -> dict[str, int]:
+        return dict(zip(self.axes, self.shape, strict=True))
 
     def read(self, rows: slice) -> NDArray[Any]:
         """Light of some rows (rows, W, T)."""
@@ -106,15 +97,14 @@ class Capture:
         slab = [slice(None)] * len(self.axes)
         if not self.rows:
             return tuple(slab), first
-        inner = self.image[0] // self.shape[self.axes.index(self.rows[0])]
-        low, high = first // inner, -(-last // inner)
+        low, high = first // self.step, -(-last // self.step)
         slab[self.axes.index(self.rows[0])] = slice(low, high)
-        return tuple(slab), first - low * inner
+        return tuple(slab), first - low * self.step
 
     @property
     def step(self) -> int:
         """Rows that belong to one step of their first axis."""
-        return self.image[0] // self.shape[self.axes.index(self.rows[0])] if self.rows else self.image[0]
+        return self.image[0] // self._size[self.rows[0]] if self.rows else self.image[0]
 
     def bands(self) -> Iterator[slice]:
         """Rows that are written together: whole steps."""

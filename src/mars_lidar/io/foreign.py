@@ -11,41 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import check_claim, open_npz, read_mat5, read_npy, reading, whole
-from mars_lidar._base.hdf5 import open_hdf5
+from mars_lidar._base.files import check_claim, open_npz, read_npy, reading
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
+from mars_lidar.io.mat_arrays import hdf5_arrays, mat_arrays
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
 from mars_lidar.io.recorder import RECORDER_SUFFIXES, Recorded, recorded
-from mars_lidar.io.streams.bare_stream import mat_cells
+from mars_lidar.io.streams.bare_stream import cells_of
 
 FOREIGN_SUFFIXES = (".npy", ".npz", ".mat", ".h5", ".hdf5", ".tif", ".tiff", ".csv", ".txt", *RECORDER_SUFFIXES)
 
 
 @dataclass(frozen=True, eq=False)
 class ForeignCounts:
-    """What `read_counts` found.
-
-    Attributes
-    ----------
-    path, name
-        The file, and the array in it; "" where the format has no names.
-    counts
-        (exposures, H, W, T), or None where the file holds photon times.
-    cells
-        (H, W) of arrays of photon times, or None.
-    axes
-        What the array's dimensions were taken for.
-    recorder
-        What a photon counter's file tells of its histograms, else None.
-    """
+    """What `read_counts` found."""
 
     path: Path
-    name: str
-    counts: NDArray[Any] | None
-    cells: NDArray[Any] | None
-    axes: str
-    recorder: Recorded | None = None
+    name: str  # of the array in the file; "" where the format has no names
+    counts: NDArray[Any] | None  # (exposures, H, W, T), or None where the file holds photon times
+    cells: NDArray[Any] | None  # (H, W) of arrays of photon times, or None
+    axes: str  # what the array's dimensions were taken for
+    recorder: Recorded | None = None  # what a photon counter's file tells of its histograms
 
     def cube(self, system: System, *, start_ns: float = 0.0, unit_ns: float | None = None) -> Cube:
         """The cube, see `foreign_cube`."""
@@ -170,39 +156,14 @@ def _npz(path: Path) -> dict[str, Any]:
 
 
 def _mat(path: Path) -> dict[str, Any]:
-    import h5py
-
-    found = _hdf5(path) if h5py.is_hdf5(path) else read_mat5(path)
+    found = mat_arrays(path)
     arrays: dict[str, Any] = {}
     for name, array in found.items():
         if hasattr(array, "toarray"):
             arrays[name] = array
-        elif isinstance(array, np.ndarray) and array.dtype.kind in "iuf" and not name.startswith("__"):
-            arrays[name] = np.squeeze(array.T if h5py.is_hdf5(path) else array)  # HDF5 has MATLAB's dimensions reversed
-    return arrays | {name: cells for name, cells in mat_cells(path).items() if cells.size > 1}
-
-
-def _hdf5(path: Path) -> dict[str, Any]:
-    """The arrays of numbers of a file, of all its groups; a sparse one of MATLAB is a group of three."""
-    import h5py
-    from scipy import sparse
-
-    out: dict[str, Any] = {}
-    parts: list[str] = []
-
-    def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
-            columns = whole(item["jc"]).astype(np.int64)
-            data, rows = (whole(item[part]) if part in item else np.zeros(0) for part in ("data", "ir"))
-            shape = (int(item.attrs["MATLAB_sparse"]), len(columns) - 1)
-            out[name] = sparse.csc_array((data, rows.astype(np.int64), columns), shape=shape)
-            parts.extend(f"{name}/{part}" for part in item)
-        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and item.ndim and name not in parts:
-            out[name] = whole(item)
-
-    with open_hdf5(path) as file:
-        file.visititems(visit)
-    return out
+        elif isinstance(array, np.ndarray) and array.dtype.kind in "iuf":
+            arrays[name] = np.squeeze(array)
+    return arrays | {name: cells for name, cells in cells_of(found).items() if cells.size > 1}
 
 
 def _tiff(path: Path) -> dict[str, Any]:
@@ -232,8 +193,8 @@ _READERS = {
     ".npy": lambda path: {"": read_npy(path)},
     ".npz": _npz,
     ".mat": _mat,
-    ".h5": _hdf5,
-    ".hdf5": _hdf5,
+    ".h5": hdf5_arrays,
+    ".hdf5": hdf5_arrays,
     ".tif": _tiff,
     ".tiff": _tiff,
     ".csv": _table,

@@ -101,7 +101,7 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     check_heaps(path)
     file = h5py.File(path, "r", rdcc_nbytes=32 * _CHUNK_BYTES)
     try:
-        attrs = {name: _plain(value) for name, value in file.attrs.items()}
+        attrs = {name: v.item() if isinstance(v, np.generic) else v for name, v in file.attrs.items()}
         check(path, attrs)
         require(file, path)
     except BaseException:
@@ -115,7 +115,3 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
         close=file.close,
         rows_of=file.__getitem__,
     )
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value

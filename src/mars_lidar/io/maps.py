@@ -40,7 +40,7 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
     "reflectivity": ("reflectivity", "1", "reflectivity, signal over level"),
     "signal": ("signal", _PHOTONS, "signal"),
     "background": ("background", _PHOTONS, "background"),
-    "delay": ("delay_ns", "ns", "delay of the return"),
+    "delay": ("delay_ns", "ns", "delay"),
     "depth_error": ("depth_error_m", "m", "standard error of the depth"),
     "delay_error": ("delay_error_ns", "ns", "standard error of the delay"),
     "signal_error": ("signal_error", _PHOTONS, "standard error of the signal"),
@@ -50,15 +50,9 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
     "returns": ("returns.count", "1", "number of returns"),
     "radius": ("radius", "pixel", "radius of the window whose photons were taken together"),
 }
-_OF_RETURNS = {  # the same of each return
-    "return_depth": ("depth_m", "m", "depth of each return"),
-    "return_signal": ("signal", _PHOTONS, "signal of each return"),
-    "return_delay": ("delay_ns", "ns", "delay of each return"),
-    "return_depth_error": ("depth_error_m", "m", "standard error of the depth of each return"),
-    "return_signal_error": ("signal_error", _PHOTONS, "standard error of the signal of each return"),
-    "return_delay_error": ("delay_error_ns", "ns", "standard error of the delay of each return"),
-    "return_false_alarm": ("false_alarm", "1", "chance of so much likelihood by a return that is not there"),
-}
+_OF_EACH = ("depth", "signal", "delay", "depth_error", "signal_error", "delay_error")
+_OF_RETURNS = {f"return_{name}": (*_VARIABLES[name][:2], f"{_VARIABLES[name][2]} of each return") for name in _OF_EACH}
+_OF_RETURNS["return_false_alarm"] = ("false_alarm", "1", "chance of so much likelihood by a return that is not there")
 
 
 def check_maps_output(path: str | Path, *, overwrite: bool = False) -> None:

@@ -210,19 +210,18 @@ def _check_counts(counts: NDArray[Any], most: float, system: System) -> None:
 def _cells(cells: Any) -> NDArray[Any]:
     """(H, W) of arrays of times."""
     checks.unmasked("cells", cells)
-    array = cells if isinstance(cells, np.ndarray) else np.empty(0)
-    if not isinstance(cells, np.ndarray):
-        if not isinstance(cells, list | tuple):
-            raise TypeError(f"cells must be (H, W) of arrays of times, got {type(cells).__name__}")
-        rows = list(cells)
-        if all(isinstance(cell, Real) for cell in rows):
-            return _cells(np.asarray(rows, np.float64))
-        array = np.empty((len(rows), len(rows[0]) if rows else 0), object)
-        for y, row in enumerate(rows):
-            if len(row) != array.shape[1]:
-                raise ValueError("cells must be rows of equally many pixels, each an array of times")
-            for x, cell in enumerate(row):
-                array[y, x] = np.asarray(cell)
+    if isinstance(cells, np.ndarray):
+        array = cells
+    elif not isinstance(cells, list | tuple):
+        raise TypeError(f"cells must be (H, W) of arrays of times, got {type(cells).__name__}")
+    elif all(isinstance(cell, Real) for cell in cells):
+        array = np.asarray(cells, np.float64)
+    elif len({len(row) for row in cells}) > 1:
+        raise ValueError("cells must be rows of equally many pixels, each an array of times")
+    else:
+        array = np.empty((len(cells), len(cells[0])), object)
+        for place in np.ndindex(array.shape):
+            array[place] = np.asarray(cells[place[0]][place[1]])
     if array.dtype != object:
         if array.ndim != 1:
             raise ValueError(f"cells must be (H, W) of arrays of times, or one array of times, got {array.shape}")

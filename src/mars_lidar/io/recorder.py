@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,24 +20,13 @@ _PICOQUANT = (".ptu", *picoquant.SUFFIXES)
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """Histograms of a recorder, and what it tells of them.
+    """Histograms of a recorder, and what it tells of them."""
 
-    Attributes
-    ----------
-    arrays
-        By name: (frames, y, x, t), (y, x, t) or (t,) counts.
-    bin_ns, period_ns, cycles
-        Width of a bin and laser period, ns, and laser periods of a pixel and frame, where the file tells them. The
-        period is that of the file, which a whole number of bins need not fill.
-    told
-        What else is worth a line.
-    """
-
-    arrays: dict[str, NDArray[Any]]
-    bin_ns: float | None = None
-    period_ns: float | None = None
-    cycles: int | None = None
-    told: tuple[str, ...] = field(default=())
+    arrays: dict[str, NDArray[Any]]  # by name: (frames, y, x, t), (y, x, t) or (t,) counts
+    bin_ns: float | None = None  # width of a bin
+    period_ns: float | None = None  # of the laser, as the file has it: a whole number of bins need not fill it
+    cycles: int | None = None  # laser periods of a pixel and frame
+    told: tuple[str, ...] = ()  # what else is worth a line
 
 
 def recorded(path: Path) -> Recorded:

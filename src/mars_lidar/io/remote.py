@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import math
 import re
@@ -47,13 +48,16 @@ def open_url(url: str) -> OpenedStore:
     if not url.rstrip("/").endswith(".zarr"):
         raise FileError(f"{url}: only a .zarr is opened from a URL; fetch other files first")
     core = needed("fsspec.core", url, "remote")
+    import zarr
+    from zarr.storage import FsspecStore
+
     with _naming(url):
         system, root = core.url_to_fs(url)
         attrs = json.loads(system.cat_file(f"{root}/zarr.json")).get("attributes", {})
         layout.check_format(Path(url), attrs)
         if attrs.get("complete") is True:
             _require(url, system, root)
-        group = _group(url)
+        group: Any = zarr.open_group(FsspecStore.from_url(url, read_only=True), mode="r")
         names = frozenset(group.array_keys())
         histogram = group["histogram"] if "histogram" in names else None
 
@@ -65,23 +69,14 @@ def open_url(url: str) -> OpenedStore:
     return OpenedStore(attrs, names, read, histogram, rows_of=group.__getitem__)
 
 
-def _group(url: str) -> Any:
-    import zarr
-    from zarr.storage import FsspecStore
-
-    return zarr.open_group(FsspecStore.from_url(url, read_only=True), mode="r")
-
-
 def _require(url: str, system: Any, root: str) -> None:
     """Raise where a document or coordinate is not as it was written, or a file is missing where they can be listed."""
     try:
         lines = system.cat_file(f"{root}/{manifest.NAME}").decode()
     except FileNotFoundError:
         return  # of an earlier version
-    told = dict(reversed(line.split("  ", 1)) for line in lines.splitlines() if "  " in line)
-    wrong = [
-        f"{name} is not as it was written" for name in manifest.changed(told, lambda n: system.cat_file(f"{root}/{n}"))
-    ]
+    told = manifest.lines_of(lines)
+    wrong = list(manifest.changed(told, lambda n: hashlib.sha256(system.cat_file(f"{root}/{n}")).hexdigest()))
     try:
         there = {str(name).rpartition(f"{root}/")[2] for name in system.find(root)}
     except Exception:  # what cannot be listed (most web servers)

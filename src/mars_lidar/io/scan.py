@@ -13,8 +13,10 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_claim, reading
 from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
+from mars_lidar.io.rgbd import middlebury, nyu
 from mars_lidar.scene.scene import Scene
 
+BAD_FILE = (ValueError, TypeError, OSError, MemoryError)  # what a scene that cannot be used raises
 MANIFEST = "manifest.csv"
 _COLUMNS = ("depth", "image", "index", "depth_unit_m", "focal_px", "max_depth_m")
 _DEPTH = (".png", ".tif", ".tiff", ".npy", ".pfm", ".exr")
@@ -47,6 +49,11 @@ class Problem:
 
     path: Path
     reason: str
+
+    @classmethod
+    def of(cls, path: Path, error: Exception) -> Problem:
+        """What an error tells."""
+        return cls(path, " ".join(str(error).split()) or type(error).__name__)
 
     def __str__(self) -> str:
         return self.reason if self.reason.startswith(str(self.path)) else f"{self.path}: {self.reason}"
@@ -134,8 +141,8 @@ def scan(
     for k, one in enumerate(candidates):
         try:
             one.load()
-        except (ValueError, TypeError, OSError, MemoryError) as error:
-            problems.append(Problem(one.depth, " ".join(str(error).split()) or type(error).__name__))
+        except BAD_FILE as error:
+            problems.append(Problem.of(one.depth, error))
         else:
             scenes.append(one)
         if progress is not None:
@@ -182,8 +189,6 @@ def _matching(root: Path, pattern: str, image: tuple[str, str] | None, problems:
 
 
 def _recognised(root: Path, problems: list[Problem]) -> Iterator[SceneFile]:
-    from mars_lidar.io.rgbd import middlebury
-
     if middlebury.is_scene(root):
         yield SceneFile(depth=root)
         return
@@ -207,12 +212,10 @@ def _frames(path: Path, image: Path | None, problems: list[Problem]) -> Iterator
     if path.suffix.lower() != ".mat":
         yield SceneFile(depth=path, image=image)
         return
-    from mars_lidar.io.rgbd import nyu
-
     try:
         count = nyu.frames(path)
-    except (ValueError, OSError, MemoryError) as error:
-        problems.append(Problem(path, str(error)))
+    except BAD_FILE as error:
+        problems.append(Problem.of(path, error))
         return
     for k in range(count):
         yield SceneFile(depth=path, image=image, index=k)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,23 +22,19 @@ def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray
     ``.npz``, ``.h5``, ``.hdf5`` and ``.mat`` (turned, as the transient is). A ValueError begins with the file.
     """
     with reading(path, "a transient with depth and reflectivity") as source:
-        return _checked(source, _read(source), shape)
-
-
-def _checked(source: Path, found: Mapping[str, Any], shape: tuple[int, int]) -> dict[str, FloatArray]:
-    told: dict[str, FloatArray] = {}
-    for name, stored in found.items():
-        if stored.shape != shape or stored.dtype.kind not in "fiu":
-            raise ValueError(f"{source}: {name} must be real numbers {shape}, got {stored.dtype} {stored.shape}")
-        told[name] = stored.astype(np.float64)
-    if "depth" in told:
-        depth = told["depth"]
-        if (depth < 0.0).any():
-            raise ValueError(f"{source}: depth must not be negative, got {np.nanmin(depth):g} m")
-        told["depth"] = np.where((depth > 0.0) & (depth < np.inf), depth, np.nan)
-    if "reflectivity" in told and not ((told["reflectivity"] >= 0.0) & (told["reflectivity"] <= 1.0)).all():
-        raise ValueError(f"{source}: reflectivity must lie in [0, 1]")
-    return told
+        told: dict[str, FloatArray] = {}
+        for name, stored in _read(source).items():
+            if stored.shape != shape or stored.dtype.kind not in "fiu":
+                raise ValueError(f"{source}: {name} must be real numbers {shape}, got {stored.dtype} {stored.shape}")
+            told[name] = stored.astype(np.float64)
+        if "depth" in told:
+            depth = told["depth"]
+            if (depth < 0.0).any():
+                raise ValueError(f"{source}: depth must not be negative, got {np.nanmin(depth):g} m")
+            told["depth"] = np.where((depth > 0.0) & (depth < np.inf), depth, np.nan)
+        if "reflectivity" in told and not ((told["reflectivity"] >= 0.0) & (told["reflectivity"] <= 1.0)).all():
+            raise ValueError(f"{source}: reflectivity must lie in [0, 1]")
+        return told
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:

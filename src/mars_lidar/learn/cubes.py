@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -40,13 +39,11 @@ class CubeMaker:
         self.device = torch.device(device)
         if self.device.type not in ("cpu", "cuda"):
             raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
-        if self.on_gpu:
-            _check_gpu()
-
-    @property
-    def on_gpu(self) -> bool:
-        """Whether cubes are made on a GPU."""
-        return self.device.type == "cuda"
+        self.on_gpu = self.device.type == "cuda"
+        if self.on_gpu and not torch.cuda.is_available():
+            raise ValueError(
+                "device='cuda' needs a GPU and a build of PyTorch for it; torch.cuda.is_available() is False"
+            )
 
     def cubes(self, samples: Sequence[Sample], threads: int) -> torch.Tensor:
         """(samples, T, H, W) or (samples, H, W, T)."""
@@ -102,9 +99,8 @@ class CubeMaker:
         return turned.coalesce() if cube.layout == torch.sparse_coo else turned
 
     def _simulated_on_gpu(self, sample: Sample) -> torch.Tensor:
-        options: dict[str, Any] = {"device": "cuda"}
         with torch.cuda.device(self.device):
-            made = simulate(sample.flux, sample.system, engine=self._engine, seed=sample.seed, **options)
+            made: Any = simulate(sample.flux, sample.system, engine=self._engine, seed=sample.seed, device="cuda")
         tensor: torch.Tensor = torch.utils.dlpack.from_dlpack(made)[0]
         return tensor
 
@@ -115,13 +111,6 @@ def _sparse(counts: NDArray[Any]) -> torch.Tensor:
     values = torch.from_numpy(counts.reshape(-1)[where].astype(np.int32))
     indices = torch.from_numpy(np.stack(np.unravel_index(where, counts.shape)).astype(np.int64, copy=False))
     return torch.sparse_coo_tensor(indices, values, counts.shape, is_coalesced=True, check_invariants=False)
-
-
-def _check_gpu() -> None:
-    if "device" not in inspect.signature(simulate).parameters:
-        raise ValueError("device='cuda' needs a mars_lidar whose simulate() takes a device; this one has CPU engines")
-    if not torch.cuda.is_available():
-        raise ValueError("device='cuda' needs a GPU and a build of PyTorch for it; torch.cuda.is_available() is False")
 
 
 class Buffers:

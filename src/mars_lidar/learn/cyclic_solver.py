@@ -148,40 +148,32 @@ class Circle:
         total = self.delay.periods * h.sum(-1, keepdim=True) + c.mean(-1, keepdim=True)
         return h - self.q * x - self.p * c + self.v * total
 
-    def apply_transposed(self, z: Rows) -> Rows:
-        """B' z."""
-        weight = (self.v * z).sum(-1, keepdim=True)
-        c = self.recursion_transposed(weight / z.shape[-1] - self.p * z)
-        back = self.delay.rearmed_transposed((1.0 - self.q) * c - self.q * z)
-        return z + back + self.delay.periods * weight
-
     def source(self, s: Rows) -> Rows:
         """Q s."""
         c = self.recursion(s)
         return s - self.p * c + self.v * c.mean(-1, keepdim=True)
 
-    def source_transposed(self, z: Rows) -> Rows:
-        """Q' z."""
+    def _back(self, z: Rows) -> tuple[Rows, Rows]:
+        """v' z, and C' of it as a mean over the bins less p z, which B' and Q' are made of."""
         weight = (self.v * z).sum(-1, keepdim=True)
-        return z + self.recursion_transposed(weight / z.shape[-1] - self.p * z)
+        return weight, self.recursion_transposed(weight / z.shape[-1] - self.p * z)
 
-    def solve(self, s: Rows, tolerance: float = TOLERANCE) -> Rows:
-        """h of (1)."""
-        return gmres(self.apply, self.source(s), tolerance)
+    def apply_transposed(self, z: Rows) -> Rows:
+        """B' z."""
+        weight, c = self._back(z)
+        back = self.delay.rearmed_transposed((1.0 - self.q) * c - self.q * z)
+        return z + back + self.delay.periods * weight
 
-    def solve_transposed(self, g: Rows, tolerance: float = TOLERANCE) -> Rows:
-        """y of A' y = g."""
-        return self.source_transposed(gmres(self.apply_transposed, g, tolerance))
+    def solve(self, s: Rows, tolerance: float = TOLERANCE, turned: bool = False) -> Rows:
+        """x of A x = s, (1), or of A' x = s."""
+        if not turned:
+            return gmres(self.apply, self.source(s), tolerance)
+        z = gmres(self.apply_transposed, s, tolerance)
+        return z + self._back(z)[1]  # Q' z
 
 
 def gmres(apply: Callable[[Rows], Rows], wanted: Rows, tolerance: float = TOLERANCE) -> Rows:
-    """x (rows, n) of apply(x) = wanted; rows are independent of each other.
-
-    Raises
-    ------
-    ConvergenceError
-        Where a residual stays above 1e-9.
-    """
+    """x (rows, n) of apply(x) = wanted, of rows that are independent; ConvergenceError for a residual above 1e-9."""
     size = torch.linalg.vector_norm(wanted, dim=-1).clamp_min(1e-300)
     x, rest, last = torch.zeros_like(wanted), wanted, math.inf
     for _ in range(_RESTARTS):
@@ -243,11 +235,8 @@ class _Solution(torch.autograd.Function):
     def forward(photons: Rows, source: Rows, known: Rows | None, delay: Delay, tolerance: float, turned: bool) -> Rows:
         if known is not None:
             return known.clone()
-        done = []
-        for light, wanted in _blocks(photons, source):
-            circle = Circle(light, delay)
-            done.append((circle.solve_transposed if turned else circle.solve)(wanted, tolerance))
-        return torch.cat(done)
+        every = blocks(_block(photons.device), photons.shape[-1], photons, source)
+        return torch.cat([Circle(light, delay).solve(wanted, tolerance, turned) for light, wanted in every])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Rows) -> None:
@@ -308,9 +297,9 @@ def registered(
     return h
 
 
-def _blocks(*rows: Rows) -> Any:
-    some = max(1, _block(rows[0].device) // rows[0].shape[-1])
-    return zip(*(torch.split(one, some) for one in rows), strict=True)
+def blocks(most: int, bins: int, *rows: torch.Tensor) -> Any:
+    """Some rows of each at a time, of at most so many rows x bins."""
+    return zip(*(torch.split(one, max(1, most // bins)) for one in rows), strict=True)
 
 
 def _block(device: torch.device) -> int:

@@ -25,7 +25,7 @@ def rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
     return checks.integer("rank", rank, low=0, high=world - 1), world
 
 
-def worker_of() -> tuple[int, int]:
-    """Number of this worker and of all workers of a DataLoader; 0 of 1 outside of one."""
+def worker_of() -> tuple[int, int, bool]:
+    """Number of this worker and of all workers of a DataLoader, and whether this is one; else 0 of 1."""
     info = torch.utils.data.get_worker_info()
-    return (0, 1) if info is None else (info.id, info.num_workers)
+    return (0, 1, False) if info is None else (info.id, info.num_workers, True)

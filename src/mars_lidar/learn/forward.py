@@ -9,7 +9,7 @@ from typing import Any
 from mars_lidar._base import checks
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.cyclic_solver import TOLERANCE, Delay, by_rows, fired, registered
+from mars_lidar.learn.cyclic_solver import TOLERANCE, Delay, blocks, by_rows, fired, registered
 from mars_lidar.learn.light import alike, check_detector, check_values, detected, photons_in
 from mars_lidar.learn.needed import torch
 
@@ -84,8 +84,8 @@ class _Expected(torch.autograd.Function):
     @staticmethod
     def forward(signal: Any, background: Any, delay_ns: Any, system: System, parts: int) -> tuple[torch.Tensor, ...]:
         check_values(signal, background, delay_ns)
-        blocks = _blocks(system.bins * parts, signal, background, delay_ns)
-        done = [_registered(rows, system, parts) for rows in blocks]
+        every = blocks(_BLOCK, system.bins * parts, signal, background, delay_ns)
+        done = [_registered(rows, system, parts) for rows in every]
         return tuple(torch.cat(one) for one in zip(*done, strict=True))
 
     @staticmethod
@@ -117,7 +117,7 @@ class _Expected(torch.autograd.Function):
 
 def _again(ctx: Any, *others: torch.Tensor) -> Iterator[tuple[Any, Any, Any]]:
     """Block by block: the histogram as a function of its light, that light, and the same rows of `others`."""
-    for rows in _blocks(ctx.system.bins * ctx.parts, *ctx.saved_tensors, *others):
+    for rows in blocks(_BLOCK, ctx.system.bins * ctx.parts, *ctx.saved_tensors, *others):
         light, known, rest = rows[:3], rows[3:5], rows[5:]
 
         def again(*light: torch.Tensor, known: Any = known) -> torch.Tensor:
@@ -158,7 +158,3 @@ def _refuse_nested_forward() -> None:
 
 def _summed(fine: torch.Tensor, parts: int) -> torch.Tensor:
     return fine.reshape(len(fine), -1, parts).sum(-1)
-
-
-def _blocks(bins: int, *rows: torch.Tensor) -> Any:
-    return zip(*(torch.split(one, max(1, _BLOCK // bins)) for one in rows), strict=True)

@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,9 +23,15 @@ class Uniform:
 
     low: float
     high: float
+    _positive: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        _ordered(self)
+        low = 0.0 if self._positive else -math.inf
+        for name in ("low", "high"):
+            number = checks.real(name, getattr(self, name), low=low, strict_low=self._positive)
+            object.__setattr__(self, name, number)
+        if self.low > self.high:
+            raise ValueError(f"low must be at most high, got {self.low:g} and {self.high:g}")
 
     def draw(self, random: np.random.Generator) -> float:
         """One number."""
@@ -38,24 +44,15 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class LogUniform:
+class LogUniform(Uniform):
     """A positive number in [low, high] whose logarithm is uniform: every factor of two is equally likely."""
 
-    low: float
-    high: float
-
-    def __post_init__(self) -> None:
-        _ordered(self, positive=True)
+    _positive: ClassVar[bool] = True
 
     def draw(self, random: np.random.Generator) -> float:
         """One number."""
         drawn = math.exp(random.uniform(math.log(self.low), math.log(self.high)))
         return min(max(drawn, self.low), self.high)  # the rounding of exp stays inside
-
-    @property
-    def ends(self) -> tuple[float, ...]:
-        """The least and the largest."""
-        return self.low, self.high
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ def as_range(name: str, value: float | Range, *, low: float = 0.0, infinite: boo
     """A range, or a number as a range of one; everything in it is above `low`."""
     if isinstance(value, list | tuple | str | bytes | bool) or value is None:
         raise TypeError(f"{name} must be a number, Uniform, LogUniform or Choice, got {value!r}")
-    given = value if isinstance(value, Uniform | LogUniform | Choice) else Choice((_number(name, value),))
+    given = value if isinstance(value, Uniform | Choice) else Choice((_number(name, value),))
     for end in given.ends:
         if not end > low or (math.isinf(end) and not infinite):
             most = "inf included" if infinite else "finite"
@@ -195,14 +192,6 @@ def as_systems(value: System | Sequence[System] | SystemRange) -> SystemRange | 
     if isinstance(value, list | tuple):
         return SystemList(value)
     raise TypeError(f"systems must be a System, several, or a SystemRange, got {value!r}")
-
-
-def _ordered(given: Uniform | LogUniform, positive: bool = False) -> None:
-    for name in ("low", "high"):
-        number = checks.real(name, getattr(given, name), low=0.0 if positive else -math.inf, strict_low=positive)
-        object.__setattr__(given, name, number)
-    if given.low > given.high:
-        raise ValueError(f"low must be at most high, got {given.low:g} and {given.high:g}")
 
 
 def _number(name: str, value: Any) -> float:

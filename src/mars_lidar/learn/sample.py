@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar._base.types import FloatArray
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import System
+from mars_lidar.learn.needed import torch
 from mars_lidar.learn.ranges import Range, SystemList, SystemRange
 from mars_lidar.learn.scenes import SceneSource, generator
 from mars_lidar.light.flux import Flux
@@ -43,9 +46,7 @@ class Recipe:
     signal: Range
     sbr: Range
     depth_scale: Range
-    attenuation: Any
-    ambient: Any
-    dark_counts_per_s: float
+    lit: dict[str, Any]  # further arguments of `Scene.flux`
     seed: int
 
     def sample(self, epoch: int, index: int) -> Sample:
@@ -57,14 +58,7 @@ class Recipe:
             scene = Scene(scene.depth_m * stretch, scene.reflectivity, scene.background)
         with warnings.catch_warnings():  # pixels without return or beyond the range: told by the maps, not every time
             warnings.simplefilter("ignore", UserWarning)
-            flux = scene.flux(
-                system,
-                signal=level,
-                sbr=sbr,
-                attenuation=self.attenuation,
-                ambient=self.ambient,
-                dark_counts_per_s=self.dark_counts_per_s,
-            )
+            flux = scene.flux(system, signal=level, sbr=sbr, **self.lit)
         seed = int(generator(6, self.seed, epoch, index).integers(2**63))
         return Sample(index, scene, system, flux, level, sbr, seed)
 
@@ -112,24 +106,36 @@ def _run(first: int, number: int, step: int) -> slice:
     return slice(first + number - 1, first - 1 if first else None, -1)
 
 
-def numbers_of(system: System) -> dict[str, float]:
-    """What a network may want to know of an instrument; `sigma_ns` is NaN for a pulse that is no Gaussian."""
-    pulse = system.pulse
+def example_of(samples: Sequence[Sample], cube: torch.Tensor) -> dict[str, Any]:
+    """What a loader gives of some samples: cubes, and maps and settings as float32, each with a leading axis."""
+
+    def maps(get: Callable[[Sample], FloatArray]) -> torch.Tensor:
+        return torch.from_numpy(np.stack([get(one) for one in samples]).astype(np.float32)).to(cube.device)
+
+    def settings(get: Callable[[Sample], float]) -> torch.Tensor:
+        return torch.tensor([float(get(one)) for one in samples], device=cube.device)
+
     return {
-        "period_ns": system.period_ns,
-        "cycles": float(system.cycles),
-        "dead_time_ns": system.detector.dead_time_ns,
-        "sigma_ns": pulse.sigma_ns if isinstance(pulse, GaussianPulse) else math.nan,
+        "cube": cube,
+        "depth": maps(lambda one: one.scene.depth_m),
+        "reflectivity": maps(lambda one: one.scene.reflectivity),
+        "flux": {
+            "signal": maps(lambda one: one.flux.signal),
+            "background": maps(lambda one: one.flux.background),
+            "delay": maps(lambda one: one.flux.delay_ns),
+        },
+        "system": {
+            "period_ns": settings(lambda one: one.system.period_ns),
+            "cycles": settings(lambda one: one.system.cycles),
+            "dead_time_ns": settings(lambda one: one.system.detector.dead_time_ns),
+            "sigma_ns": settings(lambda one: _sigma_ns(one.system.pulse)),
+        },
+        "signal_level": settings(lambda one: one.signal_level),
+        "sbr": settings(lambda one: one.sbr),
+        "index": torch.tensor([one.index for one in samples]),
+        "seed": torch.tensor([one.seed for one in samples]),
     }
 
 
-def maps_of(sample: Sample) -> dict[str, np.ndarray[Any, Any]]:
-    """The maps (H, W) of a sample."""
-    flux = sample.flux
-    return {
-        "depth": sample.scene.depth_m,
-        "reflectivity": sample.scene.reflectivity,
-        "signal": flux.signal,
-        "background": flux.background,
-        "delay": flux.delay_ns,
-    }
+def _sigma_ns(pulse: Pulse) -> float:
+    return pulse.sigma_ns if isinstance(pulse, GaussianPulse) else math.nan

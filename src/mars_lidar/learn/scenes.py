@@ -173,7 +173,7 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
     """What `CubeStream` takes as scenes."""
     reuse = checks.integer("reuse", reuse, low=1, high=2**31)
     if isinstance(scenes, str) and scenes in Scene.example_names():
-        return RayCast(scenes, (64, 64) if size is None else size, reuse)
+        return RayCast(scenes, size or (64, 64), reuse)
     if isinstance(scenes, str | Path):
         if not Path(scenes).exists():
             names = ", ".join(map(repr, Scene.example_names()))

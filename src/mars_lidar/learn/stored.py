@@ -114,7 +114,7 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
         return int(self._samples.size) * int(self._realizations) // self._world
 
     def __iter__(self) -> Iterator[Any]:
-        worker, workers = worker_of()
+        worker, workers, _ = worker_of()
         random = np.random.default_rng([self._seed, self._epoch])
         self._epoch += 1
         blocks = self._blocks()
@@ -183,32 +183,21 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
 
 
 def _signed(counts: NDArray[np.uint16]) -> NDArray[Any]:
-    if counts.size and counts.max() > np.iinfo(np.int16).max:
-        return counts.astype(np.int32)
-    return counts.view(np.int16).copy()
+    return counts.astype(np.int32) if counts.max(initial=0) > np.iinfo(np.int16).max else counts.view(np.int16).copy()
 
 
 def _share(
     blocks: list[list[tuple[int, int]]], rank: int, world: int, worker: int, workers: int
 ) -> list[list[tuple[int, int]]]:
     """Whole blocks for each worker of each rank, cut only where ranks must have equally many exposures."""
-    total = sum(map(len, blocks))
-    each = total // world
-    first, last = (rank * each, (rank + 1) * each)
-    own = _cut(blocks, first, last)
+    each = sum(map(len, blocks)) // world
+    own, begin = [], -rank * each  # of a block, from the first exposure of this rank on
+    for block in blocks:
+        if part := block[max(0, -begin) : max(0, each - begin)]:
+            own.append(part)
+        begin += len(block)
     edges = [math.ceil(k * len(own) / workers) for k in (worker, worker + 1)]
     return own[edges[0] : edges[1]]
-
-
-def _cut(blocks: list[list[tuple[int, int]]], first: int, last: int) -> list[list[tuple[int, int]]]:
-    """The exposures first to last of the concatenated blocks, still in blocks."""
-    parts, begin = [], 0
-    for block in blocks:
-        part = block[max(0, first - begin) : max(0, last - begin)]
-        if part:
-            parts.append(part)
-        begin += len(block)
-    return parts
 
 
 def _numbers(samples: Any, number: int) -> NDArray[np.int64]:

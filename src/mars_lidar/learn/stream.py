@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from mars_lidar._base import checks
 from mars_lidar._base.resample import image_size
 from mars_lidar._base.threads import thread_count
@@ -21,8 +19,9 @@ from mars_lidar.learn.distributed import rank_of, worker_of
 from mars_lidar.learn.needed import torch
 from mars_lidar.learn.passes import Passes, warn_if_put_together
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
-from mars_lidar.learn.sample import Recipe, Sample, maps_of, numbers_of
+from mars_lidar.learn.sample import Recipe, Sample, example_of
 from mars_lidar.learn.scenes import as_source
+from mars_lidar.scene.radiometry import AMBIENTS, ATTENUATIONS
 from mars_lidar.scene.scene import Scene
 
 _LAST = 2**62
@@ -139,9 +138,9 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         if shape is None and isinstance(scenes, str) and scenes in Scene.example_names():
             shape = (64, 64)
         drawn = as_systems(systems)
-        checks.choice("attenuation", attenuation, ("none", "inverse_square"))
-        if ambient is not None:
-            checks.choice("ambient", ambient, ("uniform", "reflectivity", "map"))
+        checks.choice("attenuation", attenuation, ATTENUATIONS)
+        checks.choice("ambient", "map" if ambient is None else ambient, AMBIENTS)
+        dark = checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
         self._recipe = Recipe(
             source=as_source(scenes, shape, reuse),
             systems=drawn,
@@ -150,12 +149,10 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             signal=as_range("signal", signal),
             sbr=as_range("sbr", sbr, infinite=True),
             depth_scale=as_range("depth_scale", depth_scale),
-            attenuation=attenuation,
-            ambient=ambient,
-            dark_counts_per_s=checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0),
+            lit={"attenuation": attenuation, "ambient": ambient, "dark_counts_per_s": dark},
             seed=checks.integer("seed", seed, low=0, high=2**63 - 1),
         )
-        self._size = None if epoch_size is None else checks.integer("epoch_size", epoch_size, low=1, high=_LAST)
+        self._end = _LAST if epoch_size is None else checks.integer("epoch_size", epoch_size, low=1, high=_LAST)
         self._batch = None if batch_size is None else checks.integer("batch_size", batch_size, low=1, high=2**20)
         self._threads = None if threads is None else checks.integer("threads", threads, low=1, high=1024)
         self._ahead = checks.integer("ahead", ahead, low=0, high=1024)
@@ -164,14 +161,12 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         self._rank, self._world = rank_of(rank, world_size)
         self._repeat = bool(repeat)
         self._passes = Passes()
-        self._given, self._pass_start = (
-            0,
-            0,
-        )  # batches of the pass that were given here, and in a worker those of the others before them
+        self._given = self._pass_start = 0  # batches of the pass given here; in a worker, of the others before them
         self._joined: tuple[int, int, int] | None = None  # epoch, first sample, batches given: of a pass to go on with
 
     def __repr__(self) -> str:
-        told = {"size": self._recipe.size, "epoch_size": self._size, "batch_size": self._batch}
+        size = None if self._end == _LAST else self._end
+        told = {"size": self._recipe.size, "epoch_size": size, "batch_size": self._batch}
         given = ", ".join(f"{name}={value}" for name, value in told.items() if value is not None)
         return f"CubeStream({given}, seed={self._recipe.seed}, epoch {self.epoch})"
 
@@ -183,8 +178,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         are those of a run that did not stop.
         """
         number = checks.integer("epoch", epoch, low=0, high=_LAST)
-        most = _LAST if self._size is None else self._size
-        self._passes.begin_at(number, checks.integer("start", start, low=0, high=most))
+        self._passes.begin_at(number, checks.integer("start", start, low=0, high=self._end))
         self._given, self._pass_start, self._joined = 0, start, None
 
     @property
@@ -210,10 +204,10 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         ValueError
             Without `batches` in the parent of workers.
         """
-        if torch.utils.data.get_worker_info() is not None:
-            _, workers = worker_of()
-            state = {"seed": self._recipe.seed, "epoch": self.epoch, "start": self._pass_start}
-            return state | {"given": self._given, "workers": workers}
+        _, workers, in_worker = worker_of()
+        state = {"seed": self._recipe.seed, "epoch": self.epoch}
+        if in_worker:
+            return state | {"start": self._pass_start, "given": self._given, "workers": workers}
         if batches is None and self._passes.by_workers:
             raise ValueError(
                 "batches must be given: workers of a loader made the pass, and only its caller knows how many batches "
@@ -221,9 +215,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             )
         given = self._given if batches is None else checks.integer("batches", batches, low=0, high=_LAST)
         start = (self._pass_start if batches is None else self._passes.start) + given * (self._batch or 1) * self._world
-        if self._size is not None:
-            start = min(start, self._size)
-        return {"seed": self._recipe.seed, "epoch": self.epoch, "start": start}
+        return state | {"start": min(start, self._end)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Go on where `state_dict` was taken; the settings must be the same.
@@ -232,8 +224,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         """
         if state["seed"] != self._recipe.seed:
             raise ValueError(f"the state is of a stream with seed {state['seed']}, this one has {self._recipe.seed}")
-        _, workers = worker_of()
-        in_worker = torch.utils.data.get_worker_info() is not None
+        _, workers, in_worker = worker_of()
         if in_worker != ("workers" in state) or state.get("workers", workers) != workers:
             raise ValueError(
                 f"the state is of a loader with {state.get('workers', 'no')} workers, this one has "
@@ -247,18 +238,16 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
 
     def sample(self, index: int) -> Sample:
         """Scene, Flux, System and seed of a sample of this epoch, not simulated."""
-        most = _LAST if self._size is None else self._size - 1
-        return self._recipe.sample(self.epoch, checks.integer("index", index, low=0, high=most))
+        return self._recipe.sample(self.epoch, checks.integer("index", index, low=0, high=self._end - 1))
 
     def __len__(self) -> int:
         """Examples of one pass on this rank, all workers together."""
-        if self._size is None:
+        if self._end == _LAST:
             raise TypeError("a stream without end has no length; give epoch_size")
-        return math.ceil((self._size - self._passes.start) // self._world / (self._batch or 1))
+        return math.ceil((self._end - self._passes.start) // self._world / (self._batch or 1))
 
     def __iter__(self) -> Iterator[Any]:
-        worker, workers = worker_of()
-        in_worker = torch.utils.data.get_worker_info() is not None
+        worker, workers, in_worker = worker_of()
         if in_worker and self._maker.on_gpu:
             raise ValueError("device='cuda' simulates in the process of the loader: use num_workers=0")
         warn_if_put_together(self._batch is not None)
@@ -268,16 +257,14 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         else:
             epoch, start, given = self._joined
         self._joined, self._given, self._pass_start = None, given, start
-        mine = (
-            (place, indices)
+        threads = self._threads or max(1, thread_count(None) // workers)
+        examples: Iterator[tuple[int, dict[str, Any]]] = (
+            (place, self._example(epoch, indices, threads))
             for place, indices in enumerate(self._batches(start))
             if place >= given and place % workers == worker
         )
-        threads = self._threads or max(1, thread_count(None) // workers)
-        examples = ((place, self._example(epoch, indices, threads)) for place, indices in mine)
-        if self._ahead and not in_worker and not self._maker.on_gpu:
-            examples = made_ahead(examples, self._ahead)  # type: ignore[assignment]
-        return self._given_out(examples)
+        alone = self._ahead and not in_worker and not self._maker.on_gpu
+        return self._given_out(made_ahead(examples, self._ahead) if alone else examples)
 
     def _given_out(self, examples: Iterator[tuple[int, dict[str, Any]]]) -> Iterator[Any]:
         for place, example in examples:
@@ -289,34 +276,16 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         """Samples of this rank, batch by batch: ranks take whole batches in turn, and equal parts of the last ones."""
         batch = self._batch or 1
         turn = batch * self._world
-        while self._size is None or start + turn <= self._size:
+        while start + turn <= self._end:
             yield range(start + self._rank * batch, start + (self._rank + 1) * batch)
             start += turn
-        part = (self._size - start) // self._world
+        part = (self._end - start) // self._world
         if part:
             yield range(start + self._rank * part, start + (self._rank + 1) * part)
 
     def _example(self, epoch: int, indices: range, threads: int) -> dict[str, Any]:
         samples = [self._recipe.sample(epoch, index) for index in indices]
-        device = self._maker.device
-        cube = self._maker.cubes(samples, threads)
-        maps = [maps_of(one) for one in samples]
-        stacked = {
-            name: torch.from_numpy(np.stack([one[name] for one in maps]).astype(np.float32)).to(device)
-            for name in maps[0]
-        }
-        systems = [numbers_of(one.system) for one in samples]
-        example: dict[str, Any] = {
-            "cube": cube,
-            "depth": stacked["depth"],
-            "reflectivity": stacked["reflectivity"],
-            "flux": {name: stacked[name] for name in ("signal", "background", "delay")},
-            "system": {name: torch.tensor([one[name] for one in systems], device=device) for name in systems[0]},
-            "signal_level": torch.tensor([one.signal_level for one in samples], device=device),
-            "sbr": torch.tensor([one.sbr for one in samples], device=device),
-            "index": torch.tensor([one.index for one in samples]),
-            "seed": torch.tensor([one.seed for one in samples]),
-        }
+        example = example_of(samples, self._maker.cubes(samples, threads))
         return _first(example) if self._batch is None else example
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mars_lidar.learn.cyclic_solver import Delay
+from mars_lidar.learn.cyclic_solver import Delay, blocks
 from mars_lidar.learn.light import check_detector, inputs, wrapped_energy
 from mars_lidar.learn.needed import torch
 from mars_lidar.table import Table
@@ -82,8 +82,7 @@ class HistogramTable(torch.nn.Module):
                     f"{name} must lie in the table's [{low:g}, {high:g}] photons per period, got {least:g} to {most:g}"
                 )
         flat = [one.reshape(-1).to(self.histograms.dtype) for one in given]
-        some = max(1, _BLOCK // self.system.bins)
-        parts = zip(*(torch.split(one, some) for one in flat), strict=True)
+        parts = blocks(_BLOCK, self.system.bins, *flat)
         out = [_Again.apply(self._expected, *rows) for rows in parts]  # type: ignore[no-untyped-call]
         found: torch.Tensor = torch.cat(out) if out else self.histograms.new_empty((0, self.system.bins))
         return found.reshape(*given[0].shape, self.system.bins).to(given[0].dtype)

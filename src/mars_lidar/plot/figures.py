@@ -53,10 +53,7 @@ def overview(
     ValueError
         `realization` or a pixel outside of the cube.
     """
-    _check_realization(cube, realization)
-    if cube.measured:
-        cube, realization = fitted(cube, realization), 0
-    chosen = _checked(cube, pixels)
+    cube, realization, chosen = _checked(cube, realization, pixels)
     totals, peaks_m = count_maps(cube, realization)
     with style():
         from matplotlib.figure import Figure
@@ -99,10 +96,7 @@ def overview(
 
 def pixel_histogram(cube: Cube, y: int, x: int, *, realization: int = 0) -> Figure:
     """Histogram of one pixel over the period and around its return, beside the incident rate's shape."""
-    _check_realization(cube, realization)
-    if cube.measured:
-        cube, realization = fitted(cube, realization), 0
-    chosen = _checked(cube, [(y, x)])
+    cube, realization, chosen = _checked(cube, realization, [(y, x)])
     with style():
         from matplotlib.figure import Figure
 
@@ -223,24 +217,22 @@ def _headline(cube: Cube, realization: int) -> str:
     )
 
 
-def _check_realization(cube: Cube, realization: int) -> None:
-    if not 0 <= realization < cube.shape[0]:
-        raise ValueError(f"realization must be an integer in [0, {cube.shape[0] - 1}], got {realization}")
-
-
-def _checked(cube: Cube, pixels: Sequence[tuple[int, int]] | None) -> _Pixels:
-    """The pixels to draw by name, checked."""
-    _, height, width, _ = cube.shape
+def _checked(cube: Cube, realization: int, pixels: Sequence[tuple[int, int]] | None) -> tuple[Cube, int, _Pixels]:
+    """The cube, or the light fitted to a measured one; which exposure of it, and the pixels to draw by name."""
+    count, height, width, _ = cube.shape
+    if not 0 <= realization < count:
+        raise ValueError(f"realization must be an integer in [0, {count - 1}], got {realization}")
+    if cube.measured:
+        cube, realization = fitted(cube, realization), 0
     if pixels is None:
-        return example_pixels(cube.flux, cube.depth_m)
+        return cube, realization, example_pixels(cube.flux, cube.depth_m)
     if not 1 <= len(pixels) <= len(COLOURS):
         raise ValueError(f"pixels must be 1 to {len(COLOURS)} pairs (y, x), got {len(pixels)}")
     for y, x in pixels:
         if not (0 <= y < height and 0 <= x < width):
             raise ValueError(f"pixel must lie in y 0 to {height - 1}, x 0 to {width - 1}, got ({y}, {x})")
-    if len(pixels) == 1:
-        return {"": (int(pixels[0][0]), int(pixels[0][1]))}
-    return {f"{k}.": (int(y), int(x)) for k, (y, x) in enumerate(pixels, start=1)}
+    names = [""] if len(pixels) == 1 else [f"{k}." for k in range(1, len(pixels) + 1)]
+    return cube, realization, {name: (int(y), int(x)) for name, (y, x) in zip(names, pixels, strict=True)}
 
 
 def _limits(values: NDArray[Any]) -> tuple[float, float] | None:

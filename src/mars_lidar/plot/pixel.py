@@ -35,18 +35,52 @@ def draw_pixel(
     counts = np.asarray(cube.histogram[realization, y, x]).astype(np.float64)
     rate = incident_rate(flux, system, y, x)
     expected = rate * (counts.sum() / rate.sum()) if rate.sum() > 0 else rate
+    predicted = predicted_counts(cube, y, x)
     returns = zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True)
     delays = [float(tau % system.period_ns) for s, tau in returns if s > 0]
-
-    predicted = predicted_counts(cube, y, x)
-    told = "fitted" if cube.engine == MEASURED else "true"
-    _draw_whole(whole, system, counts, expected, predicted, delays, colour, told)
     if delays:
         centre, (low, high) = float(flux.delay_ns[y, x] % system.period_ns), _zoom_ns(system)
     else:
         centre = float(system.time_ns[int((rate if np.ptp(rate) > 0 else counts).argmax())])
         low, high = -0.1 * system.period_ns, 0.1 * system.period_ns
-    _draw_zoom(zoom, system, counts, expected, predicted, delays, centre, (low, high), colour)
+
+    edges = np.linspace(0.0, system.period_ns, system.bins + 1)
+    whole.fill_between(*_steps(edges, counts), color=colour, alpha=0.4, lw=0, label="counts")
+    lowest = float(expected[expected > 0].min(initial=1.0))
+    _draw_means(whole, system, counts, expected, lowest, colour)
+    whole.plot(*_steps(edges, expected), color=MUTED, lw=0.8, label="incident rate, same total")
+    if predicted is not None:
+        whole.plot(*_steps(edges, predicted), color=INK, lw=0.9, label="predicted mean")
+    told = "fitted delay" if cube.engine == MEASURED else "true delay"
+    for k, tau in enumerate(delays):
+        whole.axvline(tau, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0, label=told if k == 0 else None)
+    whole.set_xlim(0.0, system.period_ns)
+    top = max(float(counts.max()), float(expected.max()), 1.0)
+    if top > _LOG_FROM:
+        whole.set_yscale("log")
+        whole.yaxis.set_major_formatter("{x:g}")
+        whole.yaxis.set_minor_formatter("")
+        whole.set_ylim(max(0.25 * min(lowest, 1.0), 5e-4 * top), 2.0 * top)
+    else:
+        whole.set_ylim(0.0, 1.15 * top)
+        whole.locator_params(axis="y", integer=True, nbins=4)
+
+    # whole bins around the centre, cyclic: a return at the period's edge is seen in one piece
+    first, last = np.floor((centre + low) / system.bin_ns), np.ceil((centre + high) / system.bin_ns)
+    bins = np.arange(int(first), int(max(last, first + 1)))
+    edges = np.append(bins, bins[-1] + 1) * system.bin_ns - centre
+    near, incident = counts[bins % system.bins], expected[bins % system.bins]
+    zoom.fill_between(*_steps(edges, near), color=colour, alpha=0.4, lw=0)
+    zoom.plot(*_steps(edges, near), color=colour, lw=0.6)
+    zoom.plot(*_steps(edges, incident), color=MUTED, lw=0.9)
+    if predicted is not None:
+        zoom.plot(*_steps(edges, predicted[bins % system.bins]), color=INK, lw=0.9)
+    for tau in delays:
+        offset = (tau - centre + 0.5 * system.period_ns) % system.period_ns - 0.5 * system.period_ns
+        zoom.axvline(offset, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0)
+    zoom.set_xlim(edges[0], edges[-1])
+    zoom.set_ylim(0.0, 1.1 * max(float(near.max()), float(incident.max()), 1.0))
+    zoom.locator_params(axis="y", integer=True, nbins=4)
     whole.set_title(
         f"{name} pixel (y {y}, x {x}): S = {flux.signal[y, x]:.3g}, B = {flux.background[y, x]:.3g}, "
         f"{int(counts.sum()):,} registrations".lstrip(),
@@ -64,73 +98,15 @@ def quiet_corner(rate: NDArray[np.float64]) -> str:
     return min(places, key=lambda name: places[name])
 
 
-def _draw_whole(
-    ax: Axes,
-    system: System,
-    counts: _Array,
-    expected: _Array,
-    predicted: _Array | None,
-    delays: list[float],
-    colour: str,
-    told: str,
-) -> None:
-    edges = np.linspace(0.0, system.period_ns, system.bins + 1)
-    ax.fill_between(*_steps(edges, counts), color=colour, alpha=0.4, lw=0, label="counts")
-    lowest = float(expected[expected > 0].min(initial=1.0))
+def _draw_means(ax: Axes, system: System, counts: _Array, expected: _Array, lowest: float, colour: str) -> None:
+    """Means over many bins; beside the returns, for there the bins themselves are the better picture."""
     group = system.bins // _COARSE
     if group > 1:
         starts = np.arange(0, system.bins, group)
-        ends = np.append(starts[1:], system.bins)
-        means = np.add.reduceat(counts, starts) / (ends - starts)
-        # beside the returns: there the bins themselves are the better picture
+        means = np.add.reduceat(counts, starts) / np.diff(starts, append=system.bins)
         means[np.maximum.reduceat(expected, starts) > 3.0 * lowest] = np.nan
-        coarse = _steps(edges[np.append(starts, system.bins)], means)
-        ax.plot(*coarse, color=colour, lw=1.0, label=f"counts, mean of {group} bins")
-    ax.plot(*_steps(edges, expected), color=MUTED, lw=0.8, label="incident rate, same total")
-    if predicted is not None:
-        ax.plot(*_steps(edges, predicted), color=INK, lw=0.9, label="predicted mean")
-    for k, tau in enumerate(delays):
-        ax.axvline(tau, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0, label=f"{told} delay" if k == 0 else None)
-    ax.set_xlim(0.0, system.period_ns)
-    top = max(float(counts.max()), float(expected.max()), 1.0)
-    if top > _LOG_FROM:
-        ax.set_yscale("log")
-        ax.yaxis.set_major_formatter("{x:g}")
-        ax.yaxis.set_minor_formatter("")
-        ax.set_ylim(max(0.25 * min(lowest, 1.0), 5e-4 * top), 2.0 * top)
-    else:
-        ax.set_ylim(0.0, 1.15 * top)
-        ax.locator_params(axis="y", integer=True, nbins=4)
-
-
-def _draw_zoom(
-    ax: Axes,
-    system: System,
-    counts: _Array,
-    expected: _Array,
-    predicted: _Array | None,
-    delays: list[float],
-    centre: float,
-    window: tuple[float, float],
-    colour: str,
-) -> None:
-    # whole bins around the centre, cyclic: a return at the period's edge is seen in one piece
-    first = int(np.floor((centre + window[0]) / system.bin_ns))
-    last = int(np.ceil((centre + window[1]) / system.bin_ns))
-    bins = np.arange(first, max(last, first + 1))
-    edges = np.append(bins, bins[-1] + 1) * system.bin_ns - centre
-    near, incident = counts[bins % system.bins], expected[bins % system.bins]
-    ax.fill_between(*_steps(edges, near), color=colour, alpha=0.4, lw=0)
-    ax.plot(*_steps(edges, near), color=colour, lw=0.6)
-    ax.plot(*_steps(edges, incident), color=MUTED, lw=0.9)
-    if predicted is not None:
-        ax.plot(*_steps(edges, predicted[bins % system.bins]), color=INK, lw=0.9)
-    for tau in delays:
-        offset = (tau - centre + 0.5 * system.period_ns) % system.period_ns - 0.5 * system.period_ns
-        ax.axvline(offset, color=MUTED, lw=0.7, ls=(0, (3, 2)), zorder=0)
-    ax.set_xlim(edges[0], edges[-1])
-    ax.set_ylim(0.0, 1.1 * max(float(near.max()), float(incident.max()), 1.0))
-    ax.locator_params(axis="y", integer=True, nbins=4)
+        edges = np.append(starts, system.bins) * system.bin_ns
+        ax.plot(*_steps(edges, means), color=colour, lw=1.0, label=f"counts, mean of {group} bins")
 
 
 def _steps(edges: _Array, values: _Array) -> tuple[_Array, _Array]:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
-from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.scene.radiometry import scene_flux
@@ -27,6 +26,11 @@ class LayeredScene:
         Scenes of one shape, up to 16, in any order; NaN in the depth of one: it has no surface there. Reflectivities
         share one scale and include what the surfaces before them let through. The first is the one whose depth and
         reflectivity count as the scene's, and its background map is taken for the ambient light.
+
+    Attributes
+    ----------
+    shape, depth_m, reflectivity, background
+        Those of the first layer.
     """
 
     def __init__(self, layers: Sequence[Scene]) -> None:
@@ -35,6 +39,9 @@ class LayeredScene:
             raise ValueError(f"layers must be 1 to {MOST} Scenes, got {layers!r}")
         if len({one.shape for one in self.layers}) > 1:
             raise ValueError(f"layers must have one shape, got {[one.shape for one in self.layers]}")
+        first = self.layers[0]
+        self.shape, self.depth_m, self.reflectivity = first.shape, first.depth_m, first.reflectivity
+        self.background = first.background
 
     @classmethod
     def behind_pane(
@@ -65,26 +72,6 @@ class LayeredScene:
 
         seen = np.where(behind[0].depth_m <= depth, np.nan, depth)
         return cls([*map(dimmed, behind), Scene(seen, share)])
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(H, W)."""
-        return self.layers[0].shape
-
-    @property
-    def depth_m(self) -> FloatArray:
-        """Depth of the first layer (H, W), m."""
-        return self.layers[0].depth_m
-
-    @property
-    def reflectivity(self) -> FloatArray:
-        """Reflectivity of the first layer (H, W)."""
-        return self.layers[0].reflectivity
-
-    @property
-    def background(self) -> FloatArray | None:
-        """Background of the first layer (H, W), or None."""
-        return self.layers[0].background
 
     @property
     def valid(self) -> NDArray[np.bool_]:

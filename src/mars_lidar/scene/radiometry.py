@@ -16,8 +16,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 
-_ATTENUATIONS = ("none", "inverse_square")
-_AMBIENTS = ("uniform", "reflectivity", "map")
+ATTENUATIONS = ("none", "inverse_square")
+AMBIENTS = ("uniform", "reflectivity", "map")
 
 
 class Surface(Protocol):
@@ -61,10 +61,10 @@ def scene_flux(
         raise TypeError(f"system must be a System, got {system!r}")
     level = checks.real("signal", signal, low=0.0, strict_low=True)
     ratio = _ratio(sbr)
-    checks.choice("attenuation", attenuation, _ATTENUATIONS)
+    checks.choice("attenuation", attenuation, ATTENUATIONS)
     scene = layers[0]
     light_name = ("uniform" if scene.background is None else "map") if ambient is None else ambient
-    checks.choice("ambient", light_name, _AMBIENTS)
+    checks.choice("ambient", light_name, AMBIENTS)
     rate = checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
     light = _ambient_light(layers, light_name)
     valid = _any([one.valid for one in layers])

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.files import FileError, open_npz, reading
 from mars_lidar._base.types import FloatArray
-from mars_lidar.io.rgbd import pixels
+from mars_lidar.io.rgbd import middlebury, nyu, pixels
+from mars_lidar.io.rgbd.exr import read_exr
+from mars_lidar.io.rgbd.pfm import read_pfm
 
 _DEPTH_IMAGES = (".png", ".tif", ".tiff")
 _DEPTH_FLOATS = (".pfm", ".exr")
@@ -82,15 +84,11 @@ def _read(
         raise ValueError(f"{source}: {told}")
     reflectivity = background = None
     if source.is_dir():
-        from mars_lidar.io.rgbd import middlebury
-
         if unit is not None:
             raise ValueError(f"{source}: depth_unit_m does not apply to a Middlebury folder, got {unit:g}")
         depth, own_image = middlebury.read(source)
         image = own_image if image is None else image
     elif suffix == ".mat":
-        from mars_lidar.io.rgbd import nyu
-
         if unit is not None:
             raise ValueError(f"{source}: depth_unit_m does not apply to NYUv2, which is in metres, got {unit:g}")
         metres, colours = nyu.read_frame(source, index)
@@ -99,7 +97,8 @@ def _read(
     elif suffix == ".npz":
         depth, reflectivity, background = _npz(source, unit)
     else:
-        depth = _depth(source, _stored(source, suffix), unit)
+        read = {".pfm": read_pfm, ".exr": read_exr}.get(suffix, pixels.array)
+        depth = _depth(source, read(source), unit)
     if image is not None:
         reflectivity = pixels.reflectivity(image, pixels.array(image))
         if reflectivity.shape != depth.shape:
@@ -115,18 +114,6 @@ def _read(
 
 def _positive(name: str, value: float | None) -> float | None:
     return None if value is None else checks.real(name, value, low=0.0, strict_low=True)
-
-
-def _stored(path: Path, suffix: str) -> NDArray[Any]:
-    if suffix == ".pfm":
-        from mars_lidar.io.rgbd.pfm import read_pfm
-
-        return read_pfm(path)
-    if suffix == ".exr":
-        from mars_lidar.io.rgbd.exr import read_exr
-
-        return read_exr(path)
-    return pixels.array(path)
 
 
 def _npz(path: Path, unit: float | None) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import open_npz, read_mat5, whole
-from mars_lidar._base.hdf5 import open_hdf5
+from mars_lidar._base.files import open_npz
+from mars_lidar.io.mat_arrays import mat_arrays
 from mars_lidar.io.streams.attributes import of_pixels
 from mars_lidar.io.streams.photons import NoLaserError, Photons
 from mars_lidar.light.timestamps import Timestamps
@@ -78,7 +78,7 @@ def _flat(path: Path, name: str, cells: _Cells) -> tuple[NDArray[np.float64], ND
 
 def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dict[str, _Cells], str, _Cells, float]:
     """All variables, the name and the cells of the one that holds the times, and their unit, ns."""
-    found = mat_cells(path) if path.suffix == ".mat" else _npz(path)
+    found = cells_of(mat_arrays(path, deep=False)) if path.suffix == ".mat" else _npz(path)
     name, cells = _chosen(path, found, variable)
     unit = unit_ns
     if unit is None:
@@ -130,47 +130,14 @@ def _npz(path: Path) -> dict[str, _Cells]:
     return {name: _one(values) for name, values in arrays.items() if _is_times(np.atleast_1d(values))}
 
 
-def mat_cells(path: Path) -> dict[str, _Cells]:
-    """The vectors and cell arrays of a .mat (v5, v7.3), by name: (H, W) of vectors, (1, 1) for a plain one."""
-    import h5py
-
-    return _mat_73(path) if h5py.is_hdf5(path) else _mat_5(path)
-
-
-def _mat_5(path: Path) -> dict[str, _Cells]:
+def cells_of(found: dict[str, Any]) -> dict[str, _Cells]:
+    """The vectors and cell arrays of a .mat by name: (H, W) of vectors, (1, 1) for a plain one."""
     out: dict[str, _Cells] = {}
-    for name, values in read_mat5(path).items():
-        if name.startswith("__") or not isinstance(values, np.ndarray):
-            continue
-        if values.dtype == object:
+    for name, values in found.items():
+        if isinstance(values, np.ndarray) and values.dtype == object:
             cells = np.atleast_2d(values)
             if all(_is_times(cell) or (isinstance(cell, np.ndarray) and cell.size == 0) for cell in cells.ravel()):
                 out[name] = cells
         elif _is_times(values):
             out[name] = _one(values)
-    return out
-
-
-def _mat_73(path: Path) -> dict[str, _Cells]:
-    """HDF5: a cell array is an array of references, stored transposed; an empty array holds its own size."""
-    import h5py
-
-    out: dict[str, _Cells] = {}
-    with open_hdf5(path) as file:
-        for name, item in file.items():
-            if not isinstance(item, h5py.Dataset):
-                continue
-            if item.dtype == h5py.ref_dtype:
-                references = np.atleast_2d(whole(item)).T
-                cells = np.empty(references.shape, object)
-                for place, reference in np.ndenumerate(references):
-                    part = file[reference]
-                    empty = bool(part.attrs.get("MATLAB_empty", 0))
-                    cells[place] = np.empty(0) if empty else whole(part).ravel()
-                if all(cell.dtype.kind in "fiu" for cell in cells.ravel()):
-                    out[name] = cells
-            elif item.dtype.kind in "fiu" and not item.attrs.get("MATLAB_empty", 0):
-                values = whole(item)
-                if _is_times(values):
-                    out[name] = _one(values)
     return out

@@ -6,7 +6,6 @@ import importlib
 import json
 import math
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -26,12 +25,18 @@ from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
 
 STREAM_SUFFIXES = (".npz", ".ptu", ".h5", ".hdf5")
-_OTHERS = {  # formats that are only read, and the module that does
+_MODULES = {  # that read them; of .npz, those of others
+    ".npz": "bare_stream",
+    ".ptu": "ptu_stream",
+    ".h5": "photon_hdf5",
+    ".hdf5": "photon_hdf5",
+    ".mat": "bare_stream",
     **dict.fromkeys(picoquant.SUFFIXES, "ptu_stream"),
     ".t3r": "timeharp",
     ".spc": "becker_hickl",
 }
-READ_SUFFIXES = (*STREAM_SUFFIXES, ".mat", *_OTHERS)
+_BARE = (".mat", ".npz")  # may have no header
+READ_SUFFIXES = tuple(_MODULES)
 
 
 def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_ps: float | None = None) -> None:
@@ -39,8 +44,7 @@ def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_
     if not isinstance(times, Timestamps):
         raise TypeError(f"times must be Timestamps, got {type(times).__name__}")
     target = Path(path)
-    module = _module(target)
-    write = _write_npz if module is None else module.write
+    write = _write_npz if target.suffix == ".npz" else _module(target, STREAM_SUFFIXES).write
     if not (times.cycles >= 1 and times.period_ns > 0 and math.isfinite(times.period_ns)):
         raise ValueError(
             f"times must tell the laser period and the cycles of the exposure to be written, "
@@ -58,8 +62,8 @@ def check_output(path: str | Path, *, overwrite: bool = False, clock_ps: float |
         checks.real("clock_ps", clock_ps, low=0.0, strict_low=True)
         if Path(path).suffix != ".ptu":
             raise ValueError(f"clock_ps belongs to a .ptu, got {str(path)!r}")
-    module = _module(Path(path))
-    if module is not None:
+    module = _module(Path(path), STREAM_SUFFIXES)
+    if Path(path).suffix != ".npz":
         module.check()
     check_target(Path(path), folder=False, overwrite=overwrite)
 
@@ -81,12 +85,10 @@ def load(
         unit_ns = checks.real("unit_ns", unit_ns, low=0.0, strict_low=True)
     source = Path(path)
     plain = source.with_name(source.name.removesuffix(INCOMPLETE_SUFFIX))
-    if plain.suffix not in READ_SUFFIXES:
-        raise ValueError(f"path of timestamps must end in one of {', '.join(READ_SUFFIXES)}, got {str(path)!r}")
-    bare = plain.suffix in (".mat", ".npz")
+    module = _module(plain)
+    bare = plain.suffix in _BARE
     if not bare and (unit_ns is not None or variable is not None):
         raise ValueError(f"unit_ns and variable are for .mat and .npz: a {plain.suffix} tells both, got {str(path)!r}")
-    module = None if bare else _reader(plain)
     if not source.exists():
         if source.with_name(source.name + INCOMPLETE_SUFFIX).exists():
             raise IncompleteFileError(f"{source} was never finished: a stopped run left a {INCOMPLETE_SUFFIX} file")
@@ -94,25 +96,20 @@ def load(
     if plain != source:
         raise IncompleteFileError(f"{source} is incomplete: a run that was stopped left it")
     with reading(source, "a photon stream"):
-        if module is None:
+        if bare:
             return _read_bare(source, period_ns, bins, unit_ns, variable)
-        if plain.suffix in _OTHERS:
-            found: Photons = module.photons(source)
-            return found.timestamps(period_ns, bins)
-        times: Timestamps = module.read(source, period_ns, bins)
-        return times
+        if plain.suffix in STREAM_SUFFIXES:
+            times: Timestamps = module.read(source, period_ns, bins)
+            return times
+        found: Photons = module.photons(source)
+        return found.timestamps(period_ns, bins)
 
 
 def recorded(path: Path, *, unit_ns: float | None = None, variable: str | None = None) -> Photons:
     """The photons of another program's file as its recorder counted them; `Timestamps.load` has the arguments."""
-    if path.suffix not in READ_SUFFIXES:
-        raise ValueError(f"path of photons must end in one of {', '.join(READ_SUFFIXES)}, got {str(path)!r}")
+    module = _module(path)
     with reading(path, "a photon stream"):
-        if path.suffix in (".mat", ".npz"):
-            from mars_lidar.io.streams import bare_stream
-
-            return bare_stream.photons(path, unit_ns, variable)
-        found: Photons = _reader(path).photons(path)
+        found: Photons = module.photons(path, *((unit_ns, variable) if path.suffix in _BARE else ()))
         return found
 
 
@@ -121,9 +118,8 @@ def _read_bare(
 ) -> Timestamps:
     """Of a format that may have no header."""
     if source.suffix == ".mat" or _npz_attributes(source).get("format") is None:
-        from mars_lidar.io.streams import bare_stream
-
-        return bare_stream.read(source, period_ns, bins, unit_ns, variable)
+        times: Timestamps = _module(source).read(source, period_ns, bins, unit_ns, variable)
+        return times
     if not (period_ns is None and bins is None and unit_ns is None and variable is None):
         raise ValueError(
             f"{source} tells all of itself: period_ns, bins, unit_ns and variable are for the streams of others"
@@ -139,23 +135,10 @@ def is_stream(path: Path) -> bool:
         return path.suffix in STREAM_SUFFIXES and bool(_module(path).is_stream(path))
 
 
-def _reader(path: Path) -> Any:
-    if path.suffix in _OTHERS:
-        return importlib.import_module(f"mars_lidar.io.streams.{_OTHERS[path.suffix]}")
-    return _module(path)
-
-
-def _module(path: Path) -> Any:
-    module: ModuleType
-    if path.suffix == ".npz":
-        return None
-    if path.suffix == ".ptu":
-        from mars_lidar.io.streams import ptu_stream as module
-    elif path.suffix in (".h5", ".hdf5"):
-        from mars_lidar.io.streams import photon_hdf5 as module
-    else:
-        raise ValueError(f"path of timestamps must end in one of {', '.join(STREAM_SUFFIXES)}, got {str(path)!r}")
-    return module
+def _module(path: Path, suffixes: tuple[str, ...] = READ_SUFFIXES) -> Any:
+    if path.suffix not in suffixes:
+        raise ValueError(f"path of timestamps must end in one of {', '.join(suffixes)}, got {str(path)!r}")
+    return importlib.import_module(f"mars_lidar.io.streams.{_MODULES[path.suffix]}")
 
 
 def _write_npz(path: Path, times: Timestamps) -> None:

@@ -115,7 +115,7 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
     with _opened(path) as file:
         found = _photons(path, file)
         own = file.get(f"user/{_GROUP}/{_ATTRIBUTES}")
-        attrs = {} if own is None else json.loads(_text(own[()]))
+        attrs = {} if own is None else json.loads(own[()])  # text or bytes
     if not attrs or found.fine is None:
         return found.timestamps(period_ns, bins)
     if period_ns is not None or bins is not None:
@@ -193,7 +193,3 @@ def _tcspc_unit(file: Any) -> float:
 def units_per_bin(bins: int) -> int:
     """Units of the nanotimes in a histogram bin."""
     return 2**16 // bins if bins <= 2**16 else 2**32 // (bins * 2**8)
-
-
-def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)

@@ -23,29 +23,15 @@ class NoLaserError(FileError):
 
 @dataclass(frozen=True, eq=False)
 class Photons:
-    """What every format of a stream is mapped onto.
+    """What every format of a stream is mapped onto."""
 
-    Attributes
-    ----------
-    clock, clock_ns
-        (n,) whole units of `clock_ns` since the start of the recording.
-    detector
-        (n,) channel of each photon; -1 for a pulse at the recorder's input for the laser's sync.
-    source
-        The file.
-    fine, fine_ns
-        (n,) whole units of `fine_ns` since the laser pulse; None where the recorder had no laser.
-    period_ns
-        Laser period, ns, where the file tells it.
-    """
-
-    clock: NDArray[Any]
+    clock: NDArray[Any]  # (n,) whole units of `clock_ns` since the start of the recording
     clock_ns: float
-    detector: NDArray[Any]
-    source: str
-    fine: NDArray[Any] | None = None
+    detector: NDArray[Any]  # (n,) channel of each; -1 for a pulse at the recorder's input for the laser's sync
+    source: str  # the file
+    fine: NDArray[Any] | None = None  # (n,) whole units of `fine_ns` since the laser pulse; None without a laser
     fine_ns: float = 0.0
-    period_ns: float | None = None
+    period_ns: float | None = None  # of the laser, where the file tells it
 
     def timestamps(self, period_ns: float | None = None, bins: int | None = None) -> Timestamps:
         """A pixel for each channel, in one row; `period_ns` where the file does not tell it."""

@@ -82,10 +82,6 @@ class Delay:
         window = below[..., n : 2 * n] - below[..., n - d : 2 * n - d] + self.part * torch.roll(h, d + 1, -1)
         return window + self.whole * h.sum(-1, keepdim=True)
 
-    def blind_transposed(self, y: torch.Tensor) -> torch.Tensor:
-        """G' y: G is a correlation round the circle, so G' is G from the other side."""
-        return self.blind(y.flip(-1)).flip(-1)
-
     def left(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """What dead time at the end of the exposure leaves of settled registrations h a period: e and its falls.
 
@@ -117,9 +113,9 @@ class Circle:
         total = before[:, -1:]
         self.since, self.until = torch.exp(-before[:, 1:]), torch.exp(before[:, :-1] - total)
         self.closing = -1.0 / torch.expm1(-total)
-        ones = torch.ones_like(photons) / n
-        shape = self.chain(ones)
-        wait = self.recursion((1.0 - self.q) * self.delay.rearmed(shape)).mean(-1, keepdim=True)
+        x = delay.rearmed(torch.ones_like(photons) / n)
+        shape = self.q * x + self.p * self.recursion((1.0 - self.q) * x)  # T L of uniform registrations
+        wait = self.recursion((1.0 - self.q) * delay.rearmed(shape)).mean(-1, keepdim=True)
         self.v = shape / (delay.periods + wait)
 
     def recursion(self, x: Rows) -> Rows:
@@ -135,11 +131,6 @@ class Circle:
         for step, decay in self.decays:
             y[:, :-step] += decay[:, :-1] * y[:, step:]
         return torch.roll(y + self.until * (self.closing * y[:, :1]), -1, -1)
-
-    def chain(self, h: Rows) -> Rows:
-        """T L h."""
-        x = self.delay.rearmed(h)
-        return self.q * x + self.p * self.recursion((1.0 - self.q) * x)
 
     def apply(self, h: Rows) -> Rows:
         """B h."""
@@ -261,7 +252,8 @@ class _Solution(torch.autograd.Function):
         if photons_moved is not None:
             p, q = (slope * photons_moved for slope in slopes(photons))
             if turned:
-                moved = moved + delay.rearmed_transposed(q * x) - delay.blind_transposed(p * x)
+                blind = delay.blind((p * x).flip(-1)).flip(-1)  # G' x: G is a correlation round the circle
+                moved = moved + delay.rearmed_transposed(q * x) - blind
             else:
                 moved = moved + q * delay.rearmed(x) - p * delay.blind(x)
         out: Rows = _Solution.apply(photons, moved, None, delay, tolerance, turned)  # type: ignore[no-untyped-call]

@@ -21,21 +21,12 @@ _CLASSES = ("System", "Flux", "Cube", "Recipe", "Dataset", "DatasetRecipe", "Tab
 _WORDS = {"Path": "a path", "ArrayLike": "an array of real numbers", "str": "a text", "slice": "a slice"}
 
 
-def checked(function: Callable[P, R]) -> Callable[P, R]:
+def checked(function: Callable[P, R], masks: bool = False) -> Callable[P, R]:
     """Refuse, by their names, arguments that cannot be what their annotations say.
 
     An annotation is looked at where all members of its union are paths, texts, arrays, slices, mappings, None or
-    classes of the package. Arrays must hold real numbers, and nothing that is masked.
+    classes of the package. Arrays must hold real numbers, and nothing that is masked, but where `masks` mean something.
     """
-    return _checked(function, masks=False)
-
-
-def checked_with_masks(function: Callable[P, R]) -> Callable[P, R]:
-    """As `checked`, for a function to which masked elements mean something."""
-    return _checked(function, masks=True)
-
-
-def _checked(function: Callable[P, R], masks: bool) -> Callable[P, R]:
     signature = inspect.signature(function)
     wanted = {name: _members(str(each.annotation)) for name, each in signature.parameters.items()}
     wanted = {name: members for name, members in wanted.items() if members}
@@ -52,6 +43,11 @@ def _checked(function: Callable[P, R], masks: bool) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return call
+
+
+def checked_with_masks(function: Callable[P, R]) -> Callable[P, R]:
+    """As `checked`, for a function to which masked elements mean something."""
+    return checked(function, masks=True)
 
 
 def _members(annotation: str) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import typer
@@ -160,11 +161,8 @@ def validate(
             ),
         ]
         for check in found.checks:
-            figures = (
-                ""
-                if check.error != check.error
-                else (f"{check.measured:.6g}, predicted {check.predicted:.6g} ± {check.error:.2g}; ")
-            )
+            figures = f"{check.measured:.6g}, predicted {check.predicted:.6g} ± {check.error:.2g}; "
+            figures = "" if math.isnan(check.error) else figures
             mark = "  ✗" if check in found.failed else ""
             rows.append((check.name, f"{figures}p = {check.p:.2g}{mark}"))
         if found.prediction.recovery is None:  # else what it finds is what was told

@@ -33,17 +33,14 @@ def alike(
     """
     from mars_lidar.io.capture import read_capture
 
-    for kind in ("scene", "depth", "transient"):
-        if getattr(scene, kind) is not None:
-            raise ValueError(f"--like takes its light from {like}: leave out --{kind}")
-    for option in ("transient_bin_ns", "transient_start_ns"):
-        if getattr(scene, option) is not None:
-            raise ValueError(f"--like takes time bins from {like}: leave out --{option.replace('_', '-')}")
+    asked = instrument.changes
+    taken = [name for name in (*_OPTIONS, "transient_bin_ns", "transient_start_ns") if getattr(scene, name) is not None]
+    taken += ["bins"] * (asked.bins is not None)
+    if taken:
+        told = taken[0].replace("_", "-")
+        raise ValueError(f"--like takes light and time bins from {like}: leave out --{told}")
     capture = read_capture(like)
     width, bins = float(capture.bin_ns or 0.0), capture.image[2]
-    asked = instrument.changes
-    if asked.bins is not None:
-        raise ValueError(f"--like takes time bins from {like}: leave out --bins")
     if asked.period_ns is not None:
         bins = round(asked.period_ns / width)
         if bins < capture.image[2] or abs(asked.period_ns / width - bins) > 1e-6 * bins:

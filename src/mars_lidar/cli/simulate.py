@@ -206,8 +206,11 @@ def _summary(written: Written, png: Path | None, began: float, out: Path) -> Non
             "time": f"{span(written.simulate_s)} simulating{each}; {span(written.write_s)} writing; "
             f"{span(time.perf_counter() - began)} in all",
         }
-    if written.report:
-        rows["engine"] = _told(written.report)
+    if written.report:  # seconds by stage, numbers of pixels
+        rows["engine"] = ", ".join(
+            f"{name[:-2]} {value:.3g} s" if name.endswith("_s") else f"{name.replace('_', ' ')} {value:,.0f}"
+            for name, value in written.report.items()
+        )
     rows["cube" if written.path == out else "capture"] = str(out)
     if png is not None:
         rows["picture"] = str(png)
@@ -217,11 +220,3 @@ def _summary(written: Written, png: Path | None, began: float, out: Path) -> Non
 def each_ns(number: float) -> str:
     """Nanoseconds, or microseconds, in words."""
     return f"{number:.3g} ns" if number < 999.5 else f"{number / 1e3:.3g} µs"
-
-
-def _told(report: dict[str, float]) -> str:
-    """An engine's report in words: seconds by stage, numbers of pixels."""
-    return ", ".join(
-        f"{name[:-2]} {value:.3g} s" if name.endswith("_s") else f"{name.replace('_', ' ')} {value:,.0f}"
-        for name, value in report.items()
-    )

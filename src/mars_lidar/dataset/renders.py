@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from mars_lidar.io.transient_truth import read_truth
 _OPTIONS = ("bin_ns", "start_ns", "name", "channel")
 
 
-def transient_files(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, partial[Rendered]]]:
+def transient_files(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, Callable[[], Rendered]]]:
     """The files of an entry in the order of their paths, and what opens each; ValueError where there is none."""
     root = folder / entry["transient"]
     options = {name: entry[name] for name in _OPTIONS if name in entry}
@@ -31,11 +30,11 @@ def transient_files(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path,
     elif not root.is_file():
         raise ValueError(f"{root}: no such file or folder")
     for file in files:
-        yield file, partial(_open, file, options, entry.get("pulse", True))
 
+        def load(file: Path = file) -> Rendered:
+            transient = read_transient(file, **options)
+            nothing = np.full(transient.shape, np.nan)
+            told = {"depth": nothing, "reflectivity": nothing} | read_truth(file, transient.shape)
+            return Rendered(transient, told["depth"], told["reflectivity"], entry.get("pulse", True))
 
-def _open(file: Path, options: dict[str, Any], pulse: bool) -> Rendered:
-    transient = read_transient(file, **options)
-    truth = read_truth(file, transient.shape)
-    nothing = np.full(transient.shape, np.nan)
-    return Rendered(transient, truth.get("depth", nothing), truth.get("reflectivity", nothing), pulse)
+        yield file, load

@@ -32,12 +32,9 @@ def json_schema(file: str = "recipe") -> dict[str, Any]:
     ``# yaml-language-server: $schema=recipe.json`` in the first line of the file.
     """
     checks.choice("file", file, FILES)
-    made = {"scene": _scene_file, "recipe": _recipe, "system": _system}[file]()
+    light = values.mapping("Levels of light; one of them for one scene.", LIGHT)
+    made = _kinds({"light": light}) if file == "scene" else _recipe() if file == "recipe" else _system()
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"mars-lidar {file}", **made}
-
-
-def _scene_file() -> dict[str, Any]:
-    return _kinds({"light": values.mapping("Levels of light; one of them for one scene.", LIGHT)})
 
 
 def _recipe() -> dict[str, Any]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -95,27 +96,22 @@ def verify(
 
 def _labels(dataset: Dataset) -> Iterator[str]:
     """What is wrong with the coordinates and labels of a dataset: all of them follow from its recipe and scenes."""
-    for name, values, dims, told, unit in coordinates(
-        dataset.recipe, dataset.scene_names(), dataset.histogram.shape[2:4]
-    ):
+    names = dataset.scene_names()
+    wanted: dict[str, Any] = {}
+    for name, values, dims, told, unit in coordinates(dataset.recipe, names, dataset.histogram.shape[2:4]):
+        wanted[name] = values
         array = dataset.group[name]
+        labels = array.attrs.get("long_name"), array.attrs.get("units"), array.metadata.dimension_names
+        if labels != (told, unit, dims):
+            yield f"the labels of {name} are not its own"
+    if "scene_name" in dataset.group:  # not in stores of version 0.1
+        wanted["scene_name"] = np.array(scene_names(dataset.recipe, names), object)
+    for name, values in wanted.items():
         try:
-            if not np.array_equal(array[...], values):
+            if not np.array_equal(dataset.group[name][...], values):
                 yield f"{name} is not that of the recipe"
         except Exception as error:  # whatever the codecs make of a damaged chunk
             yield f"{name} cannot be read ({error})"
-        if (array.attrs.get("long_name"), array.attrs.get("units"), array.metadata.dimension_names) != (
-            told,
-            unit,
-            dims,
-        ):
-            yield f"the labels of {name} are not its own"
-    if "scene_name" in dataset.group:  # not in stores of version 0.1
-        try:
-            if list(dataset.group["scene_name"][...]) != scene_names(dataset.recipe, dataset.scene_names()):
-                yield "scene_name is not that of the scenes"
-        except Exception as error:
-            yield f"scene_name cannot be read ({error})"
 
 
 def _compare(maker: Maker, region: tuple[slice, ...]) -> str:

@@ -142,7 +142,7 @@ def attributes(recipe: Recipe | Recording) -> dict[str, str | int]:
         "engine_settings": json.dumps(recipe.settings),
         "seed": recipe.seed,
         "first_realization": recipe.first_realization,
-        "flux": json.dumps(recipe.flux.info, default=_plain),
+        "flux": json.dumps(recipe.flux.info, default=lambda v: v.tolist() if hasattr(v, "tolist") else str(v)),
     }
 
 
@@ -171,7 +171,11 @@ def recipe_from(
     if "waveform" in names:
         stored = None if rows_of is None else rows_of("waveform")
         if stored is not None and 8 * math.prod(stored.shape) > BAND_BYTES:
-            flux = _stored_flux(stored, read("signal"), background, info)
+
+            def make(rows: slice) -> Flux:
+                return Flux(waveform=np.asarray(stored[rows]), background=background[rows], info=info)
+
+            flux = StoredFlux(read("signal"), background, int(stored.shape[-1]), make, info)
         else:
             flux = Flux(waveform=read("waveform"), background=background, info=info)
     elif "returns_signal" in names:
@@ -199,13 +203,6 @@ def recipe_from(
     return recipe
 
 
-def _stored_flux(waveforms: Any, signal: NDArray[Any], background: NDArray[Any], info: dict[str, Any]) -> StoredFlux:
-    def make(rows: slice) -> Flux:
-        return Flux(waveform=np.asarray(waveforms[rows]), background=background[rows], info=info)
-
-    return StoredFlux(signal, background, int(waveforms.shape[-1]), make, info)
-
-
 def check_format(path: Path, attrs: Mapping[str, Any]) -> None:
     """Raise ValueError unless these are the attributes of a cube that this version can read."""
     kind = attrs.get("kind", attrs.get("format"))
@@ -216,10 +213,3 @@ def check_format(path: Path, attrs: Mapping[str, Any]) -> None:
     version = int(attrs.get("format_version", 0))
     if version != FORMAT_VERSION:
         raise ValueError(f"{path} has layout version {version}; version {FORMAT_VERSION} can be read")
-
-
-def _plain(value: Any) -> Any:
-    """NumPy scalars and arrays inside `Flux.info`, as JSON knows them."""
-    if isinstance(value, (np.generic, np.ndarray)):
-        return value.tolist()
-    return str(value)

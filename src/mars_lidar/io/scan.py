@@ -177,15 +177,11 @@ def _listed(path: Path, shared: dict[str, float | None], problems: list[Problem]
 
 def _matching(root: Path, pattern: str, image: tuple[str, str] | None, problems: list[Problem]) -> Iterator[SceneFile]:
     for path in sorted(root.glob(pattern)):
-        if image is None:
-            yield from _frames(path, None, problems)
-            continue
-        name = path.relative_to(root).as_posix()
-        other = root / name.replace(*image)
-        if other == path or not other.is_file():
+        other = None if image is None else root / path.relative_to(root).as_posix().replace(*image)
+        if other is not None and (other == path or not other.is_file()):
             problems.append(Problem(path, f"its image {other} is missing"))
-            continue
-        yield from _frames(path, other, problems)
+        else:
+            yield from _frames(path, other, problems)
 
 
 def _recognised(root: Path, problems: list[Problem]) -> Iterator[SceneFile]:

@@ -240,8 +240,7 @@ class _Solution(torch.autograd.Function):
         photons, x = ctx.saved_tensors
         delay, tolerance, turned = ctx.settings
         y = _Solution.apply(photons, gradient, None, delay, tolerance, not turned)  # type: ignore[no-untyped-call]
-        p, q = slopes(photons)
-        right, left = (y, x) if turned else (x, y)
+        (p, q), (right, left) = slopes(photons), (y, x) if turned else (x, y)
         return left * (q * delay.rearmed(right) - p * delay.blind(right)), y, None, None, None, None
 
     @staticmethod

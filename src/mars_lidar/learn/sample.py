@@ -51,7 +51,8 @@ class Recipe:
 
     def sample(self, epoch: int, index: int) -> Sample:
         """Sample `index` of an epoch. What is drawn for one purpose does not depend on the settings of another."""
-        system = self._system(epoch, index)
+        drawn = self.systems.corners() if isinstance(self.systems, SystemList) else ()
+        system = drawn[0] if len(drawn) == 1 else self.systems.draw(generator(4, self.seed, epoch, index))
         level, sbr, stretch = self._light(epoch, index)
         scene = self._placed(self.source.scene(self.seed, epoch, index), epoch, index)
         if stretch != 1.0:
@@ -61,11 +62,6 @@ class Recipe:
             flux = scene.flux(system, signal=level, sbr=sbr, **self.lit)
         seed = int(generator(6, self.seed, epoch, index).integers(2**63))
         return Sample(index, scene, system, flux, level, sbr, seed)
-
-    def _system(self, epoch: int, index: int) -> System:
-        if isinstance(self.systems, SystemList) and len(self.systems.corners()) == 1:
-            return self.systems.corners()[0]
-        return self.systems.draw(generator(4, self.seed, epoch, index))
 
     def _light(self, epoch: int, index: int) -> tuple[float, ...]:
         """Signal, sbr and the factor on the depth."""

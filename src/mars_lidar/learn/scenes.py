@@ -148,12 +148,13 @@ class Arrays(Given):
         names = ("depth", "reflectivity", "background")
         if "depth" not in given or not set(given) <= set(names):
             raise ValueError(f"scenes must have maps 'depth' and perhaps {names[1:]}, got {list(maps)}")
-        shape = tuple(getattr(given["depth"], "shape", ()))
+        shapes = {name: tuple(getattr(one, "shape", ())) for name, one in given.items()}
+        shape = shapes["depth"]
         if len(shape) not in (2, 3) or 0 in shape:
             raise ValueError(f"scenes must have a depth map (n, H, W) or (H, W), got shape {shape}")
-        for name, one in given.items():
-            if tuple(getattr(one, "shape", ())) != shape:
-                told = tuple(getattr(one, "shape", ())) or repr(one)
+        for name, one in shapes.items():
+            if one != shape:
+                told = one or repr(given[name])
                 raise ValueError(f"scenes must have maps of one shape, {shape} of depth, got {name} {told}")
         self._maps = {name: one if len(shape) == 3 else one[None] for name, one in given.items()}
         self._number = shape[0] if len(shape) == 3 else 1

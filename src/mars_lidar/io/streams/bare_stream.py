@@ -78,7 +78,11 @@ def _flat(path: Path, name: str, cells: _Cells) -> tuple[NDArray[np.float64], ND
 
 def _times(path: Path, unit_ns: float | None, variable: str | None) -> tuple[dict[str, _Cells], str, _Cells, float]:
     """All variables, the name and the cells of the one that holds the times, and their unit, ns."""
-    found = cells_of(mat_arrays(path, deep=False)) if path.suffix == ".mat" else _npz(path)
+    if path.suffix == ".mat":
+        found = cells_of(mat_arrays(path, deep=False))
+    else:
+        with open_npz(path) as archive:
+            found = cells_of({name: np.atleast_1d(archive[name]) for name in archive.files})
     name, cells = _chosen(path, found, variable)
     unit = unit_ns
     if unit is None:
@@ -122,12 +126,6 @@ def _one(values: NDArray[Any]) -> _Cells:
 
 def _is_times(values: Any) -> bool:
     return isinstance(values, np.ndarray) and values.dtype.kind in "fiu" and values.size == max((0, *values.shape))
-
-
-def _npz(path: Path) -> dict[str, _Cells]:
-    with open_npz(path) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    return {name: _one(values) for name, values in arrays.items() if _is_times(np.atleast_1d(values))}
 
 
 def cells_of(found: dict[str, Any]) -> dict[str, _Cells]:

@@ -117,14 +117,15 @@ def _read_bare(
     source: Path, period_ns: float | None, bins: int | None, unit_ns: float | None, variable: str | None
 ) -> Timestamps:
     """Of a format that may have no header."""
-    if source.suffix == ".mat" or _npz_attributes(source).get("format") is None:
+    attrs = {} if source.suffix == ".mat" else _npz_attributes(source)
+    if attrs.get("format") is None:
         times: Timestamps = _module(source).read(source, period_ns, bins, unit_ns, variable)
         return times
     if not (period_ns is None and bins is None and unit_ns is None and variable is None):
         raise ValueError(
             f"{source} tells all of itself: period_ns, bins, unit_ns and variable are for the streams of others"
         )
-    return _read_npz(source)
+    return _read_npz(source, attrs)
 
 
 def is_stream(path: Path) -> bool:
@@ -156,9 +157,8 @@ def _npz_attributes(path: Path) -> dict[str, Any]:
         return dict(json.loads(archive["attributes"].item())) if "attributes" in archive.files else {}
 
 
-def _read_npz(path: Path) -> Timestamps:
-    attrs = _npz_attributes(path)
-    if attrs.get("format") != FORMAT:
+def _read_npz(path: Path, attrs: dict[str, Any]) -> Timestamps:
+    if attrs["format"] != FORMAT:
         raise ValueError(f"{path} is not a file of timestamps written by mars-lidar (no format = {FORMAT!r})")
     with open_npz(path) as archive:
         counts = np.diff(archive["offsets"])

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from mars_lidar.compare.comparison import Comparison
-    from mars_lidar.compare.pixel import PixelStatistics
 
 _MARK = "!"
 
@@ -147,9 +146,12 @@ def _scene_table(console: Console, found: Comparison) -> None:
 def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
     y, x = found.pixels[pixel]
     statistics, law = found.statistics[pixel], found.laws[pixel]
+    drawn = {name: s.realizations for name, s in statistics.items()}
+    most = max(drawn.values())
+    fewer = "".join(f", {name} {n:,}" for name, n in drawn.items() if n < most)
     shown = grid(
         f"{pixel} pixel (y {y}, x {x}): S = {found.flux.signal[y, x]:.3g}, "
-        f"B = {found.flux.background[y, x]:.3g}; {_realizations(statistics)}",
+        f"B = {found.flux.background[y, x]:.3g}; {most:,} exposures{fewer}",
         ("engine", "mean", "variance", "Fano", "window var", f"/ {found.against}", "lag-1", "TV shape", "TV count"),
     )
     if law is not None:
@@ -178,13 +180,6 @@ def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
     console.print(shown)
     if pixel in found.unpredicted:
         console.print(f"{pixel} pixel has no prediction: {found.unpredicted[pixel]}")
-
-
-def _realizations(statistics: dict[str, PixelStatistics]) -> str:
-    drawn = {name: s.realizations for name, s in statistics.items()}
-    most = max(drawn.values())
-    fewer = "".join(f", {name} {n:,}" for name, n in drawn.items() if n < most)
-    return f"{most:,} exposures{fewer}"
 
 
 def cell(found: Estimate | Distance) -> Text:

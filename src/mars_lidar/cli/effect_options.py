@@ -52,10 +52,11 @@ class StreamEffects:
         """Fields of `Detector`, as plain data."""
         told: dict[str, Any] = {name: getattr(self, name) for name in FIELDS if hasattr(self, name)}
         told["jitter"] = self._jitter()
-        told["afterpulsing"] = _together(
-            {"probability": self.afterpulse_probability, "delay_ns": self.afterpulse_delay_ns},
-            "--afterpulse-probability and --afterpulse-delay-ns",
-        )
+        probability, delay_ns = self.afterpulse_probability, self.afterpulse_delay_ns
+        if (probability is None) != (delay_ns is None):
+            raise ValueError("--afterpulse-probability and --afterpulse-delay-ns belong together: both, or neither")
+        if probability is not None:
+            told["afterpulsing"] = {"probability": probability, "delay_ns": delay_ns}
         if self.code_density_file is not None:
             told["code_density"] = read_array("--code-density-file", self.code_density_file)
         return {name: value for name, value in told.items() if value is not None}
@@ -103,13 +104,6 @@ class Effects(StreamEffects, LightEffects):
         else:
             told["crosstalk"] = {"probability": self.crosstalk, "kernel": self.crosstalk_kernel or "8"}
         return told
-
-
-def _together(values: dict[str, Any], names: str) -> dict[str, Any] | None:
-    given = [value is not None for value in values.values()]
-    if any(given) and not all(given):
-        raise ValueError(f"{names} belong together: both, or neither")
-    return values if all(given) else None
 
 
 def read_array(option: str, file: Path) -> Any:

@@ -147,8 +147,9 @@ class DatasetRecipe:
         """
         source = Path(path)
         data, lines = read_yaml(source)
-        if isinstance(data, dict):
-            data = data | {name: _merged(data.get(name), value) for name, value in replaced.items()}
+        for name, value in replaced.items() if isinstance(data, dict) else ():
+            old = data.get(name)  # of light and store, the entries that are not given stay
+            data[name] = old | value if isinstance(old, dict) and isinstance(value, dict) else value
         with located(source, lines, lambda key: bool(key) and key[0] in replaced):
             return cls.from_dict(data, source.parent)
 
@@ -159,11 +160,6 @@ _FILE: Fields = {"file": values.text("A system of its own file.")}
 def _pair(size: Any) -> Any:
     """A size as the package has it."""
     return tuple(size) if isinstance(size, list) else size
-
-
-def _merged(old: Any, new: Any) -> Any:
-    """Replace the entries of light and store that are given; the others stay."""
-    return old | new if isinstance(old, dict) and isinstance(new, dict) else new
 
 
 def _systems(data: Any, folder: Path) -> tuple[System, ...]:

@@ -8,9 +8,9 @@ import math
 import os
 import platform
 import re
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,26 +28,26 @@ Row = Mapping[str, Any]
 MAX_FIGURE_BYTES = 200_000
 
 
-def write(
-    request: Request,
-    name: str,
-    module: str,
-    template: str,
-    facts: Mapping[str, Any],
-    *,
-    rows: Sequence[Row] = (),
-    figures: Sequence[Path] = (),
-) -> list[Path]:
-    """Write NAME.md and, of `rows`, NAME.csv; returns these and `figures`.
+def write(request: Request, name: str, study: ModuleType, facts: Mapping[str, Any]) -> list[Path]:
+    """Write NAME.md, of the fact ``rows`` NAME.csv, and of each of ``tables`` NAME_KEY.csv; one of no rows is not kept.
 
-    The Markdown is made of the Jinja template ``TEMPLATE.md.jinja`` beside the module of that name, which gives the
-    `facts`; the module itself, with its constants, is `study` there.
+    Returns their paths and those of the fact ``figures``.
+
+    The Markdown is made of the Jinja template beside the module `study`: that of its name, ``report.md.jinja`` beside a
+    ``run.py``. It gives the `facts`; the module itself, with its constants, is `study` there.
     """
-    study = sys.modules[module]
-    text = request.out / f"{name}.md"
-    path = Path(str(study.__file__)).with_name(f"{template}.md.jinja")
-    text.write_text(render(request, path, {"study": study, **facts}), encoding="utf-8")
-    return [text, *figures, *([save_csv(request.out / f"{name}.csv", rows)] if rows else [])]
+    text, module = request.out / f"{name}.md", Path(str(study.__file__))
+    template = module.with_name(f"{'report' if module.stem == 'run' else module.stem}.md.jinja")
+    text.write_text(render(request, template, {"study": study, **facts}), encoding="utf-8")
+    paths = [text, *facts.get("figures", ())]
+    tables = {name: facts.get("rows", ())} | {f"{name}_{key}": rows for key, rows in facts.get("tables", {}).items()}
+    for stem, rows in tables.items():
+        path = request.out / f"{stem}.csv"
+        if rows:
+            paths.append(save_csv(path, rows))
+        else:
+            path.unlink(missing_ok=True)
+    return paths
 
 
 def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:

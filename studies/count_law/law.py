@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import distance
 from mars_lidar.statistics.count_window import gaussian_window
 from mars_lidar.statistics.distance import Pmf, total_variation
-from studies import Request, Tell
-from studies.common.report import Row, picked, write
+from studies import Facts, Request, Tell
+from studies.common.report import Row, picked
 from studies.common.sample import PERIOD_NS, log_points, system_of
 
 LAWS = {
@@ -241,7 +240,7 @@ def _drawn_out(cells: Sequence[Cell]) -> list[Cell]:
     return chosen
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
     from studies.count_law.law_figures import draw_all
 
@@ -253,7 +252,7 @@ def run(request: Request) -> list[Path]:
     plain = [c for c in cells if c.cumulants[0] >= FEW and c.cumulants[1] >= STILL]
     skewness = np.array([abs(c.cumulants[2]) / c.cumulants[1] ** 1.5 for c in plain])
     cost = [c.to_exact["mars"] - c.to_exact["gaussian"] for c in cells]
-    facts = {
+    return {
         "s": settings,
         "flux": flux,
         "exposure": exposure,
@@ -269,9 +268,9 @@ def run(request: Request) -> list[Path]:
         "cost": cost,
         "costliest": cells[int(np.argmax(cost))],
         "nan": float("nan"),
+        "rows": [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure],
+        "figures": figures,
     }
-    rows = [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure]
-    return write(request, "law", __name__, "law", facts, rows=rows, figures=figures)
 
 
 def _csv_row(name: str, cell: Cell) -> Row:

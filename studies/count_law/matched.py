@@ -15,9 +15,9 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, style
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
-from studies import Request, Tell
+from studies import Facts, Request, Tell
 from studies.common.draw import heat, panels
-from studies.common.report import Row, save_figure, write
+from studies.common.report import Row, save_figure
 from studies.common.sample import PERIOD_NS, log_points, system_of
 from studies.count_law.law import gaussian_of, pmf_of
 
@@ -176,7 +176,7 @@ def worst(parts: Sequence[Part], number: int) -> list[tuple[Part, int]]:
     return sorted(cells, key=lambda cell: -float(cell[0].matched[cell[1]]))[:number]
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
     settings = QUICK if request.quick else FULL
     parts, others = maps(settings, request.tell), drawn(settings, request.tell)
@@ -187,15 +187,15 @@ def run(request: Request) -> list[Path]:
     matched = np.concatenate([part.matched for part in everything])
     gaussian = np.concatenate([part.gaussian for part in everything])
     within = [(low, high, (variance >= low) & (variance < high)) for low, high in pairwise(_EDGES)]
-    facts = {
+    figure = _draw(request.out / "matched_map.png", settings, armed)
+    return {
         "s": settings,
         "kinds": {name: share(cells) for name, cells in kinds.items() if cells},
         "by_variance": [(low, high, matched[here], gaussian[here]) for low, high, here in within],
         "worst": worst(everything, _WORST),
+        "rows": [_csv_row(part, k) for part in everything for k in np.flatnonzero(_listed(part))],
+        "figures": [figure],
     }
-    figure = _draw(request.out / "matched_map.png", settings, armed)
-    rows = [_csv_row(part, k) for part in everything for k in np.flatnonzero(_listed(part))]
-    return write(request, "matched", __name__, "matched", facts, rows=rows, figures=[figure])
 
 
 def _listed(part: Part) -> NDArray[np.bool_]:

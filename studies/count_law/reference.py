@@ -15,8 +15,7 @@ import numpy as np
 
 from mars_lidar.statistics import distance
 from mars_lidar.statistics.distance import Pmf
-from studies import Request
-from studies.common.report import write
+from studies import Facts, Request
 from studies.common.sample import system_of
 from studies.count_law.law import LAWS, laws_of, pmfs_of
 
@@ -50,7 +49,7 @@ class Comparison:
         return scores <= _LIMIT_Z and self.distance <= self.limit and self.p_value > _LIMIT_P
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Compare, and write the table; returns the paths written."""
     if request.data is None:
         raise ValueError("data must be the folder of the reference cases, got None")
@@ -62,16 +61,15 @@ def run(request: Request) -> list[Path]:
         cases[path.stem] = case = _read(path)
         found += compare(path.stem, case, draws, np.random.default_rng([SEED, k]))
         request.tell(f"reference: {path.stem}")
-    facts = {
+    return {
         "cases": cases,
         "keys": _KEYS[:-1],
         "found": found,
         "exact": [c for c in found if c.law == "exact"],
         "laws": LAWS,
         "draws": draws,
+        "rows": [{**vars(c), "good": c.good} for c in found],
     }
-    rows = [{**vars(c), "good": c.good} for c in found]
-    return write(request, "reference", __name__, "reference", facts, rows=rows)
 
 
 def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Generator) -> list[Comparison]:

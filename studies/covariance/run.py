@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from mars_lidar import System, holding_time_covariance
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.chain import Rearm
-from studies import Request, Tell
-from studies.common.report import Row, picked, write
+from studies import Facts, Request, Tell
+from studies.common.report import Row, picked
 from studies.common.sample import NEAR_NS, PERIOD_NS, WIDE_NS, Grid, log_points, paper_grids, system_of
 from studies.covariance.modes import LeadingTerms
 
@@ -171,7 +170,7 @@ def matching_cutoff(cells: Sequence[Cell]) -> str:
     return str(enough[0]) if enough else f"> {CUTOFFS[-1]}"
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
     from studies.covariance.dense import dense_checks
     from studies.covariance.figures import draw_all
@@ -187,7 +186,7 @@ def run(request: Request) -> list[Path]:
     off = sorted(abs(c.relative_error(spectral)) for c in centre)
     against = [*((grid.name, here) for grid, here in grids), ("all", centre), ("all, edge re-arming", edge)]
     poisson, bias = _poisson(centre)
-    facts = {
+    return {
         "s": settings,
         "centre": centre,
         "edge": edge,
@@ -211,9 +210,9 @@ def run(request: Request) -> list[Path]:
         "by_rule": {grid.name: [_rule(here, rule) for rule in _RULES] for grid, here in grids},
         "edge_rules": [_rule(edge, rule) for rule in _RULES],
         "automatic": {t: np.array([c.rules[automatic_name(t)] for c in centre]).T for t in TOLERANCES},
+        "rows": [_csv_row(c) for c in (*centre, *edge)],
+        "figures": figures,
     }
-    rows = [_csv_row(c) for c in (*centre, *edge)]
-    return write(request, "covariance", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _poisson(cells: Sequence[Cell]) -> tuple[Cell | None, float]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,7 @@ from mars_lidar import Detector, Flux, GaussianPulse, System, count_law, simulat
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
 from mars_lidar.statistics import mean_histogram
-from studies import Request
-from studies.common.report import write
+from studies import Facts, Request
 from studies.common.sample import settings_of
 
 SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
@@ -71,7 +69,7 @@ class Outcome:
     law: FloatArray | None
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Write detectors.md, detectors.csv and a figure for each mode."""
     from studies.detectors.figures import draw_all
 
@@ -82,8 +80,11 @@ def run(request: Request) -> list[Path]:
         outcomes.append(outcome(shown, exposures))
     figures = draw_all(request.out, outcomes)
     rows = [row(each) for each in outcomes]
-    facts = {"settings": settings_of(outcomes[0].system, LIGHT, exposures, SEED), "rows": rows, "figures": figures}
-    return write(request, "detectors", __name__, "report", facts, rows=rows, figures=figures)
+    return {
+        "settings": settings_of(outcomes[0].system, LIGHT, exposures, SEED),
+        "rows": rows,
+        "figures": figures,
+    }
 
 
 def outcome(shown: Shown, exposures: int) -> Outcome:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mars_lidar._base.threads import thread_count
-from studies import Request
-from studies.common.report import number, save_csv, write
+from studies import Facts, Request
+from studies.common.report import number
 from studies.domain import judge, references, sweep, verdict, watch
 from studies.domain.checks import Check
 from studies.domain.figures import decades, maps
@@ -27,7 +26,7 @@ REFERENCE_LEVEL = 1e-6
 _LISTED = 40  # failures that the report names; all are in domain_failures.csv
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Sweep, and write ``domain.md``, ``domain.csv``, ``domain_failures.csv`` and the maps."""
     settings = QUICK if request.quick else FULL
     if request.seed is not None:
@@ -42,11 +41,7 @@ def run(request: Request) -> list[Path]:
     cases = [case_row(one) for one in judged]
     figures = maps(cases, request.out)
     failures = failure_rows(judged, outside)
-    if failures:
-        figures.append(save_csv(request.out / "domain_failures.csv", failures))
-    else:
-        (request.out / "domain_failures.csv").unlink(missing_ok=True)
-    facts = {
+    return {
         "s": settings,
         "judged": judged,
         "judge": judge,
@@ -55,15 +50,16 @@ def run(request: Request) -> list[Path]:
         "second_level": verdict.second_level(settings.checks),
         "result": {subject: Counter(state for _, state in _states(judged, subject)) for subject in SUBJECTS},
         "failures": failures,
+        "tables": {"failures": failures},
         "loud": sum("Error" in row["note"].split(":")[0] for row in failures),
         "ranges": [_range(judged, subject) for subject in SUBJECTS],
         "slow": [_slow(judged, subject) for subject in LAWS],
         "drawn": _drawn(judged),
         "worst": min(outside, key=lambda check: check.p, default=None),
         "outside": len(outside),
-        "seconds": time.monotonic() - began,
+        "rows": cases,
+        "figures": figures,
     }
-    return write(request, "domain", __name__, "report", facts, rows=cases, figures=figures)
 
 
 def case_row(judged: Judged) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from studies import Request
-from studies.common.report import Row, save_figure, write
+from studies import Facts, Request
+from studies.common.report import Row, save_figure
 from studies.downstream import run
 from studies.downstream.counts import QUARTERS
 from studies.downstream.data import CONFIGS, SYSTEM, WORDS, Config
@@ -38,20 +38,20 @@ ASSUMED = (
 )
 
 
-def report(
+def facts(
     request: Request,
     folder: Path,
     config: Config,
     found: Mapping[Run, Any],
     references: Mapping[str, Mapping[str, float]],
     counts: Mapping[str, Mapping[str, list[float]]],
-) -> list[Path]:
+) -> Facts:
     """downstream.md, downstream.csv and a figure for each ratio; the `found` results are complete."""
     pictures = [
         save_figure(request.out / f"downstream_sbr{sbr:g}.png", picture(folder, config, found, sbr))
         for sbr in config.sbr
     ]
-    facts = {
+    return {
         "c": config,
         "full": CONFIGS["full"],
         "system": SYSTEM,
@@ -66,9 +66,9 @@ def report(
         "quarters": QUARTERS,
         "counts": counts,
         "words": WORDS,
-        "pictures": pictures,
+        "rows": _csv(found),
+        "figures": pictures,
     }
-    return write(request, "downstream", __name__, "report", facts, rows=_csv(found), figures=pictures)
 
 
 def spread(values: list[float], digits: int) -> str:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mars_lidar import Scene, cramer_rao, reconstruct
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from studies import OtherRunsError, Request
+from studies import Facts, OtherRunsError, Request
 from studies.common.report import save_whole
 from studies.downstream.counts import count_bias
 from studies.downstream.data import CONFIGS, SYSTEM, Config, Simulators, crop, level, truths
@@ -60,9 +60,9 @@ def runs(config: Config) -> list[Run]:
     ]
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Make what is left of the runs, and write downstream.md, its CSV and its figures."""
-    from studies.downstream.report import report
+    from studies.downstream import report
 
     name = "tiny" if request.quick else request.config
     config = CONFIGS[checks.choice("config", name, tuple(CONFIGS))]
@@ -80,7 +80,7 @@ def run(request: Request) -> list[Path]:
             save_whole(folder / file, json.dumps(make(), indent=2) + "\n")
     found = {one: json.loads((folder / f"{one.name}.json").read_text()) for one in runs(config)}
     once = [json.loads((folder / file).read_text()) for file in (REFERENCES, COUNTS)]
-    return report(request, folder, config, found, *once)
+    return {"study": report} | report.facts(request, folder, config, found, *once)
 
 
 def fixed(folder: Path, config: Config) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import numpy as np
 
-from studies import Request
-from studies.common.report import Row, picked, write
+from studies import Facts, Request
+from studies.common.report import Row, picked
 from studies.hardware import alarms, cases
 from studies.hardware.cases import AT_FLOOR, FULL, PIXELS, QUICK, Case
 from studies.hardware.mismatches import mismatches, sensitivities
@@ -16,7 +15,7 @@ from studies.hardware.mismatches import mismatches, sensitivities
 PAPER = {"bright": 0.0651, "dark": 0.0601}  # T6 of arXiv 2512.04924: total variation of the count law
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
     from studies.hardware.figures import draw_all
 
@@ -33,7 +32,7 @@ def run(request: Request) -> list[Path]:
     scores = [float(value) for case in swept for value in case.scores if not np.isnan(value)]
     ways = [] if measured is None else measured.cases
     free = [case for name, case in ways if name.startswith("free shape, t_e")]
-    facts = {
+    return {
         "s": settings,
         "bright": PIXELS["bright"][0],
         "pixels": pixels,
@@ -57,10 +56,9 @@ def run(request: Request) -> list[Path]:
         "traced": any(case.recovery.findings() for case in free),
         "gaussian": [case for name, case in ways if name.startswith("Gaussian")],
         "figures": figures,
-        "seconds": time.process_time() - began,
+        "spent": time.process_time() - began,
+        "rows": [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))],
     }
-    rows = [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))]
-    return write(request, "hardware", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _csv_row(case: Case) -> Row:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,9 @@ from scipy import stats
 
 from mars_lidar import Flux, JointLaw, System, joint_law, simulate
 from mars_lidar._base.types import FloatArray
-from studies import Request, Tell
+from studies import Facts, Request, Tell
 from studies.common import sample
-from studies.common.report import Row, picked, write
+from studies.common.report import Row, picked
 
 PERIOD_NS = 100.0
 OFTEN = 500  # exposures that must differ from the rest before a z-score is as good as Gaussian
@@ -176,7 +175,7 @@ def variance_scores(x: FloatArray, variance: FloatArray) -> FloatArray:
     return np.asarray(np.log(second * len(x) / (len(x) - 1) / variance) / spread)
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Compare, draw and write; returns the paths written."""
     from studies.joint.covariance_figures import figure
     from studies.joint.reference import reference_case
@@ -188,7 +187,7 @@ def run(request: Request) -> list[Path]:
     figures = [figure(request.out / "joint_covariance.png", scores, 4000 if request.quick else 40_000)]
     numbers = sum(len(o.single) + o.bins.size + o.lags.size for o in systems)
     by_z = sorted(systems, key=lambda o: -o.worst()[0])
-    facts = {
+    return {
         "s": settings,
         "laws": [
             (name, z, stats.kstest(z, "norm").pvalue, stats.chi2.sf(float(np.sum(z**2)), z.size))
@@ -203,9 +202,9 @@ def run(request: Request) -> list[Path]:
         "systems": len(systems),
         "worst": [_worst_row(o, second_look(o, settings)) for o in by_z[:_WORST]],
         "cases": cases,
+        "rows": [_row(o) for o in [*cases, *systems]],
+        "figures": figures,
     }
-    rows = [_row(o) for o in [*cases, *systems]]
-    return write(request, "joint_covariance", __name__, "covariance", facts, rows=rows, figures=figures)
 
 
 def _scores(systems: Sequence[Outcome], settings: Settings) -> dict[str, FloatArray]:

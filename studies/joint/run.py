@@ -7,17 +7,15 @@ over the closed form of `mars_lidar.joint_law`, which shares nothing with the en
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from mars_lidar._base.types import FloatArray
-from studies import Request
-from studies.common.report import Row, crossed, marked, picked, write
+from studies import Facts, Request
+from studies.common.report import Row, crossed, marked, picked
 from studies.common.sample import PERIOD_NS
 from studies.joint import classifiers, outcomes
 from studies.joint.outcomes import ENGINES, FULL, QUICK, RATIOS, TESTS, Outcome, Settings
@@ -39,15 +37,14 @@ def auc_score(outcome: Outcome, test: str, settings: Settings) -> float:
     return (outcome.aucs[test][0] - 0.5) / chance(exposures)
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Compute, draw and write; returns the paths written. Raises MissingLibraryError without scikit-learn."""
     from studies.joint.figures import figure
 
     settings = QUICK if request.quick else FULL
-    began = time.monotonic()
     found = outcomes.compute(settings, request.tell)
     named, drawn = ([o for o in found if o.random is kind] for kind in (False, True))
-    facts = {
+    return {
         "s": settings,
         "period_ns": PERIOD_NS,
         "sklearn": classifiers.require_sklearn(),
@@ -63,11 +60,9 @@ def run(request: Request) -> list[Path]:
         "random": [_random_row(drawn, engine, test, settings) for test in TESTS[:2] for engine in ENGINES],
         "spread": [_spread_row(drawn, engine) for engine in ("exact", *ENGINES)],
         "worst": _worst_rows(drawn, settings),
-        "spent": time.monotonic() - began,
+        "rows": [_csv_row(o) for o in found],
+        "figures": [figure(request.out / "joint.png", settings, found)],
     }
-    figures = [figure(request.out / "joint.png", settings, found)]
-    rows = [_csv_row(o) for o in found]
-    return write(request, "joint", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def given_to_exact(found: Sequence[Outcome]) -> list[str]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +14,8 @@ from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.feedback_grid import cell_cuts, internal_cells
 from mars_lidar.engines.feedback_rule import draw_rest
-from studies import Request
-from studies.common.report import Row, write
+from studies import Facts, Request
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, system_of
 
 GOAL = 0.05  # standard deviations of a bin that its mean may be off (engines/feedback_grid.py)
@@ -46,24 +44,21 @@ class _Sampled(FeedbackEngine):
         draw_rest(ExactEngine(), task, out, replace(rest, pixels=rest.pixels[:0]))
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Draw, compare and write the study; returns the paths written."""
     settings = QUICK if request.quick else FULL
-    began = time.monotonic()
     random = np.random.default_rng(settings.seed)
     rows = []
     for k in range(settings.systems):
         rows.append(compare(*_system(random), settings.items, seed=k))
         request.tell(f"{k + 1} of {settings.systems}: {rows[-1]}")
     drawn = [row for row in rows if row["cells"]]
-    facts = {
+    return {
         "s": settings,
         "error": 1.0 / np.sqrt(settings.items),
         "drawn": drawn,
         "rows": [{key: "" if value is None else value for key, value in row.items()} for row in rows],
-        "spent": time.monotonic() - began,
     }
-    return write(request, "long_exposures", __name__, "report", facts, rows=rows)
 
 
 def _system(random: np.random.Generator) -> tuple[float, float, ml.System, float]:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mars_lidar import Detector, Flux, GaussianPulse, Scene, System, cramer_rao, reconstruct, simulate
 from mars_lidar._base.types import FloatArray
-from studies import Request
-from studies.common.report import Row, write
+from studies import Facts, Request
+from studies.common.report import Row
 
 SEED = 3
 SIGMA_NS = 0.5
@@ -40,7 +39,7 @@ FULL = Settings(64, (0.5, 1.0, 3.0))
 QUICK = Settings(24, (1.0,))
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Write neighbourhood.md, neighbourhood.csv and a figure."""
     from studies.reconstruction.neighbourhood_figure import neighbourhood_figure
 
@@ -54,15 +53,16 @@ def run(request: Request) -> list[Path]:
             if name == "room" and photons == SHOWN:
                 maps = found
     room = [row for row in rows if row["scene"] == "room"]
-    facts = {
+    figure = neighbourhood_figure(request.out / "neighbourhood.png", maps, SYSTEM)
+    return {
         "s": settings,
         "room": [{k: v for k, v in row.items() if k != "scene"} for row in room],
         "others": [row for row in rows if row["scene"] != "room" and row["method"] == f"neighbourhood={RADII[-1]}"],
         "least": min(row["in 95 %"] for row in rows if row["method"].startswith("neighbourhood")),
         "least68": min(row["in 68 %"] for row in rows if row["method"].startswith("neighbourhood")),
+        "rows": rows,
+        "figures": [figure],
     }
-    figure = neighbourhood_figure(request.out / "neighbourhood.png", maps, SYSTEM)
-    return write(request, "neighbourhood", __name__, "neighbourhood", facts, rows=rows, figures=[figure])
 
 
 def scenes(size: int) -> dict[str, FloatArray | None]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, reconstruct, simulate
 from mars_lidar.reconstruct import MaximumLikelihood, returns_bound
-from studies import Request
-from studies.common.report import Row, write
+from studies import Facts, Request
+from studies.common.report import Row
 
 SEED = 20
 MOST = 3  # returns that are looked for
@@ -92,7 +91,7 @@ FULL = Settings(1000, 10_000, (400, 4000, 40_000))
 QUICK = Settings(100, 200, (4000,), every=6)
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Write returns.md, returns.csv and a figure."""
     from studies.reconstruction.returns_figure import returns_figure
 
@@ -111,7 +110,7 @@ def run(request: Request) -> list[Path]:
             system = with_dead(75.3, cycles=cycles)
             curves.append({"cycles": cycles} | pair(system, (0.5, 0.5), 0.5, float(apart), settings.pixels // 2))
     figure = returns_figure(request.out / "returns.png", curves, rows)
-    facts = {
+    return {
         "s": settings,
         "alarms": alarms,
         "worst": max(alarms, key=lambda row: row["extra %"]),
@@ -119,8 +118,9 @@ def run(request: Request) -> list[Path]:
         "held": held(rows),
         "limits": [limit(curves, cycles) for cycles in settings.cycles],
         "times": timings(settings),
+        "rows": rows,
+        "figures": [figure],
     }
-    return write(request, "returns", __name__, "returns", facts, rows=rows, figures=[figure])
 
 
 def false_alarms(settings: Settings) -> Iterator[Row]:

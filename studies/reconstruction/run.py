@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mars_lidar import Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
 from mars_lidar.reconstruct import METHODS, Flags, window_error, window_weights
-from studies import Request
-from studies.common.report import Row, write
+from studies import Facts, Request
+from studies.common.report import Row
 from studies.common.sample import system_of
 
 SEED = 9
@@ -51,7 +50,7 @@ class Picture:
     seconds: dict[str, float]
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Write reconstruction.md, reconstruction.csv and two figures."""
     from studies.reconstruction.bounds import lines
     from studies.reconstruction.figures import TITLE, flux_figure, maps_figure
@@ -70,7 +69,7 @@ def run(request: Request) -> list[Path]:
     out = request.out
     figures = [flux_figure(out / "reconstruction_flux.png", rows), maps_figure(out / "reconstruction_maps.png", shown)]
     words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
-    facts = {
+    return {
         "s": settings,
         "findings": [one for mode, title in TITLE.items() if (one := _finding(rows, mode, title))],
         "chosen": _chosen(rows, settings),
@@ -81,8 +80,9 @@ def run(request: Request) -> list[Path]:
         ],
         "window": window_lines(settings),
         "times": timings(settings),
+        "rows": rows,
+        "figures": figures,
     }
-    return write(request, "reconstruction", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _chosen(rows: Sequence[Row], settings: Settings) -> list[Row]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from studies import Request
-from studies.common.report import Row, load, write
+from studies import Facts, Request
+from studies.common.report import Row, load
 from studies.common.sample import PERIOD_NS
 from studies.runtime.contenders import NUMPY
 from studies.runtime.timing import DEAD_TIME_NS, FLUX, FULL, QUICK, SIGMA_NS, Point, along, cube_stages, teaser
@@ -52,12 +50,12 @@ def crossover(points: Sequence[Point], axis: str, fast: str, other: str) -> tupl
     return least, f"{fast} is faster than {other} below {least:.3g} registrations per pixel, slower above"
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Time, draw and write the study; returns the paths written."""
     from studies.runtime.figures import draw_all
 
     settings = QUICK if request.quick else FULL
-    began, before = time.monotonic(), load()
+    before = load()
     cubes, held = cube_stages(settings, request.tell)
     single = teaser(settings, request.tell)
     points = [point for axis in settings.axes for point in along(settings, axis, request.tell)]
@@ -65,7 +63,7 @@ def run(request: Request) -> list[Path]:
         one for one in dict.fromkeys(p.contender for p in points) if one not in ("exact", "sequential", "poisson")
     ]
     axes = (("cycles", "exposure grows"), ("flux", "flux grows"))
-    facts = {
+    return {
         "s": settings,
         "period_ns": PERIOD_NS,
         "before": before,
@@ -78,11 +76,9 @@ def run(request: Request) -> list[Path]:
         "single": single,
         "held": held,
         "size": PAPER_GRID[0] * PAPER_GRID[1] * (PAPER_GRID[2] + 2) * _BYTES,
-        "spent": time.monotonic() - began,
+        "rows": [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]],
+        "figures": draw_all(request.out, settings, points, single),
     }
-    figures = draw_all(request.out, settings, points, single)
-    rows = [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]]
-    return write(request, "runtime", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _axis_rows(points: Sequence[Point], axis: str) -> list[Row]:

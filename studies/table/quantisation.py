@@ -17,9 +17,9 @@ from mars_lidar.plot.style import COLOURS, style
 from mars_lidar.statistics import Exposure, exposure_moments
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf
-from studies import Request, Tell
+from studies import Facts, Request, Tell
 from studies.common.draw import legend_below, panels
-from studies.common.report import Row, save_figure, write
+from studies.common.report import Row, save_figure
 from studies.common.sample import PERIOD_NS, system_of
 
 if TYPE_CHECKING:
@@ -121,10 +121,9 @@ def _errors(
     }
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
     settings = QUICK if request.quick else FULL
-    began = time.monotonic()
     costs = compute(settings, request.tell)
     with style():
         figure = _figure(request.out / "quantisation.png", settings, costs)
@@ -135,15 +134,14 @@ def run(request: Request) -> list[Path]:
             good = [c for c in here if np.quantile(c.errors["law"], 0.95) <= VISIBLE]
             least = min(good, key=lambda c: c.size[0] * c.size[1], default=None)
             findings.append((dead, interpolation, least, here[-1]))
-    facts = {
+    return {
         "s": settings,
         "period_ns": PERIOD_NS,
         "findings": findings,
         "costs": costs,
-        "spent": time.monotonic() - began,
+        "rows": [_csv_row(cost) for cost in costs],
+        "figures": [figure],
     }
-    rows = [_csv_row(cost) for cost in costs]
-    return write(request, "quantisation", __name__, "quantisation", facts, rows=rows, figures=[figure])
 
 
 def _figure(path: Path, settings: Settings, costs: Sequence[Cost]) -> Path:

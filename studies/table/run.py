@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from mars_lidar import QuantisationError, System, Table
 from mars_lidar.table import LawError
 from mars_lidar.table.axes import PAPER_GRID
-from studies import Request
-from studies.common.report import Row, picked, write
+from studies import Facts, Request
+from studies.common.report import Row, picked
 from studies.common.sample import system_of
 
 _SEED = 20263
@@ -61,7 +60,7 @@ class Case:
         }
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Build the tables, measure, write ``table.md`` and ``table.csv``."""
     grids = dict(PAPER_GRID)
     samples, laws = _SAMPLES, _LAWS
@@ -72,14 +71,13 @@ def run(request: Request) -> list[Path]:
         cases.append(_measure(case, grids, samples, laws))
         request.tell(f"table: {case}")
     rows = [row for case in cases for row in case.quantisation()]
-    facts = {
+    return {
         "grids": grids,
         "samples": samples,
         "laws": laws,
         "cases": cases,
         "rows": rows,
     }
-    return write(request, "table", __name__, "report", facts, rows=rows)
 
 
 def _measure(case: Mapping[str, Any], grids: Mapping[str, tuple[float, float, int]], samples: int, laws: int) -> Case:

@@ -12,9 +12,9 @@ from mars_lidar import Detector, Flux, GaussianPulse, System, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED, style
 from mars_lidar.statistics import mean_histogram
-from studies import Request
+from studies import Facts, Request
 from studies.common.draw import legend_below, panels
-from studies.common.report import save_figure, write
+from studies.common.report import save_figure
 from studies.common.sample import settings_of
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def seen_by(name: str, exposures: int) -> Seen:
     return Seen(name, expected, cube.mean(0), cube.std(0, ddof=1) / np.sqrt(exposures))
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Write transients.md, transients.csv and the figure."""
     exposures = 200 if request.quick else 4000
     shown = []
@@ -74,8 +74,11 @@ def run(request: Request) -> list[Path]:
     figures = [_draw(request.out / "transients.png", shown)]
     light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND, "dead_time_ns": DEAD_NS}
     settings = settings_of(view(DETECTORS["non-paralyzable"]), light, exposures, SEED)
-    facts = {"settings": settings, "rows": rows}
-    return write(request, "transients", __name__, "report", facts, rows=rows, figures=figures)
+    return {
+        "settings": settings,
+        "rows": rows,
+        "figures": figures,
+    }
 
 
 def row(each: Seen) -> dict[str, Any]:

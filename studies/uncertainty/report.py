@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from studies import Request
-from studies.common.report import Row, save_figure, write
+from studies import Facts, Request
+from studies.common.report import Row, save_figure
 from studies.uncertainty import data, measured
 from studies.uncertainty.data import CONFIGS, Config, system_of
 from studies.uncertainty.figures import exposures, maps, reliability
@@ -22,20 +21,20 @@ WINDOWS = ((5.0, 0.5, 0.1), (2.0, 5.0, 0.95))  # S, B, t_d / t_r of the two vari
 LEFT, OFF = 0.01, 0.02  # by which exact-trained 90 % intervals, and the closed form, may be wrong
 
 
-def report(
+def facts(
     request: Request,
     config: Config,
     found: Mapping[Run, Any],
     predicted: Mapping[float, Any],
     stream: Mapping[str, Any] | None,
-) -> list[Path]:
+) -> Facts:
     """uncertainty.md, uncertainty.csv and the figures."""
     dead = sorted(config.dead)
     pictures = {"reliability": reliability(found, predicted, dead), "coverage": maps(found, predicted, dead, config)}
     if stream is not None:
         pictures["stream"] = exposures(stream)
     figures = [save_figure(request.out / f"uncertainty_{name}.png", one) for name, one in pictures.items()]
-    facts = {
+    return {
         "c": config,
         "data": data,
         "dead": dead,
@@ -47,9 +46,9 @@ def report(
         "stream": stream,
         "measured": measured,
         "minutes": sum(result["seconds"] for result in found.values()) / 60.0,
-        "figures": [path.name for path in figures],
+        "figures": figures,
+        "rows": _csv(found),
     }
-    return write(request, "uncertainty", __name__, "report", facts, rows=_csv(found), figures=figures)
 
 
 def spread(values: list[float], digits: int) -> str:

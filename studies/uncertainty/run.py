@@ -20,7 +20,7 @@ from scipy import stats
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from studies import OtherRunsError, Request, Tell
+from studies import Facts, OtherRunsError, Request, Tell
 from studies.common.report import save_whole
 from studies.common.windows import FEATURES
 from studies.uncertainty.data import (
@@ -64,10 +64,10 @@ def runs(config: Config) -> list[Run]:
     ]
 
 
-def run(request: Request) -> list[Path]:
+def run(request: Request) -> Facts:
     """Train what is left, and write uncertainty.md, its CSV and its figures."""
+    from studies.uncertainty import report
     from studies.uncertainty.measured import measured
-    from studies.uncertainty.report import report
 
     torch.set_num_threads(1)  # the networks are too small to gain from more
     name = "tiny" if request.quick else request.config
@@ -80,7 +80,7 @@ def run(request: Request) -> list[Path]:
     found = {one: json.loads((folder / one.file).read_text()) for one in runs(config)}
     predicted = {dead: json.loads((folder / PREDICTED.format(dead=dead)).read_text()) for dead in config.dead}
     stream = None if request.stream is None else measured(request.stream, folder, config, request.tell)
-    return report(request, config, found, predicted, stream)
+    return {"study": report} | report.facts(request, config, found, predicted, stream)
 
 
 def _fixed(folder: Path, config: Config) -> None:

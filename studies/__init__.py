@@ -7,7 +7,7 @@ something depend on the machine, and they name it.
 A study is a folder: `run.py` computes what its report states, `report.md.jinja` is the report, `figures.py` draws. Some
 folders hold several studies of one subject, a module and a template of its name for each. What they share is in
 `common`. All run alike: `run(request)` of the module returns the facts that the template states, among them ``rows`` of
-the CSV file and paths of ``figures``; what writes them is here.
+the CSV file and ``figures`` by name; what writes them is here.
 """
 
 from __future__ import annotations
@@ -119,12 +119,14 @@ def module_of(name: str) -> str:
 
 def _run(name: str, request: Request) -> list[Path]:
     """Run a study, and write NAME.md, NAME.csv and its figures; returns the paths written."""
+    from mars_lidar.plot.style import style
     from studies.common.report import write
 
     study = importlib.import_module(module_of(name))  # imported when it is asked for
     began = time.monotonic()
-    facts = study.run(request)
-    return write(request, name.replace("-", "_"), study, {"spent": time.monotonic() - began} | facts)
+    with style():
+        facts = study.run(request)
+        return write(request, name.replace("-", "_"), study, {"spent": time.monotonic() - began} | facts)
 
 
 STUDIES: dict[str, tuple[str, Study]] = {name: (words, partial(_run, name)) for name, (_, words) in _STUDIES.items()}

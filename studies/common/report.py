@@ -14,13 +14,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from mars_lidar._base.files import TemporarySibling
 from mars_lidar._base.optional import MissingLibraryError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from studies import Request
 
 Row = Mapping[str, Any]
@@ -31,18 +29,20 @@ MAX_FIGURE_BYTES = 200_000
 def write(request: Request, name: str, study: ModuleType, facts: Mapping[str, Any]) -> list[Path]:
     """Write NAME.md, of the fact ``rows`` NAME.csv, and of each of ``tables`` NAME_KEY.csv; one of no rows is not kept.
 
-    Returns their paths and those of the fact ``figures``.
+    The fact ``figures`` holds figures by KEY, which become NAME_KEY.png, that of the empty key NAME.png; the template
+    gets their paths. Returns all paths.
 
     The Markdown is made of the Jinja template beside the module `study`: that of its name, ``report.md.jinja`` beside a
     ``run.py``. It gives the `facts`; the module itself, with its constants, is `study` there.
     """
     text, module = request.out / f"{name}.md", Path(str(study.__file__))
     template = module.with_name(f"{'report' if module.stem == 'run' else module.stem}.md.jinja")
-    text.write_text(render(request, template, {"study": study, **facts}), encoding="utf-8")
-    paths = [text, *facts.get("figures", ())]
-    tables = {name: facts.get("rows", ())} | {f"{name}_{key}": rows for key, rows in facts.get("tables", {}).items()}
-    for stem, rows in tables.items():
-        path = request.out / f"{stem}.csv"
+    drawn: Mapping[str, Figure] = facts.get("figures", {})
+    figures = [save_figure(request.out / f"{f'{name}_{key}' if key else name}.png", one) for key, one in drawn.items()]
+    text.write_text(render(request, template, {"study": study, **facts, "figures": figures}), encoding="utf-8")
+    paths = [text, *figures]
+    for key, rows in {"": facts.get("rows", ()), **facts.get("tables", {})}.items():
+        path = request.out / f"{f'{name}_{key}' if key else name}.csv"
         if rows:
             paths.append(save_csv(path, rows))
         else:
@@ -134,12 +134,6 @@ def versions() -> str:
 def picked(source: object, names: str) -> dict[str, Any]:
     """Attributes of `source` by name, `names` separated by blanks: columns that are called as what they hold."""
     return {name: getattr(source, name) for name in names.split()}
-
-
-def save_whole(path: Path, text: str) -> None:
-    """Write a text that is whole or not there, whatever stops the process."""
-    with TemporarySibling(path).writing() as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
 
 
 def save_csv(path: Path, rows: Sequence[Row]) -> Path:

@@ -242,13 +242,12 @@ def _drawn_out(cells: Sequence[Cell]) -> list[Cell]:
 
 def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
-    from studies.count_law.law_figures import draw_all
+    from studies.count_law import law_figures
 
     settings = QUICK if request.quick else FULL
     flux, exposure = flux_map(settings, request.tell), exposure_map(settings, request.tell)
     cells = [*flux, *exposure]
     again = second_look(settings, cells, request.tell)
-    figures = draw_all(request.out, settings, flux, exposure, _drawn_out(cells))
     plain = [c for c in cells if c.cumulants[0] >= FEW and c.cumulants[1] >= STILL]
     skewness = np.array([abs(c.cumulants[2]) / c.cumulants[1] ** 1.5 for c in plain])
     cost = [c.to_exact["mars"] - c.to_exact["gaussian"] for c in cells]
@@ -269,7 +268,13 @@ def run(request: Request) -> Facts:
         "costliest": cells[int(np.argmax(cost))],
         "nan": float("nan"),
         "rows": [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure],
-        "figures": figures,
+        "figures": {
+            "gaussian": law_figures.gaussian(settings, flux, exposure),
+            "flux": law_figures.rows(settings, flux, "flux"),
+            "exposure": law_figures.rows(settings, exposure, "exposure"),
+            "cells": law_figures.shown(_drawn_out(cells)),
+            "floor": law_figures.floors(cells),
+        },
     }
 
 

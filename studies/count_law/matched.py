@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mars_lidar import GaussianPulse, System, count_law
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, style
+from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
 from studies import Facts, Request, Tell
 from studies.common.draw import heat, panels
-from studies.common.report import Row, save_figure
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, log_points, system_of
 from studies.count_law.law import gaussian_of, pmf_of
 
@@ -187,14 +188,13 @@ def run(request: Request) -> Facts:
     matched = np.concatenate([part.matched for part in everything])
     gaussian = np.concatenate([part.gaussian for part in everything])
     within = [(low, high, (variance >= low) & (variance < high)) for low, high in pairwise(_EDGES)]
-    figure = _draw(request.out / "matched_map.png", settings, armed)
     return {
         "s": settings,
         "kinds": {name: share(cells) for name, cells in kinds.items() if cells},
         "by_variance": [(low, high, matched[here], gaussian[here]) for low, high, here in within],
         "worst": worst(everything, _WORST),
         "rows": [_csv_row(part, k) for part in everything for k in np.flatnonzero(_listed(part))],
-        "figures": [figure],
+        "figures": {"map": _draw(settings, armed)},
     }
 
 
@@ -219,30 +219,27 @@ def _csv_row(part: Part, k: int | np.intp) -> Row:
     }
 
 
-def _draw(path: Path, settings: Settings, parts: Sequence[Part]) -> Path:
+def _draw(settings: Settings, parts: Sequence[Part]) -> Figure:
     """Maps over S and B: columns for dead times; rows for cycles, and the Gaussian for comparison."""
-    from matplotlib.colors import LogNorm
-
     shape = len(settings.signal), len(settings.background)
     by = {(round(part.dead, 9), part.system.cycles): part for part in parts}
     rows = [(n, "matched", f"{n} cycles") for n in settings.cycles]
     rows.append((settings.cycles[0], "gaussian", f"Gaussian,\n{settings.cycles[0]} cycles"))
-    with style():
-        figure, axes = panels(0.5 + 0.95 * len(rows), len(rows), len(settings.dead), sharex=True, sharey=True)
-        norm, mesh = LogNorm(_LOW, _HIGH), None
-        for row, (cycles, law, words) in zip(axes, rows, strict=True):
-            for ax, dead in zip(row, settings.dead, strict=True):
-                part = by[round(dead, 9), cycles]
-                image = getattr(part, law).reshape(shape).T
-                mesh = heat(ax, settings.signal, settings.background, image, norm)
-                if law == "matched":
-                    at = ~part.trusted
-                    ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
-            row[0].set_ylabel(f"{words}\nB")
-        for ax, dead in zip(axes[0], settings.dead, strict=True):
-            ax.set_title(f"{dead:g} $t_r$")
-        axes[-1, len(settings.dead) // 2].set_xlabel("S, photons per period")
-        bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01)
-        bar.set_label("total variation to the exact law")
-        bar.ax.axhline(AIM, color=COLOURS[0], lw=0.8)
-        return save_figure(path, figure)
+    figure, axes = panels(0.5 + 0.95 * len(rows), len(rows), len(settings.dead), sharex=True, sharey=True)
+    norm = LogNorm(_LOW, _HIGH)
+    for row, (cycles, law, words) in zip(axes, rows, strict=True):
+        for ax, dead in zip(row, settings.dead, strict=True):
+            part = by[round(dead, 9), cycles]
+            image = getattr(part, law).reshape(shape).T
+            mesh = heat(ax, settings.signal, settings.background, image, norm)
+            if law == "matched":
+                at = ~part.trusted
+                ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
+        row[0].set_ylabel(f"{words}\nB")
+    for ax, dead in zip(axes[0], settings.dead, strict=True):
+        ax.set_title(f"{dead:g} $t_r$")
+    axes[-1, len(settings.dead) // 2].set_xlabel("S, photons per period")
+    bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01)
+    bar.set_label("total variation to the exact law")
+    bar.ax.axhline(AIM, color=COLOURS[0], lw=0.8)
+    return figure

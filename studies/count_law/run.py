@@ -75,12 +75,11 @@ def _row(name: str, words: str, cells: Sequence[Cell]) -> dict[str, Any]:
 
 def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
-    from studies.count_law.figures import HISTOGRAM, HISTOGRAM_CYCLES, draw_all
+    from studies.count_law import figures
 
     settings = QUICK if request.quick else FULL
     cells = compute(settings, request.truth, request.tell)
     sweep = shape_sweep(settings, request.tell)
-    figures = draw_all(request.out, settings, cells, sweep, request.truth)
     first = cells[0].scores
     words = {one.name: one.words for one in simulators(1, 0) if one.name in first}
     by_grid = {grid.name: [cell for cell in cells if cell.grid == grid.name] for grid in settings.grids}
@@ -91,10 +90,14 @@ def run(request: Request) -> Facts:
         "sampled": [name for name in first if first[name].noise > 1.0],
         "grids": {name: [_row(one, said, here) for one, said in words.items()] for name, here in by_grid.items()},
         "keys": FIGURES,
-        "histogram": HISTOGRAM,
-        "histogram_cycles": HISTOGRAM_CYCLES,
+        "histogram": figures.HISTOGRAM,
+        "histogram_cycles": figures.HISTOGRAM_CYCLES,
         "rows": [_csv_row(cell) for cell in cells],
-        "figures": figures,
+        "figures": {
+            "panels": figures.law_panels(cells),
+            "shape": figures.shapes(settings, cells, sweep),
+            "dead_time": figures.dead_time(settings, request.truth),
+        },
     }
 
 

@@ -172,15 +172,14 @@ def matching_cutoff(cells: Sequence[Cell]) -> str:
 
 def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
+    from studies.covariance import figures
     from studies.covariance.dense import dense_checks
-    from studies.covariance.figures import draw_all
 
     settings = QUICK if request.quick else FULL
     centre = compute(settings, "centre", request.tell)
     edge = compute(settings, "edge", request.tell)
     checks = dense_checks(settings, centre, settings.dense_random, request.tell)
     checks += dense_checks(settings, edge, 0, request.tell)
-    figures = draw_all(request.out, settings, centre)
     grids = [(grid, [cell for cell in centre if cell.grid is grid]) for grid in settings.grids]
     cut20, spectral = cutoff_name(20), spectral_name()
     off = sorted(abs(c.relative_error(spectral)) for c in centre)
@@ -211,7 +210,12 @@ def run(request: Request) -> Facts:
         "edge_rules": [_rule(edge, rule) for rule in _RULES],
         "automatic": {t: np.array([c.rules[automatic_name(t)] for c in centre]).T for t in TOLERANCES},
         "rows": [_csv_row(c) for c in (*centre, *edge)],
-        "figures": figures,
+        "figures": {
+            "decay": figures.decay(settings),
+            "eigenvalues": figures.eigenvalues(settings, centre),
+            "truncation": figures.truncation(settings, centre),
+            "map": figures.error_map(settings, centre),
+        },
     }
 
 

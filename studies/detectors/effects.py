@@ -48,14 +48,13 @@ def run(request: Request) -> Facts:
     for shown in SHOWN:
         request.tell(f"effects: {shown.name}")
         outcomes.append(outcome(shown, exposures))
-    figures = draw_all(request.out, outcomes, "effects")
     rows = [{"effect": each.shown.figure or "none", **row(each)} for each in outcomes]
     rates = constant_light(40 if request.quick else 4000)
     settings = settings_of(outcomes[0].system, LIGHT, exposures, SEED)
     return {
         "settings": settings,
         "rows": rows,
-        "figures": figures,
+        "figures": draw_all(outcomes),
         "rates": rates,
         "tables": {"rate": rates},
     }

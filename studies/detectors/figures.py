@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import legend_below, panels
-from studies.common.report import save_figure
-from studies.detectors.run import BACKGROUND, DELAY_NS, REACH, SIGNAL, Outcome, of_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from studies.detectors.run import BACKGROUND, DELAY_NS, REACH, SIGNAL, Outcome
 
 
-def draw_all(folder: Path, outcomes: Sequence[Outcome], study: str = "detectors") -> list[Path]:
-    """Draw the figures into `folder`."""
-    names = list(dict.fromkeys(each.shown.figure for each in outcomes if each.shown.figure))
-    with style():
-        return [_mode(folder / f"{study}_{name}.png", of_figure(outcomes, name)) for name in names]
+def draw_all(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
+    """A figure for each group of detectors, the free-running pixel in all of them."""
+    groups = dict.fromkeys(each.shown.figure for each in outcomes if each.shown.figure)
+    return {name: _group([each for each in outcomes if each.shown.figure in ("", name)]) for name in groups}
 
 
-def _mode(path: Path, shown: Sequence[Outcome]) -> Path:
+def _group(shown: Sequence[Outcome]) -> Figure:
     figure, axes = panels(2.5, 1, 3)
     colours = [MUTED, *COLOURS]
     _incident(axes[0, 0], shown[0])
@@ -40,7 +35,7 @@ def _mode(path: Path, shown: Sequence[Outcome]) -> Path:
     axes[0, 2].set_title("inter-registration times")
     axes[0, 2].set_xlim(0, REACH)
     legend_below(figure, axes.flat, 4)
-    return save_figure(path, figure)
+    return figure
 
 
 def _incident(ax: Axes, each: Outcome) -> None:

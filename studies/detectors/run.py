@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,12 +77,11 @@ def run(request: Request) -> Facts:
     for shown in SHOWN:
         request.tell(f"detectors: {shown.name}")
         outcomes.append(outcome(shown, exposures))
-    figures = draw_all(request.out, outcomes)
     rows = [row(each) for each in outcomes]
     return {
         "settings": settings_of(outcomes[0].system, LIGHT, exposures, SEED),
         "rows": rows,
-        "figures": figures,
+        "figures": draw_all(outcomes),
     }
 
 
@@ -164,8 +162,3 @@ def _fit(counts: NDArray[np.int64], law: FloatArray) -> float:
     seen = np.bincount(group, np.bincount(counts, minlength=size))
     wanted = np.bincount(group, expected)
     return float(chisquare(seen, wanted * (seen.sum() / wanted.sum())).pvalue)
-
-
-def of_figure(outcomes: Sequence[Outcome], figure: str) -> list[Outcome]:
-    """The outcomes that a figure shows: the free-running pixel first."""
-    return [each for each in outcomes if each.shown.figure in ("", figure)]

@@ -39,7 +39,6 @@ def run(request: Request) -> Facts:
             request.tell(f"{len(judged)} of {settings.systems} systems, {time.monotonic() - began:.0f} s")
     outside = references.compare(request.data, settings.seed)
     cases = [case_row(one) for one in judged]
-    figures = maps(cases, request.out)
     failures = failure_rows(judged, outside)
     return {
         "s": settings,
@@ -58,7 +57,7 @@ def run(request: Request) -> Facts:
         "worst": min(outside, key=lambda check: check.p, default=None),
         "outside": len(outside),
         "rows": cases,
-        "figures": figures,
+        "figures": maps(cases),
     }
 
 

@@ -3,45 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from mars_lidar.plot.stream import draw_counts, draw_histogram, draw_recovery, validation_figure
-from mars_lidar.plot.style import COLOURS, MUTED, style
+from mars_lidar.plot.stream import draw_counts, draw_histogram, draw_recovery
+from mars_lidar.plot.style import COLOURS, MUTED
 from studies.common.draw import panels
-from studies.common.report import save_figure
-from studies.hardware.cases import Case, Example
+from studies.hardware.cases import Case
 from studies.hardware.mismatches import Mismatch
 
 
-def draw_all(
-    out: Path,
-    pixels: Sequence[Case],
-    swept: Sequence[Case],
-    faults: Sequence[tuple[Mismatch, Case]],
-    measured: Example | None,
-) -> list[Path]:
-    """Write the figures; returns their paths."""
-    with style():
-        paths = [_pixels(out, pixels), _range(out, swept), _recoveries(out, faults)]
-    if measured is not None:
-        name, found = measured.cases[0]
-        figure = validation_figure(found, name)
-        paths.append(save_figure(out / "hardware_measured.png", figure))
-    return paths
-
-
-def _pixels(out: Path, cases: Sequence[Case]) -> Path:
+def pixels(cases: Sequence[Case]) -> Figure:
+    """Count law and mean histogram of the matched pixels."""
     figure, axes = panels(4.2, len(cases), 2)
     for row, case in zip(axes, cases, strict=True):
         draw_counts(row[0], case.found)
         draw_histogram(row[1], case.found)
         row[0].set_title(f"{case.name}: {row[0].get_title(loc='left')}", loc="left")
-    return save_figure(out / "hardware_pixels.png", figure)
+    return figure
 
 
-def _range(out: Path, cases: Sequence[Case]) -> Path:
+def dynamic_range(cases: Sequence[Case]) -> Figure:
+    """Calibrated signal over the true one, and total variation over its floor, over the signal."""
     chosen = [case for case in cases if case.name.startswith("dynamic range")]
     signal = np.array([case.truth[0] for case in chosen])
     got = np.array([case.found.calibration.signal for case in chosen])
@@ -64,7 +48,7 @@ def _range(out: Path, cases: Sequence[Case]) -> Path:
     right.plot(signal, ratio, ".", ms=5, color=COLOURS[0], label="stream")
     right.set(xscale="log", xlabel="signal S (photons per period)", ylabel="total variation / floor", ylim=(0, None))
     right.legend(frameon=False)
-    return save_figure(out / "hardware_range.png", figure)
+    return figure
 
 
 def _naive(case: Case) -> float:
@@ -76,7 +60,8 @@ def _naive(case: Case) -> float:
     return float((per_cycle[inside] - background).sum())
 
 
-def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
+def recoveries(faults: Sequence[tuple[Mismatch, Case]]) -> Figure:
+    """Rate since the last registration of each mismatch, over that of the light."""
     faults, columns = faults[1:], 4  # the second control stands for both
     rows = -(-len(faults) // columns)
     figure, axes = panels(1.15 * rows, rows, columns)
@@ -96,7 +81,7 @@ def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
             ax.set_xlabel("time since the last one (ns)", fontsize=5.5)
     for ax in axes[:, 0]:
         ax.set_ylabel("rate / light", fontsize=5.5)
-    return save_figure(out / "hardware_recovery.png", figure)
+    return figure
 
 
 def _short(name: str) -> str:

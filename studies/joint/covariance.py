@@ -184,7 +184,6 @@ def run(request: Request) -> Facts:
     systems = random_systems(settings, request.tell)
     cases = [reference_case(path) for path in sorted(request.data.glob("*.json"))] if request.data else []
     scores = _scores(systems, settings)
-    figures = [figure(request.out / "joint_covariance.png", scores, 4000 if request.quick else 40_000)]
     numbers = sum(len(o.single) + o.bins.size + o.lags.size for o in systems)
     by_z = sorted(systems, key=lambda o: -o.worst()[0])
     return {
@@ -203,7 +202,7 @@ def run(request: Request) -> Facts:
         "worst": [_worst_row(o, second_look(o, settings)) for o in by_z[:_WORST]],
         "cases": cases,
         "rows": [_row(o) for o in [*cases, *systems]],
-        "figures": figures,
+        "figures": {"": figure(scores, 4000 if request.quick else 40_000)},
     }
 
 

@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy import stats
 
 from mars_lidar import Flux, JointLaw, joint_law, simulate
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import panels
-from studies.common.report import save_figure
 from studies.joint.covariance import PERIOD_NS, system_of
 
 
-def figure(path: Path, scores: dict[str, FloatArray], exposures: int) -> Path:
+def figure(scores: dict[str, FloatArray], exposures: int) -> Figure:
     """Variances, correlations, and quantiles of the `scores`; one system of so many exposures is simulated."""
     system = system_of(0.01, 0.1, 1000, 64)
     law = joint_law(2.0, 5.0, system)
     flux = Flux(signal=2.0, background=5.0, delay_ns=0.5 * PERIOD_NS)
     x = simulate(flux, system, realizations=exposures, seed=7).reshape(exposures, -1).astype(float)
-    with style():
-        page, axes = panels(2.5, 1, 3)
-        _variances(axes[0, 0], law, x)
-        _correlations(page, axes[0, 1], law.covariance(), np.cov(x, rowvar=False))
-        _quantiles(axes[0, 2], scores)
-        return save_figure(path, page)
+    page, axes = panels(2.5, 1, 3)
+    _variances(axes[0, 0], law, x)
+    _correlations(page, axes[0, 1], law.covariance(), np.cov(x, rowvar=False))
+    _quantiles(axes[0, 2], scores)
+    return page
 
 
 def _variances(ax: Any, law: JointLaw, x: FloatArray) -> None:

@@ -15,26 +15,12 @@ from studies.joint.classifiers import CLASSIFIERS, QDA, require_sklearn, separat
 from studies.joint.table import AGAIN, COARSE, REFERENCE, SEVEN, Case, window
 
 ENGINES = (AGAIN, "feedback", "mars", "renewal")
-
-
 FINE = "fine QDA"
-
-
 TESTS = (QDA, FINE, *CLASSIFIERS[1:])
-
-
 RATIOS = ("window", "bin", "neighbour")
-
-
 REACH = 16  # output bins on either side of the pulse and of its echo
-
-
 OFTEN = 500  # exposures in which a bin must differ from its usual count to be compared
-
-
 HANDED = "pixels given to exact"  # key of the engine's report
-
-
 TOLERANCE = 1e-4  # of the closed form
 
 
@@ -51,8 +37,6 @@ class Settings:
 
 
 FULL = Settings((*REFERENCE, *SEVEN[4:]), exposures=16_000, systems=60, random_exposures=8_000)
-
-
 QUICK = Settings((REFERENCE[2], SEVEN[6]), exposures=1_200, systems=2, random_exposures=800, bins=256)
 
 

@@ -61,7 +61,7 @@ def run(request: Request) -> Facts:
         "spread": [_spread_row(drawn, engine) for engine in ("exact", *ENGINES)],
         "worst": _worst_rows(drawn, settings),
         "rows": [_csv_row(o) for o in found],
-        "figures": [figure(request.out / "joint.png", settings, found)],
+        "figures": {"": figure(settings, found)},
     }
 
 

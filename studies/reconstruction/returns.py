@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, reconstruct, simulate
+from mars_lidar.plot.style import COLOURS, INK
 from mars_lidar.reconstruct import MaximumLikelihood, returns_bound
 from studies import Facts, Request
+from studies.common.draw import legend_below, panels
 from studies.common.report import Row
 
 SEED = 20
@@ -93,8 +96,6 @@ QUICK = Settings(100, 200, (4000,), every=6)
 
 def run(request: Request) -> Facts:
     """Write returns.md, returns.csv and a figure."""
-    from studies.reconstruction.returns_figure import returns_figure
-
     settings = QUICK if request.quick else FULL
     request.tell("returns: false alarms")
     alarms = list(false_alarms(settings))
@@ -109,7 +110,6 @@ def run(request: Request) -> Facts:
         for apart in np.geomspace(0.3, 6.0, 12):
             system = with_dead(75.3, cycles=cycles)
             curves.append({"cycles": cycles} | pair(system, (0.5, 0.5), 0.5, float(apart), settings.pixels // 2))
-    figure = returns_figure(request.out / "returns.png", curves, rows)
     return {
         "s": settings,
         "alarms": alarms,
@@ -119,7 +119,7 @@ def run(request: Request) -> Facts:
         "limits": [limit(curves, cycles) for cycles in settings.cycles],
         "times": timings(settings),
         "rows": rows,
-        "figures": [figure],
+        "figures": {"": _figure(curves, rows)},
     }
 
 
@@ -242,3 +242,33 @@ def timings(settings: Settings) -> list[Row]:
             line[f"returns={most}, s for 1000 pixels"] = 1000.0 * (time.process_time() - began) / settings.pixels
         lines.append(line)
     return lines
+
+
+def _figure(curves: Sequence[Row], rows: Sequence[Row]) -> Figure:
+    """How often two returns are seen as two, over their separation; and how often their intervals hold the truth."""
+    figure, axes = panels(2.9, 1, 2)
+    left, right = axes[0]
+    for colour, cycles in zip(COLOURS, dict.fromkeys(row["cycles"] for row in curves), strict=False):
+        mine = [row for row in curves if row["cycles"] == cycles]
+        label = f"{0.5 * cycles:g} photons each"
+        left.plot(*_line(mine, "both seen %"), "o-", ms=2.5, lw=1.0, color=colour, label=label)
+    left.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="both seen (%)")
+    left.legend(frameon=False, loc="lower right")
+    for what, colour in (("depth", COLOURS[0]), ("S", COLOURS[1])):
+        for words, marker in (("95 %", "o"), ("68 %", "s")):
+            sure = [row for row in rows if row["both seen %"] >= 90.0]
+            label = f"{what}, intervals of {words}"
+            right.plot(*_line(sure, f"{what} in {words}"), marker, ms=3, mfc="none", color=colour, label=label)
+    for share in (95.0, 68.27):
+        right.axhline(share, color=INK, lw=0.7, ls="--")
+    right.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="intervals that hold the truth (%)")
+    for ax in (left, right):
+        ax.set_xticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
+        ax.minorticks_off()
+    left.set_xlim(0.28, 6.5)
+    legend_below(figure, [right], 4, handlelength=1.2, columnspacing=1.0)
+    return figure
+
+
+def _line(rows: Sequence[Row], name: str) -> tuple[list[float], list[float]]:
+    return [row["separation"] for row in rows], [row[name] for row in rows]

@@ -66,8 +66,6 @@ def run(request: Request) -> Facts:
     request.tell("reconstruction: picture")
     shown = picture(settings)
     request.tell("reconstruction: time")
-    out = request.out
-    figures = [flux_figure(out / "reconstruction_flux.png", rows), maps_figure(out / "reconstruction_maps.png", shown)]
     words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
     return {
         "s": settings,
@@ -81,7 +79,7 @@ def run(request: Request) -> Facts:
         "window": window_lines(settings),
         "times": timings(settings),
         "rows": rows,
-        "figures": figures,
+        "figures": {"flux": flux_figure(rows), "maps": maps_figure(shown)},
     }
 
 

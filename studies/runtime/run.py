@@ -10,6 +10,7 @@ from studies import Facts, Request
 from studies.common.report import Row, load
 from studies.common.sample import PERIOD_NS
 from studies.runtime.contenders import NUMPY
+from studies.runtime.figures import along_axes, single_pixel
 from studies.runtime.timing import DEAD_TIME_NS, FLUX, FULL, QUICK, SIGMA_NS, Point, along, cube_stages, teaser
 
 __all__ = ["DEAD_TIME_NS", "FLUX", "SIGMA_NS", "crossover", "run"]  # the first three for the report
@@ -52,8 +53,6 @@ def crossover(points: Sequence[Point], axis: str, fast: str, other: str) -> tupl
 
 def run(request: Request) -> Facts:
     """Time, draw and write the study; returns the paths written."""
-    from studies.runtime.figures import draw_all
-
     settings = QUICK if request.quick else FULL
     before = load()
     cubes, held = cube_stages(settings, request.tell)
@@ -77,7 +76,7 @@ def run(request: Request) -> Facts:
         "held": held,
         "size": PAPER_GRID[0] * PAPER_GRID[1] * (PAPER_GRID[2] + 2) * _BYTES,
         "rows": [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]],
-        "figures": draw_all(request.out, settings, points, single),
+        "figures": {"axes": along_axes(settings, points), "teaser": single_pixel(settings, single)},
     }
 
 

@@ -158,7 +158,8 @@ def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
     entrants = contenders(Tables(settings.axis_table))
     for value in axis.values:
         flux, seen, realizations = _at(settings, axis, value)
-        hits = registrations(flux, seen, settings.seed)
+        # mean registrations of a pixel in one exposure, from at most 16 of them
+        hits = float(simulate(flux[:, :16], seen.replace(bins=1), seed=settings.seed).mean(dtype=np.float64))
         runs: dict[str, Run] = {}
         for one in entrants:
             why = _refusal(settings, one, flux, value, points)
@@ -181,11 +182,6 @@ def teaser(settings: Settings, tell: Tell) -> list[Point]:
     timed = _least(runs, _memory(flux, seen, realizations), settings)
     tell("runtime: teaser")
     return [Point("teaser", float(realizations), name, seconds) for name, (seconds, _) in timed.items()]
-
-
-def registrations(flux: Flux, seen: System, seed: int) -> float:
-    """Mean registrations of a pixel in one exposure, from at most 16 of them."""
-    return float(simulate(flux[:, :16], seen.replace(bins=1), seed=seed).mean(dtype=np.float64))
 
 
 def _at(settings: Settings, axis: Axis, value: float) -> tuple[Flux, System, int]:

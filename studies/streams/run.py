@@ -12,7 +12,7 @@ from scipy.stats import binom
 
 from studies import Facts, Request
 from studies.common.draw import panels
-from studies.common.report import Row, picked, save_figure
+from studies.common.report import Row, picked
 from studies.streams.cases import FULL, QUICK, Outcome, Settings, outcomes
 from studies.streams.coverage import Coverage, Law, coverage, tail
 
@@ -53,7 +53,7 @@ def facts(request: Request, settings: Settings, found: list[Outcome], spent: flo
         "by_share": _by_share([one for one in found if one.ideal.jitter_ns > 0]),
         "spent": spent,
         "rows": [_csv_row(one) for one in found],
-        "figures": [save_figure(request.out / "streams.png", figure(found, covered))],
+        "figures": {"": figure(found, covered)},
     }
 
 

@@ -5,25 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mars_lidar import System, Table
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, style
+from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics import Exposure, exposure_moments
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf
 from studies import Facts, Request, Tell
 from studies.common.draw import legend_below, panels
-from studies.common.report import Row, save_figure
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, system_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Interpolation = Literal["nearest", "bilinear"]
 
@@ -125,8 +123,6 @@ def run(request: Request) -> Facts:
     """Compute, draw and write the study; returns the paths written."""
     settings = QUICK if request.quick else FULL
     costs = compute(settings, request.tell)
-    with style():
-        figure = _figure(request.out / "quantisation.png", settings, costs)
     findings = []
     for dead in settings.dead_ns:
         for interpolation in INTERPOLATIONS:
@@ -140,16 +136,16 @@ def run(request: Request) -> Facts:
         "findings": findings,
         "costs": costs,
         "rows": [_csv_row(cost) for cost in costs],
-        "figures": [figure],
+        "figures": {"": _figure(settings, costs)},
     }
 
 
-def _figure(path: Path, settings: Settings, costs: Sequence[Cost]) -> Path:
+def _figure(settings: Settings, costs: Sequence[Cost]) -> Figure:
     figure, axes = panels(2.5, 1, len(ERRORS), sharex=True)
     for ax, key in zip(axes[0], ERRORS, strict=True):
         _panel(ax, settings, costs, key)
     legend_below(figure, axes[0, :1], 4)
-    return save_figure(path, figure)
+    return figure
 
 
 def _panel(ax: Axes, settings: Settings, costs: Sequence[Cost], key: str) -> None:

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, simulate
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from mars_lidar.statistics import mean_histogram
 from studies import Facts, Request
 from studies.common.draw import legend_below, panels
-from studies.common.report import save_figure
 from studies.common.sample import settings_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 GLASS, WALL = (0.15, 40.0), (3.0, 73.0)  # photons per period without fog, delay in ns
 FOG = {"extinction_per_m": 0.08, "backscatter": 1.2, "nearest_m": 0.6}
@@ -71,13 +67,12 @@ def run(request: Request) -> Facts:
         request.tell(f"transients: {name}")
         shown.append(seen_by(name, exposures))
     rows = [row(each) for each in shown]
-    figures = [_draw(request.out / "transients.png", shown)]
     light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND, "dead_time_ns": DEAD_NS}
     settings = settings_of(view(DETECTORS["non-paralyzable"]), light, exposures, SEED)
     return {
         "settings": settings,
         "rows": rows,
-        "figures": figures,
+        "figures": {"": _draw(shown)},
     }
 
 
@@ -97,21 +92,20 @@ def row(each: Seen) -> dict[str, Any]:
     return line
 
 
-def _draw(path: Path, shown: list[Seen]) -> Path:
-    with style():
-        figure, axes = panels(2.8, 1, 2)
-        system = view(DETECTORS["non-paralyzable"])
-        flux = incident(system)
-        assert flux.waveform is not None
-        arrivals = flux.waveform[0, 0] + BACKGROUND / system.bins
-        for ax, low, high in ((axes[0, 0], 0.0, 100.0), (axes[0, 1], 66.0, 82.0)):
-            _panel(ax, system, arrivals, shown)
-            ax.set(xlabel="time in the period, ns", xlim=(low, high), yscale="log")
-        axes[0, 0].set_ylabel("per period and ns")
-        axes[0, 0].set_title("fog, glass and wall")
-        axes[0, 1].set_title("the wall")
-        legend_below(figure, axes[0, :1], 4)
-        return save_figure(path, figure)
+def _draw(shown: list[Seen]) -> Figure:
+    figure, axes = panels(2.8, 1, 2)
+    system = view(DETECTORS["non-paralyzable"])
+    flux = incident(system)
+    assert flux.waveform is not None
+    arrivals = flux.waveform[0, 0] + BACKGROUND / system.bins
+    for ax, low, high in ((axes[0, 0], 0.0, 100.0), (axes[0, 1], 66.0, 82.0)):
+        _panel(ax, system, arrivals, shown)
+        ax.set(xlabel="time in the period, ns", xlim=(low, high), yscale="log")
+    axes[0, 0].set_ylabel("per period and ns")
+    axes[0, 0].set_title("fog, glass and wall")
+    axes[0, 1].set_title("the wall")
+    legend_below(figure, axes[0, :1], 4)
+    return figure
 
 
 def _panel(ax: Axes, system: System, arrivals: FloatArray, shown: list[Seen]) -> None:

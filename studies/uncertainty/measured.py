@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,6 @@ from scipy import stats
 
 from mars_lidar import Calibration, Detector, Flux, GaussianPulse, System, Timestamps, calibrate, simulate
 from mars_lidar._base.types import FloatArray
-from studies import Tell
-from studies.common.report import save_whole
 from studies.uncertainty.data import GOLD, Config
 from studies.uncertainty.network import IntervalNetwork, told, trained
 
@@ -22,20 +19,10 @@ UNIT_NS = 0.064  # of the times in the stream
 CYCLES, BINS, LEVELS = 100, 32, 64  # of an exposure; of light in the training, log-spaced
 DARKEST, BRIGHTEST = 0.4, 2.5  # over the light of the whole stream
 SIMULATORS = ("exact", "mars", "renewal", "poisson")
-FILE = "measured.json"
 
 
-def measured(path: Path, folder: Path, config: Config, tell: Tell) -> dict[str, Any]:
+def measured(path: Path, config: Config) -> dict[str, Any]:
     """By simulator: what a network trained on its data says of exposures of the stream, and of simulated ones."""
-    made = folder / FILE
-    if not made.exists():
-        tell(f"uncertainty: {path.name}")
-        save_whole(made, json.dumps(_measured(path, config)) + "\n")
-    found: dict[str, Any] = json.loads(made.read_text())
-    return found
-
-
-def _measured(path: Path, config: Config) -> dict[str, Any]:
     times = Timestamps.load(path, unit_ns=UNIT_NS)
     dead_ns = _electronics_ns(path)
     whole = calibrate(times, pulse="free", dead_time_ns=dead_ns)

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from studies import Facts, Request
-from studies.common.report import Row, save_figure
+from studies import Facts
+from studies.common.kept import spread
+from studies.common.report import Row
 from studies.uncertainty import data, measured
-from studies.uncertainty.data import CONFIGS, Config, system_of
+from studies.uncertainty.data import CONFIGS, Config, instrument
 from studies.uncertainty.figures import exposures, maps, reliability
 from studies.uncertainty.prediction import at
 from studies.uncertainty.run import LEVELS, Run, by_simulator
@@ -22,39 +23,32 @@ LEFT, OFF = 0.01, 0.02  # by which exact-trained 90 % intervals, and the closed 
 
 
 def facts(
-    request: Request,
     config: Config,
     found: Mapping[Run, Any],
     predicted: Mapping[float, Any],
     stream: Mapping[str, Any] | None,
 ) -> Facts:
-    """uncertainty.md, uncertainty.csv and the figures."""
+    """What the report states of the results by run, and the figures."""
     dead = sorted(config.dead)
     pictures = {"reliability": reliability(found, predicted, dead), "coverage": maps(found, predicted, dead, config)}
     if stream is not None:
         pictures["stream"] = exposures(stream)
-    figures = [save_figure(request.out / f"uncertainty_{name}.png", one) for name, one in pictures.items()]
     return {
         "c": config,
         "data": data,
+        "system": instrument(0.0),
         "dead": dead,
         "table_rows": [row for d in dead for row in _rows(found, predicted, d)],
         "differences": [_difference(found, predicted, config, d) for d in dead],
         "cells": [_cells(found, predicted, d) for d in dead],
-        "windows": [(s, b, d, at(s, b, system_of(d)).window) for s, b, d in WINDOWS],
+        "windows": [(s, b, d, at(s, b, instrument(d)).window) for s, b, d in WINDOWS],
         "extremes": _extremes(predicted),
         "stream": stream,
         "measured": measured,
         "minutes": sum(result["seconds"] for result in found.values()) / 60.0,
-        "figures": figures,
+        "figures": pictures,
         "rows": _csv(found),
     }
-
-
-def spread(values: list[float], digits: int) -> str:
-    """Mean, and the standard deviation between seeds where there are several."""
-    mean = f"{np.mean(values):.{digits}f}"
-    return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
 
 
 def _of(results: list[Any], test: str, measure: str, output: str = "log S") -> list[float]:

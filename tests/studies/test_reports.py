@@ -12,6 +12,7 @@ from pathlib import Path
 import jinja2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import studies
 from studies import STUDIES, Request
@@ -102,15 +103,15 @@ def test_a_template_is_filled_strictly(tmp_path: Path):
 def test_a_report_has_the_template_and_the_constants_of_its_module(tmp_path: Path, stem: str, template: str):
     module = types.ModuleType("made_up")
     module.__file__, module.LIMIT = str(tmp_path / f"{stem}.py"), 3  # type: ignore[attr-defined]
-    (tmp_path / f"{template}.md.jinja").write_text("{{ word }} {{ study.LIMIT }}{{ flag }}")
+    (tmp_path / f"{template}.md.jinja").write_text("{{ word }} {{ study.LIMIT }}{{ flag }} {{ figures[1].name }}")
     request = Request(tmp_path, quick=True)
-    facts = {"word": "at", "rows": [{"a": 1, "b": 0.1234567}], "figures": [tmp_path / "x.png"]}
+    facts = {"word": "at", "rows": [{"a": 1, "b": 0.1234567}], "figures": {"": Figure(), "map": Figure()}}
     written = report.write(request, "x", module, facts | {"tables": {"wrong": [{"c": "?"}]}})
-    assert [path.name for path in written] == ["x.md", "x.png", "x.csv", "x_wrong.csv"]
-    assert written[0].read_text() == "at 3 --quick\n"
-    assert written[2].read_text() == "a,b\n1,0.123457\n"
+    assert [path.name for path in written] == ["x.md", "x.png", "x_map.png", "x.csv", "x_wrong.csv"]
+    assert written[0].read_text() == "at 3 --quick x_map.png\n"
+    assert written[3].read_text() == "a,b\n1,0.123457\n"
     written = report.write(request, "x", module, facts | {"tables": {"wrong": []}})
-    assert len(written) == 3
+    assert len(written) == 4
     assert not (tmp_path / "x_wrong.csv").exists(), "what an earlier run left would be taken for this one's"
 
 

@@ -132,8 +132,9 @@ def versions() -> str:
 
 
 def picked(source: object, names: str) -> dict[str, Any]:
-    """Attributes of `source` by name, `names` separated by blanks: columns that are called as what they hold."""
-    return {name: getattr(source, name) for name in names.split()}
+    """Columns of attributes of `source`: `names` separated by blanks, ``column=attribute`` where they differ."""
+    pairs = (name.split("=") for name in names.split())
+    return {pair[0]: getattr(source, pair[-1]) for pair in pairs}
 
 
 def save_csv(path: Path, rows: Sequence[Row]) -> Path:

@@ -241,7 +241,7 @@ def _drawn_out(cells: Sequence[Cell]) -> list[Cell]:
 
 
 def run(request: Request) -> Facts:
-    """Compute, draw and write the study; returns the paths written."""
+    """Both maps, and a second look where the exact law looked worst."""
     from studies.count_law import law_figures
 
     settings = QUICK if request.quick else FULL
@@ -281,14 +281,9 @@ def run(request: Request) -> Facts:
 def _csv_row(name: str, cell: Cell) -> Row:
     return {
         "map": name,
-        **picked(cell, "signal background"),
-        "dead_time_periods": cell.dead,
-        "cycles": cell.cycles,
+        **picked(cell, "signal background dead_time_periods=dead cycles"),
         **{f"cumulant_{k + 1}": float(cell.cumulants[k]) for k in range(4)},
-        **picked(cell, "floor limit"),
-        "g_test_p": cell.p_value,
-        "z_mean": cell.mean_score,
-        "z_variance": cell.variance_score,
+        **picked(cell, "floor limit g_test_p=p_value z_mean=mean_score z_variance=variance_score"),
         **{f"tv_simulation_{law}": cell.to_simulation[law] for law in LAWS},
         **{f"tv_exact_{law}": cell.to_exact[law] for law in LAWS if law != "exact"},
     }

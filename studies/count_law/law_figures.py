@@ -39,7 +39,7 @@ def _at(cells: Sequence[Cell], dead: float) -> list[Cell]:
 def rows(settings: Settings, cells: Sequence[Cell], kind: str) -> Figure:
     """Total variation to simulation: rows for the sampling floor and each law, columns for dead times."""
     lines: list[tuple[str, Value]] = [("sampling floor", lambda cell: cell.floor)]
-    lines += [(words, _to_simulation(name)) for name, words in LAWS.items()]
+    lines += [(words, lambda cell, name=name: cell.to_simulation[name]) for name, words in LAWS.items()]  # type: ignore[misc]
     figure, axes = panels(8.4, len(lines), len(settings.dead), sharex=True, sharey=True)
     norm = LogNorm(_LOW, _HIGH)
     for row, (words, value) in zip(axes, lines, strict=True):
@@ -48,10 +48,6 @@ def rows(settings: Settings, cells: Sequence[Cell], kind: str) -> Figure:
         row[0].set_ylabel(f"{words}\n{'B' if kind == 'flux' else 'cycles'}")
     _frame(figure, axes, settings, mesh, "total variation to simulation")
     return figure
-
-
-def _to_simulation(name: str) -> Value:
-    return lambda cell: cell.to_simulation[name]
 
 
 def _frame(figure: Any, axes: Any, settings: Settings, mesh: Any, label: str) -> None:

@@ -74,7 +74,7 @@ def _row(name: str, words: str, cells: Sequence[Cell]) -> dict[str, Any]:
 
 
 def run(request: Request) -> Facts:
-    """Compute, draw and write the study; returns the paths written."""
+    """All cells, the sweep of shapes, and the figures."""
     from studies.count_law import figures
 
     settings = QUICK if request.quick else FULL
@@ -103,10 +103,8 @@ def run(request: Request) -> Facts:
 
 def _csv_row(cell: Cell) -> Row:
     row: dict[str, object] = {
-        **picked(cell, "grid period_ns signal background"),
-        "dead_time_ns": cell.dead_ns,
-        "simulated_mean": cell.mean,
-        "simulated_variance": cell.variance,
+        **picked(cell, "grid period_ns signal background dead_time_ns=dead_ns"),
+        **picked(cell, "simulated_mean=mean simulated_variance=variance"),
         "exact_mean": float(cell.exact[0]),
         "exact_variance": float(cell.exact[1]),
     }

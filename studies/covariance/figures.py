@@ -12,13 +12,13 @@ from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import heat, legend_below, panels
 from studies.covariance.run import (
     CUTOFFS,
+    SPECTRAL_NAME,
     TOLERANCES,
     Cell,
     Settings,
     automatic_name,
     cutoff_name,
     one_cell,
-    spectral_name,
 )
 
 _DECAY = ((1.0, 1.0), (10.0, 0.1))  # S, B
@@ -92,7 +92,7 @@ def eigenvalues(settings: Settings, cells: Sequence[Cell]) -> Figure:
 def truncation(settings: Settings, cells: Sequence[Cell]) -> Figure:
     """Mean absolute error of the sum against the fixed cut-off, with the other rules as levels."""
     figure, axes = panels(2.7, 1, len(settings.grids), sharey=True)
-    levels = [(spectral_name(), COLOURS[1], "-")]
+    levels = [(SPECTRAL_NAME, COLOURS[1], "-")]
     levels += [(automatic_name(t), c, "--") for t, c in zip(TOLERANCES, (COLOURS[2], COLOURS[3]), strict=True)]
     for ax, grid in zip(axes[0], settings.grids, strict=True):
         here = [cell for cell in cells if cell.grid is grid]
@@ -113,7 +113,7 @@ def truncation(settings: Settings, cells: Sequence[Cell]) -> Figure:
 
 def error_map(settings: Settings, cells: Sequence[Cell]) -> Figure:
     """Relative error of sigma^2 over (S, B) for three rules, at each dead time of the last grid."""
-    rules = ("cut-off 0", "cut-off 20", spectral_name())
+    rules = ("cut-off 0", "cut-off 20", SPECTRAL_NAME)
     grid = settings.grids[-1]
     dead = grid.dead_ns
     figure, axes = panels(3.3, len(rules), len(dead), sharex=True, sharey=True)

@@ -40,7 +40,7 @@ SHOWN = (
 
 
 def run(request: Request) -> Facts:
-    """Write effects.md, effects.csv, effects_rate.csv and a figure for each group of effects."""
+    """Every effect, and the rate under constant light; a figure for each group of effects."""
     from studies.detectors.figures import draw_all
 
     exposures = 400 if request.quick else 10_000

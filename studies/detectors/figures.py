@@ -21,27 +21,28 @@ def draw_all(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
 
 def _group(shown: Sequence[Outcome]) -> Figure:
     figure, axes = panels(2.5, 1, 3)
-    colours = [MUTED, *COLOURS]
-    _incident(axes[0, 0], shown[0])
-    for each, colour in zip(shown, colours, strict=False):
-        _histogram(axes[0, 0], each, colour)
-        _counts(axes[0, 1], each, colour)
-        _intervals(axes[0, 2], each, colour)
-    axes[0, 0].set(xlabel="time in the period, ns", ylabel="registrations per period and ns", yscale="log")
-    axes[0, 0].set_title("mean histogram")
-    axes[0, 1].set(xlabel="registrations N in an exposure", ylabel="P(N)")
-    axes[0, 1].set_title("count law")
-    axes[0, 2].set(xlabel="periods between registrations", ylabel="intervals per exposure", yscale="log")
-    axes[0, 2].set_title("inter-registration times")
-    axes[0, 2].set_xlim(0, REACH)
+    left, middle, right = axes[0]
+    system = shown[0].system
+    energy = SIGNAL * system.pulse.bin_energy(DELAY_NS, system.period_ns, system.bins) + BACKGROUND / system.bins
+    left.plot(system.time_ns, energy / system.bin_ns, color=INK, lw=0.6, ls=":", label="arrivals")
+    for each, colour in zip(shown, [MUTED, *COLOURS], strict=False):
+        _histogram(left, each, colour)
+        number = np.bincount(each.counts) / each.counts.size
+        n = np.flatnonzero(number)
+        middle.plot(n, number[n], ".", ms=2.0, color=colour)
+        if each.law is not None:
+            middle.plot(n, np.pad(each.law, (0, max(0, number.size - each.law.size)))[n], color=colour, lw=0.9)
+        edges = np.linspace(0.0, REACH, each.intervals.size + 1)
+        right.stairs(np.where(each.intervals > 0, each.intervals, np.nan), edges, color=colour, lw=0.8)
+    left.set(xlabel="time in the period, ns", ylabel="registrations per period and ns", yscale="log")
+    left.set_title("mean histogram")
+    middle.set(xlabel="registrations N in an exposure", ylabel="P(N)")
+    middle.set_title("count law")
+    right.set(xlabel="periods between registrations", ylabel="intervals per exposure", yscale="log")
+    right.set_title("inter-registration times")
+    right.set_xlim(0, REACH)
     legend_below(figure, axes.flat, 4)
     return figure
-
-
-def _incident(ax: Axes, each: Outcome) -> None:
-    system = each.system
-    energy = SIGNAL * system.pulse.bin_energy(DELAY_NS, system.period_ns, system.bins) + BACKGROUND / system.bins
-    ax.plot(system.time_ns, energy / system.bin_ns, color=INK, lw=0.6, ls=":", label="arrivals")
 
 
 def _histogram(ax: Axes, each: Outcome, colour: str) -> None:
@@ -56,16 +57,3 @@ def _histogram(ax: Axes, each: Outcome, colour: str) -> None:
     inside = each.expected > 1e-9
     gaps = np.where(inside, each.expected * scale, np.nan)
     ax.plot(system.time_ns, gaps, color=colour, lw=0.9, label=label)
-
-
-def _counts(ax: Axes, each: Outcome, colour: str) -> None:
-    number = np.bincount(each.counts) / each.counts.size
-    n = np.flatnonzero(number)
-    ax.plot(n, number[n], ".", ms=2.0, color=colour)
-    if each.law is not None:
-        ax.plot(n, np.pad(each.law, (0, max(0, number.size - each.law.size)))[n], color=colour, lw=0.9)
-
-
-def _intervals(ax: Axes, each: Outcome, colour: str) -> None:
-    edges = np.linspace(0.0, REACH, each.intervals.size + 1)
-    ax.stairs(np.where(each.intervals > 0, each.intervals, np.nan), edges, color=colour, lw=0.8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,10 +28,10 @@ _LISTED = 40  # failures that the report names; all are in domain_failures.csv
 
 
 def run(request: Request) -> Facts:
-    """Sweep, and write ``domain.md``, ``domain.csv``, ``domain_failures.csv`` and the maps."""
+    """The sweep, the reference cases if there are any, and the maps."""
     settings = QUICK if request.quick else FULL
     if request.seed is not None:
-        settings = Settings(settings.systems, request.seed, settings.budget, settings.checks)
+        settings = replace(settings, seed=request.seed)
     began = time.monotonic()
     judged: list[Judged] = []
     for case in sweep.sweep(settings, request.tell, min(thread_count(None), settings.systems)):

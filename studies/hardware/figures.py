@@ -11,7 +11,7 @@ from mars_lidar.plot.stream import draw_counts, draw_histogram, draw_recovery
 from mars_lidar.plot.style import COLOURS, MUTED
 from studies.common.draw import panels
 from studies.hardware.cases import Case
-from studies.hardware.mismatches import Mismatch
+from studies.hardware.mismatches import TWO_NAME, Mismatch
 
 
 def pixels(cases: Sequence[Case]) -> Figure:
@@ -71,7 +71,8 @@ def recoveries(faults: Sequence[tuple[Mismatch, Case]]) -> Figure:
         if drawn is not None:
             ax.stairs(drawn.ratio, drawn.edges_ns, baseline=None, color=COLOURS[2], lw=0.8, zorder=4)
         mark = "fits" if case.found.consistent else "does not fit"
-        ax.set_title(f"{_short(case.name)}\n({mark})", loc="left", fontsize=5.5)
+        name = case.name.replace(", sequential engine", "").replace(TWO_NAME, "t_e 85, t_d 50")
+        ax.set_title(f"{name}\n({mark})", loc="left", fontsize=5.5)
         ax.set(xlabel="", ylabel="", ylim=(0.0, 1.5))
         ax.tick_params(labelsize=5)
     for ax in list(axes.flat)[len(faults) :]:
@@ -82,8 +83,3 @@ def recoveries(faults: Sequence[tuple[Mismatch, Case]]) -> Figure:
     for ax in axes[:, 0]:
         ax.set_ylabel("rate / light", fontsize=5.5)
     return figure
-
-
-def _short(name: str) -> str:
-    name = name.replace(", sequential engine", "")
-    return name.replace("electronics dead 85 ns, detector 50 ns", "t_e 85, t_d 50")

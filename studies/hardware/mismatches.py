@@ -44,7 +44,7 @@ def _afterpulses(probability: float) -> Detector:
 _PLAIN = Detector(dead_time_ns=DEAD_NS)
 _JITTER = replace(_PLAIN, jitter=Jitter(sigma_ns=0.2))
 _AFTERPULSES = _afterpulses(0.02)
-_TWO_NAME = "electronics dead 85 ns, detector 50 ns"
+TWO_NAME = "electronics dead 85 ns, detector 50 ns"
 _TWO = Detector(dead_time_ns=50.0, electronics_dead_time_ns=DEAD_NS)
 _PARALYZABLE = replace(_PLAIN, mode="paralyzable")
 
@@ -86,10 +86,10 @@ MISMATCHES = (
     Mismatch("afterpulses 2 %", detector=_AFTERPULSES),
     Mismatch("afterpulses 2 %, hold-off 400 ns", detector=_AFTERPULSES, hold_off_ns=400.0),
     Mismatch("afterpulses 2 %, told", detector=_AFTERPULSES, told=True, fits=True),
-    Mismatch(f"{_TWO_NAME}, B = 1", detector=_TWO, background=1.0),
-    Mismatch(f"{_TWO_NAME}, B = 1, hold-off 135 ns", detector=_TWO, hold_off_ns=DEAD_NS + 50.0, background=1.0),
-    Mismatch(f"{_TWO_NAME}, B = 1, told", detector=_TWO, told=True, fits=True, background=1.0),
-    Mismatch(f"{_TWO_NAME}, B = 0.1", detector=_TWO),
+    Mismatch(f"{TWO_NAME}, B = 1", detector=_TWO, background=1.0),
+    Mismatch(f"{TWO_NAME}, B = 1, hold-off 135 ns", detector=_TWO, hold_off_ns=DEAD_NS + 50.0, background=1.0),
+    Mismatch(f"{TWO_NAME}, B = 1, told", detector=_TWO, told=True, fits=True, background=1.0),
+    Mismatch(f"{TWO_NAME}, B = 0.1", detector=_TWO),
     Mismatch("a second return 4 ns behind, not fitted", second_return=True),
     Mismatch("signal drifts by 10 %", drift=0.1),
 )
@@ -137,8 +137,8 @@ WAYS: dict[str, Callable[[Timestamps, Timestamps], Calibration]] = {
 WEAK = (
     Mismatch("none (control)", fits=True),
     *(Mismatch(f"afterpulses {100 * p:g} %", detector=_afterpulses(p)) for p in (0.003, 0.006, 0.01)),
-    Mismatch(_TWO_NAME, detector=_TWO, background=0.03),
-    Mismatch(_TWO_NAME, detector=_TWO),
+    Mismatch(TWO_NAME, detector=_TWO, background=0.03),
+    Mismatch(TWO_NAME, detector=_TWO),
     Mismatch("paralyzable detector", detector=_PARALYZABLE, background=0.03),
 )
 

@@ -17,7 +17,7 @@ PAPER = {"bright": 0.0651, "dark": 0.0601}  # T6 of arXiv 2512.04924: total vari
 
 
 def run(request: Request) -> Facts:
-    """Compute, draw and write the study; returns the paths written."""
+    """All streams: matched, swept, mismatched, replicated, and measured if there is one."""
     settings = QUICK if request.quick else FULL
     began = time.process_time()
     pixels = cases.matched(settings, request.tell)
@@ -33,19 +33,19 @@ def run(request: Request) -> Facts:
         "recovery": figures.recoveries(faults),
     }
     if measured is not None:
-        name, found = measured.cases[0]
+        name, found = measured["cases"][0]
         drawn["measured"] = validation_figure(found, name)
     scores = [float(value) for case in swept for value in case.scores if not np.isnan(value)]
-    ways = [] if measured is None else measured.cases
+    ways = [] if measured is None else measured["cases"]
     free = [case for name, case in ways if name.startswith("free shape, t_e")]
     return {
         "s": settings,
         "bright": PIXELS["bright"][0],
         "pixels": pixels,
         "many": many,
-        "bias": max(float(np.abs(one.bias).max()) for one in many),
-        "scatters": [float(value) for one in many for value in one.scatter],
-        "stateds": [float(value) for one in many for value in one.stated],
+        "bias": max(float(np.abs(one["bias"]).max()) for one in many),
+        "scatters": [float(value) for one in many for value in one["scatter"]],
+        "stateds": [float(value) for one in many for value in one["stated"]],
         "swept": swept,
         "fits": sum(case.found.consistent for case in swept),
         "scores": scores,
@@ -77,9 +77,9 @@ def _csv_row(case: Case) -> Row:
         "true_signal": signal,
         "true_background": background,
         "true_delay_ns": delay,
-        "registrations": light.summary.registrations,
-        "realizations": found.realizations,
-        "cycles": found.system.cycles,
+        **picked(light.summary, "registrations"),
+        **picked(found, "realizations"),
+        **picked(found.system, "cycles"),
         **picked(light, "signal background delay_ns dead_time_ns hold_off_ns"),
         "signal_error": light.errors.get("signal", float("nan")),
         "background_error": light.errors["background"],

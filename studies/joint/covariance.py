@@ -17,6 +17,7 @@ from mars_lidar._base.types import FloatArray
 from studies import Facts, Request, Tell
 from studies.common import sample
 from studies.common.report import Row, picked
+from studies.joint.table import random_light
 
 PERIOD_NS = 100.0
 OFTEN = 500  # exposures that must differ from the rest before a z-score is as good as Gaussian
@@ -51,7 +52,6 @@ class Outcome:
     name: str
     settings: dict[str, float | str]
     law: JointLaw
-    window: FloatArray
     single: dict[str, float]
     bins: FloatArray
     bin_index: NDArray[np.intp]
@@ -93,16 +93,12 @@ def random_systems(settings: Settings, tell: Tell) -> list[Outcome]:
     random = np.random.default_rng(settings.seed)
     found = []
     for k in range(settings.systems):
-        signal, background = 10 ** random.uniform(-2, 1), 10 ** random.uniform(-3, 1)
-        dead = 10 ** random.uniform(np.log10(0.02), np.log10(4.0))
-        if k % 3 == 0:
-            dead = int(random.integers(1, 5)) - random.choice([0.0, 1.0, 1.0, -1.0]) * 10 ** random.uniform(-3, -1)
-            dead = min(dead, 4.0)
+        signal, background, dead = random_light(random, k)
         sigma, delay = 10 ** random.uniform(-2.7, -1.5), random.uniform(0, 1)
         cycles = int(np.exp(random.uniform(*np.log(settings.cycles))))
         start = "stationary" if k % 2 else "armed"
         system = system_of(sigma, dead, cycles, settings.bins, start)
-        found.append(_compare(k, float(signal), float(background), float(delay), system, settings))
+        found.append(_compare(k, signal, background, float(delay), system, settings))
         if k % 20 == 19:
             tell(f"joint-covariance: {k + 1} of {settings.systems} systems")
     return found
@@ -157,7 +153,6 @@ def _compare(
             "start": system.start,
         },
         law=law,
-        window=window,
         single=single,
         bins=variance_scores(x[:, often], law.variance[often]),
         bin_index=np.flatnonzero(often),
@@ -176,7 +171,7 @@ def variance_scores(x: FloatArray, variance: FloatArray) -> FloatArray:
 
 
 def run(request: Request) -> Facts:
-    """Compare, draw and write; returns the paths written."""
+    """Random systems and the reference cases, compared with the closed form."""
     from studies.joint.covariance_figures import figure
     from studies.joint.reference import reference_case
 

@@ -38,10 +38,14 @@ def auc_score(outcome: Outcome, test: str, settings: Settings) -> float:
 
 
 def run(request: Request) -> Facts:
-    """Compute, draw and write; returns the paths written. Raises MissingLibraryError without scikit-learn."""
+    """All engines in all cases; raises MissingLibraryError without scikit-learn."""
     from studies.joint.figures import figure
 
     settings = QUICK if request.quick else FULL
+
+    def seen(o: Outcome, test: str) -> bool:
+        return abs(auc_score(o, test, settings)) > _SEEN
+
     found = outcomes.compute(settings, request.tell)
     named, drawn = ([o for o in found if o.random is kind] for kind in (False, True))
     return {
@@ -53,7 +57,11 @@ def run(request: Request) -> Facts:
         "asked": sum(o.engine == "feedback" for o in found),
         "band": [2 * chance(n) for n in (settings.exposures, settings.random_exposures)],
         "aucs": {
-            test: crossed((o.case.name, o.engine, _auc_cell(o, test, settings)) for o in named if o.engine != "exact")
+            test: crossed(
+                (o.case.name, o.engine, marked(o.aucs[test], seen(o, test)) if o.aucs else "exact")
+                for o in named
+                if o.engine != "exact"
+            )
             for test in TESTS
         },
         "ratios": [crossed((o.case.name, o.engine, _ratio_cell(o, key)) for o in named) for key in RATIOS],
@@ -95,10 +103,6 @@ def _finding(engine: str, named: Sequence[Outcome], settings: Settings) -> dict[
         "auc": o.aucs[test][0],
         "p": _p(min(1.0, 2 * z.size * float(stats.norm.sf(z.max())))),
     }
-
-
-def _auc_cell(o: Outcome, test: str, settings: Settings) -> str:
-    return "exact" if o.handed else marked(o.aucs[test], abs(auc_score(o, test, settings)) > _SEEN)
 
 
 def _ratio_cell(o: Outcome, key: str) -> str:

@@ -81,6 +81,16 @@ SEVEN = tuple(
 SEVEN_RATIOS = (1.10, 1.17, 1.02, 0.74, 1.14, 0.70, 0.42)
 
 
+def random_light(random: np.random.Generator, k: int) -> tuple[float, float, float]:
+    """S, B and dead time of random pixel `k`, log-uniform; every third dead time is near a whole number of periods."""
+    signal, background = 10 ** random.uniform(-2, 1), 10 ** random.uniform(-3, 1)
+    dead = 10 ** random.uniform(np.log10(0.02), np.log10(4.0))
+    if k % 3 == 0:
+        whole, side = int(random.integers(1, 5)), random.choice([0.0, 1.0, 1.0, -1.0])
+        dead = min(whole - side * 10 ** random.uniform(-3, -1), 4.0)
+    return float(signal), float(background), float(dead)
+
+
 @dataclass(frozen=True)
 class Settings:
     """Configuration of the study."""
@@ -211,7 +221,7 @@ def _difference(found: FloatArray, truth: FloatArray) -> tuple[float, float]:
 
 
 def run(request: Request) -> Facts:
-    """Compute and write the study; returns the paths written."""
+    """All engines in all cases."""
     settings = QUICK if request.quick else FULL
     scores = compute(settings, request.tell)
     engines = list(dict.fromkeys(s.engine for s in scores))

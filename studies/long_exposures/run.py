@@ -45,7 +45,7 @@ class _Sampled(FeedbackEngine):
 
 
 def run(request: Request) -> Facts:
-    """Draw, compare and write the study; returns the paths written."""
+    """Random systems, compared one by one."""
     settings = QUICK if request.quick else FULL
     random = np.random.default_rng(settings.seed)
     rows = []
@@ -57,7 +57,7 @@ def run(request: Request) -> Facts:
         "s": settings,
         "error": 1.0 / np.sqrt(settings.items),
         "drawn": drawn,
-        "rows": [{key: "" if value is None else value for key, value in row.items()} for row in rows],
+        "rows": rows,
     }
 
 
@@ -86,9 +86,9 @@ def compare(signal: float, background: float, system: ml.System, delay_ns: float
         "cells": int(internal_cells(flux, system)[0, 0]),
         "cut": f"{merge[0, 0]} x {parts[0, 0]}",
     }
-    keys = ("largest", "rms", "count", "window", "var count", "var window", "var bins")
     if report["refused"]:
-        return row | {"cells": 0} | dict.fromkeys(keys)
+        keys = ("largest", "rms", "count", "window", "var count", "var window", "var bins")
+        return row | {"cells": 0} | dict.fromkeys(keys, "")
     law = ml.joint_law(signal, background, system, delay_ns=delay_ns, tolerance=1e-4)
     apart = ((np.arange(system.bins) + 0.5) / system.bins - delay_ns / PERIOD_NS + 0.5) % 1.0 - 0.5
     near = np.abs(apart) < max(3.0 * sigma / PERIOD_NS, 0.51 / system.bins)
@@ -98,13 +98,12 @@ def compare(signal: float, background: float, system: ml.System, delay_ns: float
     off = (x.mean(0) - law.mean) / np.sqrt(law.variance)
     count, window = (y.mean(0) - mean) / np.sqrt(np.maximum(variance, 1e-300))
     spread = y.var(0) / np.maximum(variance, 1e-300)
-    found = (
-        float(np.abs(off).max()),
-        float(np.sqrt(max(0.0, np.mean(off**2) - 1.0 / items))),
-        float(count),
-        float(window),
-        float(spread[0]),
-        float(spread[1]),
-        float(np.mean(x.var(0) / law.variance)),
-    )
-    return row | dict(zip(keys, found, strict=True))
+    return row | {
+        "largest": float(np.abs(off).max()),
+        "rms": float(np.sqrt(max(0.0, np.mean(off**2) - 1.0 / items))),
+        "count": float(count),
+        "window": float(window),
+        "var count": float(spread[0]),
+        "var window": float(spread[1]),
+        "var bins": float(np.mean(x.var(0) / law.variance)),
+    }

@@ -44,7 +44,7 @@ QUICK = Settings(24, (1.0,))
 
 
 def run(request: Request) -> Facts:
-    """Write neighbourhood.md, neighbourhood.csv and a figure."""
+    """Every scene at every brightness, by every method."""
     settings = QUICK if request.quick else FULL
     rows, maps = [], {}
     for name, delay in scenes(settings.size).items():

@@ -95,7 +95,7 @@ QUICK = Settings(100, 200, (4000,), every=6)
 
 
 def run(request: Request) -> Facts:
-    """Write returns.md, returns.csv and a figure."""
+    """False alarms, pairs of returns, and curves of resolution."""
     settings = QUICK if request.quick else FULL
     request.tell("returns: false alarms")
     alarms = list(false_alarms(settings))

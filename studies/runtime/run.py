@@ -52,7 +52,7 @@ def crossover(points: Sequence[Point], axis: str, fast: str, other: str) -> tupl
 
 
 def run(request: Request) -> Facts:
-    """Time, draw and write the study; returns the paths written."""
+    """Stages of a cube, four axes, and a single pixel, timed."""
     settings = QUICK if request.quick else FULL
     before = load()
     cubes, held = cube_stages(settings, request.tell)

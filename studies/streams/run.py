@@ -22,7 +22,7 @@ FAR = 5.0  # stated errors beyond which an estimate is named
 
 
 def run(request: Request) -> Facts:
-    """Compute and write the study; returns the paths written."""
+    """All streams, inspected and calibrated."""
     settings = QUICK if request.quick else FULL
     began = time.process_time()
     found = outcomes(settings, request.tell)

@@ -31,7 +31,7 @@ _CASES = (
 
 
 def run(request: Request) -> Facts:
-    """Measure, write ``start_up.md`` and ``start_up.csv``."""
+    """All dead times and exposures."""
     points, delays = (4, 4) if request.quick else (13, 24)
     rows = []
     for case in _CASES[: 2 if request.quick else None]:
@@ -84,14 +84,10 @@ def _measure(dead_ns: float, cycles: int, points: int, delays: int) -> list[Row]
     ]
 
 
-def _dim(row: Row) -> bool:
-    return float(row["signal"]) <= 1.001 * _DIM and float(row["background"]) <= 1.001 * _DIM
-
-
 def _line(case: tuple[Any, Any], rows: list[Row]) -> Row:
     tv = [float(row["tv"]) for row in rows]
     worst = rows[int(np.argmax(tv))]
-    dim = [row for row in rows if _dim(row)]
+    dim = [row for row in rows if max(row["signal"], row["background"]) <= 1.001 * _DIM]
     return {
         "t_d, ns": case[0],
         "N_r": case[1],

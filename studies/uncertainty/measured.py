@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -24,7 +25,8 @@ SIMULATORS = ("exact", "mars", "renewal", "poisson")
 def measured(path: Path, config: Config) -> dict[str, Any]:
     """By simulator: what a network trained on its data says of exposures of the stream, and of simulated ones."""
     times = Timestamps.load(path, unit_ns=UNIT_NS)
-    dead_ns = _electronics_ns(path)
+    with h5py.File(path) as file:
+        dead_ns = float(np.asarray(file["DT_electronics"])[0, 0]) * UNIT_NS
     whole = calibrate(times, pulse="free", dead_time_ns=dead_ns)
     system = System(
         period_ns=times.period_ns,
@@ -62,13 +64,6 @@ def measured(path: Path, config: Config) -> dict[str, Any]:
         "gold": len(gold),
     }
     return {"about": about, "rows": rows}
-
-
-def _electronics_ns(path: Path) -> float:
-    import h5py
-
-    with h5py.File(path) as file:
-        return float(np.asarray(file["DT_electronics"])[0, 0]) * UNIT_NS
 
 
 def _cut(times: Timestamps) -> NDArray[np.int64]:

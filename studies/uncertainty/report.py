@@ -33,6 +33,7 @@ def facts(
     pictures = {"reliability": reliability(found, predicted, dead), "coverage": maps(found, predicted, dead, config)}
     if stream is not None:
         pictures["stream"] = exposures(stream)
+    lights = [(d, one) for d, rows in predicted.items() for one in rows]
     return {
         "c": config,
         "data": data,
@@ -42,7 +43,8 @@ def facts(
         "differences": [_difference(found, predicted, config, d) for d in dead],
         "cells": [_cells(found, predicted, d) for d in dead],
         "windows": [(s, b, d, at(s, b, instrument(d)).window) for s, b, d in WINDOWS],
-        "extremes": _extremes(predicted),
+        # where the variance of the window is furthest off in the map, either way
+        "extremes": [pick(lights, key=lambda pair: pair[1]["window"]) for pick in (min, max)],
         "stream": stream,
         "measured": measured,
         "minutes": sum(result["seconds"] for result in found.values()) / 60.0,
@@ -149,12 +151,6 @@ def _cells(found: Mapping[Run, Any], predicted: Mapping[float, Any], dead: float
 
 def _map(results: list[Any], which: str) -> Any:
     return np.mean([np.array(result["tests"]["gold"][which]).ravel() for result in results], axis=0)
-
-
-def _extremes(predicted: Mapping[float, Any]) -> list[tuple[float, Any]]:
-    """Where the variance of the window is furthest off in the map, either way."""
-    every = [(dead, one) for dead, rows in predicted.items() for one in rows]
-    return [pick(every, key=lambda pair: pair[1]["window"]) for pick in (min, max)]
 
 
 def _csv(found: Mapping[Run, Any]) -> list[Row]:

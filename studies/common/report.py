@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.optional import needed
 
 if TYPE_CHECKING:
     from studies import Request
@@ -52,10 +52,7 @@ def write(request: Request, name: str, study: ModuleType, facts: Mapping[str, An
 
 def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:
     """The Markdown of a template, which also knows the names below."""
-    try:
-        import jinja2
-    except ImportError as error:
-        raise MissingLibraryError(f"studies need Jinja2: pip install 'mars-lidar[studies]' ({error})") from error
+    jinja2 = needed("jinja2", "a study's report", "studies")
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template.parent),
         undefined=jinja2.StrictUndefined,
@@ -75,7 +72,7 @@ def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:
         "zip": zip,
         "len": len,
     }
-    text = environment.get_template(template.name).render(facts)
+    text: str = environment.get_template(template.name).render(facts)
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 
 
@@ -162,7 +159,7 @@ def machine() -> str:
     from mars_lidar._base.threads import thread_count
 
     return (
-        f"{_processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "
+        f"{processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "
         f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
     )
 
@@ -175,7 +172,8 @@ def load() -> str:
         return "not known on this system"
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Name of the processor."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith(("model name", "Model")):

@@ -46,20 +46,14 @@ def _colour(name: str) -> tuple[str, str, float]:
     return _LINES.get(name, (MUTED, "-.", 1.0))  # engines whose law is known by sampling
 
 
-def _nearest(cells: Sequence[Cell], target: tuple[float, float, float]) -> Cell:
-    def distance(cell: Cell) -> float:
-        apart = np.abs(np.log([cell.signal / target[0], cell.background / target[1]])).sum()
-        return float(apart) + abs(cell.dead_ns - target[2]) / 25.0
-
-    return min(cells, key=distance)
-
-
 def law_panels(cells: Sequence[Cell]) -> Figure:
     """Four count laws beside the simulated frequencies; the inset compares KL with its floor."""
     grid = [cell for cell in cells if cell.grid == "wide"]
     figure, axes = panels(5.0, 2, 2)
     for ax, target in zip(axes.flat, PANELS, strict=True):
-        _panel(ax, _nearest(grid, target))
+        near = (np.abs(np.log([c.signal / target[0], c.background / target[1]])).sum() for c in grid)
+        apart = [float(flux) + abs(c.dead_ns - target[2]) / 25.0 for flux, c in zip(near, grid, strict=True)]
+        _panel(ax, grid[int(np.argmin(apart))])
     for ax in axes[-1]:
         ax.set_xlabel("registrations N")
     for row in axes:

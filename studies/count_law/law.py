@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import CountLaw, Flux, System, count_law, simulate
 from mars_lidar._base.types import FloatArray
@@ -134,7 +132,10 @@ def _cells(
 ) -> list[Cell]:
     """All (S, B) of one system; `number` keys its simulation and its bootstrap."""
     system = settings.system(dead, cycles)
-    counts = _simulate(settings, signal, background, system, number)
+    # a histogram of one bin holds nothing but the count
+    flux, seed = Flux(signal[None], background[None], 0.5 * system.period_ns), (settings.seed << 16) + number
+    cube = simulate(flux, system.replace(bins=1), realizations=settings.realizations, seed=seed)
+    counts = cube.reshape(settings.realizations, signal.size)
     random = np.random.default_rng([settings.seed, number])
     batch = laws_of(signal, background, system)
     exact = batch["exact"]
@@ -199,16 +200,6 @@ def pmf_of(law: CountLaw, k: int) -> Pmf:
 def gaussian_of(exact: CountLaw, k: int) -> Pmf:
     """The Gaussian with mean and variance of one cell of the exact law."""
     return gaussian_window(float(exact.mean[k]), float(exact.variance[k]))
-
-
-def _simulate(
-    settings: Settings, signal: FloatArray, background: FloatArray, system: System, number: int
-) -> NDArray[np.integer[Any]]:
-    """Counts (realizations, cells) by the exact engine; a histogram of one bin holds nothing else."""
-    flux = Flux(signal[None], background[None], 0.5 * system.period_ns)
-    seed = (settings.seed << 16) + number
-    cube = simulate(flux, system.replace(bins=1), realizations=settings.realizations, seed=seed)
-    return cube.reshape(settings.realizations, signal.size)
 
 
 def _regimes(cells: Sequence[Cell]) -> dict[str, list[Cell]]:

@@ -89,7 +89,10 @@ def shown(cells: Sequence[Cell]) -> Figure:
     """Count laws of a few cells beside the simulated frequencies."""
     figure, axes = panels(3.9, 2, len(cells) // 2)
     for ax, cell in zip(axes.flat, cells, strict=False):
-        low, high = _window(cell)
+        # around the mean: what holds the law, at least two counts
+        reach = max(4.5 * float(cell.cumulants[1]) ** 0.5, 2.5)
+        low = max(0, int(np.floor(cell.cumulants[0] - reach)))
+        high = int(np.ceil(cell.cumulants[0] + reach))
         counts = np.arange(low, high + 1)
         ax.bar(counts, cell.sample.on(low, high), width=1.0, color="#d9d9d9", label="simulation")
         ax.plot(counts, cell.laws["exact"].on(low, high), "o-", ms=2.2, lw=0.8, color=INK, label="exact")
@@ -111,12 +114,6 @@ def shown(cells: Sequence[Cell]) -> Figure:
         row[0].set_ylabel("P(N)")
     legend_below(figure, axes[0, :1], 5)
     return figure
-
-
-def _window(cell: Cell) -> tuple[int, int]:
-    """Counts around the mean that hold the law, five standard deviations and at least two counts."""
-    reach = max(4.5 * float(cell.cumulants[1]) ** 0.5, 2.5)
-    return max(0, int(np.floor(cell.cumulants[0] - reach))), int(np.ceil(cell.cumulants[0] + reach))
 
 
 def floors(cells: Sequence[Cell]) -> Figure:

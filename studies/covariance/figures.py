@@ -116,13 +116,12 @@ def error_map(settings: Settings, cells: Sequence[Cell]) -> Figure:
     rules = ("cut-off 0", "cut-off 20", SPECTRAL_NAME)
     grid = settings.grids[-1]
     dead = grid.dead_ns
+    by = {(c.signal, c.background, c.dead_ns): c for c in cells if c.grid is grid}
     figure, axes = panels(3.3, len(rules), len(dead), sharex=True, sharey=True)
     norm = LogNorm(1e-6, 1.0)
     for row, rule in zip(axes, rules, strict=True):
         for ax, dead_ns in zip(row, dead, strict=True):
-            error = np.array(
-                [[_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.flux] for b in grid.flux]
-            )
+            error = np.array([[by[s, b, dead_ns].relative_error(rule) for s in grid.flux] for b in grid.flux])
             mesh = heat(ax, grid.flux, grid.flux, np.abs(error), norm)
     for ax, dead_ns in zip(axes[0], dead, strict=True):
         ax.set_title(f"$t_d$ = {dead_ns / grid.period_ns:g} $t_r$", fontsize=7)
@@ -132,8 +131,3 @@ def error_map(settings: Settings, cells: Sequence[Cell]) -> Figure:
     bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=40, pad=0.01)
     bar.set_label(r"|relative error of $\sigma^2$|")
     return figure
-
-
-def _at(cells: Sequence[Cell], grid: str, signal: float, background: float, dead_ns: float) -> Cell:
-    wanted = (grid, signal, background, dead_ns)
-    return next(c for c in cells if (c.grid.name, c.signal, c.background, c.dead_ns) == wanted)

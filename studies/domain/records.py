@@ -46,13 +46,9 @@ def recorded(case: Case, seed: int, budget: float) -> list[Check]:
 
 def _lattice(case: Case, t: NDArray[np.float64], owner: NDArray[np.int64]) -> list[Check]:
     """Phases of smooth light are even on the scale of 2^-17 period: first registrations, and all of them."""
-    if case.waveform is not None or {"jitter", "code_density", "max_events_per_exposure"} & set(
-        case.system.detector.effects
-    ):
-        return []
-    if case.strongest > 0.0 and getattr(case.system.pulse, "sigma_ns", 0.0) < 1e-3 * PERIOD_NS:
-        return []
-    if case.mode in ("gated", "moving gate", "synchronous"):
+    spoiled = {"jitter", "code_density", "max_events_per_exposure"} & set(case.system.detector.effects)
+    narrow = case.strongest > 0.0 and getattr(case.system.pulse, "sigma_ns", 0.0) < 1e-3 * PERIOD_NS
+    if case.waveform is not None or spoiled or narrow or case.mode in ("gated", "moving gate", "synchronous"):
         return []
     fine = (t * 2.0**_LATTICE) % 1.0
     first = np.diff(owner, prepend=-1) != 0

@@ -81,17 +81,13 @@ def failure_rows(judged: list[Judged], outside: list[Check]) -> list[dict[str, A
         if outcome.state == "failed"
     ]
     blank = dict.fromkeys(judged[0].case.facts(), "") if judged else {}
-    for check in outside:
-        if check.p < REFERENCE_LEVEL:
-            rows.append(
-                blank
-                | {
-                    "case": check.a,
-                    "subject": check.a.split(",")[0],
-                    "note": f"{check.what}: p {check.p:.1g} against the reference",
-                }
-            )
-    return rows
+    return rows + [
+        blank
+        | {"case": check.a, "subject": check.a.split(",")[0]}
+        | {"note": f"{check.what}: p {check.p:.1g} against the reference"}
+        for check in outside
+        if check.p < REFERENCE_LEVEL
+    ]
 
 
 def _states(judged: Sequence[Judged], subject: str) -> list[tuple[Judged, str]]:

@@ -52,7 +52,11 @@ def run(request: Request) -> Facts:
         "s": settings,
         "period_ns": PERIOD_NS,
         "sklearn": classifiers.require_sklearn(),
-        "findings": [_finding(engine, named, settings) for engine in ENGINES if _judged(engine, named)],
+        "findings": [
+            _finding(engine, here, settings)
+            for engine in ENGINES
+            if (here := [(o, test) for o in named if o.engine == engine and o.aucs for test in TESTS])
+        ],
         "gone": given_to_exact(found),
         "asked": sum(o.engine == "feedback" for o in found),
         "band": [2 * chance(n) for n in (settings.exposures, settings.random_exposures)],
@@ -82,12 +86,7 @@ def _p(value: float) -> str:
     return f"{value:.2g}" if value >= _LEAST_P else f"< {_LEAST_P:g}"
 
 
-def _judged(engine: str, named: Sequence[Outcome]) -> list[tuple[Outcome, str]]:
-    return [(o, test) for o in named if o.engine == engine and o.aucs for test in TESTS]
-
-
-def _finding(engine: str, named: Sequence[Outcome], settings: Settings) -> dict[str, Any]:
-    here = _judged(engine, named)
+def _finding(engine: str, here: Sequence[tuple[Outcome, str]], settings: Settings) -> dict[str, Any]:
     z = np.abs([auc_score(o, test, settings) for o, test in here])
     value = [o.aucs[test][0] for o, test in here]
     o, test = here[int(z.argmax())]

@@ -13,7 +13,7 @@ from scipy.stats import binom
 from studies import Facts, Request
 from studies.common.draw import panels
 from studies.common.report import Row, picked
-from studies.streams.cases import FULL, QUICK, Outcome, Settings, outcomes
+from studies.streams.cases import FULL, QUICK, Outcome, outcomes
 from studies.streams.coverage import Coverage, Law, coverage, tail
 
 LEVEL = 1e-4  # false-alarm probability of an inspection, as it is stated
@@ -27,11 +27,6 @@ def run(request: Request) -> Facts:
     began = time.process_time()
     found = outcomes(settings, request.tell)
     spent = time.process_time() - began + sum(one.seconds for one in found)
-    return facts(request, settings, found, spent)
-
-
-def facts(request: Request, settings: Settings, found: list[Outcome], spent: float) -> Facts:
-    """What the report of the outcomes states, with its table and figure; `spent`: processor time, s."""
     covered = coverage(found)
     alarmed = sum(bool(one.alarms) for one in found)
     tests = {name: value for one in covered for name, value in one.p.items()}

@@ -45,7 +45,10 @@ def maps(found: Mapping[Run, Any], predicted: Mapping[float, Any], dead: Sequenc
     for row, one in zip(axes, dead, strict=True):
         arms = dict(by_simulator(found, one))
         closed = [cell["coverage"][LEVELS.index(0.9)] for cell in predicted[one]]
-        shown = [(f"trained on {name}", _mean(arms[name])) for name in ("exact", "mars")]
+        shown = [
+            (f"trained on {name}", np.mean([result["tests"]["gold"]["map"] for result in arms[name]], axis=0))
+            for name in ("exact", "mars")
+        ]
         shown.append(("closed form for mars", np.reshape(closed, (config.cells, config.cells))))
         for ax, (title, image) in zip(row, shown, strict=True):
             mesh = ax.pcolormesh(*edges, image.T, norm=norm, cmap="RdBu", rasterized=True)
@@ -58,10 +61,6 @@ def maps(found: Mapping[Run, Any], predicted: Mapping[float, Any], dead: Sequenc
         ax.set_xlabel("S, photons per period")
     figure.colorbar(mesh, ax=axes, label="share of 90 % intervals that hold the true log S", shrink=0.7)
     return figure
-
-
-def _mean(results: list[Any]) -> Any:
-    return np.mean([result["tests"]["gold"]["map"] for result in results], axis=0)
 
 
 def exposures(stream: Mapping[str, Any]) -> Figure:

@@ -97,22 +97,19 @@ def _difference(
     def less(a: list[float], b: list[float]) -> list[float]:
         return [x - y for x, y in zip(a, b, strict=False)]
 
-    steps = [*(str(step) for step in config.looks if step < config.steps["mars"])]
-    growth = [(step, float(np.mean(less(_look(mars, step), _look(exact, step))))) for step in steps]
+    growth = []
+    for step in (str(step) for step in config.looks if step < config.steps["mars"]):
+        one, other = ([result["looks"][step]["log S"]["loss"] for result in arm] for arm in (mars, exact))
+        growth.append((step, float(np.mean(less(one, other)))))
     final = less(_of(mars, "gold", "loss"), _of(exact, "gold", "loss"))
+    errors = zip(_of(mars, "gold", "rmse"), _of(exact, "gold", "rmse"), strict=False)
     covered = {name: float(np.mean(_covered(arms[name], "gold", 0.9))) for name in ("mars", "exact")}
     closed = _closed(predicted, dead, 0.9)
     return {
         "dead": dead,
         "loss": spread(final, 3),
         "loss_closed": float(np.mean([one["loss"] for one in predicted[dead]])),
-        "rmse": spread(
-            [
-                100.0 * (a / b - 1.0)
-                for a, b in zip(_of(mars, "gold", "rmse"), _of(exact, "gold", "rmse"), strict=False)
-            ],
-            1,
-        ),
+        "rmse": spread([100.0 * (a / b - 1.0) for a, b in errors], 1),
         "covered": spread(less(_covered(mars, "gold", 0.9), _covered(exact, "gold", 0.9)), 3),
         "growth": [*growth, (str(config.steps["mars"]), float(np.mean(final)))],
         "exact": covered["exact"],
@@ -121,10 +118,6 @@ def _difference(
         "closed": closed,
         "closed_holds": abs(covered["mars"] - closed) <= OFF,
     }
-
-
-def _look(results: list[Any], step: str) -> list[float]:
-    return [result["looks"][step]["log S"]["loss"] for result in results]
 
 
 def _cells(found: Mapping[Run, Any], predicted: Mapping[float, Any], dead: float) -> dict[str, Any]:

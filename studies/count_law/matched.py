@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mars_lidar import GaussianPulse, System, count_law
+from mars_lidar import System, count_law
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics.distance import total_variation
@@ -81,12 +81,6 @@ class Part:
     def dead(self) -> float:
         """Dead time in periods."""
         return self.system.dead_time_periods
-
-    @property
-    def sigma_ns(self) -> float:
-        """Width of the pulse."""
-        pulse = self.system.pulse
-        return pulse.sigma_ns if isinstance(pulse, GaussianPulse) else float("nan")
 
     def name(self, k: int) -> str:
         """One cell in words."""
@@ -191,7 +185,7 @@ def _csv_row(part: Part, k: int | np.intp) -> Row:
         "background": float(part.background[k]),
         "dead_time": part.dead,
         "cycles": system.cycles,
-        "sigma_ns": part.sigma_ns,
+        "sigma_ns": system.pulse.to_dict()["sigma_ns"],
         **{f"cumulant_{n + 1}": float(part.cumulants[k, n]) for n in range(4)},
         "tv_exact_matched": float(part.matched[k]),
         "tv_exact_gaussian": float(part.gaussian[k]),

@@ -65,11 +65,13 @@ def run(request: Request) -> Facts:
     request.tell("reconstruction: picture")
     shown = picture(settings)
     request.tell("reconstruction: time")
+    n = len(settings.signals)  # three fluxes: dim, ordinary, bright
+    chosen = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
     words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
     return {
         "s": settings,
         "findings": [one for mode, title in TITLE.items() if (one := _finding(rows, mode, title))],
-        "chosen": _chosen(rows, settings),
+        "chosen": [row for row in rows if row["signal"] in chosen],
         "near": near,
         "shown": [
             (said, 1e3 * (found.depth_m - shown.depth_m), float(np.median(found.signal / shown.signal - 1.0)))
@@ -80,13 +82,6 @@ def run(request: Request) -> Facts:
         "rows": rows,
         "figures": {"flux": flux_figure(rows), "maps": maps_figure(shown)},
     }
-
-
-def _chosen(rows: Sequence[Row], settings: Settings) -> list[Row]:
-    """Three fluxes: dim, ordinary, bright."""
-    n = len(settings.signals)
-    picked = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
-    return [row for row in rows if row["signal"] in picked]
 
 
 def _finding(rows: Sequence[Row], detector: str, title: str) -> dict[str, Any] | None:

@@ -16,6 +16,7 @@ import scipy
 import mars_lidar as ml
 from benchmarks.config import Config
 from mars_lidar import _core
+from studies.common.report import processor
 
 _QUIET = 0.1  # share of the processors
 
@@ -24,7 +25,7 @@ def describe_machine(config: Config) -> dict[str, Any]:
     """Processor, memory, versions and date, as the first lines of a report."""
     return {
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "processor": _processor(),
+        "processor": processor(),
         "processors of this process": config.threads,
         "vector levels": ", ".join(_core.levels()),
         "memory": f"{_memory_bytes() / 2**30:.1f} GiB",
@@ -81,16 +82,6 @@ class Interference:
         own = os.times()
         user, nice, kernel, _, _, interrupts, soft, steal = field[:8]
         return time.perf_counter(), sum(own[:4]), user + nice + kernel + interrupts + soft, steal
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith(("model name", "Model")):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
 
 
 def _memory_bytes() -> int:

@@ -5,17 +5,22 @@ a figure in it is made from the run. Reports hold the configuration and the seed
 something depend on the machine, and they name it.
 
 A study is a folder: `run.py` computes what its report states, `report.md.jinja` is the report, `figures.py` draws. Some
-folders hold several studies of one subject, a module and a template for each. What they share is in `common`.
+folders hold several studies of one subject, a module and a template of its name for each. What they share is in
+`common`. All run alike: `run(request)` of the module returns the facts that the template states, among them ``rows`` of
+the CSV file and ``figures`` by name; what writes them is here.
 """
 
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+Facts = dict[str, Any]
 Tell = Callable[[str], object]
 
 
@@ -113,10 +118,17 @@ def module_of(name: str) -> str:
 
 
 def _run(name: str, request: Request) -> list[Path]:
-    study: Study = importlib.import_module(module_of(name)).run  # imported when it is asked for
-    return study(request)
+    """Run a study, and write NAME.md, NAME.csv and its figures; returns the paths written."""
+    from mars_lidar.plot.style import style
+    from studies.common.report import write
+
+    study = importlib.import_module(module_of(name))  # imported when it is asked for
+    began = time.monotonic()
+    with style():
+        facts = study.run(request)
+        return write(request, name.replace("-", "_"), study, {"spent": time.monotonic() - began} | facts)
 
 
 STUDIES: dict[str, tuple[str, Study]] = {name: (words, partial(_run, name)) for name, (_, words) in _STUDIES.items()}
 
-__all__ = ["STUDIES", "OtherRunsError", "Request", "Study", "Tell", "module_of"]
+__all__ = ["STUDIES", "Facts", "OtherRunsError", "Request", "Study", "Tell", "module_of"]

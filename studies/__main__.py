@@ -6,6 +6,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
@@ -24,44 +25,26 @@ def _parser(command: str) -> argparse.ArgumentParser:
         f"  {command} covariance law --out docs/studies\n\n"
         "exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted",
     )
-    parser.add_argument(
-        "studies", nargs="+", choices=list(STUDIES), metavar="STUDY", help="one or more of the list below"
+    add = parser.add_argument
+    add("studies", nargs="+", choices=list(STUDIES), metavar="STUDY", help="one or more of the list below")
+    out = Path("study-results")
+    add("--out", type=Path, default=out, metavar="DIR", help="folder to write into, made if missing (%(default)s)")
+    add("--quick", action="store_true", help="small grids, few realizations: seconds, not for citing")
+    words = "folder of the reference cases, *.json (studies 'reference', 'joint-covariance', 'domain')"
+    add("--data", type=Path, metavar="DIR", help=words)
+    words = "measured photon stream: a .mat with times in units of 64 ps (studies 'hardware', 'uncertainty')"
+    add("--stream", type=Path, metavar="FILE", help=words)
+    words = (
+        "engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is several "
+        "times faster (default: %(default)s)"
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("study-results"),
-        metavar="DIR",
-        help="folder to write into, made if missing (default: %(default)s)",
+    add("--truth", choices=("sequential", "exact"), default="sequential", help=words)
+    words = (
+        "size of the studies 'downstream' and 'uncertainty': half an hour of one core each, or several hours "
+        "(default: %(default)s); with --quick a tiny one, seconds"
     )
-    parser.add_argument("--quick", action="store_true", help="small grids, few realizations: seconds, not for citing")
-    parser.add_argument(
-        "--data",
-        type=Path,
-        metavar="DIR",
-        help="folder of the reference cases, *.json (studies 'reference', 'joint-covariance', 'domain')",
-    )
-    parser.add_argument(
-        "--stream",
-        type=Path,
-        metavar="FILE",
-        help="measured photon stream: a .mat with times in units of 64 ps (studies 'hardware', 'uncertainty')",
-    )
-    parser.add_argument(
-        "--truth",
-        choices=("sequential", "exact"),
-        default="sequential",
-        help="engine taken for true (study 'count-law'): 'sequential' shares nothing with the laws, 'exact' is "
-        "several times faster (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--config",
-        choices=("small", "full"),
-        default="small",
-        help="size of the studies 'downstream' and 'uncertainty': half an hour of one core each, or several hours "
-        "(default: %(default)s); with --quick a tiny one, seconds",
-    )
-    parser.add_argument("--seed", type=int, metavar="N", help="another sweep (study 'domain')")
+    add("--config", choices=("small", "full"), default="small", help=words)
+    add("--seed", type=int, metavar="N", help="another sweep (study 'domain')")
     return parser
 
 
@@ -69,7 +52,12 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
     """Entry point; returns the exit code. `command` is what was called, for the help."""
     asked = list(sys.argv[1:] if arguments is None else arguments)
     if asked[:1] == ["neural"]:
-        return _neural(asked[1:], f"{command} neural")
+        try:
+            from studies.neural.command import main as neural
+        except MissingLibraryError as error:
+            print(f"{command} neural: {error}", file=sys.stderr)
+            return 1
+        return neural(asked[1:], f"{command} neural")
     parser = _parser(command)
     given = parser.parse_args(asked)
     if "reference" in given.studies and given.data is None:
@@ -82,31 +70,21 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
         given.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         parser.error(f"--out must be a folder that can be made, got {str(given.out)!r}: {error.strerror}")
-    tell = partial(print, file=sys.stderr, flush=True)
-    request = Request(given.out, given.quick, given.data, tell, given.truth, given.stream, given.config, given.seed)
+    given.tell = partial(print, file=sys.stderr, flush=True)
+    request = Request(**{field.name: getattr(given, field.name) for field in fields(Request)})
     try:
         for name in dict.fromkeys(given.studies):
             began = time.monotonic()
             for path in STUDIES[name][1](request):
                 print(path)
-            tell(f"{name}: done in {time.monotonic() - began:.0f} s")
+            request.tell(f"{name}: done in {time.monotonic() - began:.0f} s")
     except (MissingLibraryError, OtherRunsError) as error:
-        tell(str(error))
+        request.tell(str(error))
         return 1
     except KeyboardInterrupt:
-        tell("interrupted")
+        request.tell("interrupted")
         return 130
     return 0
-
-
-def _neural(arguments: Sequence[str], command: str) -> int:
-    """Train the network of the neural baseline, or say what is in one."""
-    try:
-        from studies.neural.command import main as neural
-    except MissingLibraryError as error:
-        print(f"{command}: {error}", file=sys.stderr)
-        return 1
-    return neural(arguments, command)
 
 
 if __name__ == "__main__":

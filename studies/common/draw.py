@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar.plot.style import DPI
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import LogNorm
-
 WIDTH = 7.0  # inches: two columns of a paper
 
 
-def panels(height: float, rows: int, columns: int, **options: Any) -> tuple[Any, Any]:
+def panels(height: float, rows: int, columns: int, **options: Any) -> tuple[Figure, Any]:
     """A figure of the common width, `height` in inches, with its axes (rows, columns)."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     for ax in axes.flat:

@@ -19,22 +19,22 @@ class Steps:
     """AdamW with a rate that rises over a twentieth of the steps, then falls as a cosine to a hundredth."""
 
     def __init__(self, network: nn.Module, steps: int, largest: float = RATE) -> None:
-        self._network, self._steps, self._largest, self._made = network, steps, largest, 0
-        self._optimizer = torch.optim.AdamW(network.parameters(), lr=largest, weight_decay=1e-4)
+        warm = max(1, steps // 20)
+
+        def rate(made: int) -> float:
+            if made < warm:
+                return largest * (made + 1) / warm
+            share = (made - warm) / max(1, steps - warm)
+            return largest * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * share)))
+
+        self._network = network
+        self._optimizer = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-4)  # times `rate`
+        self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimizer, rate)
 
     def step(self, loss: Tensor) -> None:
         """One step down the gradient of `loss`, no longer than 10."""
-        for group in self._optimizer.param_groups:
-            group["lr"] = self._rate()
         self._optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self._network.parameters(), 10.0)
         self._optimizer.step()
-        self._made += 1
-
-    def _rate(self) -> float:
-        warm = max(1, self._steps // 20)
-        if self._made < warm:
-            return self._largest * (self._made + 1) / warm
-        share = (self._made - warm) / max(1, self._steps - warm)
-        return self._largest * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * share)))
+        self._schedule.step()

@@ -8,19 +8,17 @@ import math
 import os
 import platform
 import re
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from mars_lidar._base.files import TemporarySibling
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.optional import needed
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from studies import Request
 
 Row = Mapping[str, Any]
@@ -28,34 +26,33 @@ Row = Mapping[str, Any]
 MAX_FIGURE_BYTES = 200_000
 
 
-def write(
-    request: Request,
-    name: str,
-    module: str,
-    template: str,
-    facts: Mapping[str, Any],
-    *,
-    rows: Sequence[Row] = (),
-    figures: Sequence[Path] = (),
-) -> list[Path]:
-    """Write NAME.md and, of `rows`, NAME.csv; returns these and `figures`.
+def write(request: Request, name: str, study: ModuleType, facts: Mapping[str, Any]) -> list[Path]:
+    """Write NAME.md, of the fact ``rows`` NAME.csv, and of each of ``tables`` NAME_KEY.csv; one of no rows is not kept.
 
-    The Markdown is made of the Jinja template ``TEMPLATE.md.jinja`` beside the module of that name, which gives the
-    `facts`; the module itself, with its constants, is `study` there.
+    The fact ``figures`` holds figures by KEY, which become NAME_KEY.png, that of the empty key NAME.png; the template
+    gets their paths. Returns all paths.
+
+    The Markdown is made of the Jinja template beside the module `study`: that of its name, ``report.md.jinja`` beside a
+    ``run.py``. It gives the `facts`; the module itself, with its constants, is `study` there.
     """
-    study = sys.modules[module]
-    text = request.out / f"{name}.md"
-    path = Path(str(study.__file__)).with_name(f"{template}.md.jinja")
-    text.write_text(render(request, path, {"study": study, **facts}), encoding="utf-8")
-    return [text, *figures, *([save_csv(request.out / f"{name}.csv", rows)] if rows else [])]
+    text, module = request.out / f"{name}.md", Path(str(study.__file__))
+    template = module.with_name(f"{'report' if module.stem == 'run' else module.stem}.md.jinja")
+    drawn: Mapping[str, Figure] = facts.get("figures", {})
+    figures = [save_figure(request.out / f"{f'{name}_{key}' if key else name}.png", one) for key, one in drawn.items()]
+    text.write_text(render(request, template, {"study": study, **facts, "figures": figures}), encoding="utf-8")
+    paths = [text, *figures]
+    for key, rows in {"": facts.get("rows", ()), **facts.get("tables", {})}.items():
+        path = request.out / f"{f'{name}_{key}' if key else name}.csv"
+        if rows:
+            paths.append(save_csv(path, rows))
+        else:
+            path.unlink(missing_ok=True)
+    return paths
 
 
 def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:
     """The Markdown of a template, which also knows the names below."""
-    try:
-        import jinja2
-    except ImportError as error:
-        raise MissingLibraryError(f"studies need Jinja2: pip install 'mars-lidar[studies]' ({error})") from error
+    jinja2 = needed("jinja2", "a study's report", "studies")
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template.parent),
         undefined=jinja2.StrictUndefined,
@@ -75,7 +72,7 @@ def render(request: Request, template: Path, facts: Mapping[str, Any]) -> str:
         "zip": zip,
         "len": len,
     }
-    text = environment.get_template(template.name).render(facts)
+    text: str = environment.get_template(template.name).render(facts)
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 
 
@@ -132,14 +129,9 @@ def versions() -> str:
 
 
 def picked(source: object, names: str) -> dict[str, Any]:
-    """Attributes of `source` by name, `names` separated by blanks: columns that are called as what they hold."""
-    return {name: getattr(source, name) for name in names.split()}
-
-
-def save_whole(path: Path, text: str) -> None:
-    """Write a text that is whole or not there, whatever stops the process."""
-    with TemporarySibling(path).writing() as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
+    """Columns of attributes of `source`: `names` separated by blanks, ``column=attribute`` where they differ."""
+    pairs = (name.split("=") for name in names.split())
+    return {pair[0]: getattr(source, pair[-1]) for pair in pairs}
 
 
 def save_csv(path: Path, rows: Sequence[Row]) -> Path:
@@ -167,7 +159,7 @@ def machine() -> str:
     from mars_lidar._base.threads import thread_count
 
     return (
-        f"{_processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "
+        f"{processor()}, {thread_count(None)} processors used, {_core.levels()[0]}, "
         f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
     )
 
@@ -180,7 +172,8 @@ def load() -> str:
         return "not known on this system"
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Name of the processor."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith(("model name", "Model")):

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class Prediction:
     sampled: int = 0
 
 
+Shape = Callable[[FloatArray, FloatArray, System], FloatArray]
 Predict = Callable[[FloatArray, FloatArray, System], Prediction]
 
 
@@ -64,24 +65,44 @@ def simulators(sampled: int, seed: int, training: Training | None = None) -> lis
     it is left out where PyTorch is not installed.
     """
     plan = training or Training()
+    chain, exposure = (partial(registration_pdf, method=method) for method in ("chain", "exposure"))
+    edge = partial(registration_pdf, method="chain", rearm="edge")
+
+    def matched(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        """What a table holds of the exact law, and an engine with a table draws: four cumulants."""
+        cumulants = count_law(signal, background, system, "exact").cumulants
+        shape = exposure(signal, background, system)
+        return Prediction(cumulants[:, 0], cumulants[:, 1], matched_pmf(cumulants), shape)
+
+    def neural(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
+        engine = _trained(system.replace(cycles=1, start="armed"), plan)
+        shape = engine.registration_pdf(signal, background, system)
+        return _of_law(engine.count_law(signal, background, system), shape)
+
     evaluated = [
-        Simulator("poisson", "Poisson", _poisson),
-        Simulator("renewal", "renewal", _renewal),
-        Simulator("mars_centre", "MaRS, paper's, centre", lambda s, b, system: _mars(s, b, system, "centre")),
-        Simulator("mars_edge", "MaRS, paper's, edge", lambda s, b, system: _mars(s, b, system, "edge")),
-        Simulator("mars_exact", "MaRS, ours, exact law", _exact),
-        Simulator("mars_matched", "MaRS, ours, four cumulants", _matched),
+        Simulator("poisson", "Poisson", _by_law(arrival_shape, method="poisson")),
+        Simulator("renewal", "renewal", _by_law(chain, method="renewal")),
+        Simulator("mars_centre", "MaRS, paper's, centre", _by_law(chain, method="mars")),
+        Simulator("mars_edge", "MaRS, paper's, edge", _by_law(edge, method="mars", rearm="edge")),
+        Simulator("mars_exact", "MaRS, ours, exact law", _by_law(exposure, method="exact")),
+        Simulator("mars_matched", "MaRS, ours, four cumulants", matched),
     ]
     if find_spec("torch") is not None:  # the extra "learn"
-        evaluated.append(Simulator("neural", "neural, stand-in", lambda s, b, system: _neural(s, b, system, plan)))
+        evaluated.append(Simulator("neural", "neural, stand-in", neural))
     others = [name for name in ENGINES if name not in _IN_CLOSED_FORM]
     return evaluated + [Simulator(name, f"{name} (sampled)", _sampler(name, sampled, seed)) for name in others]
 
 
-def of_law(law: CountLaw, shape: FloatArray) -> Prediction:
+def _of_law(law: CountLaw, shape: FloatArray) -> Prediction:
     """The prediction of a batched count law (cells,)."""
     pmfs = [Pmf(int(first), p) for first, p in zip(law.support[:, 0], law.pmf, strict=True)]
     return Prediction(law.mean, law.variance, pmfs, shape)
+
+
+def _by_law(shape: Shape, **law: Any) -> Predict:
+    return lambda signal, background, system: _of_law(
+        count_law(signal, background, system, **law), shape(signal, background, system)
+    )
 
 
 def arrival_shape(signal: FloatArray, background: FloatArray, system: System) -> FloatArray:
@@ -91,44 +112,11 @@ def arrival_shape(signal: FloatArray, background: FloatArray, system: System) ->
     return np.asarray(shape / shape.sum(-1, keepdims=True), dtype=np.float64)
 
 
-def _poisson(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
-    return of_law(count_law(signal, background, system, "poisson"), arrival_shape(signal, background, system))
-
-
-def _renewal(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
-    shape = registration_pdf(signal, background, system, "chain")
-    return of_law(count_law(signal, background, system, "renewal"), shape)
-
-
-def _neural(signal: FloatArray, background: FloatArray, system: System, training: Training) -> Prediction:
-    engine = _trained(system.replace(cycles=1, start="armed"), training)
-    shape = engine.registration_pdf(signal, background, system)
-    return of_law(engine.count_law(signal, background, system), shape)
-
-
 @lru_cache(maxsize=8)
 def _trained(system: System, training: Training) -> NeuralEngine:
     from studies.neural import NeuralEngine, train
 
     return NeuralEngine(train(system, training).map)
-
-
-def _mars(signal: FloatArray, background: FloatArray, system: System, rearm: Literal["centre", "edge"]) -> Prediction:
-    shape = registration_pdf(signal, background, system, "chain", rearm=rearm)
-    return of_law(count_law(signal, background, system, "mars", rearm=rearm), shape)
-
-
-def _exact(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
-    shape = registration_pdf(signal, background, system, "exposure")
-    return of_law(count_law(signal, background, system, "exact"), shape)
-
-
-def _matched(signal: FloatArray, background: FloatArray, system: System) -> Prediction:
-    """What a table holds of the exact law, and an engine with a table draws: four cumulants."""
-    shape = registration_pdf(signal, background, system, "exposure")
-    cumulants = count_law(signal, background, system, "exact").cumulants
-    pmfs = matched_pmf(cumulants)
-    return Prediction(cumulants[:, 0], cumulants[:, 1], pmfs, shape)
 
 
 def _sampler(engine: str, realizations: int, seed: int) -> Predict:

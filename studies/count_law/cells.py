@@ -64,8 +64,6 @@ FULL = Settings(
     dead_sweep=linear_points(40, 0.05, 2.0),
     sweep_flux=log_points(8),
 )
-
-
 QUICK = Settings(
     grids=paper_grids(2, (25.0, 75.0), (50.0,)),
     realizations=400,
@@ -144,8 +142,8 @@ def compute(settings: Settings, truth: str, tell: Tell) -> list[Cell]:
 def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, number: int) -> list[Cell]:
     system = settings.system(grid.period_ns, dead_ns)
     signal, background = grid.cells
-    seed = (settings.seed << 16) + number
-    sample = draw(truth, signal, background, system, realizations=settings.realizations, seed=seed)
+    seed, size = (settings.seed << 16) + number, settings.realizations
+    sample = draw(truth, signal, background, system, realizations=size, seed=seed)
     # another seed: an engine must not share random numbers with the truth
     training = Training(steps=settings.steps, pairs=settings.pairs, held_out=min(500, settings.pairs))
     asked = simulators(settings.sampled, seed + (1 << 40), training)
@@ -154,9 +152,6 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
     random = np.random.default_rng([settings.seed, number])
     cells = []
     for k in range(signal.size):
-        found = Pmf.of_counts(sample.counts[:, k])
-        laws = {name: one.pmfs[k] for name, one in predictions.items()}
-        scores = _scores(settings, sample, found, predictions, k, random)
         counts = sample.counts[:, k].astype(np.float64)
         cells.append(
             Cell(
@@ -168,25 +163,20 @@ def _system_cells(settings: Settings, grid: Grid, dead_ns: float, truth: str, nu
                 float(counts.mean()),
                 float(counts.var(ddof=1)),
                 cumulants[k],
-                settings.realizations,
-                scores,
-                found,
-                laws,
+                size,
+                _scores(settings, sample, predictions, k, random),
+                Pmf.of_counts(sample.counts[:, k]),
+                {name: one.pmfs[k] for name, one in predictions.items()},
             )
         )
     return cells
 
 
 def _scores(
-    settings: Settings,
-    sample: Sample,
-    found: Pmf,
-    predictions: dict[str, Prediction],
-    k: int,
-    random: np.random.Generator,
+    settings: Settings, sample: Sample, predictions: dict[str, Prediction], k: int, random: np.random.Generator
 ) -> dict[str, Score]:
     """Scores of every simulator in cell `k`."""
-    exact, size = predictions["mars_exact"], settings.realizations
+    exact, size, found = predictions["mars_exact"], settings.realizations, Pmf.of_counts(sample.counts[:, k])
     noise: dict[int, FloatArray] = {}
     scores = {}
     for name, one in predictions.items():
@@ -195,9 +185,8 @@ def _scores(
         shape = 0.5 * float(np.abs(sample.shape[k] - one.shape[k]).sum())
         # a sample has its own noise as well, as much as the truth's for the same number of exposures
         own = float(np.sqrt(1.0 + size / one.sampled)) if one.sampled else 1.0
-        floor = own * float(sample.shape_floor[k])
         figures = law_figures(found, one.pmfs[k], float(one.mean[k]), float(one.variance[k]), size)
-        scores[name] = Score(figures, noise[one.sampled], shape, floor, own)
+        scores[name] = Score(figures, noise[one.sampled], shape, own * float(sample.shape_floor[k]), own)
     return scores
 
 

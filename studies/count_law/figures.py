@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from mars_lidar import Flux, simulate
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from mars_lidar.statistics import exposure_moments
 from studies.common.draw import legend_below, panels
-from studies.common.report import save_figure
 from studies.common.sample import PERIOD_NS
 from studies.common.simulators import arrival_shape
 from studies.count_law.cells import FIGURES, SHAPES, Cell, Settings
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 PANELS = ((0.07, 0.07, 25.0), (0.5, 0.5, 50.0), (4.0, 0.5, 75.0), (10.0, 10.0, 100.0))  # nearest cells are drawn
 HISTOGRAM = (2.0, 1.0, 0.6375)  # S, B in photons per period, dead time in periods
@@ -46,38 +42,18 @@ _LEGEND = {
 _REACH = 30.0  # standard deviations beyond which a law is named at the panel's side instead of drawn
 
 
-def draw_all(
-    folder: Path, settings: Settings, cells: Sequence[Cell], sweep: dict[str, FloatArray], truth: str
-) -> list[Path]:
-    """Draw the figures into `folder`."""
-    with style():
-        return [
-            _panels(folder / "count_law_panels.png", cells),
-            _shape(folder / "count_law_shape.png", settings, cells, sweep),
-            _dead_time(folder / "count_law_dead_time.png", settings, truth),
-        ]
-
-
 def _colour(name: str) -> tuple[str, str, float]:
     return _LINES.get(name, (MUTED, "-.", 1.0))  # engines whose law is known by sampling
 
 
-def _nearest(cells: Sequence[Cell], target: tuple[float, float, float]) -> Cell:
-    def distance(cell: Cell) -> float:
-        apart = np.abs(np.log([cell.signal / target[0], cell.background / target[1]])).sum()
-        return float(apart) + abs(cell.dead_ns - target[2]) / 25.0
-
-    return min(cells, key=distance)
-
-
-def _panels(path: Path, cells: Sequence[Cell]) -> Path:
+def law_panels(cells: Sequence[Cell]) -> Figure:
     """Four count laws beside the simulated frequencies; the inset compares KL with its floor."""
-    from matplotlib.patches import Patch
-
     grid = [cell for cell in cells if cell.grid == "wide"]
     figure, axes = panels(5.0, 2, 2)
     for ax, target in zip(axes.flat, PANELS, strict=True):
-        _panel(ax, _nearest(grid, target))
+        near = (np.abs(np.log([c.signal / target[0], c.background / target[1]])).sum() for c in grid)
+        apart = [float(flux) + abs(c.dead_ns - target[2]) / 25.0 for flux, c in zip(near, grid, strict=True)]
+        _panel(ax, grid[int(np.argmin(apart))])
     for ax in axes[-1]:
         ax.set_xlabel("registrations N")
     for row in axes:
@@ -86,7 +62,7 @@ def _panels(path: Path, cells: Sequence[Cell]) -> Path:
     if sampled := [name for name in grid[0].laws if name not in _LINES]:
         handles[f"{', '.join(sampled)}: KL only"] = Patch(color=MUTED)
     figure.legend(handles.values(), handles.keys(), frameon=False, loc="outside lower center", ncols=4)
-    return save_figure(path, figure)
+    return figure
 
 
 def _panel(ax: Axes, cell: Cell) -> None:
@@ -137,7 +113,7 @@ def _inset(ax: Axes, cell: Cell) -> None:
     inset.spines[["top", "right"]].set_visible(False)
 
 
-def _shape(path: Path, settings: Settings, cells: Sequence[Cell], sweep: dict[str, FloatArray]) -> Path:
+def shapes(settings: Settings, cells: Sequence[Cell], sweep: dict[str, FloatArray]) -> Figure:
     """Total variation of the shape over the dead time: lines to the exact law, dots to the simulation."""
     figure, axes = panels(2.9, 1, 2, sharey=True)
     dead = np.array(settings.dead_sweep)
@@ -178,10 +154,10 @@ def _shape(path: Path, settings: Settings, cells: Sequence[Cell], sweep: dict[st
         ax.set_title(words, loc="left")
     axes[0, 0].set_ylabel("total variation of the shape")
     legend_below(figure, axes[0, :1], 3)
-    return save_figure(path, figure)
+    return figure
 
 
-def _dead_time(path: Path, settings: Settings, truth: str) -> Path:
+def dead_time(settings: Settings, truth: str) -> Figure:
     """One exposure of one pixel before and after dead time, with the expectations."""
     signal, background, dead = HISTOGRAM
     system = settings.system(PERIOD_NS, dead * PERIOD_NS).replace(cycles=HISTOGRAM_CYCLES)
@@ -203,4 +179,4 @@ def _dead_time(path: Path, settings: Settings, truth: str) -> Path:
         ax.set_title(f"{words}, N = {int(counts.sum())}", loc="left")
     axes[0, 0].set_ylabel("counts per bin")
     axes[0, 0].legend(frameon=False, loc="upper left")
-    return save_figure(path, figure)
+    return figure

@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import CountLaw, Flux, System, count_law, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import distance
 from mars_lidar.statistics.count_window import gaussian_window
 from mars_lidar.statistics.distance import Pmf, total_variation
-from studies import Request, Tell
-from studies.common.report import Row, picked, write
+from studies import Facts, Request, Tell
+from studies.common.report import Row, picked
 from studies.common.sample import PERIOD_NS, log_points, system_of
 
 LAWS = {
@@ -135,7 +132,10 @@ def _cells(
 ) -> list[Cell]:
     """All (S, B) of one system; `number` keys its simulation and its bootstrap."""
     system = settings.system(dead, cycles)
-    counts = _simulate(settings, signal, background, system, number)
+    # a histogram of one bin holds nothing but the count
+    flux, seed = Flux(signal[None], background[None], 0.5 * system.period_ns), (settings.seed << 16) + number
+    cube = simulate(flux, system.replace(bins=1), realizations=settings.realizations, seed=seed)
+    counts = cube.reshape(settings.realizations, signal.size)
     random = np.random.default_rng([settings.seed, number])
     batch = laws_of(signal, background, system)
     exact = batch["exact"]
@@ -202,16 +202,6 @@ def gaussian_of(exact: CountLaw, k: int) -> Pmf:
     return gaussian_window(float(exact.mean[k]), float(exact.variance[k]))
 
 
-def _simulate(
-    settings: Settings, signal: FloatArray, background: FloatArray, system: System, number: int
-) -> NDArray[np.integer[Any]]:
-    """Counts (realizations, cells) by the exact engine; a histogram of one bin holds nothing else."""
-    flux = Flux(signal[None], background[None], 0.5 * system.period_ns)
-    seed = (settings.seed << 16) + number
-    cube = simulate(flux, system.replace(bins=1), realizations=settings.realizations, seed=seed)
-    return cube.reshape(settings.realizations, signal.size)
-
-
 def _regimes(cells: Sequence[Cell]) -> dict[str, list[Cell]]:
     """Cells by what their count is like."""
     tests: dict[str, Callable[[float, float], bool]] = {
@@ -241,19 +231,18 @@ def _drawn_out(cells: Sequence[Cell]) -> list[Cell]:
     return chosen
 
 
-def run(request: Request) -> list[Path]:
-    """Compute, draw and write the study; returns the paths written."""
-    from studies.count_law.law_figures import draw_all
+def run(request: Request) -> Facts:
+    """Both maps, and a second look where the exact law looked worst."""
+    from studies.count_law import law_figures
 
     settings = QUICK if request.quick else FULL
     flux, exposure = flux_map(settings, request.tell), exposure_map(settings, request.tell)
     cells = [*flux, *exposure]
     again = second_look(settings, cells, request.tell)
-    figures = draw_all(request.out, settings, flux, exposure, _drawn_out(cells))
     plain = [c for c in cells if c.cumulants[0] >= FEW and c.cumulants[1] >= STILL]
     skewness = np.array([abs(c.cumulants[2]) / c.cumulants[1] ** 1.5 for c in plain])
     cost = [c.to_exact["mars"] - c.to_exact["gaussian"] for c in cells]
-    facts = {
+    return {
         "s": settings,
         "flux": flux,
         "exposure": exposure,
@@ -269,22 +258,23 @@ def run(request: Request) -> list[Path]:
         "cost": cost,
         "costliest": cells[int(np.argmax(cost))],
         "nan": float("nan"),
+        "rows": [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure],
+        "figures": {
+            "gaussian": law_figures.gaussian(settings, flux, exposure),
+            "flux": law_figures.rows(settings, flux, "flux"),
+            "exposure": law_figures.rows(settings, exposure, "exposure"),
+            "cells": law_figures.shown(_drawn_out(cells)),
+            "floor": law_figures.floors(cells),
+        },
     }
-    rows = [_csv_row("flux", c) for c in flux] + [_csv_row("exposure", c) for c in exposure]
-    return write(request, "law", __name__, "law", facts, rows=rows, figures=figures)
 
 
 def _csv_row(name: str, cell: Cell) -> Row:
     return {
         "map": name,
-        **picked(cell, "signal background"),
-        "dead_time_periods": cell.dead,
-        "cycles": cell.cycles,
+        **picked(cell, "signal background dead_time_periods=dead cycles"),
         **{f"cumulant_{k + 1}": float(cell.cumulants[k]) for k in range(4)},
-        **picked(cell, "floor limit"),
-        "g_test_p": cell.p_value,
-        "z_mean": cell.mean_score,
-        "z_variance": cell.variance_score,
+        **picked(cell, "floor limit g_test_p=p_value z_mean=mean_score z_variance=variance_score"),
         **{f"tv_simulation_{law}": cell.to_simulation[law] for law in LAWS},
         **{f"tv_exact_{law}": cell.to_exact[law] for law in LAWS if law != "exact"},
     }

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import heat, legend_below, panels
-from studies.common.report import save_figure
 from studies.count_law.law import LAWS, Cell, Settings
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _LOW, _HIGH = 3e-3, 1.0  # total variation on the colour scales
 _LOW_EXACT = 1e-3  # where there is no sampling noise
@@ -25,20 +23,6 @@ _LINES = {
     "renewal": (COLOURS[2], ":", 1.0),
 }
 Value = Callable[[Cell], float]
-
-
-def draw_all(
-    folder: Path, settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell], shown: Sequence[Cell]
-) -> list[Path]:
-    """Draw the figures into `folder`; `shown` are the cells whose laws are drawn out."""
-    with style():
-        return [
-            _gaussian(folder / "law_gaussian.png", settings, flux, exposure),
-            _rows(folder / "law_flux.png", settings, flux, "flux"),
-            _rows(folder / "law_exposure.png", settings, exposure, "exposure"),
-            _shown(folder / "law_cells.png", shown),
-            _floor(folder / "law_floor.png", [*flux, *exposure]),
-        ]
 
 
 def _heat(ax: Axes, settings: Settings, cells: Sequence[Cell], kind: str, value: Value, norm: Any) -> Any:
@@ -52,24 +36,18 @@ def _at(cells: Sequence[Cell], dead: float) -> list[Cell]:
     return [cell for cell in cells if cell.dead == dead]
 
 
-def _rows(path: Path, settings: Settings, cells: Sequence[Cell], kind: str) -> Path:
+def rows(settings: Settings, cells: Sequence[Cell], kind: str) -> Figure:
     """Total variation to simulation: rows for the sampling floor and each law, columns for dead times."""
-    from matplotlib.colors import LogNorm
-
-    rows: list[tuple[str, Value]] = [("sampling floor", lambda cell: cell.floor)]
-    rows += [(words, _to_simulation(name)) for name, words in LAWS.items()]
-    figure, axes = panels(8.4, len(rows), len(settings.dead), sharex=True, sharey=True)
-    norm, mesh = LogNorm(_LOW, _HIGH), None
-    for row, (words, value) in zip(axes, rows, strict=True):
+    lines: list[tuple[str, Value]] = [("sampling floor", lambda cell: cell.floor)]
+    lines += [(words, lambda cell, name=name: cell.to_simulation[name]) for name, words in LAWS.items()]  # type: ignore[misc]
+    figure, axes = panels(8.4, len(lines), len(settings.dead), sharex=True, sharey=True)
+    norm = LogNorm(_LOW, _HIGH)
+    for row, (words, value) in zip(axes, lines, strict=True):
         for ax, dead in zip(row, settings.dead, strict=True):
             mesh = _heat(ax, settings, _at(cells, dead), kind, value, norm)
         row[0].set_ylabel(f"{words}\n{'B' if kind == 'flux' else 'cycles'}")
     _frame(figure, axes, settings, mesh, "total variation to simulation")
-    return save_figure(path, figure)
-
-
-def _to_simulation(name: str) -> Value:
-    return lambda cell: cell.to_simulation[name]
+    return figure
 
 
 def _frame(figure: Any, axes: Any, settings: Settings, mesh: Any, label: str) -> None:
@@ -79,12 +57,10 @@ def _frame(figure: Any, axes: Any, settings: Settings, mesh: Any, label: str) ->
     figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01).set_label(label)
 
 
-def _gaussian(path: Path, settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell]) -> Path:
+def gaussian(settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell]) -> Figure:
     """Where the Gaussian breaks: its distance to the exact law, without noise, and why."""
-    from matplotlib.colors import LogNorm
-
     figure, axes = panels(3.3, 2, len(settings.dead), gridspec_kw={"hspace": 0.0})
-    norm, mesh = LogNorm(_LOW_EXACT, _HIGH), None
+    norm = LogNorm(_LOW_EXACT, _HIGH)
     for row, cells, kind in zip(axes, (flux, exposure), ("flux", "exposure"), strict=True):
         for ax, dead in zip(row, settings.dead, strict=True):
             here = _at(cells, dead)
@@ -106,14 +82,17 @@ def _gaussian(path: Path, settings: Settings, flux: Sequence[Cell], exposure: Se
         axes[0, 0].plot([], [], mark, ms=4, color=COLOURS[0], label=words)
     legend_below(figure, axes[0, :1], 2)
     _frame(figure, axes, settings, mesh, "total variation,\nbest Gaussian to exact law")
-    return save_figure(path, figure)
+    return figure
 
 
-def _shown(path: Path, cells: Sequence[Cell]) -> Path:
+def shown(cells: Sequence[Cell]) -> Figure:
     """Count laws of a few cells beside the simulated frequencies."""
     figure, axes = panels(3.9, 2, len(cells) // 2)
     for ax, cell in zip(axes.flat, cells, strict=False):
-        low, high = _window(cell)
+        # around the mean: what holds the law, at least two counts
+        reach = max(4.5 * float(cell.cumulants[1]) ** 0.5, 2.5)
+        low = max(0, int(np.floor(cell.cumulants[0] - reach)))
+        high = int(np.ceil(cell.cumulants[0] + reach))
         counts = np.arange(low, high + 1)
         ax.bar(counts, cell.sample.on(low, high), width=1.0, color="#d9d9d9", label="simulation")
         ax.plot(counts, cell.laws["exact"].on(low, high), "o-", ms=2.2, lw=0.8, color=INK, label="exact")
@@ -134,16 +113,10 @@ def _shown(path: Path, cells: Sequence[Cell]) -> Path:
     for row in axes:
         row[0].set_ylabel("P(N)")
     legend_below(figure, axes[0, :1], 5)
-    return save_figure(path, figure)
+    return figure
 
 
-def _window(cell: Cell) -> tuple[int, int]:
-    """Counts around the mean that hold the law, five standard deviations and at least two counts."""
-    reach = max(4.5 * float(cell.cumulants[1]) ** 0.5, 2.5)
-    return max(0, int(np.floor(cell.cumulants[0] - reach))), int(np.ceil(cell.cumulants[0] + reach))
-
-
-def _floor(path: Path, cells: Sequence[Cell]) -> Path:
+def floors(cells: Sequence[Cell]) -> Figure:
     """Distance to simulation over the sampling floor, against the spread of the count."""
     figure, axes = panels(2.3, 1, 4, sharex=True, sharey=True)
     spread = np.array([np.sqrt(cell.cumulants[1]) for cell in cells])
@@ -159,4 +132,4 @@ def _floor(path: Path, cells: Sequence[Cell]) -> Path:
         ax.set_title(LAWS[name], loc="left")
     axes[0, 0].set_ylabel("total variation / floor")
     axes[0, 0].legend(frameon=False, loc="upper left", markerscale=4, handletextpad=0.2)
-    return save_figure(path, figure)
+    return figure

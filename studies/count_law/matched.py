@@ -5,26 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mars_lidar import GaussianPulse, System, count_law
+from mars_lidar import System, count_law
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, style
+from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
-from studies import Request, Tell
+from studies import Facts, Request, Tell
 from studies.common.draw import heat, panels
-from studies.common.report import Row, save_figure, write
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, log_points, system_of
 from studies.count_law.law import gaussian_of, pmf_of
 
 AIM = 0.002  # total variation
 _EDGES = (0.0, 0.2, 0.7, 2.3, 9.0, 100.0, np.inf)  # of the variance
 _WORST = 12
-_LISTED = 0.25  # of the aim
+_LISTED = 0.25  # of the aim: all cells would be a large file of little news
 _LOW, _HIGH = 1e-5, 1e-1  # total variation on the colour scale
 
 
@@ -81,12 +82,6 @@ class Part:
         """Dead time in periods."""
         return self.system.dead_time_periods
 
-    @property
-    def sigma_ns(self) -> float:
-        """Width of the pulse."""
-        pulse = self.system.pulse
-        return pulse.sigma_ns if isinstance(pulse, GaussianPulse) else float("nan")
-
     def name(self, k: int) -> str:
         """One cell in words."""
         flux = f"S = {self.signal[k]:.3g}, B = {self.background[k]:.3g}"
@@ -136,38 +131,23 @@ def measure(kind: str, system: System, signal: FloatArray, background: FloatArra
     return Part(kind, system, signal, background, exact.cumulants, matched, gaussian, trusted(exact.cumulants))
 
 
-@dataclass(frozen=True)
-class Share:
-    """Cells together: shares within the aim, and how the criterion fares."""
-
-    cells: int
-    within: float
-    within_gaussian: float
-    worst: float
-    worst_gaussian: float
-    untrusted: float
-    missed: int  # trusted, but beyond the aim
-    needless: int  # not trusted, but within the aim
-    worst_trusted: float
-
-
-def share(parts: Sequence[Part]) -> Share:
-    """Summary over all cells of some parts."""
+def share(parts: Sequence[Part]) -> dict[str, float]:
+    """All cells of some parts together: shares within the aim, and how the criterion fares."""
     matched, gaussian, sure = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("matched", "gaussian", "trusted")
     )
     good = matched <= AIM
-    return Share(
-        cells=matched.size,
-        within=float(good.mean()),
-        within_gaussian=float((gaussian <= AIM).mean()),
-        worst=float(matched.max()),
-        worst_gaussian=float(gaussian.max()),
-        untrusted=float((~sure).mean()),
-        missed=int((~good & sure).sum()),
-        needless=int((good & ~sure).sum()),
-        worst_trusted=float(matched[sure].max(initial=0.0)),
-    )
+    return {
+        "cells": matched.size,
+        "within": float(good.mean()),
+        "within_gaussian": float((gaussian <= AIM).mean()),
+        "worst": float(matched.max()),
+        "worst_gaussian": float(gaussian.max()),
+        "untrusted": float((~sure).mean()),
+        "missed": int((~good & sure).sum()),  # trusted, but beyond the aim
+        "needless": int((good & ~sure).sum()),  # not trusted, but within the aim
+        "worst_trusted": float(matched[sure].max(initial=0.0)),
+    }
 
 
 def worst(parts: Sequence[Part], number: int) -> list[tuple[Part, int]]:
@@ -176,8 +156,8 @@ def worst(parts: Sequence[Part], number: int) -> list[tuple[Part, int]]:
     return sorted(cells, key=lambda cell: -float(cell[0].matched[cell[1]]))[:number]
 
 
-def run(request: Request) -> list[Path]:
-    """Compute, draw and write the study; returns the paths written."""
+def run(request: Request) -> Facts:
+    """The grids and the systems at random."""
     settings = QUICK if request.quick else FULL
     parts, others = maps(settings, request.tell), drawn(settings, request.tell)
     armed, stationary = ([part for part in parts if part.kind == kind] for kind in ("armed", "stationary"))
@@ -187,20 +167,14 @@ def run(request: Request) -> list[Path]:
     matched = np.concatenate([part.matched for part in everything])
     gaussian = np.concatenate([part.gaussian for part in everything])
     within = [(low, high, (variance >= low) & (variance < high)) for low, high in pairwise(_EDGES)]
-    facts = {
+    return {
         "s": settings,
         "kinds": {name: share(cells) for name, cells in kinds.items() if cells},
         "by_variance": [(low, high, matched[here], gaussian[here]) for low, high, here in within],
         "worst": worst(everything, _WORST),
+        "rows": [_csv_row(p, k) for p in everything for k in np.flatnonzero((p.matched > _LISTED * AIM) | ~p.trusted)],
+        "figures": {"map": _draw(settings, armed)},
     }
-    figure = _draw(request.out / "matched_map.png", settings, armed)
-    rows = [_csv_row(part, k) for part in everything for k in np.flatnonzero(_listed(part))]
-    return write(request, "matched", __name__, "matched", facts, rows=rows, figures=[figure])
-
-
-def _listed(part: Part) -> NDArray[np.bool_]:
-    """Cells of the table: all would be a large file of little news."""
-    return np.asarray((part.matched > _LISTED * AIM) | ~part.trusted, dtype=np.bool_)
 
 
 def _csv_row(part: Part, k: int | np.intp) -> Row:
@@ -211,7 +185,7 @@ def _csv_row(part: Part, k: int | np.intp) -> Row:
         "background": float(part.background[k]),
         "dead_time": part.dead,
         "cycles": system.cycles,
-        "sigma_ns": part.sigma_ns,
+        "sigma_ns": system.pulse.to_dict()["sigma_ns"],
         **{f"cumulant_{n + 1}": float(part.cumulants[k, n]) for n in range(4)},
         "tv_exact_matched": float(part.matched[k]),
         "tv_exact_gaussian": float(part.gaussian[k]),
@@ -219,30 +193,27 @@ def _csv_row(part: Part, k: int | np.intp) -> Row:
     }
 
 
-def _draw(path: Path, settings: Settings, parts: Sequence[Part]) -> Path:
+def _draw(settings: Settings, parts: Sequence[Part]) -> Figure:
     """Maps over S and B: columns for dead times; rows for cycles, and the Gaussian for comparison."""
-    from matplotlib.colors import LogNorm
-
     shape = len(settings.signal), len(settings.background)
     by = {(round(part.dead, 9), part.system.cycles): part for part in parts}
     rows = [(n, "matched", f"{n} cycles") for n in settings.cycles]
     rows.append((settings.cycles[0], "gaussian", f"Gaussian,\n{settings.cycles[0]} cycles"))
-    with style():
-        figure, axes = panels(0.5 + 0.95 * len(rows), len(rows), len(settings.dead), sharex=True, sharey=True)
-        norm, mesh = LogNorm(_LOW, _HIGH), None
-        for row, (cycles, law, words) in zip(axes, rows, strict=True):
-            for ax, dead in zip(row, settings.dead, strict=True):
-                part = by[round(dead, 9), cycles]
-                image = getattr(part, law).reshape(shape).T
-                mesh = heat(ax, settings.signal, settings.background, image, norm)
-                if law == "matched":
-                    at = ~part.trusted
-                    ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
-            row[0].set_ylabel(f"{words}\nB")
-        for ax, dead in zip(axes[0], settings.dead, strict=True):
-            ax.set_title(f"{dead:g} $t_r$")
-        axes[-1, len(settings.dead) // 2].set_xlabel("S, photons per period")
-        bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01)
-        bar.set_label("total variation to the exact law")
-        bar.ax.axhline(AIM, color=COLOURS[0], lw=0.8)
-        return save_figure(path, figure)
+    figure, axes = panels(0.5 + 0.95 * len(rows), len(rows), len(settings.dead), sharex=True, sharey=True)
+    norm = LogNorm(_LOW, _HIGH)
+    for row, (cycles, law, words) in zip(axes, rows, strict=True):
+        for ax, dead in zip(row, settings.dead, strict=True):
+            part = by[round(dead, 9), cycles]
+            image = getattr(part, law).reshape(shape).T
+            mesh = heat(ax, settings.signal, settings.background, image, norm)
+            if law == "matched":
+                at = ~part.trusted
+                ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
+        row[0].set_ylabel(f"{words}\nB")
+    for ax, dead in zip(axes[0], settings.dead, strict=True):
+        ax.set_title(f"{dead:g} $t_r$")
+    axes[-1, len(settings.dead) // 2].set_xlabel("S, photons per period")
+    bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01)
+    bar.set_label("total variation to the exact law")
+    bar.ax.axhline(AIM, color=COLOURS[0], lw=0.8)
+    return figure

@@ -7,7 +7,6 @@ A case holds ``S``, ``B`` (photons per period); ``tau``, ``sigma``, ``dead`` (la
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,7 @@ import numpy as np
 
 from mars_lidar.statistics import distance
 from mars_lidar.statistics.distance import Pmf
-from studies import Request
-from studies.common.report import write
+from studies import Facts, Request
 from studies.common.sample import system_of
 from studies.count_law.law import LAWS, laws_of, pmfs_of
 
@@ -27,55 +25,34 @@ _LIMIT_Z, _LIMIT_P = 4.0, 1e-4
 _KEYS = ("S", "B", "tau", "sigma", "dead", "cycles", "count")
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """One law beside one case; z in standard errors, p of the G-test."""
-
-    case: str
-    law: str
-    size: int
-    mean: float
-    variance: float
-    z_mean: float
-    z_variance: float
-    distance: float
-    floor: float
-    limit: float
-    p_value: float
-
-    @property
-    def good(self) -> bool:
-        """Mean and variance within 4 standard errors, total variation below the limit, p above 1e-4."""
-        scores = max(abs(self.z_mean), abs(self.z_variance))
-        return scores <= _LIMIT_Z and self.distance <= self.limit and self.p_value > _LIMIT_P
-
-
-def run(request: Request) -> list[Path]:
-    """Compare, and write the table; returns the paths written."""
+def run(request: Request) -> Facts:
+    """Every law beside every case."""
     if request.data is None:
         raise ValueError("data must be the folder of the reference cases, got None")
     paths = sorted(request.data.glob("*.json"))
     draws = QUICK_DRAWS if request.quick else DRAWS
-    found: list[Comparison] = []
+    found: list[dict[str, Any]] = []
     cases = {}
     for k, path in enumerate(paths):
         cases[path.stem] = case = _read(path)
         found += compare(path.stem, case, draws, np.random.default_rng([SEED, k]))
         request.tell(f"reference: {path.stem}")
-    facts = {
+    return {
         "cases": cases,
         "keys": _KEYS[:-1],
         "found": found,
-        "exact": [c for c in found if c.law == "exact"],
+        "exact": [c for c in found if c["law"] == "exact"],
         "laws": LAWS,
         "draws": draws,
+        "rows": found,
     }
-    rows = [{**vars(c), "good": c.good} for c in found]
-    return write(request, "reference", __name__, "reference", facts, rows=rows)
 
 
-def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Generator) -> list[Comparison]:
-    """Every law beside one case, at the case's own delay."""
+def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Generator) -> list[dict[str, Any]]:
+    """Every law beside one case, at the case's own delay; z in standard errors, p of the G-test.
+
+    ``good``: mean and variance within 4 standard errors, total variation below the limit, p above 1e-4.
+    """
     dead, sigma = case["dead"] * _PERIOD_NS, case["sigma"] * _PERIOD_NS
     system = system_of(dead, case["cycles"], period_ns=_PERIOD_NS, sigma_ns=sigma)
     signal, background, delay = float(case["S"]), float(case["B"]), case["tau"] * _PERIOD_NS
@@ -93,22 +70,22 @@ def compare(name: str, case: dict[str, Any], draws: int, random: np.random.Gener
     for key, pmf in pmfs.items():
         # the Gaussian has mean and variance of the exact law
         expected, variance = (float(v) for v in laws.get(key, laws["exact"]).cumulants[0, :2])
-        found.append(
-            Comparison(
-                name,
-                key,
-                size,
-                expected,
-                variance,
-                # what the sample's mean and variance scatter by is known from the exact law
-                z_mean=distance.mean_score(expected, float(exact[1]), mean, size),
-                z_variance=distance.variance_score(exact, sample, size, variance),
-                distance=distance.total_variation(pmf, sample),
-                floor=float(noise.mean()),
-                limit=float(np.quantile(noise, 0.999)),
-                p_value=distance.g_test(pmf, sample, size),
-            )
-        )
+        row: dict[str, Any] = {
+            "case": name,
+            "law": key,
+            "size": size,
+            "mean": expected,
+            "variance": variance,
+            # what the sample's mean and variance scatter by is known from the exact law
+            "z_mean": distance.mean_score(expected, float(exact[1]), mean, size),
+            "z_variance": distance.variance_score(exact, sample, size, variance),
+            "distance": distance.total_variation(pmf, sample),
+            "floor": float(noise.mean()),
+            "limit": float(np.quantile(noise, 0.999)),
+            "p_value": distance.g_test(pmf, sample, size),
+        }
+        close = max(abs(row["z_mean"]), abs(row["z_variance"])) <= _LIMIT_Z
+        found.append(row | {"good": close and row["distance"] <= row["limit"] and row["p_value"] > _LIMIT_P})
     return found
 
 

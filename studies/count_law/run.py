@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mars_lidar.statistics.distance import KL_FLOOR
-from studies import Request
-from studies.common.report import Row, picked, write
+from studies import Facts, Request
+from studies.common.report import Row, picked
 from studies.common.simulators import simulators
 from studies.count_law.cells import FIGURES, FULL, QUICK, Cell, compute, shape_sweep
 
@@ -75,39 +73,38 @@ def _row(name: str, words: str, cells: Sequence[Cell]) -> dict[str, Any]:
     }
 
 
-def run(request: Request) -> list[Path]:
-    """Compute, draw and write the study; returns the paths written."""
-    from studies.count_law.figures import HISTOGRAM, HISTOGRAM_CYCLES, draw_all
+def run(request: Request) -> Facts:
+    """All cells, the sweep of shapes, and the figures."""
+    from studies.count_law import figures
 
     settings = QUICK if request.quick else FULL
-    began = time.monotonic()
     cells = compute(settings, request.truth, request.tell)
     sweep = shape_sweep(settings, request.tell)
-    figures = draw_all(request.out, settings, cells, sweep, request.truth)
     first = cells[0].scores
     words = {one.name: one.words for one in simulators(1, 0) if one.name in first}
     by_grid = {grid.name: [cell for cell in cells if cell.grid == grid.name] for grid in settings.grids}
-    facts = {
+    return {
         "s": settings,
         "truth": request.truth,
-        "spent": time.monotonic() - began,
         "kl_floor": KL_FLOOR,
         "sampled": [name for name in first if first[name].noise > 1.0],
         "grids": {name: [_row(one, said, here) for one, said in words.items()] for name, here in by_grid.items()},
         "keys": FIGURES,
-        "histogram": HISTOGRAM,
-        "histogram_cycles": HISTOGRAM_CYCLES,
+        "histogram": figures.HISTOGRAM,
+        "histogram_cycles": figures.HISTOGRAM_CYCLES,
+        "rows": [_csv_row(cell) for cell in cells],
+        "figures": {
+            "panels": figures.law_panels(cells),
+            "shape": figures.shapes(settings, cells, sweep),
+            "dead_time": figures.dead_time(settings, request.truth),
+        },
     }
-    rows = [_csv_row(cell) for cell in cells]
-    return write(request, "count_law", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _csv_row(cell: Cell) -> Row:
     row: dict[str, object] = {
-        **picked(cell, "grid period_ns signal background"),
-        "dead_time_ns": cell.dead_ns,
-        "simulated_mean": cell.mean,
-        "simulated_variance": cell.variance,
+        **picked(cell, "grid period_ns signal background dead_time_ns=dead_ns"),
+        **picked(cell, "simulated_mean=mean simulated_variance=variance"),
         "exact_mean": float(cell.exact[0]),
         "exact_variance": float(cell.exact[1]),
     }

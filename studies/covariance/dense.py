@@ -3,34 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics import HoldingTimeCovariance, moment_matrices
 from studies import Tell
-from studies.covariance.run import SPECTRAL, Cell, Settings, spectral_name
+from studies.covariance.run import SPECTRAL, SPECTRAL_NAME, Cell, Settings
 
 
-@dataclass(frozen=True)
-class DenseCheck:
-    """One cell by the paper's way, dense matrices and LAPACK, beside the O(n) way.
-
-    Differences of sums are relative to sigma^2. `inverse` is what left vectors from inv(V) in place of
-    LAPACK's change of sigma^2 by the paper's rule, relative to it; `negative` whether it is below 0.
-    """
-
-    cell: Cell
-    eigenvalues: float
-    spectral: float
-    exact: float
-    summed: float
-    inverse: float
-    negative: bool
-
-
-def dense_checks(settings: Settings, cells: list[Cell], extra: int, tell: Tell) -> list[DenseCheck]:
+def dense_checks(settings: Settings, cells: list[Cell], extra: int, tell: Tell) -> list[dict[str, Any]]:
     """Some cells the paper's way: the slowest at each dead time, the worst, `extra` at random, per grid."""
     found = [_dense_check(cell) for cell in _chosen(settings, cells, extra)]
     tell(f"covariance: {len(found)} cells by dense matrices, re-arming at the {cells[0].rearm}")
@@ -42,7 +25,7 @@ def _chosen(settings: Settings, cells: list[Cell], extra: int) -> Iterator[Cell]
     for grid in settings.grids:
         here = [cell for cell in cells if cell.grid is grid]
         slowest = [max((c for c in here if c.dead_ns == d), key=lambda c: c.sizes[1]) for d in grid.dead_ns]
-        worst = max(here, key=lambda cell: abs(cell.relative_error(spectral_name())))
+        worst = max(here, key=lambda cell: abs(cell.relative_error(SPECTRAL_NAME)))
         first = slowest if worst in slowest else [*slowest, worst]
         rest = [cell for cell in here if cell not in first]
         yield from first
@@ -50,7 +33,12 @@ def _chosen(settings: Settings, cells: list[Cell], extra: int) -> Iterator[Cell]
             yield rest[k]
 
 
-def _dense_check(cell: Cell) -> DenseCheck:
+def _dense_check(cell: Cell) -> dict[str, Any]:
+    """One cell by the paper's way, dense matrices and LAPACK, beside the O(n) way.
+
+    Differences of sums are relative to sigma^2. ``inverse`` is what left vectors from inv(V) in place of LAPACK's
+    change of sigma^2 by the paper's rule, relative to it; ``negative`` whether it is below 0.
+    """
     terms = cell.terms
     dense = HoldingTimeCovariance(**{name: getattr(terms, name) for name in terms.__dataclass_fields__})
     count = SPECTRAL[1] + 1
@@ -60,15 +48,15 @@ def _dense_check(cell: Cell) -> DenseCheck:
     paper = dense.spectral_sum(*SPECTRAL)
     inverse = _by_inverse(cell)
     sigma2 = terms.sigma2
-    return DenseCheck(
-        cell,
-        eigenvalues=float(apart.max()),
-        spectral=2.0 * abs(paper - cell.sums[spectral_name()]) / sigma2,
-        exact=2.0 * abs(_by_solve(cell) - terms.exact_sum) / sigma2,
-        summed=2.0 * abs(dense.cutoff_sum(3000) - terms.exact_sum) / sigma2,
-        inverse=2.0 * (inverse - paper) / sigma2,
-        negative=terms.sigma_ss2 + 2.0 * inverse < 0.0,
-    )
+    return {
+        "cell": cell,
+        "eigenvalues": float(apart.max()),
+        "spectral": 2.0 * abs(paper - cell.sums[SPECTRAL_NAME]) / sigma2,
+        "exact": 2.0 * abs(_by_solve(cell) - terms.exact_sum) / sigma2,
+        "summed": 2.0 * abs(dense.cutoff_sum(3000) - terms.exact_sum) / sigma2,
+        "inverse": 2.0 * (inverse - paper) / sigma2,
+        "negative": terms.sigma_ss2 + 2.0 * inverse < 0.0,
+    }
 
 
 def _parts(cell: Cell) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import heat, legend_below, panels
-from studies.common.report import save_figure
 from studies.covariance.run import (
     CUTOFFS,
+    SPECTRAL_NAME,
     TOLERANCES,
     Cell,
     Settings,
     automatic_name,
     cutoff_name,
     one_cell,
-    spectral_name,
 )
 
 _DECAY = ((1.0, 1.0), (10.0, 0.1))  # S, B
@@ -26,18 +26,7 @@ _DECAY_LAGS = 20
 _FLOOR = 1e-9  # of sigma_ss^2; below it covariances are not drawn
 
 
-def draw_all(folder: Path, settings: Settings, cells: Sequence[Cell]) -> list[Path]:
-    """Draw the four figures into `folder`; returns their paths."""
-    with style():
-        return [
-            _decay(folder / "covariance_decay.png", settings),
-            _eigenvalues(folder / "covariance_eigenvalues.png", settings, cells),
-            _truncation(folder / "covariance_truncation.png", settings, cells),
-            _map(folder / "covariance_map.png", settings, cells),
-        ]
-
-
-def _decay(path: Path, settings: Settings) -> Path:
+def decay(settings: Settings) -> Figure:
     """|gamma_l| / sigma_ss^2 against the lag, sign in the marker."""
     figure, axes = panels(2.7, 1, len(_DECAY), sharey=True)
     lags = np.arange(1, _DECAY_LAGS + 1)
@@ -67,10 +56,10 @@ def _decay(path: Path, settings: Settings) -> Path:
         fontsize=7,
         color=MUTED,
     )
-    return save_figure(path, figure)
+    return figure
 
 
-def _eigenvalues(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
+def eigenvalues(settings: Settings, cells: Sequence[Cell]) -> Figure:
     """Magnitudes of the leading eigenvalues: every cell a point, median and largest as lines."""
     figure, axes = panels(2.5, 1, len(settings.grids), sharey=True)
     random = np.random.default_rng(0)
@@ -97,13 +86,13 @@ def _eigenvalues(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
         fontsize=7,
         color=MUTED,
     )
-    return save_figure(path, figure)
+    return figure
 
 
-def _truncation(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
+def truncation(settings: Settings, cells: Sequence[Cell]) -> Figure:
     """Mean absolute error of the sum against the fixed cut-off, with the other rules as levels."""
     figure, axes = panels(2.7, 1, len(settings.grids), sharey=True)
-    levels = [(spectral_name(), COLOURS[1], "-")]
+    levels = [(SPECTRAL_NAME, COLOURS[1], "-")]
     levels += [(automatic_name(t), c, "--") for t, c in zip(TOLERANCES, (COLOURS[2], COLOURS[3]), strict=True)]
     for ax, grid in zip(axes[0], settings.grids, strict=True):
         here = [cell for cell in cells if cell.grid is grid]
@@ -119,23 +108,20 @@ def _truncation(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
         ax.set_title(f"{grid.name}, {grid.size} cells", loc="left")
     axes[0, 0].set_ylabel(r"mean |error| of $\sum\gamma_l$, ns$^2$")
     legend_below(figure, axes[0, :1], 4)
-    return save_figure(path, figure)
+    return figure
 
 
-def _map(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
+def error_map(settings: Settings, cells: Sequence[Cell]) -> Figure:
     """Relative error of sigma^2 over (S, B) for three rules, at each dead time of the last grid."""
-    from matplotlib.colors import LogNorm
-
-    rules = ("cut-off 0", "cut-off 20", spectral_name())
+    rules = ("cut-off 0", "cut-off 20", SPECTRAL_NAME)
     grid = settings.grids[-1]
     dead = grid.dead_ns
+    by = {(c.signal, c.background, c.dead_ns): c for c in cells if c.grid is grid}
     figure, axes = panels(3.3, len(rules), len(dead), sharex=True, sharey=True)
-    norm, mesh = LogNorm(1e-6, 1.0), None
+    norm = LogNorm(1e-6, 1.0)
     for row, rule in zip(axes, rules, strict=True):
         for ax, dead_ns in zip(row, dead, strict=True):
-            error = np.array(
-                [[_at(cells, grid.name, s, b, dead_ns).relative_error(rule) for s in grid.flux] for b in grid.flux]
-            )
+            error = np.array([[by[s, b, dead_ns].relative_error(rule) for s in grid.flux] for b in grid.flux])
             mesh = heat(ax, grid.flux, grid.flux, np.abs(error), norm)
     for ax, dead_ns in zip(axes[0], dead, strict=True):
         ax.set_title(f"$t_d$ = {dead_ns / grid.period_ns:g} $t_r$", fontsize=7)
@@ -144,9 +130,4 @@ def _map(path: Path, settings: Settings, cells: Sequence[Cell]) -> Path:
     figure.supxlabel("S, photons per period", fontsize=7.5)
     bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=40, pad=0.01)
     bar.set_label(r"|relative error of $\sigma^2$|")
-    return save_figure(path, figure)
-
-
-def _at(cells: Sequence[Cell], grid: str, signal: float, background: float, dead_ns: float) -> Cell:
-    wanted = (grid, signal, background, dead_ns)
-    return next(c for c in cells if (c.grid.name, c.signal, c.background, c.dead_ns) == wanted)
+    return figure

@@ -8,25 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from mars_lidar import System, holding_time_covariance
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.chain import Rearm
-from studies import Request, Tell
-from studies.common.report import Row, picked, write
+from studies import Facts, Request, Tell
+from studies.common.report import Row, picked
 from studies.common.sample import NEAR_NS, PERIOD_NS, WIDE_NS, Grid, log_points, paper_grids, system_of
 from studies.covariance.modes import LeadingTerms
 
 CUTOFFS = (*range(21), 25, 30, 40, 50, 75, 100, 150, 200, 300, 500)
 SPECTRAL = (6, 5)  # the paper's L and p
+SPECTRAL_NAME = "spectral L = {}, p = {}".format(*SPECTRAL)
 TOLERANCES = (1e-3, 1e-6)  # of the automatic rule
 PAPER_CUTOFF, PAPER_SPECTRAL = 125.91, 10.00  # mean absolute errors, in a unit the paper does not state
 PAPER_BEYOND_FIFTH = 0.7
 _USUAL_CUTOFFS = range(21)  # among these the best fixed one is looked for
 _HARD = (10.0, 1.0, 1.0)  # S, B, t_d / t_r
+_LOCKED = (0.0, 0.5, 0.9, 0.95, 0.98, 0.99, 0.999)  # t_d / t_r
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,10 @@ class Settings:
         return system_of(dead_ns, 1000, period_ns=period_ns, bins=self.bins, sigma_ns=self.sigma_ns)
 
 
-def _periods(*dead: float) -> tuple[float, ...]:
-    return tuple(d * PERIOD_NS for d in dead)
-
-
 FULL = Settings(
     grids=(
         *paper_grids(8, WIDE_NS, NEAR_NS),
-        Grid("locked", PERIOD_NS, log_points(8), _periods(0.0, 0.5, 0.9, 0.95, 0.98, 0.99, 0.999)),
+        Grid("locked", PERIOD_NS, log_points(8), tuple(PERIOD_NS * d for d in _LOCKED)),
     ),
     decay_dead=(0.0, 0.1875, 0.5, 0.6375, 0.95, 0.99),
     dense_random=2,
@@ -60,7 +57,7 @@ FULL = Settings(
 QUICK = Settings(
     grids=(
         Grid("wide", PERIOD_NS, log_points(2), (50.0,)),
-        Grid("locked", PERIOD_NS, log_points(2), _periods(0.0, 0.95)),
+        Grid("locked", PERIOD_NS, log_points(2), (0.0, 0.95 * PERIOD_NS)),
     ),
     decay_dead=(0.0, 0.6375, 0.95),
     dense_random=0,
@@ -107,11 +104,6 @@ def cutoff_name(cutoff: int) -> str:
     return f"cut-off {cutoff}"
 
 
-def spectral_name() -> str:
-    """Name of the paper's rule."""
-    return f"spectral L = {SPECTRAL[0]}, p = {SPECTRAL[1]}"
-
-
 def automatic_name(tolerance: float) -> str:
     """Name of the automatic rule (4.3) at a tolerance."""
     return f"automatic {tolerance:.0e}"
@@ -131,7 +123,7 @@ def compute(settings: Settings, rearm: Rearm, tell: Tell) -> list[Cell]:
 
 def one_cell(settings: Settings, signal: float, background: float, dead_periods: float, rearm: Rearm) -> Cell:
     """A cell outside of the grids, at the period of the canonical system."""
-    grid = Grid("single", PERIOD_NS, (), _periods(dead_periods))
+    grid = Grid("single", PERIOD_NS, (), (dead_periods * PERIOD_NS,))
     system = settings.system(PERIOD_NS, grid.dead_ns[0])
     return _cell(settings, grid, system, signal, background, rearm)
 
@@ -140,7 +132,7 @@ def _cell(settings: Settings, grid: Grid, system: System, signal: float, backgro
     full = holding_time_covariance(signal, background, system, lags=CUTOFFS[-1], rearm=rearm, bins=settings.bins)
     terms = LeadingTerms.of(full)
     sums = {cutoff_name(c): terms.cutoff_sum(c) for c in CUTOFFS}
-    sums[spectral_name()] = terms.spectral_sum(*SPECTRAL)
+    sums[SPECTRAL_NAME] = terms.spectral_sum(*SPECTRAL)
     rules = {}
     for tolerance in TOLERANCES:
         rule = terms.automatic_rule(tolerance)
@@ -160,43 +152,34 @@ def best_cutoff(cells: Sequence[Cell]) -> int:
     return min(_USUAL_CUTOFFS, key=lambda c: mean_error(cells, cutoff_name(c)))
 
 
-def _ratio(cells: Sequence[Cell]) -> float:
-    return mean_error(cells, cutoff_name(best_cutoff(cells))) / mean_error(cells, spectral_name())
-
-
-def matching_cutoff(cells: Sequence[Cell]) -> str:
-    """The least fixed cut-off tried that does as well as the spectral rule."""
-    goal = mean_error(cells, spectral_name())
-    enough = [c for c in CUTOFFS if mean_error(cells, cutoff_name(c)) <= goal]
-    return str(enough[0]) if enough else f"> {CUTOFFS[-1]}"
-
-
-def run(request: Request) -> list[Path]:
-    """Compute, draw and write the study; returns the paths written."""
+def run(request: Request) -> Facts:
+    """Both ways of re-arming on all grids, and the check by dense matrices."""
+    from studies.covariance import figures
     from studies.covariance.dense import dense_checks
-    from studies.covariance.figures import draw_all
 
     settings = QUICK if request.quick else FULL
     centre = compute(settings, "centre", request.tell)
     edge = compute(settings, "edge", request.tell)
     checks = dense_checks(settings, centre, settings.dense_random, request.tell)
     checks += dense_checks(settings, edge, 0, request.tell)
-    figures = draw_all(request.out, settings, centre)
     grids = [(grid, [cell for cell in centre if cell.grid is grid]) for grid in settings.grids]
-    cut20, spectral = cutoff_name(20), spectral_name()
+    cut20, spectral = cutoff_name(20), SPECTRAL_NAME
+    against = [
+        _against_paper(settings, name, here)
+        for name, here in (*((grid.name, here) for grid, here in grids), ("all", centre), ("all, edge re-arming", edge))
+    ]
     off = sorted(abs(c.relative_error(spectral)) for c in centre)
-    against = [*((grid.name, here) for grid, here in grids), ("all", centre), ("all, edge re-arming", edge)]
     poisson, bias = _poisson(centre)
-    facts = {
+    return {
         "s": settings,
         "centre": centre,
         "edge": edge,
         "wanted": sum(grid.size for grid in settings.grids),
         "grids": grids,
-        "against": [_against_paper(settings, name, here) for name, here in against],
+        "against": against,
         "cut20": cut20,
         "spectral": spectral,
-        "ratios": {grid.name: _ratio(here) for grid, here in grids},
+        "ratios": {row["grid"]: row["ratio"] for row in against[: len(grids)]},
         "beyond": max(centre, key=lambda c: c.sizes[5]),
         "hard": sum(abs(c.relative_error(cut20)) > 0.01 for c in centre),
         "worst20": max(centre, key=lambda c: abs(c.relative_error(cut20))),
@@ -207,13 +190,18 @@ def run(request: Request) -> list[Path]:
         "poisson": poisson,
         "bias": bias,
         "checks": checks,
-        "spoiled": sum(not abs(c.inverse) < 0.01 for c in checks),
+        "spoiled": sum(not abs(c["inverse"]) < 0.01 for c in checks),
         "by_rule": {grid.name: [_rule(here, rule) for rule in _RULES] for grid, here in grids},
         "edge_rules": [_rule(edge, rule) for rule in _RULES],
         "automatic": {t: np.array([c.rules[automatic_name(t)] for c in centre]).T for t in TOLERANCES},
+        "rows": [_csv_row(c) for c in (*centre, *edge)],
+        "figures": {
+            "decay": figures.decay(settings),
+            "eigenvalues": figures.eigenvalues(settings, centre),
+            "truncation": figures.truncation(settings, centre),
+            "map": figures.error_map(settings, centre),
+        },
     }
-    rows = [_csv_row(c) for c in (*centre, *edge)]
-    return write(request, "covariance", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _poisson(cells: Sequence[Cell]) -> tuple[Cell | None, float]:
@@ -227,11 +215,12 @@ def _poisson(cells: Sequence[Cell]) -> tuple[Cell | None, float]:
 
 def _against_paper(settings: Settings, name: str, cells: Sequence[Cell]) -> Row:
     best = best_cutoff(cells)
-    cut, spectral = mean_error(cells, cutoff_name(best)), mean_error(cells, spectral_name())
-    bin2 = [(settings.bins / cell.grid.period_ns) ** 2 for cell in cells]
+    cut, spectral = mean_error(cells, cutoff_name(best)), mean_error(cells, SPECTRAL_NAME)
+    # the least fixed cut-off tried that does as well as the spectral rule
+    match = next((str(c) for c in CUTOFFS if mean_error(cells, cutoff_name(c)) <= spectral), f"> {CUTOFFS[-1]}")
     in_bins = [
-        float(np.mean([abs(c.error(rule)) * b for c, b in zip(cells, bin2, strict=True)]))
-        for rule in (cutoff_name(best), spectral_name())
+        float(np.mean([abs(c.error(rule)) * (settings.bins / c.grid.period_ns) ** 2 for c in cells]))
+        for rule in (cutoff_name(best), SPECTRAL_NAME)
     ]
     return {
         "grid": name,
@@ -241,7 +230,7 @@ def _against_paper(settings: Settings, name: str, cells: Sequence[Cell]) -> Row:
         "best cut-off, bins²": in_bins[0],
         "spectral, bins²": in_bins[1],
         "ratio": cut / spectral,
-        "match": matching_cutoff(cells),
+        "match": match,
     }
 
 
@@ -257,29 +246,23 @@ def _rule(cells: Sequence[Cell], rule: str) -> dict[str, object]:
 
 _RULES = (
     *(cutoff_name(c) for c in (0, 1, 2, 3, 5, 6, 10, 15, 20, 50, 100, 500)),
-    spectral_name(),
+    SPECTRAL_NAME,
     *(automatic_name(t) for t in TOLERANCES),
 )
 
-_CSV_RULES = tuple(rule for rule in _RULES if rule not in {cutoff_name(c) for c in (1, 2, 3, 15)})
+_CSV_RULES = {
+    rule: rule.replace(" = ", "").replace(",", "").replace("cut-off", "cutoff").replace(" ", "_")
+    for rule in _RULES
+    if rule not in {cutoff_name(c) for c in (1, 2, 3, 15)}
+}
 
 
 def _csv_row(cell: Cell) -> Row:
-    terms = cell.terms
     return {
         "grid": cell.grid.name,
-        **picked(cell, "rearm signal background"),
-        "dead_time_ns": cell.dead_ns,
+        **picked(cell, "rearm signal background dead_time_ns=dead_ns"),
         "period_ns": cell.grid.period_ns,
-        "mu_ns": terms.mu,
-        "sigma_ss2_ns2": terms.sigma_ss2,
-        "sigma2_ns2": terms.sigma2,
-        "exact_sum_ns2": terms.exact_sum,
-        "defect": terms.defect,
+        **picked(cell.terms, "mu_ns=mu sigma_ss2_ns2=sigma_ss2 sigma2_ns2=sigma2 exact_sum_ns2=exact_sum defect"),
         **{f"abs_lambda_{k}": float(cell.sizes[k - 1]) for k in (2, 3, 4, 5, 6)},
-        **{f"error_{_column(rule)}_ns2": cell.error(rule) for rule in _CSV_RULES},
+        **{f"error_{column}_ns2": cell.error(rule) for rule, column in _CSV_RULES.items()},
     }
-
-
-def _column(rule: str) -> str:
-    return rule.replace(" = ", "").replace(",", "").replace("cut-off", "cutoff").replace(" ", "_")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mars_lidar import Afterpulsing, Crosstalk, Detector, Flux, GaussianPulse, Jitter, System, simulate
 from mars_lidar.statistics import constant_light_rate
-from studies import Request
-from studies.common.report import save_csv, write
+from studies import Facts, Request
 from studies.common.sample import settings_of
 from studies.detectors.run import LIGHT, SEED, outcome, row, shown_as
 
@@ -41,8 +39,8 @@ SHOWN = (
 )
 
 
-def run(request: Request) -> list[Path]:
-    """Write effects.md, effects.csv, effects_rate.csv and a figure for each group of effects."""
+def run(request: Request) -> Facts:
+    """Every effect, and the rate under constant light; a figure for each group of effects."""
     from studies.detectors.figures import draw_all
 
     exposures = 400 if request.quick else 10_000
@@ -50,13 +48,16 @@ def run(request: Request) -> list[Path]:
     for shown in SHOWN:
         request.tell(f"effects: {shown.name}")
         outcomes.append(outcome(shown, exposures))
-    figures = draw_all(request.out, outcomes, "effects")
     rows = [{"effect": each.shown.figure or "none", **row(each)} for each in outcomes]
     rates = constant_light(40 if request.quick else 4000)
     settings = settings_of(outcomes[0].system, LIGHT, exposures, SEED)
-    facts = {"settings": settings, "rows": rows, "figures": figures, "rates": rates}
-    figures = [*figures, save_csv(request.out / "effects_rate.csv", rates)]
-    return write(request, "effects", __name__, "effects", facts, rows=rows, figures=figures)
+    return {
+        "settings": settings,
+        "rows": rows,
+        "figures": draw_all(outcomes),
+        "rates": rates,
+        "tables": {"rate": rates},
+    }
 
 
 def constant_light(exposures: int) -> list[dict[str, Any]]:

@@ -3,50 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import legend_below, panels
-from studies.common.report import save_figure
-from studies.detectors.run import BACKGROUND, DELAY_NS, REACH, SIGNAL, Outcome, of_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from studies.detectors.run import BACKGROUND, DELAY_NS, REACH, SIGNAL, Outcome
 
 
-def draw_all(folder: Path, outcomes: Sequence[Outcome], study: str = "detectors") -> list[Path]:
-    """Draw the figures into `folder`."""
-    names = list(dict.fromkeys(each.shown.figure for each in outcomes if each.shown.figure))
-    with style():
-        return [_mode(folder / f"{study}_{name}.png", of_figure(outcomes, name)) for name in names]
+def draw_all(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
+    """A figure for each group of detectors, the free-running pixel in all of them."""
+    groups = dict.fromkeys(each.shown.figure for each in outcomes if each.shown.figure)
+    return {name: _group([each for each in outcomes if each.shown.figure in ("", name)]) for name in groups}
 
 
-def _mode(path: Path, shown: Sequence[Outcome]) -> Path:
+def _group(shown: Sequence[Outcome]) -> Figure:
     figure, axes = panels(2.5, 1, 3)
-    colours = [MUTED, *COLOURS]
-    _incident(axes[0, 0], shown[0])
-    for each, colour in zip(shown, colours, strict=False):
-        _histogram(axes[0, 0], each, colour)
-        _counts(axes[0, 1], each, colour)
-        _intervals(axes[0, 2], each, colour)
-    axes[0, 0].set(xlabel="time in the period, ns", ylabel="registrations per period and ns", yscale="log")
-    axes[0, 0].set_title("mean histogram")
-    axes[0, 1].set(xlabel="registrations N in an exposure", ylabel="P(N)")
-    axes[0, 1].set_title("count law")
-    axes[0, 2].set(xlabel="periods between registrations", ylabel="intervals per exposure", yscale="log")
-    axes[0, 2].set_title("inter-registration times")
-    axes[0, 2].set_xlim(0, REACH)
-    legend_below(figure, axes.flat, 4)
-    return save_figure(path, figure)
-
-
-def _incident(ax: Axes, each: Outcome) -> None:
-    system = each.system
+    left, middle, right = axes[0]
+    system = shown[0].system
     energy = SIGNAL * system.pulse.bin_energy(DELAY_NS, system.period_ns, system.bins) + BACKGROUND / system.bins
-    ax.plot(system.time_ns, energy / system.bin_ns, color=INK, lw=0.6, ls=":", label="arrivals")
+    left.plot(system.time_ns, energy / system.bin_ns, color=INK, lw=0.6, ls=":", label="arrivals")
+    for each, colour in zip(shown, [MUTED, *COLOURS], strict=False):
+        _histogram(left, each, colour)
+        number = np.bincount(each.counts) / each.counts.size
+        n = np.flatnonzero(number)
+        middle.plot(n, number[n], ".", ms=2.0, color=colour)
+        if each.law is not None:
+            middle.plot(n, np.pad(each.law, (0, max(0, number.size - each.law.size)))[n], color=colour, lw=0.9)
+        edges = np.linspace(0.0, REACH, each.intervals.size + 1)
+        right.stairs(np.where(each.intervals > 0, each.intervals, np.nan), edges, color=colour, lw=0.8)
+    left.set(xlabel="time in the period, ns", ylabel="registrations per period and ns", yscale="log")
+    left.set_title("mean histogram")
+    middle.set(xlabel="registrations N in an exposure", ylabel="P(N)")
+    middle.set_title("count law")
+    right.set(xlabel="periods between registrations", ylabel="intervals per exposure", yscale="log")
+    right.set_title("inter-registration times")
+    right.set_xlim(0, REACH)
+    legend_below(figure, axes.flat, 4)
+    return figure
 
 
 def _histogram(ax: Axes, each: Outcome, colour: str) -> None:
@@ -61,16 +57,3 @@ def _histogram(ax: Axes, each: Outcome, colour: str) -> None:
     inside = each.expected > 1e-9
     gaps = np.where(inside, each.expected * scale, np.nan)
     ax.plot(system.time_ns, gaps, color=colour, lw=0.9, label=label)
-
-
-def _counts(ax: Axes, each: Outcome, colour: str) -> None:
-    number = np.bincount(each.counts) / each.counts.size
-    n = np.flatnonzero(number)
-    ax.plot(n, number[n], ".", ms=2.0, color=colour)
-    if each.law is not None:
-        ax.plot(n, np.pad(each.law, (0, max(0, number.size - each.law.size)))[n], color=colour, lw=0.9)
-
-
-def _intervals(ax: Axes, each: Outcome, colour: str) -> None:
-    edges = np.linspace(0.0, REACH, each.intervals.size + 1)
-    ax.stairs(np.where(each.intervals > 0, each.intervals, np.nan), edges, color=colour, lw=0.8)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +13,7 @@ from mars_lidar import Detector, Flux, GaussianPulse, System, count_law, simulat
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
 from mars_lidar.statistics import mean_histogram
-from studies import Request
-from studies.common.report import write
+from studies import Facts, Request
 from studies.common.sample import settings_of
 
 SIGNAL, BACKGROUND, DELAY_NS, DEAD_NS = 1.0, 1.0, 37.0, 45.0
@@ -71,8 +68,8 @@ class Outcome:
     law: FloatArray | None
 
 
-def run(request: Request) -> list[Path]:
-    """Write detectors.md, detectors.csv and a figure for each mode."""
+def run(request: Request) -> Facts:
+    """Every mode; a figure for each."""
     from studies.detectors.figures import draw_all
 
     exposures = 400 if request.quick else 40_000
@@ -80,10 +77,12 @@ def run(request: Request) -> list[Path]:
     for shown in SHOWN:
         request.tell(f"detectors: {shown.name}")
         outcomes.append(outcome(shown, exposures))
-    figures = draw_all(request.out, outcomes)
     rows = [row(each) for each in outcomes]
-    facts = {"settings": settings_of(outcomes[0].system, LIGHT, exposures, SEED), "rows": rows, "figures": figures}
-    return write(request, "detectors", __name__, "report", facts, rows=rows, figures=figures)
+    return {
+        "settings": settings_of(outcomes[0].system, LIGHT, exposures, SEED),
+        "rows": rows,
+        "figures": draw_all(outcomes),
+    }
 
 
 def outcome(shown: Shown, exposures: int) -> Outcome:
@@ -98,18 +97,13 @@ def outcome(shown: Shown, exposures: int) -> Outcome:
     exposures = counts.size
     each = np.bincount(times.bin, minlength=system.bins) / exposures
     item = np.repeat(np.arange(exposures), counts)
-    second = _mean_square(item * system.bins + times.bin, exposures, system.bins)
+    place, number = np.unique(item * system.bins + times.bin, return_counts=True)
+    second = np.bincount(place % system.bins, number.astype(np.float64) ** 2, minlength=system.bins) / exposures
     apart = np.diff(times.times_ns)[item[1:] == item[:-1]] / system.period_ns
     intervals = np.histogram(apart, _BINS_OF_INTERVALS, (0.0, REACH))[0] / exposures
     expected, moments, law = _predicted(system)
     error = np.sqrt(np.maximum(second - each**2, 0.0) / exposures)
     return Outcome(shown, system, counts, each, error, intervals, expected, moments, law)
-
-
-def _mean_square(place: NDArray[np.int64], exposures: int, bins: int) -> FloatArray:
-    """Mean of the squares of the counts in each bin, from the place (exposure, bin) of every registration."""
-    cell, number = np.unique(place, return_counts=True)
-    return np.bincount(cell % bins, number.astype(np.float64) ** 2, minlength=bins) / exposures
 
 
 def _predicted(system: System) -> tuple[FloatArray | None, tuple[float, float] | None, FloatArray | None]:
@@ -126,19 +120,10 @@ def row(each: Outcome) -> dict[str, Any]:
     """One line of the table."""
     n = each.counts.size
     mean, variance = float(each.counts.mean()), float(each.counts.var(ddof=1))
-    line: dict[str, Any] = {
-        "detector": each.shown.name,
-        "simulated mean": mean,
-        "simulated variance": variance,
-        "predicted mean": "-",
-        "predicted variance": "-",
-        "z mean": "-",
-        "z variance": "-",
-        "worst z of a bin": "-",
-        "p of the law": "-",
-    }
+    line: dict[str, Any] = {"detector": each.shown.name, "simulated mean": mean, "simulated variance": variance}
     if each.moments is None or each.expected is None or each.law is None:
-        return line
+        words = ("predicted mean", "predicted variance", "z mean", "z variance", "worst z of a bin", "p of the law")
+        return line | dict.fromkeys(words, "-")
     fourth = float(np.mean((each.counts - mean) ** 4))
     seen = each.histogram_error > 0
     z = (each.histogram[seen] - each.expected[seen]) / each.histogram_error[seen]
@@ -163,8 +148,3 @@ def _fit(counts: NDArray[np.int64], law: FloatArray) -> float:
     seen = np.bincount(group, np.bincount(counts, minlength=size))
     wanted = np.bincount(group, expected)
     return float(chisquare(seen, wanted * (seen.sum() / wanted.sum())).pvalue)
-
-
-def of_figure(outcomes: Sequence[Outcome], figure: str) -> list[Outcome]:
-    """The outcomes that a figure shows: the free-running pixel first."""
-    return [each for each in outcomes if each.shown.figure in ("", figure)]

@@ -139,14 +139,10 @@ def two_samples(a: Sample, b: Sample) -> list[Check]:
     for k, name in enumerate(("variance of the count", "variance of the window", "variance of the echo")):
         u, v = a.windows[:, k].astype(float), b.windows[:, k].astype(float)
         checks += _two_variances(a, b, name, u, v)
-    if _sparse(a, b):
+    # at most one in ten exposures has a registration: they are as good as independent
+    if max(a.counts.mean(), b.counts.mean()) < 0.1 and min(a.counts.sum(), b.counts.sum()) > 100:
         checks.append(homogeneous(a.engine, b.engine, "sum histogram", np.array([a.cells.sum(0), b.cells.sum(0)])))
     return checks
-
-
-def _sparse(a: Sample, b: Sample) -> bool:
-    """Whether registrations of these samples are as good as independent: at most one in ten exposures."""
-    return bool(max(a.counts.mean(), b.counts.mean()) < 0.1 and min(a.counts.sum(), b.counts.sum()) > 100)
 
 
 def _two_variances(a: Sample, b: Sample, name: str, u: FloatArray, v: FloatArray) -> list[Check]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from studies.common.draw import WIDTH, panels
-from studies.common.report import save_figure
 from studies.domain.verdict import ENGINES, FAILED, HANDED, LAWS, REFUSED, SLOW, UNJUDGED, VERIFIED
 
 _INK = {
@@ -30,18 +30,18 @@ _TITLE = {
 }
 
 
-def maps(rows: Sequence[dict[str, Any]], out: Path) -> list[Path]:
-    """`rows`: a case each, with a state by subject. Writes the figures; returns their paths."""
-    return [
-        _map(rows, ENGINES, "S", "dead", out / "domain_engines.png"),
-        _map(rows, ENGINES, "B", "cycles", out / "domain_engines_exposure.png"),
-        _map(rows, LAWS[:5], "S", "dead", out / "domain_laws.png"),
-        _map(rows, LAWS[:5], "cycles", "bins", out / "domain_laws_exposure.png"),
-        _modes(rows, out / "domain_modes.png"),
-    ]
+def maps(rows: Sequence[dict[str, Any]]) -> dict[str, Figure]:
+    """`rows`: a case each, with a state by subject. The figures by name."""
+    return {
+        "engines": _map(rows, ENGINES, "S", "dead"),
+        "engines_exposure": _map(rows, ENGINES, "B", "cycles"),
+        "laws": _map(rows, LAWS[:5], "S", "dead"),
+        "laws_exposure": _map(rows, LAWS[:5], "cycles", "bins"),
+        "modes": _modes(rows),
+    }
 
 
-def _map(rows: Sequence[dict[str, Any]], subjects: Sequence[str], x: str, y: str, path: Path) -> Path:
+def _map(rows: Sequence[dict[str, Any]], subjects: Sequence[str], x: str, y: str) -> Figure:
     """A scatter plot for each subject, over two quantities."""
     figure, axes = panels(2.3, 1, len(subjects))
     for ax, subject in zip(axes[0], subjects, strict=True):
@@ -59,10 +59,10 @@ def _map(rows: Sequence[dict[str, Any]], subjects: Sequence[str], x: str, y: str
         ax.tick_params(labelsize=6, which="both")
     axes[0, 0].set_ylabel(_TITLE[y], fontsize=7)
     _legend(figure)
-    return save_figure(path, figure)
+    return figure
 
 
-def _modes(rows: Sequence[dict[str, Any]], path: Path) -> Path:
+def _modes(rows: Sequence[dict[str, Any]]) -> Figure:
     """Shares of the states, by mode and start, a bar for each subject."""
     kinds = [
         (mode, start)
@@ -87,12 +87,10 @@ def _modes(rows: Sequence[dict[str, Any]], path: Path) -> Path:
         ax.set_xticks([0, 0.5, 1], ["0", "50 %", "100 %"], fontsize=5)
     _legend(figure)
     figure.set_size_inches(WIDTH, 4.4)
-    return save_figure(path, figure)
+    return figure
 
 
 def _legend(figure: Any) -> None:
-    from matplotlib.lines import Line2D
-
     handles = [
         Line2D([], [], marker="x" if state == FAILED else "o", ls="", ms=4, color=ink, label=state)
         for state, ink in _INK.items()

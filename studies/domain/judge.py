@@ -23,7 +23,7 @@ from studies.domain.checks import (
 )
 from studies.domain.predictions import TOLERANCE, Predictions
 from studies.domain.records import recorded
-from studies.domain.samples import Sample, Windows, handed, own, simulated
+from studies.domain.samples import Sample, Windows, collect, handed, simulated
 from studies.domain.verdict import FAILED, HANDED, LAWS, REFUSED, SLOW, UNJUDGED, VERIFIED, Outcome, refusal
 
 LAW_SECONDS = 2.0  # a prediction that takes longer is slower than real use
@@ -33,6 +33,7 @@ _LANES = 32  # exposures that the exact engine draws in the time of one
 _NEEDS = {"cramer_rao": ("mean_histogram",), "mars": ("count_law", "mean_histogram"), "pmf": ("count_law",)}
 _SLACK = {"feedback": 0.05, "auto": 0.05}  # standard deviations that the mean of a bin may be off (docs/feedback.md)
 _MARS_SECONDS = 0.03  # of its laws, beyond which engine "mars" is not asked for them again
+ENGINES = ("exact", "sequential", "feedback", "auto", "mars")  # in order of drawing; each has a seed of its own
 _PAIRS = (
     ("exact", "sequential"),
     ("exact", "simulator"),
@@ -84,7 +85,7 @@ class _Judge:
         self.windows = self.predicted.windows
         if self.windows is None and mean is not None:
             self.windows = Windows.of(self.case, mean)
-        for engine in ("exact", "sequential", "feedback", "auto", "mars"):
+        for engine in ENGINES:
             if engine == "auto" and self.case.number % 2:
                 continue  # it draws with the other two: every second system
             self._attempt(engine, lambda engine=engine: self._engine(engine), np.inf)  # type: ignore[misc]
@@ -130,7 +131,9 @@ class _Judge:
         case, one = self.case, self.case.registrations()
         if engine != "exact" and engine != "sequential":
             simulate(case.flux(), case.system.replace(cycles=1), engine=engine, threads=1)  # claims it, or refuses
-        arrivals = case.photons * (case.system.cycles + _warm_up(case))
+        # before a stationary exposure the sequential engine draws so many periods
+        early = 320.0 * (case.system.dead_time_periods + 1.0) if case.system.start == "stationary" else 0.0
+        arrivals = case.photons * (case.system.cycles + early)
         events = arrivals if engine == "sequential" or case.mode == "paralyzable" else one
         if case.mode in ("gated", "moving gate"):
             events = max(events, min(arrivals, case.system.cycles))
@@ -142,7 +145,7 @@ class _Judge:
             items = self._handed(engine, items, one)
         if self.windows is None:
             self.windows = Windows.of(case, self._pilot())
-        sample = simulated(engine, case, items, self.seed + 1 + hash_of(engine), self.windows)
+        sample = simulated(engine, case, items, self.seed + 1 + 1000 * ENGINES.index(engine), self.windows)
         if sample.counts.sum() > 0 or items * one > 30:
             self.samples[engine] = sample
         if engine in ("feedback", "auto") and sample.handed >= 1.0:
@@ -165,7 +168,10 @@ class _Judge:
         if engine == "auto" and one <= 4 * self.case.system.bins:
             return min(items, 64)
         pixels = 1 if cost > 0.03 else 16
-        share = handed(self._report(engine, pixels)) / pixels
+        report: dict[str, float] = {}
+        case = self.case
+        simulate(case.flux(pixels), case.system, engine=engine, threads=1, seed=self.seed, report=report)
+        share = handed(report) / pixels
         if share >= 1.0 and cost > EXPOSURE_SECONDS:
             raise _Skipped(HANDED, "report: pixels given to exact")
         if share > 0.0:
@@ -173,12 +179,6 @@ class _Judge:
         parts = 0 if self.case.waveform is None else self.case.waveform.size
         per = max(self.case.system.bins, parts, 2000.0)
         return int(np.clip(0.15 * self.budget.cells / per, 1, 0.5 * self.budget.exposures))
-
-    def _report(self, engine: str, pixels: int) -> dict[str, float]:
-        report: dict[str, float] = {}
-        case = self.case
-        simulate(case.flux(pixels), case.system, engine=engine, threads=1, seed=self.seed, report=report)
-        return report
 
     def _against_predictions(self, sample: Sample) -> list[Check]:
         told, found, engine = self.predicted, [], sample.engine
@@ -246,7 +246,9 @@ class _Judge:
             return
         assert self.windows is not None
         self.tell("simulator", "begin")
-        self.samples["simulator"] = own(self.case, items, self.seed + 5, self.windows, simulator.counts)
+        self.samples["simulator"] = collect(
+            "simulator", [simulator.counts(self.case, items, self.seed + 5)], self.windows
+        )
         self.outcomes.append(
             Outcome(self.case.name, "simulator", VERIFIED, checks=self._against_predictions(self.samples["simulator"]))
         )
@@ -273,13 +275,3 @@ class _Skipped(Exception):
     def __init__(self, state: str, why: str) -> None:
         super().__init__(why)
         self.state = state
-
-
-def hash_of(engine: str) -> int:
-    """A different seed for each engine."""
-    return 1000 * ("exact", "sequential", "feedback", "auto", "mars").index(engine)
-
-
-def _warm_up(case: Case) -> float:
-    """Periods that the sequential engine draws before a stationary exposure."""
-    return 320.0 * (case.system.dead_time_periods + 1.0) if case.system.start == "stationary" else 0.0

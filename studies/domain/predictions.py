@@ -32,7 +32,6 @@ class Predictions:
         self.law: CountLaw | None = None
         self.pmf: tuple[int, FloatArray] | None = None
         self.histogram: FloatArray | None = None
-        self.stationary: FloatArray | None = None
         self.joint: JointLaw | None = None
         self.windows: Windows | None = None
         self.window_mean: FloatArray | None = None
@@ -120,7 +119,6 @@ class Predictions:
     def _stationary(self) -> list[Check]:
         case = self.case
         shape = np.asarray(registration_pdf(method="stationary", system=case.system, threads=1, **case.light()))
-        self.stationary = shape
         found = [_sane("stationary shape", bool(np.isfinite(shape).all() and abs(shape.sum() - 1.0) < 1e-6))]
         dead = case.system.dead_time_periods
         plain = case.mode == "nonparalyzable" and not case.system.detector.effects

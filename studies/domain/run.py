@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mars_lidar._base.threads import thread_count
-from studies import Request
-from studies.common.report import number, save_csv, write
+from studies import Facts, Request
+from studies.common.report import number
 from studies.domain import judge, references, sweep, verdict, watch
 from studies.domain.checks import Check
 from studies.domain.figures import decades, maps
@@ -27,11 +27,11 @@ REFERENCE_LEVEL = 1e-6
 _LISTED = 40  # failures that the report names; all are in domain_failures.csv
 
 
-def run(request: Request) -> list[Path]:
-    """Sweep, and write ``domain.md``, ``domain.csv``, ``domain_failures.csv`` and the maps."""
+def run(request: Request) -> Facts:
+    """The sweep, the reference cases if there are any, and the maps."""
     settings = QUICK if request.quick else FULL
     if request.seed is not None:
-        settings = Settings(settings.systems, request.seed, settings.budget, settings.checks)
+        settings = replace(settings, seed=request.seed)
     began = time.monotonic()
     judged: list[Judged] = []
     for case in sweep.sweep(settings, request.tell, min(thread_count(None), settings.systems)):
@@ -40,13 +40,8 @@ def run(request: Request) -> list[Path]:
             request.tell(f"{len(judged)} of {settings.systems} systems, {time.monotonic() - began:.0f} s")
     outside = references.compare(request.data, settings.seed)
     cases = [case_row(one) for one in judged]
-    figures = maps(cases, request.out)
     failures = failure_rows(judged, outside)
-    if failures:
-        figures.append(save_csv(request.out / "domain_failures.csv", failures))
-    else:
-        (request.out / "domain_failures.csv").unlink(missing_ok=True)
-    facts = {
+    return {
         "s": settings,
         "judged": judged,
         "judge": judge,
@@ -55,15 +50,16 @@ def run(request: Request) -> list[Path]:
         "second_level": verdict.second_level(settings.checks),
         "result": {subject: Counter(state for _, state in _states(judged, subject)) for subject in SUBJECTS},
         "failures": failures,
+        "tables": {"failures": failures},
         "loud": sum("Error" in row["note"].split(":")[0] for row in failures),
         "ranges": [_range(judged, subject) for subject in SUBJECTS],
         "slow": [_slow(judged, subject) for subject in LAWS],
         "drawn": _drawn(judged),
         "worst": min(outside, key=lambda check: check.p, default=None),
         "outside": len(outside),
-        "seconds": time.monotonic() - began,
+        "rows": cases,
+        "figures": maps(cases),
     }
-    return write(request, "domain", __name__, "report", facts, rows=cases, figures=figures)
 
 
 def case_row(judged: Judged) -> dict[str, Any]:
@@ -85,17 +81,13 @@ def failure_rows(judged: list[Judged], outside: list[Check]) -> list[dict[str, A
         if outcome.state == "failed"
     ]
     blank = dict.fromkeys(judged[0].case.facts(), "") if judged else {}
-    for check in outside:
-        if check.p < REFERENCE_LEVEL:
-            rows.append(
-                blank
-                | {
-                    "case": check.a,
-                    "subject": check.a.split(",")[0],
-                    "note": f"{check.what}: p {check.p:.1g} against the reference",
-                }
-            )
-    return rows
+    return rows + [
+        blank
+        | {"case": check.a, "subject": check.a.split(",")[0]}
+        | {"note": f"{check.what}: p {check.p:.1g} against the reference"}
+        for check in outside
+        if check.p < REFERENCE_LEVEL
+    ]
 
 
 def _states(judged: Sequence[Judged], subject: str) -> list[tuple[Judged, str]]:

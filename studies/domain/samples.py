@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,14 +60,13 @@ def pulse_window(case: Case) -> tuple[float, float]:
 
 @dataclass(eq=False)
 class Sample:
-    """`counts` (items,), `cells` (items, cells), `windows` (items, windows), `total` (bins,); largest bin of all."""
+    """`counts` (items,), `cells` (items, cells), `windows` (items, windows), `total` (bins,)."""
 
     engine: str
     counts: NDArray[np.int64]
     cells: NDArray[np.int64]
     windows: NDArray[np.int64]
     total: NDArray[np.int64]
-    largest: int
     handed: float = 0.0
 
     @property
@@ -79,14 +77,13 @@ class Sample:
 
 def collect(engine: str, blocks: Any, windows: Windows) -> Sample:
     """A sample from blocks of histograms (items, bins)."""
-    counts, cells, looked, largest, total = [], [], [], 0, np.zeros(windows.weights.shape[1], np.int64)
+    counts, cells, looked, total = [], [], [], np.zeros(windows.weights.shape[1], np.int64)
     for block in blocks:
         counts.append(block.sum(1, dtype=np.int64))
         cells.append(np.add.reduceat(block, windows.edges, axis=1, dtype=np.int64))
         looked.append(np.stack([block[:, row].sum(1, dtype=np.int64) for row in windows.weights], axis=1))
         total += block.sum(0, dtype=np.int64)
-        largest = max(largest, int(block.max(initial=0)))
-    return Sample(engine, np.concatenate(counts), np.concatenate(cells), np.concatenate(looked), total, largest)
+    return Sample(engine, np.concatenate(counts), np.concatenate(cells), np.concatenate(looked), total)
 
 
 def simulated(engine: str, case: Case, items: int, seed: int, windows: Windows) -> Sample:
@@ -122,8 +119,3 @@ def simulated(engine: str, case: Case, items: int, seed: int, windows: Windows) 
 def handed(report: dict[str, float]) -> float:
     """Pixels that `feedback` or `auto` gave to the exact engine, by their report."""
     return max(report.get("pixels given to exact", 0.0), report.get("pixels drawn by exact", 0.0))
-
-
-def own(case: Case, items: int, seed: int, windows: Windows, counts: Callable[..., NDArray[np.int64]]) -> Sample:
-    """Exposures by the sweep's own simulator."""
-    return collect("simulator", [counts(case, items, seed)], windows)

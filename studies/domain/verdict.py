@@ -72,7 +72,7 @@ def blamed(failing: list[Check]) -> dict[str, list[Check]]:
     while left:
         times = Counter(name for check in left for name in {check.a, check.b})
         pairs = {name: len({frozenset((c.a, c.b)) for c in left if name in (c.a, c.b)}) for name in times}
-        worst = min(times, key=lambda name: (-pairs[name], _rank(name)))
+        worst = min(times, key=lambda name: (-pairs[name], (*_SUSPECTS, name).index(name)))
         found[worst] = [check for check in left if worst in (check.a, check.b)]
         left = [check for check in left if worst not in (check.a, check.b)]
     return found
@@ -81,7 +81,3 @@ def blamed(failing: list[Check]) -> dict[str, list[Check]]:
 def second_level(checks: int) -> float:
     """Level of the second drawing, so that `checks` true hypotheses all survive with probability 1 - `FAMILY_LEVEL`."""
     return FAMILY_LEVEL / (max(checks, 1) * FIRST_LEVEL)
-
-
-def _rank(name: str) -> int:
-    return _SUSPECTS.index(name) if name in _SUSPECTS else len(_SUSPECTS)

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Detector, GaussianPulse, Scene, System, Table, simulate
+from mars_lidar import Scene, Table, simulate
 from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
 from mars_lidar.learn import CubeStream, Uniform
 from mars_lidar.table.start_phase import StartPhases
+from studies.common.sample import system_of
 from studies.neural import NeuralEngine
 
-SYSTEM = System(  # that of the network beside studies/neural
-    period_ns=1e3 / 7.5, cycles=1000, bins=1024, pulse=GaussianPulse(sigma_ns=0.5), detector=Detector(dead_time_ns=75.0)
-)
+SYSTEM = system_of(75.0, 1000)  # that of the network beside studies/neural
 WORDS = {
     "poisson": "Poisson",
     "renewal": "renewal",
@@ -188,3 +187,33 @@ def truths(scenes: Sequence[Scene]) -> tuple[NDArray[np.float64], NDArray[np.flo
     """Depth, m, NaN without a return, and reflectivity, 0 there: (N, H, W)."""
     light = [np.where(scene.valid, scene.reflectivity, 0.0) for scene in scenes]
     return np.stack([scene.depth_m for scene in scenes]), np.stack(light)
+
+
+QUARTERS = ("dimmest", "second", "third", "brightest")
+_STREAMS = (5, 6, 7)  # of the arms and of two exposures by the gold standard; others than those of the networks' data
+
+
+def count_bias(config: Config, scenes: Sequence[Scene], simulators: Simulators) -> dict[str, dict[str, list[float]]]:
+    """By ratio and arm: mean count over that of the gold standard, less 1, in quarters of the pixels by reflectivity.
+
+    Key ``"scatter"`` stands for the gold standard's own standard deviation of a pixel's count, over its mean: what a
+    bias is to be measured by.
+    """
+    reflectivity = np.stack([scene.reflectivity for scene in scenes]).ravel()
+    quarters = np.array_split(np.argsort(reflectivity, kind="stable"), len(QUARTERS))
+
+    def totals(arm: str, sbr: float, stream: int) -> NDArray[np.float64]:
+        cubes = simulators.cubes(arm, scenes, sbr, (config.seed << 8) + stream)
+        return np.asarray(cubes.sum(axis=-1, dtype=np.float64)).ravel()
+
+    def by_quarter(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.array([values[pixels].mean() for pixels in quarters])
+
+    found: dict[str, dict[str, list[float]]] = {}
+    for sbr in config.sbr:
+        first, second = (totals(config.gold, sbr, stream) for stream in _STREAMS[1:])
+        gold = 0.5 * by_quarter(first + second)
+        rows = {arm: by_quarter(totals(arm, sbr, _STREAMS[0])) / gold - 1.0 for arm in config.arms}
+        rows["scatter"] = np.sqrt(0.5 * by_quarter((first - second) ** 2)) / gold
+        found[f"{sbr:g}"] = {name: row.tolist() for name, row in rows.items()}
+    return found

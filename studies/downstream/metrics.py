@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.optional import needed
 
 
 def psnr(found: ArrayLike, true: ArrayLike, data_range: float) -> float:
@@ -30,16 +31,10 @@ def rmse(found: ArrayLike, true: ArrayLike) -> float:
 def ssim(found: ArrayLike, true: ArrayLike, data_range: float) -> float:
     """Structural similarity (Wang et al. 2004) of two images (H, W), Gaussian window of 1.5 pixels; scikit-image's."""
     peak = checks.real("data_range", data_range, low=0.0, strict_low=True)
-    try:
-        from skimage.metrics import structural_similarity
-    except ImportError as error:
-        raise ImportError(f"ssim needs scikit-image: pip install 'mars-lidar[estimate]' ({error})") from error
+    metrics = needed("skimage.metrics", "ssim", "estimate")
     a, b = _pair(found, true)
-    return float(
-        structural_similarity(  # type: ignore[no-untyped-call]
-            a, b, data_range=peak, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
-        )
-    )
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    return float(metrics.structural_similarity(a, b, data_range=peak, **options))
 
 
 def _pair(found: ArrayLike, true: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:

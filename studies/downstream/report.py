@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-from studies import Request
-from studies.common.report import Row, save_figure, write
+from studies import Facts
+from studies.common.kept import spread
+from studies.common.report import Row
 from studies.downstream import run
-from studies.downstream.counts import QUARTERS
-from studies.downstream.data import CONFIGS, SYSTEM, WORDS, Config
-from studies.downstream.figures import picture
-from studies.downstream.run import MODELS, Run, by_arm
+from studies.downstream.data import CONFIGS, QUARTERS, SYSTEM, WORDS, Config, crop
+from studies.downstream.run import MODELS, TARGETS, Run, by_arm
 
 PAPER = {  # T5 of arXiv 2512.04924: by ratio and arm, own then gold; reflectivity PSNR in dB, depth RMSE in m
     (0.6, "poisson"): ((36.49, 0.072), (7.02, 1.654)),
@@ -38,20 +39,15 @@ ASSUMED = (
 )
 
 
-def report(
-    request: Request,
+def facts(
     folder: Path,
     config: Config,
     found: Mapping[Run, Any],
     references: Mapping[str, Mapping[str, float]],
     counts: Mapping[str, Mapping[str, list[float]]],
-) -> list[Path]:
-    """downstream.md, downstream.csv and a figure for each ratio; the `found` results are complete."""
-    pictures = [
-        save_figure(request.out / f"downstream_sbr{sbr:g}.png", picture(folder, config, found, sbr))
-        for sbr in config.sbr
-    ]
-    facts = {
+) -> Facts:
+    """What the report states of the results by run, with a figure for each ratio."""
+    return {
         "c": config,
         "full": CONFIGS["full"],
         "system": SYSTEM,
@@ -66,15 +62,9 @@ def report(
         "quarters": QUARTERS,
         "counts": counts,
         "words": WORDS,
-        "pictures": pictures,
+        "rows": _csv(found),
+        "figures": {f"sbr{sbr:g}": picture(folder, config, found, sbr) for sbr in config.sbr},
     }
-    return write(request, "downstream", __name__, "report", facts, rows=_csv(found), figures=pictures)
-
-
-def spread(values: list[float], digits: int) -> str:
-    """Mean, and the standard deviation between seeds where there are several."""
-    mean = f"{np.mean(values):.{digits}f}"
-    return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
 
 
 def _values(results: list[Any], where: str, model: str, target: str, measure: str) -> list[float]:
@@ -133,3 +123,35 @@ def _csv(found: Mapping[Run, Any]) -> list[Row]:
                     row |= {"tested": where, "target": target} | measures
                     rows.append(row | {"covered": measures.get("covered", "")})
     return rows
+
+
+_SHORT = {"poisson": "Poisson", "nearest": "MaRS, nearest", "mars": "MaRS"}
+
+
+def picture(folder: Path, config: Config, found: Mapping[Run, Any], sbr: float) -> Figure:
+    """The first test scene: truth, and every arm's window network on its own and on gold-standard data."""
+    scene = crop(config.test[0], config)
+    arms = list(config.arms)
+    figure = Figure(figsize=(1.05 * (len(arms) + 1), 4.7), dpi=90, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(4, len(arms) + 1, squeeze=False)
+    for half, target in enumerate(TARGETS):
+        true = scene.depth_m if target == "depth" else scene.reflectivity
+        limits: dict[str, Any] = {"vmin": float(np.nanmin(true)), "vmax": float(np.nanmax(true))}
+        limits["cmap"] = "viridis" if target == "depth" else "gray"
+        axes[2 * half, 0].imshow(true, **limits)
+        axes[2 * half, 0].set_title(f"{target}, true")
+        axes[2 * half + 1, 0].axis("off")
+        for k, arm in enumerate(arms, 1):
+            one = Run(arm, sbr, config.arms[arm][0])
+            with np.load(folder / f"{one.name}.npz") as shown:
+                for row, data in enumerate(("own", "gold")):
+                    ax = axes[2 * half + row, k]
+                    ax.imshow(shown[f"{data}_window_{target}"], **limits)
+                    error = found[one][data]["window"][target]
+                    told = f"{error['rmse']:.3f} m" if target == "depth" else f"{error['psnr']:.1f} dB"
+                    ax.set_title(f"{_SHORT.get(arm, arm)}\n{data}: {told}" if row == 0 else f"{data}: {told}")
+    for ax in axes.flat:
+        ax.set(xticks=[], yticks=[])
+    figure.suptitle(f"Window networks, SBR {sbr:g}; figures under the names: over all test scenes", fontsize=8)
+    return figure

@@ -6,10 +6,10 @@ network side by side. Each leaves its result in a file of its own, and a study t
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import Scene, cramer_rao, reconstruct
-from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from studies import OtherRunsError, Request
-from studies.common.report import save_whole
-from studies.downstream.counts import count_bias
-from studies.downstream.data import CONFIGS, SYSTEM, Config, Simulators, crop, level, truths
+from studies import Facts, Request
+from studies.common.kept import chosen, fixed, kept
+from studies.common.windows import features
+from studies.downstream.data import CONFIGS, SYSTEM, Config, Simulators, count_bias, crop, level, truths
 from studies.downstream.metrics import psnr, rmse, ssim
 
 TARGETS = ("reflectivity", "depth")
 MODELS = {"polynomial": "polynomial", "window": "window network", "bins": "bin network"}
 METHODS = ("peak", "matched_filter", "generalised_coates", "maximum_likelihood")  # that need no training
-CONFIG, COUNTS, REFERENCES = "config.json", "counts.json", "references.json"
 DEGREE = 4  # of the polynomial, in log(1 + total) and log(1 + counts of the window)
 LIGHT_M_PER_NS = 0.299792458 / 2.0  # of depth
 _TRAINING, _OWN, _GOLD = range(3)  # streams of noise
@@ -60,37 +58,23 @@ def runs(config: Config) -> list[Run]:
     ]
 
 
-def run(request: Request) -> list[Path]:
-    """Make what is left of the runs, and write downstream.md, its CSV and its figures."""
-    from studies.downstream.report import report
+def run(request: Request) -> Facts:
+    """Make what is left of the runs, and report all."""
+    from studies.downstream import report
 
-    name = "tiny" if request.quick else request.config
-    config = CONFIGS[checks.choice("config", name, tuple(CONFIGS))]
+    config = chosen(CONFIGS, request)
     folder = request.out / f"downstream-{config.name}"
-    fixed(folder, config)
+    fixed(folder, asdict(config) | {"system": SYSTEM.to_dict()})
     data = Data(config)
-    left = [one for one in runs(config) if not (folder / f"{one.name}.json").exists()]
-    request.tell(f"downstream: {len(left)} of {len(runs(config))} streams to train on")
-    for done, one in enumerate(left):
-        train_and_test(one, data, folder)
-        request.tell(f"downstream: {one.name} ({len(left) - done - 1} left)")
-    for file, make in ((REFERENCES, data.references), (COUNTS, data.count_bias)):
-        if not (folder / file).exists():
-            request.tell(f"downstream: {file.removesuffix('.json')}")
-            save_whole(folder / file, json.dumps(make(), indent=2) + "\n")
-    found = {one: json.loads((folder / f"{one.name}.json").read_text()) for one in runs(config)}
-    once = [json.loads((folder / file).read_text()) for file in (REFERENCES, COUNTS)]
-    return report(request, folder, config, found, *once)
-
-
-def fixed(folder: Path, config: Config) -> None:
-    """Write the configuration, or refuse a folder with runs of another."""
-    folder.mkdir(parents=True, exist_ok=True)
-    record = json.dumps(asdict(config) | {"system": SYSTEM.to_dict()}, indent=2) + "\n"
-    path = folder / CONFIG
-    if path.exists() and path.read_text() != record:
-        raise OtherRunsError(f"{folder} holds runs of another configuration ({CONFIG}); give another --out")
-    save_whole(path, record)
+    files = {one: folder / f"{one.name}.json" for one in runs(config)}
+    left = sum(not path.exists() for path in files.values())
+    request.tell(f"downstream: {left} of {len(files)} streams to train on")
+    found = {one: kept(path, partial(train_and_test, one, data, folder), request.tell) for one, path in files.items()}
+    references, counts = (
+        kept(folder / f"{name}.json", make, request.tell)
+        for name, make in (("references", data.references), ("counts", data.count_bias))
+    )
+    return {"study": report} | report.facts(folder, config, found, references, counts)
 
 
 class Data:
@@ -115,7 +99,7 @@ class Data:
         return self._gold[sbr]
 
     def count_bias(self) -> dict[str, Any]:
-        """See `studies.downstream.counts`."""
+        """How far the counts of each arm are off, see `studies.downstream.data.count_bias`."""
         return count_bias(self.config, self.test, self.simulators)
 
     def references(self) -> dict[str, dict[str, float]]:
@@ -139,8 +123,8 @@ class Data:
         return found
 
 
-def train_and_test(one: Run, data: Data, folder: Path) -> None:
-    """Train on one stream, and leave what the three tell of the test scenes in `folder`."""
+def train_and_test(one: Run, data: Data, folder: Path) -> dict[str, Any]:
+    """Train on one stream and judge what the three tell of the test scenes; maps of the first are left in `folder`."""
     import torch
 
     from studies.common.intervals import Steps
@@ -173,7 +157,7 @@ def train_and_test(one: Run, data: Data, folder: Path) -> None:
             result[where][name] = tested(maps, spread, data.test, config)
             shown |= {f"{where}_{name}_{target}": maps[target][0] for target in TARGETS}
     np.savez_compressed(folder / f"{one.name}.npz", allow_pickle=False, **shown)
-    save_whole(folder / f"{one.name}.json", json.dumps(result, indent=2) + "\n")
+    return result
 
 
 class Polynomial:
@@ -197,8 +181,6 @@ class Polynomial:
 
 def _terms(cubes: NDArray[Any]) -> FloatArray:
     """Monomials (pixels, terms), of numbers of the order of 1."""
-    from studies.common.windows import features
-
     total, near = 0.2 * features(cubes.reshape(-1, cubes.shape[-1]))[0][:, -2:].T.astype(np.float64)
     return np.stack([total**i * near**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=-1)
 

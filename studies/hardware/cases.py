@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar import (
-    Calibration,
     Detector,
     Flux,
     GaussianPulse,
@@ -24,6 +22,7 @@ from mars_lidar import (
 )
 from mars_lidar.calibrate import calibration_bound
 from studies import Tell
+from studies.common.report import picked
 
 PERIOD_NS, DEAD_NS, SIGMA_NS, DELAY_NS, BINS = 1e3 / 7.5, 85.0, 0.5, 40.0, 1024
 AT_FLOOR = 1.15  # times the floor that matched pixels may have
@@ -114,24 +113,6 @@ class Case:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Spread:
-    """Calibrations of many streams of the same light: estimates over the truth and the Cramer-Rao bound.
-
-    Each (3,): background, signal, delay. `bias` in standard errors of the mean of the replicates, `scatter` the
-    standard deviation of the estimates and `stated` the mean stated standard error, both over the bound; `rapp`
-    the scatter of Rapp's total over that of the likelihood's.
-    """
-
-    signal: float
-    background: float
-    registrations: float
-    bias: NDArray[np.float64]
-    scatter: NDArray[np.float64]
-    stated: NDArray[np.float64]
-    rapp: float
-
-
 def system_of(cycles: int, detector: Detector | None = None) -> System:
     """The paper's laser and detector, started ready as a recording is."""
     return System(
@@ -209,52 +190,45 @@ def joined(parts: list[Timestamps]) -> Timestamps:
     )
 
 
-def spreads(settings: Settings, tell: Tell) -> list[Spread]:
-    """Bias and scatter of calibrations of short streams, against the Cramer-Rao bound."""
-    out = []
-    number = 0
-    for signal in settings.fluxes:
-        for background in settings.fluxes:
-            tell(f"hardware: calibrations of S = {signal:g}, B = {background:g}")
-            out.append(_spread(settings, signal, background, settings.seed + 300 + number))
-            number += 1
-    return out
+def spreads(settings: Settings, tell: Tell) -> list[dict[str, Any]]:
+    """Calibrations of many short streams of the same light: estimates over the truth and the Cramer-Rao bound.
 
-
-def _spread(settings: Settings, signal: float, background: float, seed: int) -> Spread:
+    Each (3,): background, signal, delay. ``bias`` in standard errors of the mean of the replicates, ``scatter`` the
+    standard deviation of the estimates and ``stated`` the mean stated standard error, both over the bound; ``rapp``
+    the scatter of Rapp's total over that of the likelihood's.
+    """
+    rows = []
     known = system_of(settings.replicate_cycles)
-    flux = Flux(np.full((1, settings.replicates), signal), background, DELAY_NS)
-    times = simulate_timestamps(flux, known, seed=seed)
-    truth = np.array([background, signal, DELAY_NS])
-    bound = np.array(list(calibration_bound(signal, background, known, delay_ns=DELAY_NS).errors.values()))
-    found = list(_each(times, known))
-    got = np.array([[one.background, one.signal, one.delay_ns] for one in found])
-    stated = np.array([list(one.errors.values()) for one in found])
-    scatter = got.std(0, ddof=1)
-    bias = (got.mean(0) - truth) / (scatter / np.sqrt(len(found)))
-    totals = np.array([one.total for one in found]), np.array([one.rapp.total for one in found])
-    ratio = float(totals[1].std() / totals[0].std()) if np.isfinite(totals[1]).all() else float("inf")
-    return Spread(signal, background, len(times) / len(found), bias, scatter / bound, stated.mean(0) / bound, ratio)
+    for number, (signal, background) in enumerate(itertools.product(settings.fluxes, repeat=2)):
+        tell(f"hardware: calibrations of S = {signal:g}, B = {background:g}")
+        flux = Flux(np.full((1, settings.replicates), signal), background, DELAY_NS)
+        times = simulate_timestamps(flux, known, seed=settings.seed + 300 + number)
+        truth = np.array([background, signal, DELAY_NS])
+        bound = np.array(list(calibration_bound(signal, background, known, delay_ns=DELAY_NS).errors.values()))
+        found = [calibrate(times.pixel(0, k), known) for k in range(settings.replicates)]
+        got = np.array([[one.background, one.signal, one.delay_ns] for one in found])
+        stated = np.array([list(one.errors.values()) for one in found])
+        scatter = got.std(0, ddof=1)
+        totals, rapp = np.array([one.total for one in found]), np.array([one.rapp.total for one in found])
+        rows.append(
+            {
+                "signal": signal,
+                "background": background,
+                "registrations": len(times) / len(found),
+                "bias": (got.mean(0) - truth) / (scatter / np.sqrt(len(found))),
+                "scatter": scatter / bound,
+                "stated": stated.mean(0) / bound,
+                "rapp": float(rapp.std() / totals.std()) if np.isfinite(rapp).all() else float("inf"),
+            }
+        )
+    return rows
 
 
-def _each(times: Timestamps, known: System) -> Iterator[Calibration]:
-    for k in range(times.shape[1]):
-        yield calibrate(times.pixel(0, k), known)
+def example(path: Path, settings: Settings, tell: Tell) -> dict[str, Any]:
+    """The stream of a TCSPC instrument, light of any shape, two dead times (``told`` by the file), few photons.
 
-
-@dataclass(frozen=True, eq=False)
-class Example:
-    """The measured stream, calibrated in several ways, each validated; `told` what the file says of its dead times."""
-
-    registrations: int
-    cycles: int
-    period_ns: float
-    told: dict[str, float]
-    cases: list[tuple[str, Validation]]
-
-
-def example(path: Path, settings: Settings, tell: Tell) -> Example:
-    """The stream of a TCSPC instrument: light of any shape, two dead times, few photons."""
+    ``cases`` are the ways in which it is calibrated, each validated.
+    """
     import h5py
 
     tell(f"hardware: {path.name}")
@@ -278,4 +252,4 @@ def example(path: Path, settings: Settings, tell: Tell) -> Example:
             ("Gaussian pulse, t_e", {"pulse": "gaussian", "dead_time_ns": electronics}),
         ]
     cases = [(name, validate(times, calibrate(times, **way), cycles=settings.example_cycles)) for name, way in ways]
-    return Example(len(times), times.cycles, times.period_ns, told, cases)
+    return {**picked(times, "cycles period_ns"), "registrations": len(times), "told": told, "cases": cases}

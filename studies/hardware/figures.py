@@ -3,45 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from mars_lidar.plot.stream import draw_counts, draw_histogram, draw_recovery, validation_figure
-from mars_lidar.plot.style import COLOURS, MUTED, style
+from mars_lidar.plot.stream import draw_counts, draw_histogram, draw_recovery
+from mars_lidar.plot.style import COLOURS, MUTED
 from studies.common.draw import panels
-from studies.common.report import save_figure
-from studies.hardware.cases import Case, Example
-from studies.hardware.mismatches import Mismatch
+from studies.hardware.cases import Case
+from studies.hardware.mismatches import TWO_NAME, Mismatch
 
 
-def draw_all(
-    out: Path,
-    pixels: Sequence[Case],
-    swept: Sequence[Case],
-    faults: Sequence[tuple[Mismatch, Case]],
-    measured: Example | None,
-) -> list[Path]:
-    """Write the figures; returns their paths."""
-    with style():
-        paths = [_pixels(out, pixels), _range(out, swept), _recoveries(out, faults)]
-    if measured is not None:
-        name, found = measured.cases[0]
-        figure = validation_figure(found, name)
-        paths.append(save_figure(out / "hardware_measured.png", figure))
-    return paths
-
-
-def _pixels(out: Path, cases: Sequence[Case]) -> Path:
+def pixels(cases: Sequence[Case]) -> Figure:
+    """Count law and mean histogram of the matched pixels."""
     figure, axes = panels(4.2, len(cases), 2)
     for row, case in zip(axes, cases, strict=True):
         draw_counts(row[0], case.found)
         draw_histogram(row[1], case.found)
         row[0].set_title(f"{case.name}: {row[0].get_title(loc='left')}", loc="left")
-    return save_figure(out / "hardware_pixels.png", figure)
+    return figure
 
 
-def _range(out: Path, cases: Sequence[Case]) -> Path:
+def dynamic_range(cases: Sequence[Case]) -> Figure:
+    """Calibrated signal over the true one, and total variation over its floor, over the signal."""
     chosen = [case for case in cases if case.name.startswith("dynamic range")]
     signal = np.array([case.truth[0] for case in chosen])
     got = np.array([case.found.calibration.signal for case in chosen])
@@ -64,7 +48,7 @@ def _range(out: Path, cases: Sequence[Case]) -> Path:
     right.plot(signal, ratio, ".", ms=5, color=COLOURS[0], label="stream")
     right.set(xscale="log", xlabel="signal S (photons per period)", ylabel="total variation / floor", ylim=(0, None))
     right.legend(frameon=False)
-    return save_figure(out / "hardware_range.png", figure)
+    return figure
 
 
 def _naive(case: Case) -> float:
@@ -76,7 +60,8 @@ def _naive(case: Case) -> float:
     return float((per_cycle[inside] - background).sum())
 
 
-def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
+def recoveries(faults: Sequence[tuple[Mismatch, Case]]) -> Figure:
+    """Rate since the last registration of each mismatch, over that of the light."""
     faults, columns = faults[1:], 4  # the second control stands for both
     rows = -(-len(faults) // columns)
     figure, axes = panels(1.15 * rows, rows, columns)
@@ -86,7 +71,8 @@ def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
         if drawn is not None:
             ax.stairs(drawn.ratio, drawn.edges_ns, baseline=None, color=COLOURS[2], lw=0.8, zorder=4)
         mark = "fits" if case.found.consistent else "does not fit"
-        ax.set_title(f"{_short(case.name)}\n({mark})", loc="left", fontsize=5.5)
+        name = case.name.replace(", sequential engine", "").replace(TWO_NAME, "t_e 85, t_d 50")
+        ax.set_title(f"{name}\n({mark})", loc="left", fontsize=5.5)
         ax.set(xlabel="", ylabel="", ylim=(0.0, 1.5))
         ax.tick_params(labelsize=5)
     for ax in list(axes.flat)[len(faults) :]:
@@ -96,9 +82,4 @@ def _recoveries(out: Path, faults: Sequence[tuple[Mismatch, Case]]) -> Path:
             ax.set_xlabel("time since the last one (ns)", fontsize=5.5)
     for ax in axes[:, 0]:
         ax.set_ylabel("rate / light", fontsize=5.5)
-    return save_figure(out / "hardware_recovery.png", figure)
-
-
-def _short(name: str) -> str:
-    name = name.replace(", sequential engine", "")
-    return name.replace("electronics dead 85 ns, detector 50 ns", "t_e 85, t_d 50")
+    return figure

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import binom
 
-from mars_lidar import Afterpulsing, Detector, Flux, GaussianPulse, Jitter, calibrate, validate
+from mars_lidar import (
+    Afterpulsing,
+    Calibration,
+    Detector,
+    Flux,
+    GaussianPulse,
+    Jitter,
+    Timestamps,
+    Validation,
+    calibrate,
+    simulate_timestamps,
+    validate,
+)
 from studies import Tell
 from studies.hardware.cases import (
     DEAD_NS,
@@ -17,6 +31,7 @@ from studies.hardware.cases import (
     Case,
     Settings,
     joined,
+    recorded,
     stream_of,
     system_of,
 )
@@ -29,7 +44,7 @@ def _afterpulses(probability: float) -> Detector:
 _PLAIN = Detector(dead_time_ns=DEAD_NS)
 _JITTER = replace(_PLAIN, jitter=Jitter(sigma_ns=0.2))
 _AFTERPULSES = _afterpulses(0.02)
-_TWO_NAME = "electronics dead 85 ns, detector 50 ns"
+TWO_NAME = "electronics dead 85 ns, detector 50 ns"
 _TWO = Detector(dead_time_ns=50.0, electronics_dead_time_ns=DEAD_NS)
 _PARALYZABLE = replace(_PLAIN, mode="paralyzable")
 
@@ -71,10 +86,10 @@ MISMATCHES = (
     Mismatch("afterpulses 2 %", detector=_AFTERPULSES),
     Mismatch("afterpulses 2 %, hold-off 400 ns", detector=_AFTERPULSES, hold_off_ns=400.0),
     Mismatch("afterpulses 2 %, told", detector=_AFTERPULSES, told=True, fits=True),
-    Mismatch(f"{_TWO_NAME}, B = 1", detector=_TWO, background=1.0),
-    Mismatch(f"{_TWO_NAME}, B = 1, hold-off 135 ns", detector=_TWO, hold_off_ns=DEAD_NS + 50.0, background=1.0),
-    Mismatch(f"{_TWO_NAME}, B = 1, told", detector=_TWO, told=True, fits=True, background=1.0),
-    Mismatch(f"{_TWO_NAME}, B = 0.1", detector=_TWO),
+    Mismatch(f"{TWO_NAME}, B = 1", detector=_TWO, background=1.0),
+    Mismatch(f"{TWO_NAME}, B = 1, hold-off 135 ns", detector=_TWO, hold_off_ns=DEAD_NS + 50.0, background=1.0),
+    Mismatch(f"{TWO_NAME}, B = 1, told", detector=_TWO, told=True, fits=True, background=1.0),
+    Mismatch(f"{TWO_NAME}, B = 0.1", detector=_TWO),
     Mismatch("a second return 4 ns behind, not fitted", second_return=True),
     Mismatch("signal drifts by 10 %", drift=0.1),
 )
@@ -107,48 +122,88 @@ def mismatches(settings: Settings, tell: Tell) -> list[tuple[Mismatch, Case]]:
     return cases
 
 
+_PULSE = GaussianPulse(sigma_ns=SIGMA_NS)
+ALARM_BINS = 128  # of the histogram: the laws of 1024 would take three times as long
+_AT_ONCE = 50  # streams simulated
+
+KNOWN = "pulse and dead time known"
+WAYS: dict[str, Callable[[Timestamps, Timestamps], Calibration]] = {
+    KNOWN: lambda times, other: calibrate(times, pulse=_PULSE, dead_time_ns=DEAD_NS),
+    "width and dead time fitted": lambda times, other: calibrate(times),
+    "hold-off 250 ns": lambda times, other: calibrate(times, pulse=_PULSE, dead_time_ns=DEAD_NS, hold_off_ns=250.0),
+    "light of another stream": lambda times, other: calibrate(other, pulse=_PULSE, dead_time_ns=DEAD_NS),
+}
+
 WEAK = (
     Mismatch("none (control)", fits=True),
     *(Mismatch(f"afterpulses {100 * p:g} %", detector=_afterpulses(p)) for p in (0.003, 0.006, 0.01)),
-    Mismatch(_TWO_NAME, detector=_TWO, background=0.03),
-    Mismatch(_TWO_NAME, detector=_TWO),
+    Mismatch(TWO_NAME, detector=_TWO, background=0.03),
+    Mismatch(TWO_NAME, detector=_TWO),
     Mismatch("paralyzable detector", detector=_PARALYZABLE, background=0.03),
 )
 
 
 @dataclass(frozen=True)
-class Sensitivity:
-    """How many `streams` of a mismatch are `refused`, by which tests how often, and the mean score of B."""
+class Refusals:
+    """Of `streams` the `refused` at 1 %, and `by` which tests; the mean score of B, and of TV / floor."""
 
     name: str
     background: float
     streams: int
     refused: int
-    by: dict[str, int]
+    by: Counter[str]
     score: float
+    ratio: float
+
+    @classmethod
+    def of(cls, name: str, background: float, found: list[Validation]) -> Refusals:
+        """From the validations of many streams of one `background`."""
+        light = [one.calibration for one in found]
+        return cls(
+            name,
+            background,
+            streams=len(found),
+            refused=sum(not one.consistent for one in found),
+            by=Counter(check.name for one in found for check in one.failed),
+            score=float(np.mean([(one.background - background) / one.errors["background"] for one in light])),
+            ratio=float(np.mean([one.total_variation / one.total_variation_floor[0] for one in found])),
+        )
 
     @property
-    def reasons(self) -> str:
-        """The tests, the most frequent first."""
-        by = sorted(self.by.items(), key=lambda item: -item[1])
-        return "; ".join(f"{name} ({times})" for name, times in by) or "-"
+    def p(self) -> float:
+        """Probability of as many false alarms or more, at 1 %."""
+        return float(binom.sf(self.refused - 1, self.streams, 0.01))
 
 
-def sensitivities(settings: Settings, tell: Tell) -> list[Sensitivity]:
+def sensitivities(settings: Settings, tell: Tell) -> list[Refusals]:
     """Each of `WEAK`, and the control, in several streams."""
-    found = []
+    rows = []
     cycles = settings.fault_cycles * settings.fault_realizations
     for number, one in enumerate(WEAK):
         tell(f"hardware: how weak a mismatch is seen, {one.name}")
         light = Flux(PIXELS["bright"][0], one.background, DELAY_NS)
-        by: Counter[str] = Counter()
-        scores, refused = [], 0
+        found = []
         for k in range(settings.sensed * (2 if one.fits else 1)):
             times = stream_of(light, cycles, settings.seed + 400 + 100 * number + k, one.detector)
-            fitted = calibrate(times, pulse=GaussianPulse(sigma_ns=SIGMA_NS), dead_time_ns=DEAD_NS)
-            result = validate(times, fitted, cycles=settings.fault_cycles)
-            refused += not result.consistent
-            by.update(check.name for check in result.failed)
-            scores.append((fitted.background - one.background) / fitted.errors["background"])
-        found.append(Sensitivity(one.name, one.background, len(scores), refused, dict(by), float(np.mean(scores))))
-    return found
+            found.append(validate(times, WAYS[KNOWN](times, times), cycles=settings.fault_cycles))
+        rows.append(Refusals.of(one.name, one.background, found))
+    return rows
+
+
+def alarms(settings: Settings, tell: Tell) -> list[Refusals]:
+    """How often the verdict refuses streams of its own model: the bright pixel, calibrated in each of `WAYS`."""
+    rows = []
+    signal, background = PIXELS["bright"]
+    system = system_of(settings.replicate_cycles).replace(bins=ALARM_BINS)
+    for way, fitted in WAYS.items():
+        tell(f"hardware: false alarms, {way}")
+        found = []
+        for begin in range(0, settings.alarms, _AT_ONCE):
+            size = min(_AT_ONCE, settings.alarms - begin)
+            light = Flux(np.full((1, size + 1), signal), background, DELAY_NS)
+            times = recorded(simulate_timestamps(light, system, seed=settings.seed + 900, realization=begin))
+            for k in range(size):
+                one = times.pixel(0, k)
+                found.append(validate(one, fitted(one, times.pixel(0, k + 1)), cycles=settings.alarm_cycles))
+        rows.append(Refusals.of(way, background, found))
+    return rows

@@ -3,44 +3,49 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import numpy as np
 
-from studies import Request
-from studies.common.report import Row, picked, write
-from studies.hardware import alarms, cases
+from mars_lidar.plot.stream import validation_figure
+from studies import Facts, Request
+from studies.common.report import Row, picked
+from studies.hardware import cases, figures
 from studies.hardware.cases import AT_FLOOR, FULL, PIXELS, QUICK, Case
-from studies.hardware.mismatches import mismatches, sensitivities
+from studies.hardware.mismatches import ALARM_BINS, alarms, mismatches, sensitivities
 
 PAPER = {"bright": 0.0651, "dark": 0.0601}  # T6 of arXiv 2512.04924: total variation of the count law
 
 
-def run(request: Request) -> list[Path]:
-    """Compute, draw and write the study; returns the paths written."""
-    from studies.hardware.figures import draw_all
-
+def run(request: Request) -> Facts:
+    """All streams: matched, swept, mismatched, replicated, and measured if there is one."""
     settings = QUICK if request.quick else FULL
     began = time.process_time()
     pixels = cases.matched(settings, request.tell)
     swept = cases.sweeps(settings, request.tell)
     faults = mismatches(settings, request.tell)
     weak = sensitivities(settings, request.tell)
-    false = alarms.alarms(settings, request.tell)
+    false = alarms(settings, request.tell)
     many = cases.spreads(settings, request.tell)
     measured = None if request.stream is None else cases.example(request.stream, settings, request.tell)
-    figures = draw_all(request.out, pixels, swept, faults, measured)
+    drawn = {
+        "pixels": figures.pixels(pixels),
+        "range": figures.dynamic_range(swept),
+        "recovery": figures.recoveries(faults),
+    }
+    if measured is not None:
+        name, found = measured["cases"][0]
+        drawn["measured"] = validation_figure(found, name)
     scores = [float(value) for case in swept for value in case.scores if not np.isnan(value)]
-    ways = [] if measured is None else measured.cases
+    ways = [] if measured is None else measured["cases"]
     free = [case for name, case in ways if name.startswith("free shape, t_e")]
-    facts = {
+    return {
         "s": settings,
         "bright": PIXELS["bright"][0],
         "pixels": pixels,
         "many": many,
-        "bias": max(float(np.abs(one.bias).max()) for one in many),
-        "scatters": [float(value) for one in many for value in one.scatter],
-        "stateds": [float(value) for one in many for value in one.stated],
+        "bias": max(float(np.abs(one["bias"]).max()) for one in many),
+        "scatters": [float(value) for one in many for value in one["scatter"]],
+        "stateds": [float(value) for one in many for value in one["stated"]],
         "swept": swept,
         "fits": sum(case.found.consistent for case in swept),
         "scores": scores,
@@ -52,15 +57,15 @@ def run(request: Request) -> list[Path]:
         "below": [case.name for _, case in faults if not case.found.consistent and case.ratio < AT_FLOOR],
         "weak": weak,
         "alarms": false,
+        "alarm_bins": ALARM_BINS,
         "measured": measured,
         "free": free,
         "traced": any(case.recovery.findings() for case in free),
         "gaussian": [case for name, case in ways if name.startswith("Gaussian")],
-        "figures": figures,
-        "seconds": time.process_time() - began,
+        "figures": drawn,
+        "spent": time.process_time() - began,
+        "rows": [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))],
     }
-    rows = [_csv_row(case) for case in (*pixels, *swept, *(case for _, case in faults))]
-    return write(request, "hardware", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _csv_row(case: Case) -> Row:
@@ -72,9 +77,9 @@ def _csv_row(case: Case) -> Row:
         "true_signal": signal,
         "true_background": background,
         "true_delay_ns": delay,
-        "registrations": light.summary.registrations,
-        "realizations": found.realizations,
-        "cycles": found.system.cycles,
+        **picked(light.summary, "registrations"),
+        **picked(found, "realizations"),
+        **picked(found.system, "cycles"),
         **picked(light, "signal background delay_ns dead_time_ns hold_off_ns"),
         "signal_error": light.errors.get("signal", float("nan")),
         "background_error": light.errors["background"],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.optional import needed
 from mars_lidar._base.types import FloatArray
 
 QDA, BOOSTING, FOREST = "QDA", "gradient boosting", "random forest"
@@ -22,13 +22,7 @@ _JOBS = 2  # of the random forest
 
 def require_sklearn() -> str:
     """Version of scikit-learn; raises MissingLibraryError where it cannot be imported."""
-    try:
-        import sklearn
-    except ImportError as error:
-        raise MissingLibraryError(
-            "study 'joint' needs scikit-learn >= 1.5: pip install 'mars-lidar[studies]'"
-        ) from error
-    return str(sklearn.__version__)
+    return str(needed("sklearn", "study 'joint'", "studies").__version__)
 
 
 def separate(kind: str, first: FloatArray, second: FloatArray, seed: int) -> tuple[float, float]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +14,10 @@ from scipy import stats
 
 from mars_lidar import Flux, JointLaw, System, joint_law, simulate
 from mars_lidar._base.types import FloatArray
-from studies import Request, Tell
+from studies import Facts, Request, Tell
 from studies.common import sample
-from studies.common.report import Row, picked, write
+from studies.common.report import Row, picked
+from studies.joint.table import random_light
 
 PERIOD_NS = 100.0
 OFTEN = 500  # exposures that must differ from the rest before a z-score is as good as Gaussian
@@ -52,7 +52,6 @@ class Outcome:
     name: str
     settings: dict[str, float | str]
     law: JointLaw
-    window: FloatArray
     single: dict[str, float]
     bins: FloatArray
     bin_index: NDArray[np.intp]
@@ -94,16 +93,12 @@ def random_systems(settings: Settings, tell: Tell) -> list[Outcome]:
     random = np.random.default_rng(settings.seed)
     found = []
     for k in range(settings.systems):
-        signal, background = 10 ** random.uniform(-2, 1), 10 ** random.uniform(-3, 1)
-        dead = 10 ** random.uniform(np.log10(0.02), np.log10(4.0))
-        if k % 3 == 0:
-            dead = int(random.integers(1, 5)) - random.choice([0.0, 1.0, 1.0, -1.0]) * 10 ** random.uniform(-3, -1)
-            dead = min(dead, 4.0)
+        signal, background, dead = random_light(random, k)
         sigma, delay = 10 ** random.uniform(-2.7, -1.5), random.uniform(0, 1)
         cycles = int(np.exp(random.uniform(*np.log(settings.cycles))))
         start = "stationary" if k % 2 else "armed"
         system = system_of(sigma, dead, cycles, settings.bins, start)
-        found.append(_compare(k, float(signal), float(background), float(delay), system, settings))
+        found.append(_compare(k, signal, background, float(delay), system, settings))
         if k % 20 == 19:
             tell(f"joint-covariance: {k + 1} of {settings.systems} systems")
     return found
@@ -158,7 +153,6 @@ def _compare(
             "start": system.start,
         },
         law=law,
-        window=window,
         single=single,
         bins=variance_scores(x[:, often], law.variance[often]),
         bin_index=np.flatnonzero(often),
@@ -176,8 +170,8 @@ def variance_scores(x: FloatArray, variance: FloatArray) -> FloatArray:
     return np.asarray(np.log(second * len(x) / (len(x) - 1) / variance) / spread)
 
 
-def run(request: Request) -> list[Path]:
-    """Compare, draw and write; returns the paths written."""
+def run(request: Request) -> Facts:
+    """Random systems and the reference cases, compared with the closed form."""
     from studies.joint.covariance_figures import figure
     from studies.joint.reference import reference_case
 
@@ -185,10 +179,9 @@ def run(request: Request) -> list[Path]:
     systems = random_systems(settings, request.tell)
     cases = [reference_case(path) for path in sorted(request.data.glob("*.json"))] if request.data else []
     scores = _scores(systems, settings)
-    figures = [figure(request.out / "joint_covariance.png", scores, 4000 if request.quick else 40_000)]
     numbers = sum(len(o.single) + o.bins.size + o.lags.size for o in systems)
     by_z = sorted(systems, key=lambda o: -o.worst()[0])
-    facts = {
+    return {
         "s": settings,
         "laws": [
             (name, z, stats.kstest(z, "norm").pvalue, stats.chi2.sf(float(np.sum(z**2)), z.size))
@@ -203,9 +196,9 @@ def run(request: Request) -> list[Path]:
         "systems": len(systems),
         "worst": [_worst_row(o, second_look(o, settings)) for o in by_z[:_WORST]],
         "cases": cases,
+        "rows": [_row(o) for o in [*cases, *systems]],
+        "figures": {"": figure(scores, 4000 if request.quick else 40_000)},
     }
-    rows = [_row(o) for o in [*cases, *systems]]
-    return write(request, "joint_covariance", __name__, "covariance", facts, rows=rows, figures=figures)
 
 
 def _scores(systems: Sequence[Outcome], settings: Settings) -> dict[str, FloatArray]:

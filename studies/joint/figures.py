@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from mars_lidar.plot.style import COLOURS, DPI, INK, MISSING, style
+from mars_lidar.plot.style import COLOURS, DPI, INK, MISSING
 from studies.common.draw import WIDTH, legend_below
-from studies.common.report import save_figure
 from studies.joint.outcomes import ENGINES, TESTS, Outcome, Settings
 from studies.joint.run import chance
 
@@ -21,20 +19,20 @@ _COLOUR = dict(zip(ENGINES, (INK, COLOURS[0], COLOURS[1], COLOURS[2]), strict=Tr
 _MARK = dict(zip(ENGINES, "|osD", strict=True))
 
 
-def figure(path: Path, settings: Settings, outcomes: Sequence[Outcome]) -> Path:
+def figure(settings: Settings, outcomes: Sequence[Outcome]) -> Figure:
     """Cases above, one panel a classifier; the random systems below, in the order of each engine's AUCs."""
-    with style():
-        named, drawn = ([o for o in outcomes if o.random is kind and o.aucs] for kind in (False, True))
-        page: Any = Figure(figsize=(WIDTH, 5.2), dpi=DPI, layout="constrained")
-        upper, lower = page.subfigures(2, 1, height_ratios=(1.5, 1.0))
-        above = upper.subplots(1, len(TESTS), sharey=True)
-        for ax, test in zip(above, TESTS, strict=True):
-            _cases(ax, test, [c.name for c in settings.cases], named, 2.0 * chance(settings.exposures))
-        for ax, test in zip(lower.subplots(1, 2, sharey=True), TESTS[:2], strict=True):
-            _random(ax, test, drawn, 2.0 * chance(settings.random_exposures))
-        lower.axes[0].set_ylabel("share of systems below")
-        legend_below(lower, above[:1], len(ENGINES))
-        return save_figure(path, page)
+    named, drawn = ([o for o in outcomes if o.random is kind and o.aucs] for kind in (False, True))
+    page = Figure(figsize=(WIDTH, 5.2), dpi=DPI, layout="constrained")
+    halves: Any = page.subfigures(2, 1, height_ratios=(1.5, 1.0))
+    upper, lower = halves
+    above = upper.subplots(1, len(TESTS), sharey=True)
+    for ax, test in zip(above, TESTS, strict=True):
+        _cases(ax, test, [c.name for c in settings.cases], named, 2.0 * chance(settings.exposures))
+    for ax, test in zip(lower.subplots(1, 2, sharey=True), TESTS[:2], strict=True):
+        _random(ax, test, drawn, 2.0 * chance(settings.random_exposures))
+    lower.axes[0].set_ylabel("share of systems below")
+    legend_below(lower, above[:1], len(ENGINES))
+    return page
 
 
 def _axis(ax: Any, band: float, lowest: float) -> None:

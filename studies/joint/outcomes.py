@@ -12,29 +12,15 @@ from mars_lidar._base.types import FloatArray
 from studies import Tell
 from studies.common.sample import PERIOD_NS
 from studies.joint.classifiers import CLASSIFIERS, QDA, require_sklearn, separate
-from studies.joint.table import AGAIN, COARSE, REFERENCE, SEVEN, Case, window
+from studies.joint.table import AGAIN, COARSE, REFERENCE, SEVEN, Case, random_light, window
 
 ENGINES = (AGAIN, "feedback", "mars", "renewal")
-
-
 FINE = "fine QDA"
-
-
 TESTS = (QDA, FINE, *CLASSIFIERS[1:])
-
-
 RATIOS = ("window", "bin", "neighbour")
-
-
 REACH = 16  # output bins on either side of the pulse and of its echo
-
-
 OFTEN = 500  # exposures in which a bin must differ from its usual count to be compared
-
-
 HANDED = "pixels given to exact"  # key of the engine's report
-
-
 TOLERANCE = 1e-4  # of the closed form
 
 
@@ -51,8 +37,6 @@ class Settings:
 
 
 FULL = Settings((*REFERENCE, *SEVEN[4:]), exposures=16_000, systems=60, random_exposures=8_000)
-
-
 QUICK = Settings((REFERENCE[2], SEVEN[6]), exposures=1_200, systems=2, random_exposures=800, bins=256)
 
 
@@ -91,22 +75,10 @@ def random_systems(settings: Settings) -> list[Case]:
     random = np.random.default_rng(settings.seed)
     found = []
     for k in range(settings.systems):
-        signal, background = 10 ** random.uniform(-2, 1), 10 ** random.uniform(-3, 1)
-        dead = 10 ** random.uniform(np.log10(0.02), np.log10(4.0))
-        if k % 3 == 0:
-            whole, side = int(random.integers(1, 5)), random.choice([0.0, 1.0, 1.0, -1.0])
-            dead = min(whole - side * 10 ** random.uniform(-3, -1), 4.0)
-        found.append(
-            Case(
-                f"r{k:02d}",
-                float(signal),
-                float(background),
-                float(dead),
-                delay=float(random.uniform()),
-                sigma=float(10 ** random.uniform(-2.7, -1.5)),
-                cycles=int(np.exp(random.uniform(*np.log([1e3, 2e4])))),
-            )
-        )
+        light = random_light(random, k)
+        delay, sigma = float(random.uniform()), float(10 ** random.uniform(-2.7, -1.5))
+        cycles = int(np.exp(random.uniform(*np.log([1e3, 2e4]))))
+        found.append(Case(f"r{k:02d}", *light, delay=delay, sigma=sigma, cycles=cycles))
     return found
 
 

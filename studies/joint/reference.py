@@ -48,7 +48,6 @@ def reference_case(path: Path) -> Outcome:
         name=path.stem,
         settings={"S": signal, "B": background, "t_d": case["dead"], "cycles": float(case["cycles"])},
         law=law,
-        window=window,
         single={
             "count, mean": (case["count_mean"] - law.count_mean) / float(np.sqrt(law.count_variance / size)),
             "count, variance": float(np.log(case["count_var"] / law.count_variance) / np.sqrt(kurtosis / size)),

@@ -7,17 +7,15 @@ over the closed form of `mars_lidar.joint_law`, which shares nothing with the en
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from mars_lidar._base.types import FloatArray
-from studies import Request
-from studies.common.report import Row, crossed, marked, picked, write
+from studies import Facts, Request
+from studies.common.report import Row, crossed, marked, picked
 from studies.common.sample import PERIOD_NS
 from studies.joint import classifiers, outcomes
 from studies.joint.outcomes import ENGINES, FULL, QUICK, RATIOS, TESTS, Outcome, Settings
@@ -39,35 +37,44 @@ def auc_score(outcome: Outcome, test: str, settings: Settings) -> float:
     return (outcome.aucs[test][0] - 0.5) / chance(exposures)
 
 
-def run(request: Request) -> list[Path]:
-    """Compute, draw and write; returns the paths written. Raises MissingLibraryError without scikit-learn."""
+def run(request: Request) -> Facts:
+    """All engines in all cases; raises MissingLibraryError without scikit-learn."""
     from studies.joint.figures import figure
 
     settings = QUICK if request.quick else FULL
-    began = time.monotonic()
+
+    def seen(o: Outcome, test: str) -> bool:
+        return abs(auc_score(o, test, settings)) > _SEEN
+
     found = outcomes.compute(settings, request.tell)
     named, drawn = ([o for o in found if o.random is kind] for kind in (False, True))
-    facts = {
+    return {
         "s": settings,
         "period_ns": PERIOD_NS,
         "sklearn": classifiers.require_sklearn(),
-        "findings": [_finding(engine, named, settings) for engine in ENGINES if _judged(engine, named)],
+        "findings": [
+            _finding(engine, here, settings)
+            for engine in ENGINES
+            if (here := [(o, test) for o in named if o.engine == engine and o.aucs for test in TESTS])
+        ],
         "gone": given_to_exact(found),
         "asked": sum(o.engine == "feedback" for o in found),
         "band": [2 * chance(n) for n in (settings.exposures, settings.random_exposures)],
         "aucs": {
-            test: crossed((o.case.name, o.engine, _auc_cell(o, test, settings)) for o in named if o.engine != "exact")
+            test: crossed(
+                (o.case.name, o.engine, marked(o.aucs[test], seen(o, test)) if o.aucs else "exact")
+                for o in named
+                if o.engine != "exact"
+            )
             for test in TESTS
         },
         "ratios": [crossed((o.case.name, o.engine, _ratio_cell(o, key)) for o in named) for key in RATIOS],
         "random": [_random_row(drawn, engine, test, settings) for test in TESTS[:2] for engine in ENGINES],
         "spread": [_spread_row(drawn, engine) for engine in ("exact", *ENGINES)],
         "worst": _worst_rows(drawn, settings),
-        "spent": time.monotonic() - began,
+        "rows": [_csv_row(o) for o in found],
+        "figures": {"": figure(settings, found)},
     }
-    figures = [figure(request.out / "joint.png", settings, found)]
-    rows = [_csv_row(o) for o in found]
-    return write(request, "joint", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def given_to_exact(found: Sequence[Outcome]) -> list[str]:
@@ -79,12 +86,7 @@ def _p(value: float) -> str:
     return f"{value:.2g}" if value >= _LEAST_P else f"< {_LEAST_P:g}"
 
 
-def _judged(engine: str, named: Sequence[Outcome]) -> list[tuple[Outcome, str]]:
-    return [(o, test) for o in named if o.engine == engine and o.aucs for test in TESTS]
-
-
-def _finding(engine: str, named: Sequence[Outcome], settings: Settings) -> dict[str, Any]:
-    here = _judged(engine, named)
+def _finding(engine: str, here: Sequence[tuple[Outcome, str]], settings: Settings) -> dict[str, Any]:
     z = np.abs([auc_score(o, test, settings) for o, test in here])
     value = [o.aucs[test][0] for o, test in here]
     o, test = here[int(z.argmax())]
@@ -100,10 +102,6 @@ def _finding(engine: str, named: Sequence[Outcome], settings: Settings) -> dict[
         "auc": o.aucs[test][0],
         "p": _p(min(1.0, 2 * z.size * float(stats.norm.sf(z.max())))),
     }
-
-
-def _auc_cell(o: Outcome, test: str, settings: Settings) -> str:
-    return "exact" if o.handed else marked(o.aucs[test], abs(auc_score(o, test, settings)) > _SEEN)
 
 
 def _ratio_cell(o: Outcome, key: str) -> str:

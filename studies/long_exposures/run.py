@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +14,8 @@ from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.feedback_grid import cell_cuts, internal_cells
 from mars_lidar.engines.feedback_rule import draw_rest
-from studies import Request
-from studies.common.report import Row, write
+from studies import Facts, Request
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, system_of
 
 GOAL = 0.05  # standard deviations of a bin that its mean may be off (engines/feedback_grid.py)
@@ -46,24 +44,21 @@ class _Sampled(FeedbackEngine):
         draw_rest(ExactEngine(), task, out, replace(rest, pixels=rest.pixels[:0]))
 
 
-def run(request: Request) -> list[Path]:
-    """Draw, compare and write the study; returns the paths written."""
+def run(request: Request) -> Facts:
+    """Random systems, compared one by one."""
     settings = QUICK if request.quick else FULL
-    began = time.monotonic()
     random = np.random.default_rng(settings.seed)
     rows = []
     for k in range(settings.systems):
         rows.append(compare(*_system(random), settings.items, seed=k))
         request.tell(f"{k + 1} of {settings.systems}: {rows[-1]}")
     drawn = [row for row in rows if row["cells"]]
-    facts = {
+    return {
         "s": settings,
         "error": 1.0 / np.sqrt(settings.items),
         "drawn": drawn,
-        "rows": [{key: "" if value is None else value for key, value in row.items()} for row in rows],
-        "spent": time.monotonic() - began,
+        "rows": rows,
     }
-    return write(request, "long_exposures", __name__, "report", facts, rows=rows)
 
 
 def _system(random: np.random.Generator) -> tuple[float, float, ml.System, float]:
@@ -91,9 +86,9 @@ def compare(signal: float, background: float, system: ml.System, delay_ns: float
         "cells": int(internal_cells(flux, system)[0, 0]),
         "cut": f"{merge[0, 0]} x {parts[0, 0]}",
     }
-    keys = ("largest", "rms", "count", "window", "var count", "var window", "var bins")
     if report["refused"]:
-        return row | {"cells": 0} | dict.fromkeys(keys)
+        keys = ("largest", "rms", "count", "window", "var count", "var window", "var bins")
+        return row | {"cells": 0} | dict.fromkeys(keys, "")
     law = ml.joint_law(signal, background, system, delay_ns=delay_ns, tolerance=1e-4)
     apart = ((np.arange(system.bins) + 0.5) / system.bins - delay_ns / PERIOD_NS + 0.5) % 1.0 - 0.5
     near = np.abs(apart) < max(3.0 * sigma / PERIOD_NS, 0.51 / system.bins)
@@ -103,13 +98,12 @@ def compare(signal: float, background: float, system: ml.System, delay_ns: float
     off = (x.mean(0) - law.mean) / np.sqrt(law.variance)
     count, window = (y.mean(0) - mean) / np.sqrt(np.maximum(variance, 1e-300))
     spread = y.var(0) / np.maximum(variance, 1e-300)
-    found = (
-        float(np.abs(off).max()),
-        float(np.sqrt(max(0.0, np.mean(off**2) - 1.0 / items))),
-        float(count),
-        float(window),
-        float(spread[0]),
-        float(spread[1]),
-        float(np.mean(x.var(0) / law.variance)),
-    )
-    return row | dict(zip(keys, found, strict=True))
+    return row | {
+        "largest": float(np.abs(off).max()),
+        "rms": float(np.sqrt(max(0.0, np.mean(off**2) - 1.0 / items))),
+        "count": float(count),
+        "window": float(window),
+        "var count": float(spread[0]),
+        "var window": float(spread[1]),
+        "var bins": float(np.mean(x.var(0) / law.variance)),
+    }

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from mars_lidar import Detector, GaussianPulse, System
 from studies.neural.model import NeuralMap, check_target
 from studies.neural.pairs import FluxRange, Training
-from studies.neural.training import Point, save_curves, train
+from studies.neural.training import save_curves, train
+
+_TRAINING = ("steps", "pairs", "seconds", "processor_seconds", "seed")  # of a network's record
 
 
 def main(arguments: Sequence[str], command: str) -> int:
@@ -18,7 +21,11 @@ def main(arguments: Sequence[str], command: str) -> int:
     parser = _parser(command)
     given = parser.parse_args(arguments)
     try:
-        return _train(given) if given.verb == "train" else _info(given.file)
+        if given.verb == "train":
+            _train(given)
+        else:
+            _show(given.file, NeuralMap.example() if given.file is None else NeuralMap.load(given.file))
+        return 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -44,8 +51,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
     add("--pulse-sigma-ns", type=float, help="Gaussian pulse: standard deviation, ns (0.5); others: --system")
     flux, plan = FluxRange(), Training()
     for name in ("signal", "background"):
-        default = "{:g},{:g}".format(*getattr(flux, name))
-        add(f"--{name}", default=default, metavar="LOW,HIGH", help=f"range of the {name}, photons per period")
+        add(f"--{name}", type=_pair, default=getattr(flux, name), metavar="LOW,HIGH", help="range, photons per period")
     add("--returns", type=int, default=flux.returns, help="most returns of a flux, 1 or 2")
     add("--steps", type=int, default=plan.steps, help="steps of the training")
     add("--pairs", type=int, default=plan.pairs, help="pairs to learn from")
@@ -56,32 +62,20 @@ def _parser(command: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _train(given: argparse.Namespace) -> int:
+def _train(given: argparse.Namespace) -> None:
     check_target(given.out, given.overwrite)
-    fluxes = FluxRange(
-        signal=_pair("--signal", given.signal),
-        background=_pair("--background", given.background),
-        returns=given.returns,
-    )
+    fluxes = FluxRange(signal=given.signal, background=given.background, returns=given.returns)
     plan = Training(fluxes=fluxes, steps=given.steps, pairs=given.pairs, seed=given.seed)
-
-    def tell(point: Point) -> None:
-        print(
-            f"step {point.step}: total variation {point.tv_mean:.4f}, 95 % {point.tv_95:.4f}, largest "
-            f"{point.tv_max:.4f}; {point.seconds:.0f} s",
-            file=sys.stderr,
-        )
-
-    trained = train(_system(given), plan, tell=tell)
+    trained = train(_system(given), plan, tell=partial(print, file=sys.stderr, flush=True))
     trained.map.save(given.out, overwrite=given.overwrite)
-    curves = save_curves(trained, given.out.with_suffix(""))
-    _show([*_rows(given.out, trained.map), ("curves", ", ".join(map(str, curves)))])
-    return 0
+    _show(given.out, trained.map)
+    print(f"{'curves':<10}", *save_curves(trained, given.out.with_suffix("")))
 
 
-def _info(file: Path | None) -> int:
-    _show(_rows(file, NeuralMap.example() if file is None else NeuralMap.load(file)))
-    return 0
+def _pair(text: str) -> tuple[float, float]:
+    """Range of photons per period, such as 0.002,12."""
+    low, high = text.split(",")
+    return float(low), float(high)
 
 
 def _system(given: argparse.Namespace) -> System:
@@ -95,43 +89,18 @@ def _system(given: argparse.Namespace) -> System:
     return base.replace(**{name: value for name, value in changes.items() if value is not None})
 
 
-def _pair(name: str, text: str) -> tuple[float, float]:
-    try:
-        low, high = text.split(",")
-        return float(low), float(high)
-    except ValueError:
-        raise ValueError(f"{name} must be LOW,HIGH, such as 0.002,12, got {text!r}") from None
-
-
-def _show(rows: list[tuple[str, str]]) -> None:
-    for label, text in rows:
+def _show(path: Path | None, network: NeuralMap) -> None:
+    """Print what a network is for and what its training found, name and value a line."""
+    system, record = network.system, network.record
+    lines = {
+        "network": "example.npz" if path is None else f"{path} ({path.stat().st_size / 1e3:,.4g} kB)",
+        "system": f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
+        f"{system.detector.dead_time_ns:.6g} ns",
+        "fluxes": ", ".join(f"{name} {value}" for name, value in network.fluxes.to_dict().items()),
+        "training": ", ".join(f"{name} {record[name]}" for name in _TRAINING),
+        "held out": f"{record['held_out']} fluxes: total variation to the chain {record['tv_mean']:.4f} (95 % "
+        f"{record['tv_95']:.4f}, largest {record['tv_max']:.4f}); the mean PDF alone: {record['tv_unconditional']:.4f}",
+        "count": f"mean off by {record['mean_error']:.2g} of itself, on average",
+    }
+    for label, text in lines.items():
         print(f"{label:<10} {text}")
-
-
-def _rows(path: Path | None, network: NeuralMap) -> list[tuple[str, str]]:
-    system, record, fluxes = network.system, network.record, network.fluxes
-    return [
-        ("network", "example.npz" if path is None else f"{path} ({path.stat().st_size / 1e3:,.4g} kB)"),
-        (
-            "system",
-            f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
-            f"{system.detector.dead_time_ns:.6g} ns",
-        ),
-        (
-            "fluxes",
-            f"S up to {fluxes.signal[1]:g}, B {fluxes.background[0]:g} to {fluxes.background[1]:g} photons per period, "
-            f"up to {fluxes.returns} returns",
-        ),
-        (
-            "training",
-            f"{record['steps']} steps on {record['pairs']} pairs, {record['seconds']:.4g} s "
-            f"({record['processor_seconds']:.4g} s of processor time), seed {record['seed']}",
-        ),
-        (
-            "held out",
-            f"{record['held_out']} fluxes: total variation to the chain {record['tv_mean']:.4f} (95 % "
-            f"{record['tv_95']:.4f}, largest {record['tv_max']:.4f}); the mean PDF alone: "
-            f"{record['tv_unconditional']:.4f}",
-        ),
-        ("count", f"mean off by {record['mean_error']:.2g} of itself, on average"),
-    ]

@@ -16,7 +16,7 @@ from mars_lidar.engines.alignment import Alignment
 from mars_lidar.engines.count_shape import as_shapes
 from mars_lidar.engines.counts import RoundedGaussian
 from mars_lidar.engines.engine import Task
-from mars_lidar.engines.pixels import Group, groups, single_return
+from mars_lidar.engines.pixels import groups, single_return
 from mars_lidar.engines.synthesis import Batch, Run
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics import photons_per_bin
@@ -83,8 +83,13 @@ class NeuralEngine(Engine):
         single = single_return(task.flux)
         for group in groups(task.flux, task.system, np.arange(task.pixel_index.size), delays=single is None):
             with run.stage("evaluation_s"):
-                batch = self._batch(run, group, None if single is None else single[1])
-            run.draw(batch)
+                cells, cell, alignment = group.cells, group.cell, None
+                pdf, mean, variance = self._moments(cells)
+                laws = RoundedGaussian(mean[cell], variance[cell])
+                if single is not None:
+                    light, rate = (cells.signal[cell], cells.background[cell]), mean[cell] / task.system.cycles
+                    alignment = Alignment.of(task.system, *light, single[1][group.pixels], rate)
+            run.draw(Batch.unmixed(group.pixels, as_shapes(pdf), cell, laws, alignment))
 
     def registration_pdf(
         self, signal: ArrayLike, background: ArrayLike, system: System, *, delay_ns: ArrayLike | None = None
@@ -119,16 +124,6 @@ class NeuralEngine(Engine):
         some = cells.signal + cells.background > 0.0
         mean[some], variance[some] = model.moments(flux[some], pdf[some], system.cycles)
         return pdf, mean, variance
-
-    def _batch(self, run: Run, group: Group, delay: FloatArray | None) -> Batch:
-        system, cells, cell = run.task.system, group.cells, group.cell
-        pdf, mean, variance = self._moments(cells)
-        laws, alignment = RoundedGaussian(mean[cell], variance[cell]), None
-        if delay is not None:
-            signal, background = cells.signal[cell], cells.background[cell]
-            rate = mean[cell] / system.cycles
-            alignment = Alignment.of(system, signal, background, delay[group.pixels], rate)
-        return Batch.unmixed(group.pixels, as_shapes(pdf), cell, laws, alignment)
 
 
 def _cells(signal: ArrayLike, background: ArrayLike, system: System, delay_ns: ArrayLike | None) -> Cells:

@@ -46,22 +46,17 @@ class Trained:
     unconditional: float
 
 
-@dataclass(frozen=True, eq=False)
 class _Tensors:
-    photons: Tensor
-    pdf: Tensor
-    wait: Tensor  # relative to its mean: the PDF of a right mean count gives 1
+    """Pairs in the frame of the network; waits relative to their mean: the PDF of a right mean count gives 1."""
 
-    @classmethod
-    def of(cls, pairs: Pairs) -> _Tensors:
-        photons, pdf, wait = (
-            torch.from_numpy(x).to(torch.float32)
-            for x in (pairs.photons, pairs.pdf, pairs.wait / pairs.mean_wait[:, None])
-        )
-        photons, shift = canonical(photons)
-        return cls(photons, rolled(pdf, shift), rolled(wait, shift))
+    def __init__(self, pairs: Pairs) -> None:
+        arrays = pairs.photons, pairs.pdf, pairs.wait / pairs.mean_wait[:, None]
+        photons, pdf, wait = (torch.from_numpy(x).to(torch.float32) for x in arrays)
+        self.photons, shift = canonical(photons)
+        self.pdf, self.wait = rolled(pdf, shift), rolled(wait, shift)
 
 
+@one_thread()
 def train(
     system: System,
     training: Training | None = None,
@@ -85,16 +80,11 @@ def train(
     require_mode("the neural map", system)
     system = system.detected()
     checks.integer("bins of the neural map", system.bins, low=_MIN_BINS, high=2**16)
-    with one_thread():
-        return _train(system, chosen, tell)
-
-
-def _train(system: System, chosen: Training, tell: Callable[[Point], object] | None) -> Trained:
     torch.manual_seed(chosen.seed)
     network = PdfAutoencoder(system.bins, system.dead_time_periods, chosen.width, chosen.code)
     began, used = time.monotonic(), time.process_time()
     learn_on, held_out = (
-        _Tensors.of(Pairs.of(chosen.fluxes.draw(system, n, np.random.default_rng([chosen.seed, k])), system))
+        _Tensors(Pairs.of(chosen.fluxes.draw(system, n, np.random.default_rng([chosen.seed, k])), system))
         for k, n in ((1, chosen.pairs), (2, chosen.held_out))
     )
     mean_pdf = learn_on.pdf.mean(0)
@@ -121,17 +111,11 @@ def _train(system: System, chosen: Training, tell: Callable[[Point], object] | N
                 tell(point)
     network.eval().requires_grad_(False)
     last = curve[-1]
-    record: dict[str, Any] = {
-        "steps": chosen.steps,
-        "pairs": chosen.pairs,
-        "held_out": chosen.held_out,
-        "seed": chosen.seed,
+    record: dict[str, Any] = {name: getattr(chosen, name) for name in ("steps", "pairs", "held_out", "seed")}
+    record |= {
         "seconds": round(last.seconds, 1),
         "processor_seconds": round(time.process_time() - used, 1),
-        "tv_mean": last.tv_mean,
-        "tv_95": last.tv_95,
-        "tv_max": last.tv_max,
-        "mean_error": last.mean_error,
+        **{name: getattr(last, name) for name in ("tv_mean", "tv_95", "tv_max", "mean_error")},
         "tv_unconditional": unconditional,
     }
     return Trained(NeuralMap(system, chosen.fluxes, network, record), curve, unconditional)

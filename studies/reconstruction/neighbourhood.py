@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from mars_lidar import Detector, Flux, GaussianPulse, Scene, System, cramer_rao, reconstruct, simulate
 from mars_lidar._base.types import FloatArray
-from studies import Request
-from studies.common.report import Row, write
+from mars_lidar.plot.figures import _draw_map, _limits
+from studies import Facts, Request
+from studies.common.draw import panels
+from studies.common.report import Row
 
 SEED = 3
 SIGMA_NS = 0.5
@@ -40,10 +43,8 @@ FULL = Settings(64, (0.5, 1.0, 3.0))
 QUICK = Settings(24, (1.0,))
 
 
-def run(request: Request) -> list[Path]:
-    """Write neighbourhood.md, neighbourhood.csv and a figure."""
-    from studies.reconstruction.neighbourhood_figure import neighbourhood_figure
-
+def run(request: Request) -> Facts:
+    """Every scene at every brightness, by every method."""
     settings = QUICK if request.quick else FULL
     rows, maps = [], {}
     for name, delay in scenes(settings.size).items():
@@ -54,15 +55,15 @@ def run(request: Request) -> list[Path]:
             if name == "room" and photons == SHOWN:
                 maps = found
     room = [row for row in rows if row["scene"] == "room"]
-    facts = {
+    return {
         "s": settings,
         "room": [{k: v for k, v in row.items() if k != "scene"} for row in room],
         "others": [row for row in rows if row["scene"] != "room" and row["method"] == f"neighbourhood={RADII[-1]}"],
         "least": min(row["in 95 %"] for row in rows if row["method"].startswith("neighbourhood")),
         "least68": min(row["in 68 %"] for row in rows if row["method"].startswith("neighbourhood")),
+        "rows": rows,
+        "figures": {"": _figure(maps)},
     }
-    figure = neighbourhood_figure(request.out / "neighbourhood.png", maps, SYSTEM)
-    return write(request, "neighbourhood", __name__, "neighbourhood", facts, rows=rows, figures=[figure])
 
 
 def scenes(size: int) -> dict[str, FloatArray | None]:
@@ -129,3 +130,14 @@ def case(
         }
     )
     return lines, maps
+
+
+def _figure(maps: Mapping[str, FloatArray]) -> Figure:
+    """Maps of depth: the truth and each way."""
+    figure, axes = panels(1.35, 1, len(maps))
+    depth = {name: np.asarray(SYSTEM.depth_m(delay)) for name, delay in maps.items()}
+    limits = _limits(depth["truth"])
+    for ax, (name, values) in zip(axes[0], depth.items(), strict=True):
+        _draw_map(ax, values, "depth (m)" if ax is axes[0, -1] else "", "viridis", limits, name)
+        ax.images[0].set_interpolation("nearest")
+    return figure

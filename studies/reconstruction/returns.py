@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, reconstruct, simulate
+from mars_lidar.plot.style import COLOURS, INK
 from mars_lidar.reconstruct import MaximumLikelihood, returns_bound
-from studies import Request
-from studies.common.report import Row, write
+from studies import Facts, Request
+from studies.common.draw import legend_below, panels
+from studies.common.report import Row
 
 SEED = 20
 MOST = 3  # returns that are looked for
@@ -92,10 +94,8 @@ FULL = Settings(1000, 10_000, (400, 4000, 40_000))
 QUICK = Settings(100, 200, (4000,), every=6)
 
 
-def run(request: Request) -> list[Path]:
-    """Write returns.md, returns.csv and a figure."""
-    from studies.reconstruction.returns_figure import returns_figure
-
+def run(request: Request) -> Facts:
+    """False alarms, pairs of returns, and curves of resolution."""
     settings = QUICK if request.quick else FULL
     request.tell("returns: false alarms")
     alarms = list(false_alarms(settings))
@@ -110,8 +110,7 @@ def run(request: Request) -> list[Path]:
         for apart in np.geomspace(0.3, 6.0, 12):
             system = with_dead(75.3, cycles=cycles)
             curves.append({"cycles": cycles} | pair(system, (0.5, 0.5), 0.5, float(apart), settings.pixels // 2))
-    figure = returns_figure(request.out / "returns.png", curves, rows)
-    facts = {
+    return {
         "s": settings,
         "alarms": alarms,
         "worst": max(alarms, key=lambda row: row["extra %"]),
@@ -119,8 +118,9 @@ def run(request: Request) -> list[Path]:
         "held": held(rows),
         "limits": [limit(curves, cycles) for cycles in settings.cycles],
         "times": timings(settings),
+        "rows": rows,
+        "figures": {"": _figure(curves, rows)},
     }
-    return write(request, "returns", __name__, "returns", facts, rows=rows, figures=[figure])
 
 
 def false_alarms(settings: Settings) -> Iterator[Row]:
@@ -133,13 +133,21 @@ def false_alarms(settings: Settings) -> Iterator[Row]:
     yield alarm(with_dead(75.3), (0.1,), 0.01, settings.rare, RARE)
 
 
+def histograms(
+    system: System, signals: Sequence[float], background: float, delays: Iterable[Any], pixels: int
+) -> NDArray[Any]:
+    """One exposure of each of `pixels` (pixels, bins) with one or two returns: `signals` at `delays`, ns."""
+    each = zip(signals, (background, 0.0), delays, strict=False)
+    parts = [Flux(np.full(pixels, s), b, delay) for s, b, delay in each]
+    return np.asarray(simulate(Flux.multi(*parts), system, seed=SEED)[0, 0])
+
+
 def alarm(system: System, signals: tuple[float, ...], background: float, pixels: int, level: float) -> Row:
     """A line: of the pixels in which all returns were seen, how many show one more."""
     random = np.random.default_rng(SEED)
     gated = system.detector.mode == "gated"
     delay = 90.0 + 15.0 * random.random(pixels) if gated else 100.0 * random.random(pixels)
-    parts = [Flux(np.full(pixels, s), background if k == 0 else 0.0, delay + 20.0 * k) for k, s in enumerate(signals)]
-    cube = simulate(Flux.multi(*parts), system, seed=SEED)[0, 0]
+    cube = histograms(system, signals, background, [delay + 20.0 * k for k in range(len(signals))], pixels)
     found = reconstruct(cube, system, MaximumLikelihood(false_alarm=level), returns=MOST)
     assert found.returns is not None
     seen = found.returns.count >= len(signals)
@@ -162,11 +170,7 @@ def alarm(system: System, signals: tuple[float, ...], background: float, pixels:
 def pair(system: System, signals: tuple[float, float], background: float, apart: float, pixels: int) -> dict[str, Any]:
     """A line: how often two returns so many sigma apart are both seen, and how well their errors hold then."""
     delay = DELAY_NS + SIGMA_NS * np.array([0.0, apart])
-    parts = [
-        Flux(np.full(pixels, s), background if k == 0 else 0.0, at)
-        for k, (s, at) in enumerate(zip(signals, delay, strict=True))
-    ]
-    cube = simulate(Flux.multi(*parts), system, seed=SEED)[0, 0]
+    cube = histograms(system, signals, background, delay, pixels)
     found = reconstruct(cube, system, returns=MOST).returns
     assert found is not None
     both = found.count == 2
@@ -184,17 +188,13 @@ def pair(system: System, signals: tuple[float, float], background: float, apart:
     }
     for what, (error, stated, least) in off.items():
         for words, times in COVERS.items():
-            line[f"{what} in {words}"] = _worst(np.abs(error) <= times * stated)
-        line[f"{what} error / bound"] = float(np.max(error.std(0) / least)) if both.sum() > 1 else float("nan")
-        line[f"{what} stated / bound"] = (
-            float(np.max(np.nanmedian(stated, 0) / least)) if both.sum() > 1 else float("nan")
-        )
+            # the lesser share, %, of two returns whose interval holds the truth
+            inside = np.abs(error) <= times * stated
+            line[f"{what} in {words}"] = 100.0 * float(inside.mean(0).min()) if both.any() else np.nan
+        scatters = {"error": error.std(0), "stated": np.nanmedian(stated, 0)} if both.sum() > 1 else {}
+        for name in ("error", "stated"):
+            line[f"{what} {name} / bound"] = float(np.max(scatters.get(name, np.nan) / least))
     return line
-
-
-def _worst(inside: NDArray[np.bool_]) -> float:
-    """The lesser share, %, of two returns whose interval holds the truth."""
-    return 100.0 * float(inside.mean(0).min()) if len(inside) else float("nan")
 
 
 def held(rows: list[dict[str, Any]]) -> list[Row]:
@@ -231,10 +231,7 @@ def timings(settings: Settings) -> list[Row]:
     """Processor seconds of 1000 pixels of one and of two returns."""
     lines: list[Row] = []
     for signals in ((1.0,), (0.5, 0.5)):
-        parts = [
-            Flux(np.full(settings.pixels, s), 0.5 if k == 0 else 0.0, 37.0 + 5.0 * k) for k, s in enumerate(signals)
-        ]
-        cube = simulate(Flux.multi(*parts), SYSTEM, seed=SEED)[0, 0]
+        cube = histograms(SYSTEM, signals, 0.5, (37.0, 42.0)[: len(signals)], settings.pixels)
         line: dict[str, Any] = {"returns there": len(signals)}
         for most in (1, MOST):
             began = time.process_time()
@@ -242,3 +239,33 @@ def timings(settings: Settings) -> list[Row]:
             line[f"returns={most}, s for 1000 pixels"] = 1000.0 * (time.process_time() - began) / settings.pixels
         lines.append(line)
     return lines
+
+
+def _figure(curves: Sequence[Row], rows: Sequence[Row]) -> Figure:
+    """How often two returns are seen as two, over their separation; and how often their intervals hold the truth."""
+    figure, axes = panels(2.9, 1, 2)
+    left, right = axes[0]
+    for colour, cycles in zip(COLOURS, dict.fromkeys(row["cycles"] for row in curves), strict=False):
+        mine = [row for row in curves if row["cycles"] == cycles]
+        label = f"{0.5 * cycles:g} photons each"
+        left.plot(*_line(mine, "both seen %"), "o-", ms=2.5, lw=1.0, color=colour, label=label)
+    left.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="both seen (%)")
+    left.legend(frameon=False, loc="lower right")
+    for what, colour in (("depth", COLOURS[0]), ("S", COLOURS[1])):
+        for words, marker in (("95 %", "o"), ("68 %", "s")):
+            sure = [row for row in rows if row["both seen %"] >= 90.0]
+            label = f"{what}, intervals of {words}"
+            right.plot(*_line(sure, f"{what} in {words}"), marker, ms=3, mfc="none", color=colour, label=label)
+    for share in (95.0, 68.27):
+        right.axhline(share, color=INK, lw=0.7, ls="--")
+    right.set(xscale="log", xlabel="separation (sigma of the pulse)", ylabel="intervals that hold the truth (%)")
+    for ax in (left, right):
+        ax.set_xticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
+        ax.minorticks_off()
+    left.set_xlim(0.28, 6.5)
+    legend_below(figure, [right], 4, handlelength=1.2, columnspacing=1.0)
+    return figure
+
+
+def _line(rows: Sequence[Row], name: str) -> tuple[list[float], list[float]]:
+    return [row["separation"] for row in rows], [row[name] for row in rows]

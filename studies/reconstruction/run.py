@@ -5,15 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mars_lidar import Detector, Flux, Reconstruction, Scene, System, cramer_rao, reconstruct, simulate
 from mars_lidar.reconstruct import METHODS, Flags, window_error, window_weights
-from studies import Request
-from studies.common.report import Row, write
+from studies import Facts, Request
+from studies.common.report import Row
 from studies.common.sample import system_of
 
 SEED = 9
@@ -48,11 +47,10 @@ class Picture:
     depth_m: Any
     signal: Any
     found: dict[str, Reconstruction]
-    seconds: dict[str, float]
 
 
-def run(request: Request) -> list[Path]:
-    """Write reconstruction.md, reconstruction.csv and two figures."""
+def run(request: Request) -> Facts:
+    """Sweeps over flux, near the bound, a picture, and times."""
     from studies.reconstruction.bounds import lines
     from studies.reconstruction.figures import TITLE, flux_figure, maps_figure
 
@@ -67,13 +65,13 @@ def run(request: Request) -> list[Path]:
     request.tell("reconstruction: picture")
     shown = picture(settings)
     request.tell("reconstruction: time")
-    out = request.out
-    figures = [flux_figure(out / "reconstruction_flux.png", rows), maps_figure(out / "reconstruction_maps.png", shown)]
+    n = len(settings.signals)  # three fluxes: dim, ordinary, bright
+    chosen = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
     words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
-    facts = {
+    return {
         "s": settings,
         "findings": [one for mode, title in TITLE.items() if (one := _finding(rows, mode, title))],
-        "chosen": _chosen(rows, settings),
+        "chosen": [row for row in rows if row["signal"] in chosen],
         "near": near,
         "shown": [
             (said, 1e3 * (found.depth_m - shown.depth_m), float(np.median(found.signal / shown.signal - 1.0)))
@@ -81,15 +79,9 @@ def run(request: Request) -> list[Path]:
         ],
         "window": window_lines(settings),
         "times": timings(settings),
+        "rows": rows,
+        "figures": {"flux": flux_figure(rows), "maps": maps_figure(shown)},
     }
-    return write(request, "reconstruction", __name__, "report", facts, rows=rows, figures=figures)
-
-
-def _chosen(rows: Sequence[Row], settings: Settings) -> list[Row]:
-    """Three fluxes: dim, ordinary, bright."""
-    n = len(settings.signals)
-    picked = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
-    return [row for row in rows if row["signal"] in picked]
 
 
 def _finding(rows: Sequence[Row], detector: str, title: str) -> dict[str, Any] | None:
@@ -174,12 +166,8 @@ def picture(settings: Settings) -> Picture:
     scene = Scene.example("room", size=settings.size)
     flux = scene.flux(PLAIN, signal=BRIGHT, sbr=SBR)
     cube = simulate(flux, PLAIN, seed=SEED)[0]
-    found, seconds = {}, {}
-    for name in ("matched_filter", "maximum_likelihood"):
-        began = time.perf_counter()
-        found[name] = reconstruct(cube, PLAIN, name)
-        seconds[name] = time.perf_counter() - began
-    return Picture(scene.depth_m, flux.signal, found, seconds)
+    found = {name: reconstruct(cube, PLAIN, name) for name in ("matched_filter", "maximum_likelihood")}
+    return Picture(scene.depth_m, flux.signal, found)
 
 
 def timings(settings: Settings) -> list[dict[str, Any]]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from numpy.typing import NDArray
 
 from mars_lidar import Flux, System, Table, simulate
 from mars_lidar.engines import ANY_SYSTEM, Engine, MarsEngine
-from studies.runtime.numpy_pipeline import NumpyTable, Stages, synthesize
+from studies.runtime.numpy_pipeline import NumpyTable, synthesize
 
 Run = Callable[[int, NDArray[Any]], dict[str, float]]  # seed, memory for the cube -> seconds of stages
 TABLE_RANGE = (0.01, 10.0)  # photons per period, of both axes of the tables
@@ -61,44 +62,35 @@ class Tables:
 
 def contenders(tables: Tables) -> list[Contender]:
     """All of them; those that need a table share it."""
-    found = [Contender(name, "mars, no table" if name == "mars" else name, _engine(name)) for name in ANY_SYSTEM]
-    found.append(Contender(TABLED, "mars, table", _tabled(tables), tabled=True))
-    return [*found, Contender(NUMPY, "MaRS pipeline in NumPy, table", _numpy(tables), tabled=True)]
+
+    def tabled(flux: Flux, system: System, realizations: int) -> Run:
+        return _engine(MarsEngine(tables.get(system), outside="exact"), flux, system, realizations)
+
+    def numpy(flux: Flux, system: System, realizations: int) -> Run:
+        return partial(_pipeline, tables.numpy(system), flux, realizations)
+
+    found = [
+        Contender(name, "mars, no table" if name == "mars" else name, partial(_engine, name)) for name in ANY_SYSTEM
+    ]
+    found.append(Contender(TABLED, "mars, table", tabled, tabled=True))
+    return [*found, Contender(NUMPY, "MaRS pipeline in NumPy, table", numpy, tabled=True)]
 
 
-def _engine(engine: str | Engine) -> Callable[[Flux, System, int], Run]:
-    def prepare(flux: Flux, system: System, realizations: int) -> Run:
-        def run(seed: int, out: NDArray[Any]) -> dict[str, float]:
-            report: dict[str, float] = {}
-            simulate(flux, system, engine=engine, realizations=realizations, seed=seed, out=out, report=report)
-            return stages_of(report)
+def _engine(engine: str | Engine, flux: Flux, system: System, realizations: int) -> Run:
+    def run(seed: int, out: NDArray[Any]) -> dict[str, float]:
+        report: dict[str, float] = {}
+        simulate(flux, system, engine=engine, realizations=realizations, seed=seed, out=out, report=report)
+        return stages_of(report)
 
-        return run
+    return run
 
-    return prepare
+
+def _pipeline(table: NumpyTable, flux: Flux, realizations: int, seed: int, out: NDArray[Any]) -> dict[str, float]:
+    stages: dict[str, float] = {}
+    synthesize(table, flux, realizations=realizations, seed=seed, stages=stages, out=out)
+    return stages
 
 
 def stages_of(report: dict[str, float]) -> dict[str, float]:
     """Seconds by stage out of what an engine reports: its entries that end in "_s"."""
     return {key[:-2]: value for key, value in report.items() if key.endswith("_s")}
-
-
-def _tabled(tables: Tables) -> Callable[[Flux, System, int], Run]:
-    def prepare(flux: Flux, system: System, realizations: int) -> Run:
-        return _engine(MarsEngine(tables.get(system), outside="exact"))(flux, system, realizations)
-
-    return prepare
-
-
-def _numpy(tables: Tables) -> Callable[[Flux, System, int], Run]:
-    def prepare(flux: Flux, system: System, realizations: int) -> Run:
-        table = tables.numpy(system)
-
-        def run(seed: int, out: NDArray[Any]) -> dict[str, float]:
-            stages = Stages()
-            synthesize(table, flux, realizations=realizations, seed=seed, stages=stages, out=out)
-            return stages.seconds
-
-        return run
-
-    return prepare

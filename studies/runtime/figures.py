@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import legend_below, panels
-from studies.common.report import save_figure
 from studies.runtime.contenders import NUMPY, TABLED
 from studies.runtime.timing import Point, Settings
 
@@ -27,21 +26,12 @@ _COLOURS = {
 _OTHER = ("#8c564b", "#7f7f00", "#17607f")  # engines that came later
 
 
-def draw_all(folder: Path, settings: Settings, points: Sequence[Point], single: Sequence[Point]) -> list[Path]:
-    """Draw the figures into `folder`."""
-    with style():
-        return [
-            _axes(folder / "runtime_axes.png", settings, points),
-            _teaser(folder / "runtime_teaser.png", settings, single),
-        ]
-
-
 def _colour(name: str, names: Sequence[str]) -> str:
     unknown = [n for n in names if n not in _COLOURS]
     return _COLOURS[name] if name in _COLOURS else _OTHER[unknown.index(name) % len(_OTHER)]
 
 
-def _axes(path: Path, settings: Settings, points: Sequence[Point]) -> Path:
+def along_axes(settings: Settings, points: Sequence[Point]) -> Figure:
     """Seconds against cycles, flux, realizations and pixels; a line ends where the next point was left out."""
     figure, axes = panels(5.2, 2, 2, sharey=True)
     names = list(dict.fromkeys(p.contender for p in points))
@@ -64,10 +54,10 @@ def _axes(path: Path, settings: Settings, points: Sequence[Point]) -> Path:
     for row in axes:
         row[0].set_ylabel("seconds")
     legend_below(figure, axes[0, :1], min(len(names), 6))
-    return save_figure(path, figure)
+    return figure
 
 
-def _teaser(path: Path, settings: Settings, single: Sequence[Point]) -> Path:
+def single_pixel(settings: Settings, single: Sequence[Point]) -> Figure:
     """Bars of the single pixel, here and in the paper."""
     figure, axes = panels(2.4, 1, 2, gridspec_kw={"width_ratios": (2, 1)})
     cycles, realizations = settings.teaser
@@ -86,4 +76,4 @@ def _teaser(path: Path, settings: Settings, single: Sequence[Point]) -> Path:
         ax.set_xlim(low, high * 4.0)
         ax.set_title(words, loc="left")
         ax.invert_yaxis()
-    return save_figure(path, figure)
+    return figure

@@ -9,7 +9,7 @@ normal, and `Generator.multinomial` for all rows of a block in one call. Blocks 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,18 +20,6 @@ from mars_lidar._base.types import FloatArray
 
 STAGES = ("lookup", "alignment", "sampling")
 _BLOCK = 1024  # pixels at a time
-
-
-@dataclass
-class Stages:
-    """Seconds spent in each stage, summed over blocks."""
-
-    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
-
-    @property
-    def total(self) -> float:
-        """Of all stages."""
-        return sum(self.seconds.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +101,14 @@ def synthesize(
     *,
     realizations: int = 1,
     seed: int = 0,
-    stages: Stages | None = None,
+    stages: dict[str, float] | None = None,
     out: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
     """A cube (realizations, H, W, bins) of counts x multinomial, in `out` if given.
 
-    `stages` takes the seconds of each stage.
+    To `stages` the seconds of each of `STAGES` are added.
     """
-    spent = (stages or Stages()).seconds
+    spent = {} if stages is None else stages
     random = np.random.default_rng(seed)
     system = table.system
     bins, pixels = system.bins, flux.shape[0] * flux.shape[1]
@@ -144,5 +132,5 @@ def synthesize(
             one[start : start + _BLOCK] = random.multinomial(counts, shapes)
         done = time.perf_counter()
         for name, seconds in zip(STAGES, (looked - begun, aligned - looked, done - aligned), strict=True):
-            spent[name] += seconds
+            spent[name] = spent.get(name, 0.0) + seconds
     return out

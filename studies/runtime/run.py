@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from studies import Request
-from studies.common.report import Row, load, write
+from studies import Facts, Request
+from studies.common.report import Row, load
 from studies.common.sample import PERIOD_NS
 from studies.runtime.contenders import NUMPY
+from studies.runtime.figures import along_axes, single_pixel
 from studies.runtime.timing import DEAD_TIME_NS, FLUX, FULL, QUICK, SIGMA_NS, Point, along, cube_stages, teaser
 
 __all__ = ["DEAD_TIME_NS", "FLUX", "SIGMA_NS", "crossover", "run"]  # the first three for the report
@@ -52,12 +51,10 @@ def crossover(points: Sequence[Point], axis: str, fast: str, other: str) -> tupl
     return least, f"{fast} is faster than {other} below {least:.3g} registrations per pixel, slower above"
 
 
-def run(request: Request) -> list[Path]:
-    """Time, draw and write the study; returns the paths written."""
-    from studies.runtime.figures import draw_all
-
+def run(request: Request) -> Facts:
+    """Stages of a cube, four axes, and a single pixel, timed."""
     settings = QUICK if request.quick else FULL
-    began, before = time.monotonic(), load()
+    before = load()
     cubes, held = cube_stages(settings, request.tell)
     single = teaser(settings, request.tell)
     points = [point for axis in settings.axes for point in along(settings, axis, request.tell)]
@@ -65,24 +62,22 @@ def run(request: Request) -> list[Path]:
         one for one in dict.fromkeys(p.contender for p in points) if one not in ("exact", "sequential", "poisson")
     ]
     axes = (("cycles", "exposure grows"), ("flux", "flux grows"))
-    facts = {
+    return {
         "s": settings,
         "period_ns": PERIOD_NS,
         "before": before,
         "cubes": cubes,
-        "engines": [cube for cube in cubes if cube.contender != NUMPY],
-        "base": next(cube.seconds for cube in cubes if cube.contender == NUMPY),
+        "engines": [cube for cube in cubes if cube["contender"] != NUMPY],
+        "base": next(cube["seconds"] for cube in cubes if cube["contender"] == NUMPY),
         "rules": [(words, *crossover(points, axis, "exact", one)) for one in others for axis, words in axes],
         "pixels": next(axis.pixels for axis in settings.axes if axis.name == "cycles"),
         "axes": {axis.words: _axis_rows(points, axis.name) for axis in settings.axes},
         "single": single,
         "held": held,
         "size": PAPER_GRID[0] * PAPER_GRID[1] * (PAPER_GRID[2] + 2) * _BYTES,
-        "spent": time.monotonic() - began,
+        "rows": [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]],
+        "figures": {"axes": along_axes(settings, points), "teaser": single_pixel(settings, single)},
     }
-    figures = draw_all(request.out, settings, points, single)
-    rows = [vars(p) | {"seconds": "" if p.seconds is None else p.seconds} for p in [*points, *single]]
-    return write(request, "runtime", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def _axis_rows(points: Sequence[Point], axis: str) -> list[Row]:

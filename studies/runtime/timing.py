@@ -102,21 +102,6 @@ class Point:
     registrations: float = 0.0  # mean of a pixel, one realization
 
 
-@dataclass(frozen=True)
-class Cube:
-    """One contender on the cube of the stages: least seconds, and the stages of that run.
-
-    `predicted` where it would have taken too long: seconds and stages are those of a part of the pixels, scaled.
-    """
-
-    contender: str
-    words: str
-    seconds: float
-    predicted: bool
-    stages: dict[str, float]
-    prepared: float  # seconds spent before, on a table or nothing
-
-
 def image(pixels: int, seed: int, level: float = 1.0) -> Flux:
     """A row of pixels, S and B uniform on `FLUX` times `level`, delays anywhere but at the edges."""
     random = np.random.default_rng([seed, pixels])
@@ -129,8 +114,12 @@ def system(settings: Settings, cycles: int) -> System:
     return system_of(DEAD_TIME_NS, cycles, bins=settings.bins, sigma_ns=SIGMA_NS)
 
 
-def cube_stages(settings: Settings, tell: Tell) -> tuple[list[Cube], Table]:
-    """Every contender on one cube of side x side pixels, and the table that some of them used."""
+def cube_stages(settings: Settings, tell: Tell) -> tuple[list[dict[str, Any]], Table]:
+    """Every contender on one cube of side x side pixels, and the table that some of them used.
+
+    Least seconds, and the stages of that run; ``predicted`` where it would have taken too long: they are those of a
+    part of the pixels, scaled. ``prepared``: seconds spent before, on a table or nothing.
+    """
     flux, seen = image(settings.side**2, settings.seed), system(settings, 1000)
     out, part = _memory(flux, seen, 1), max(1, settings.side**2 // _CUBE_PART)
     found = []
@@ -147,7 +136,8 @@ def cube_stages(settings: Settings, tell: Tell) -> tuple[list[Cube], Table]:
             seconds, stages = scale * seconds, {name: scale * spent for name, spent in stages.items()}
         else:
             seconds, stages = _least({one.name: run}, out, settings)[one.name]
-        found.append(Cube(one.name, one.words, seconds, predicted, stages, prepared))
+        times = {"seconds": seconds, "predicted": predicted, "stages": stages, "prepared": prepared}
+        found.append({"contender": one.name, "words": one.words} | times)
         tell(f"runtime: cube, {one.words}: {seconds:.3g} s{' (predicted)' if predicted else ''}")
     return found, tables.get(seen)
 
@@ -158,7 +148,8 @@ def along(settings: Settings, axis: Axis, tell: Tell) -> list[Point]:
     entrants = contenders(Tables(settings.axis_table))
     for value in axis.values:
         flux, seen, realizations = _at(settings, axis, value)
-        hits = registrations(flux, seen, settings.seed)
+        # mean registrations of a pixel in one exposure, from at most 16 of them
+        hits = float(simulate(flux[:, :16], seen.replace(bins=1), seed=settings.seed).mean(dtype=np.float64))
         runs: dict[str, Run] = {}
         for one in entrants:
             why = _refusal(settings, one, flux, value, points)
@@ -181,11 +172,6 @@ def teaser(settings: Settings, tell: Tell) -> list[Point]:
     timed = _least(runs, _memory(flux, seen, realizations), settings)
     tell("runtime: teaser")
     return [Point("teaser", float(realizations), name, seconds) for name, (seconds, _) in timed.items()]
-
-
-def registrations(flux: Flux, seen: System, seed: int) -> float:
-    """Mean registrations of a pixel in one exposure, from at most 16 of them."""
-    return float(simulate(flux[:, :16], seen.replace(bins=1), seed=seed).mean(dtype=np.float64))
 
 
 def _at(settings: Settings, axis: Axis, value: float) -> tuple[Flux, System, int]:

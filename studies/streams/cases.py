@@ -14,14 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar import Detector, Flux, GaussianPulse, System, Timestamps, calibrate, simulate_timestamps
 from mars_lidar._base.threads import thread_count
-from mars_lidar.calibrate import Calibration, Inspection, calibrate, inspect
-from mars_lidar.instrument.detector import Detector
-from mars_lidar.instrument.pulse import GaussianPulse
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.timestamps import Timestamps
-from mars_lidar.simulate import simulate_timestamps
+from mars_lidar.calibrate import Calibration, Inspection, inspect
 from studies import Tell
 
 ESTIMATES = ("dead time", "jitter", "background", "signal", "delay", "width", "all light, any shape")

@@ -5,16 +5,15 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import binom
 
-from studies import Request
+from studies import Facts, Request
 from studies.common.draw import panels
-from studies.common.report import Row, picked, save_figure, write
-from studies.streams.cases import FULL, QUICK, Outcome, Settings, outcomes
+from studies.common.report import Row, picked
+from studies.streams.cases import FULL, QUICK, Outcome, outcomes
 from studies.streams.coverage import Coverage, Law, coverage, tail
 
 LEVEL = 1e-4  # false-alarm probability of an inspection, as it is stated
@@ -22,22 +21,17 @@ FAMILY = 1e-3  # of all tests of coverage together, by Holm
 FAR = 5.0  # stated errors beyond which an estimate is named
 
 
-def run(request: Request) -> list[Path]:
-    """Compute and write the study; returns the paths written."""
+def run(request: Request) -> Facts:
+    """All streams, inspected and calibrated."""
     settings = QUICK if request.quick else FULL
     began = time.process_time()
     found = outcomes(settings, request.tell)
     spent = time.process_time() - began + sum(one.seconds for one in found)
-    return written(request, settings, found, spent)
-
-
-def written(request: Request, settings: Settings, found: list[Outcome], spent: float) -> list[Path]:
-    """The report of the outcomes, with its table and figure; `spent`: processor time, s."""
     covered = coverage(found)
     alarmed = sum(bool(one.alarms) for one in found)
     tests = {name: value for one in covered for name, value in one.p.items()}
     far = [{name: pull for name, pull in one.pulls.items() if abs(pull) > FAR} for one in found]
-    facts = {
+    return {
         "s": settings,
         "found": found,
         "covered": covered,
@@ -53,10 +47,9 @@ def written(request: Request, settings: Settings, found: list[Outcome], spent: f
         "unknown": Counter(text.split(":")[0] for one in found for text in one.unknown).most_common(),
         "by_share": _by_share([one for one in found if one.ideal.jitter_ns > 0]),
         "spent": spent,
+        "rows": [_csv_row(one) for one in found],
+        "figures": {"": figure(found, covered)},
     }
-    figures = [save_figure(request.out / "streams.png", figure(found, covered))]
-    rows = [_csv_row(one) for one in found]
-    return write(request, "streams", __name__, "report", facts, rows=rows, figures=figures)
 
 
 def refused_by_holm(p: dict[str, float], level: float) -> list[str]:

@@ -5,29 +5,28 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from itertools import product
+from typing import Literal
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mars_lidar import System, Table
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, style
+from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics import Exposure, exposure_moments
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf
-from studies import Request, Tell
+from studies import Facts, Request, Tell
 from studies.common.draw import legend_below, panels
-from studies.common.report import Row, save_figure, write
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, system_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Interpolation = Literal["nearest", "bilinear"]
 
 INTERPOLATIONS: tuple[Interpolation, ...] = ("nearest", "bilinear")
+_DASH = dict(zip(INTERPOLATIONS, ("--", "-"), strict=True))
 LOW, HIGH = 0.01, 10.0  # photons per period, of both axes
 VISIBLE = 0.002  # total variation of the count law, or standard deviations of the mean, that a lookup may cost
 ERRORS = {  # in words
@@ -121,50 +120,40 @@ def _errors(
     }
 
 
-def run(request: Request) -> list[Path]:
-    """Compute, draw and write the study; returns the paths written."""
+def run(request: Request) -> Facts:
+    """All tables and ways of lookup."""
     settings = QUICK if request.quick else FULL
-    began = time.monotonic()
     costs = compute(settings, request.tell)
-    with style():
-        figure = _figure(request.out / "quantisation.png", settings, costs)
     findings = []
-    for dead in settings.dead_ns:
-        for interpolation in INTERPOLATIONS:
-            here = [c for c in costs if c.dead_ns == dead and c.interpolation == interpolation]
-            good = [c for c in here if np.quantile(c.errors["law"], 0.95) <= VISIBLE]
-            least = min(good, key=lambda c: c.size[0] * c.size[1], default=None)
-            findings.append((dead, interpolation, least, here[-1]))
-    facts = {
+    for dead, interpolation in product(settings.dead_ns, INTERPOLATIONS):
+        here = [c for c in costs if c.dead_ns == dead and c.interpolation == interpolation]
+        good = [c for c in here if np.quantile(c.errors["law"], 0.95) <= VISIBLE]
+        least = min(good, key=lambda c: c.size[0] * c.size[1], default=None)
+        findings.append((dead, interpolation, least, here[-1]))
+    return {
         "s": settings,
         "period_ns": PERIOD_NS,
         "findings": findings,
         "costs": costs,
-        "spent": time.monotonic() - began,
+        "rows": [_csv_row(cost) for cost in costs],
+        "figures": {"": _figure(settings, costs)},
     }
-    rows = [_csv_row(cost) for cost in costs]
-    return write(request, "quantisation", __name__, "quantisation", facts, rows=rows, figures=[figure])
 
 
-def _figure(path: Path, settings: Settings, costs: Sequence[Cost]) -> Path:
+def _figure(settings: Settings, costs: Sequence[Cost]) -> Figure:
     figure, axes = panels(2.5, 1, len(ERRORS), sharex=True)
     for ax, key in zip(axes[0], ERRORS, strict=True):
-        _panel(ax, settings, costs, key)
-    legend_below(figure, axes[0, :1], 4)
-    return save_figure(path, figure)
-
-
-def _panel(ax: Axes, settings: Settings, costs: Sequence[Cost], key: str) -> None:
-    for k, dead in enumerate(settings.dead_ns):
-        for interpolation, dash in zip(INTERPOLATIONS, ("--", "-"), strict=True):
+        for (k, dead), (interpolation, dash) in product(enumerate(settings.dead_ns), _DASH.items()):
             here = [c for c in costs if c.dead_ns == dead and c.interpolation == interpolation]
             entries = [c.size[0] * c.size[1] for c in here]
             words = f"{interpolation}, $t_d$ = {dead:g} ns"
             ax.plot(entries, [c.errors[key].mean() for c in here], dash, color=COLOURS[k], lw=1.2, label=words)
             ax.plot(entries, [np.quantile(c.errors[key], 0.95) for c in here], dash, color=COLOURS[k], lw=0.5)
-    ax.set(xscale="log", yscale="log", xlabel="entries")
-    ax.tick_params(axis="x", which="minor", labelbottom=False)
-    ax.set_title(ERRORS[key], loc="left", fontsize=7.0)
+        ax.set(xscale="log", yscale="log", xlabel="entries")
+        ax.tick_params(axis="x", which="minor", labelbottom=False)
+        ax.set_title(ERRORS[key], loc="left", fontsize=7.0)
+    legend_below(figure, axes[0, :1], 4)
+    return figure
 
 
 def _csv_row(cost: Cost) -> Row:

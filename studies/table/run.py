@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from mars_lidar import QuantisationError, System, Table
+from mars_lidar import QuantisationError, Table
 from mars_lidar.table import LawError
 from mars_lidar.table.axes import PAPER_GRID
-from studies import Request
-from studies.common.report import Row, picked, write
+from studies import Facts, Request
+from studies.common.report import Row
 from studies.common.sample import system_of
 
 _SEED = 20263
@@ -25,26 +24,29 @@ _CASES: tuple[Mapping[str, Any], ...] = (
     {"dead_time_ns": 130.2},
     {"dead_time_ns": 75.0, "cycles": 20},
 )
+_AT_DELAY = "interpolation mean_rms mean_max variance_max third_max fourth_max shape_mean shape_max"
+_DELAYED = "delayed_mean_max delayed_variance_max delayed_shape_max"
+_COLUMNS = {key: key.replace("delayed_", "delayed: ").replace("_", " ") for key in f"{_AT_DELAY} {_DELAYED}".split()}
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One table, and its errors between entries."""
+    """One table, and its errors between entries: bilinear, nearest."""
 
-    system: System
     table: Table
     errors: tuple[QuantisationError, QuantisationError]
     law: LawError
 
     def quantisation(self) -> list[Row]:
-        """Lines of the second table: bilinear, nearest."""
-        at_delay = "mean_rms mean_max variance_max third_max fourth_max shape_mean shape_max"
-        delayed = "delayed_mean_max delayed_variance_max delayed_shape_max"
-        found = [picked(errors, f"interpolation {at_delay} {delayed}") for errors in self.errors]
-        return [
-            self._name() | {key.replace("delayed_", "delayed: ").replace("_", " "): v for key, v in row.items()}
-            for row in found
-        ]
+        """Lines of the second table."""
+        system = self.table.system
+        name = {
+            "t_d, ns": system.detector.dead_time_ns,
+            "start": system.start,
+            "method": self.table.method,
+            "N_r": system.cycles,
+        }
+        return [name | {words: getattr(errors, key) for key, words in _COLUMNS.items()} for errors in self.errors]
 
     @property
     def longest(self) -> QuantisationError | None:
@@ -52,45 +54,27 @@ class Case:
         made = self.table.provenance["error_longest"]
         return None if made is None else QuantisationError(**made)
 
-    def _name(self) -> dict[str, Any]:
-        return {
-            "t_d, ns": self.system.detector.dead_time_ns,
-            "start": self.system.start,
-            "method": self.table.method,
-            "N_r": self.system.cycles,
-        }
 
-
-def run(request: Request) -> list[Path]:
-    """Build the tables, measure, write ``table.md`` and ``table.csv``."""
+def run(request: Request) -> Facts:
+    """All tables, built and measured."""
     grids = dict(PAPER_GRID)
     samples, laws = _SAMPLES, _LAWS
     if request.quick:
         grids, samples, laws = {"signal": (0.01, 10.0, 24), "background": (0.01, 10.0, 16)}, 20, 4
     cases = []
     for case in _CASES[: 1 if request.quick else None]:
-        cases.append(_measure(case, grids, samples, laws))
+        system = system_of(case["dead_time_ns"], case.get("cycles", 1000), start=case.get("start", "armed"))
+        table = Table.build(system, grids["signal"], grids["background"], method=case.get("method", "exposure"))
+        errors = (
+            table.quantisation_error(samples=samples, seed=_SEED),
+            table.quantisation_error(interpolation="nearest", samples=samples, seed=_SEED),
+        )
+        cases.append(Case(table, errors, table.law_error(samples=laws, seed=_SEED)))
         request.tell(f"table: {case}")
-    rows = [row for case in cases for row in case.quantisation()]
-    facts = {
+    return {
         "grids": grids,
         "samples": samples,
         "laws": laws,
         "cases": cases,
-        "rows": rows,
+        "rows": [row for case in cases for row in case.quantisation()],
     }
-    return write(request, "table", __name__, "report", facts, rows=rows)
-
-
-def _measure(case: Mapping[str, Any], grids: Mapping[str, tuple[float, float, int]], samples: int, laws: int) -> Case:
-    system = system_of(case["dead_time_ns"], case.get("cycles", 1000), start=case.get("start", "armed"))
-    built = Table.build(system, grids["signal"], grids["background"], method=case.get("method", "exposure"))
-    return Case(
-        system,
-        built,
-        (
-            built.quantisation_error(samples=samples, seed=_SEED),
-            built.quantisation_error(interpolation="nearest", samples=samples, seed=_SEED),
-        ),
-        built.law_error(samples=laws, seed=_SEED),
-    )

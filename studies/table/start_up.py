@@ -7,14 +7,13 @@ at the canonical delay t_r / 2 moved there, which is what a table without any in
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mars_lidar.statistics import exposure_moments
-from studies import Request
-from studies.common.report import Row, write
+from studies import Facts, Request
+from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, system_of
 
 _LEVELS = (0.01, 10.0)
@@ -31,8 +30,8 @@ _CASES = (
 )  # ns, cycles
 
 
-def run(request: Request) -> list[Path]:
-    """Measure, write ``start_up.md`` and ``start_up.csv``."""
+def run(request: Request) -> Facts:
+    """All dead times and exposures."""
     points, delays = (4, 4) if request.quick else (13, 24)
     rows = []
     for case in _CASES[: 2 if request.quick else None]:
@@ -41,15 +40,15 @@ def run(request: Request) -> list[Path]:
     shown = dict.fromkeys((row["dead_time_ns"], row["cycles"]) for row in rows)
     # start-up lasts where the dead time is near the period
     close = [row["displaced"] for row in rows if 0.9 * PERIOD_NS <= row["dead_time_ns"] <= PERIOD_NS]
-    facts = {
+    return {
         "points": points,
         "delays": delays,
         "levels": list(_LEVELS),
         "lines": [_line(case, [row for row in rows if (row["dead_time_ns"], row["cycles"]) == case]) for case in shown],
         "away": max(row["displaced"] for row in rows if row["dead_time_ns"] < 0.9 * PERIOD_NS),
         "near": max(close, default=None),
+        "rows": rows,
     }
-    return write(request, "start_up", __name__, "start_up", facts, rows=rows)
 
 
 def _measure(dead_ns: float, cycles: int, points: int, delays: int) -> list[Row]:
@@ -85,14 +84,10 @@ def _measure(dead_ns: float, cycles: int, points: int, delays: int) -> list[Row]
     ]
 
 
-def _dim(row: Row) -> bool:
-    return float(row["signal"]) <= 1.001 * _DIM and float(row["background"]) <= 1.001 * _DIM
-
-
 def _line(case: tuple[Any, Any], rows: list[Row]) -> Row:
     tv = [float(row["tv"]) for row in rows]
     worst = rows[int(np.argmax(tv))]
-    dim = [row for row in rows if _dim(row)]
+    dim = [row for row in rows if max(row["signal"], row["background"]) <= 1.001 * _DIM]
     return {
         "t_d, ns": case[0],
         "N_r": case[1],

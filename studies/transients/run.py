@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from mars_lidar import Detector, Flux, GaussianPulse, System, simulate
 from mars_lidar._base.types import FloatArray
-from mars_lidar.plot.style import COLOURS, INK, MUTED, style
+from mars_lidar.plot.style import COLOURS, INK, MUTED
 from mars_lidar.statistics import mean_histogram
-from studies import Request
+from studies import Facts, Request
 from studies.common.draw import legend_below, panels
-from studies.common.report import save_figure, write
 from studies.common.sample import settings_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 GLASS, WALL = (0.15, 40.0), (3.0, 73.0)  # photons per period without fog, delay in ns
 FOG = {"extinction_per_m": 0.08, "backscatter": 1.2, "nearest_m": 0.6}
@@ -29,6 +24,15 @@ DETECTORS = {
     "paralyzable": Detector(dead_time_ns=DEAD_NS, mode="paralyzable"),
     "synchronous": Detector(dead_time_ns=DEAD_NS, mode="synchronous"),
 }
+
+
+SYSTEM = System(
+    period_ns=100.0,
+    cycles=1000,
+    bins=400,
+    pulse=GaussianPulse(sigma_ns=0.3),
+    detector=DETECTORS["non-paralyzable"],
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,80 +45,58 @@ class Seen:
     error: FloatArray
 
 
-def view(detector: Detector) -> System:
-    """The system of the study."""
-    return System(period_ns=100.0, cycles=1000, bins=400, pulse=GaussianPulse(sigma_ns=0.3), detector=detector)
-
-
-def incident(system: System) -> Flux:
-    """One pixel: a pane of glass, a wall, and the fog before them."""
+def incident() -> FloatArray:
+    """Waveform (bins,) of one pixel, photons: a pane of glass, a wall, and the fog before them."""
     clear = Flux.multi(Flux(GLASS[0], BACKGROUND, GLASS[1]), Flux(WALL[0], 0.0, WALL[1]))
-    return clear.in_fog(system, parts=system.bins, **FOG)
+    waveform = clear.in_fog(SYSTEM, parts=SYSTEM.bins, **FOG).waveform
+    assert waveform is not None
+    return np.asarray(waveform[0, 0])
 
 
-def seen_by(name: str, exposures: int) -> Seen:
-    """Simulate and predict one detector."""
-    system = view(DETECTORS[name])
-    flux = incident(system)
-    assert flux.waveform is not None
-    every = Flux(waveform=np.broadcast_to(flux.waveform, (1, exposures, system.bins)), background=BACKGROUND)
-    cube = simulate(every, system, seed=SEED)[0, 0].astype(np.float64)
-    expected = mean_histogram(None, BACKGROUND, system, waveform=flux.waveform[0, 0])
-    return Seen(name, expected, cube.mean(0), cube.std(0, ddof=1) / np.sqrt(exposures))
-
-
-def run(request: Request) -> list[Path]:
-    """Write transients.md, transients.csv and the figure."""
+def run(request: Request) -> Facts:
+    """Simulate and predict every detector."""
     exposures = 200 if request.quick else 4000
+    waveform = incident()
+    flux = Flux(waveform=np.broadcast_to(waveform, (1, exposures, SYSTEM.bins)), background=BACKGROUND)
+    arrivals = waveform + BACKGROUND / SYSTEM.bins  # per period
     shown = []
-    for name in DETECTORS:
+    for name, detector in DETECTORS.items():
         request.tell(f"transients: {name}")
-        shown.append(seen_by(name, exposures))
-    rows = [row(each) for each in shown]
-    figures = [_draw(request.out / "transients.png", shown)]
+        system = SYSTEM.replace(detector=detector)
+        cube = simulate(flux, system, seed=SEED)[0, 0].astype(np.float64)
+        expected = mean_histogram(None, BACKGROUND, system, waveform=waveform)
+        shown.append(Seen(name, expected, cube.mean(0), cube.std(0, ddof=1) / np.sqrt(exposures)))
     light = {"glass (S, ns)": GLASS, "wall (S, ns)": WALL, **FOG, "background B": BACKGROUND, "dead_time_ns": DEAD_NS}
-    settings = settings_of(view(DETECTORS["non-paralyzable"]), light, exposures, SEED)
-    facts = {"settings": settings, "rows": rows}
-    return write(request, "transients", __name__, "report", facts, rows=rows, figures=figures)
+    return {
+        "settings": settings_of(SYSTEM, light, exposures, SEED),
+        "rows": [row(each, SYSTEM.cycles * arrivals) for each in shown],
+        "figures": {"": _draw(shown, arrivals)},
+    }
 
 
-def row(each: Seen) -> dict[str, Any]:
+def row(each: Seen, arrivals: FloatArray) -> dict[str, Any]:
     """One line of the table."""
-    system = view(DETECTORS[each.name])
-    flux = incident(system)
-    assert flux.waveform is not None
-    arrivals = system.cycles * (flux.waveform[0, 0] + BACKGROUND / system.bins)
-    time = system.time_ns
     line: dict[str, Any] = {"detector": each.name, "registrations": float(each.simulated.sum())}
     for name, low, high in (("fog", 0.0, 37.0), ("glass", 37.0, 43.0), ("wall", 70.0, 76.0)):
-        inside = (time >= low) & (time < high)
+        inside = (SYSTEM.time_ns >= low) & (SYSTEM.time_ns < high)
         line[name] = float(each.simulated[inside].sum() / arrivals[inside].sum())
     often = each.error > 0
     line["worst z"] = float(np.abs((each.simulated - each.expected)[often] / each.error[often]).max())
     return line
 
 
-def _draw(path: Path, shown: list[Seen]) -> Path:
-    with style():
-        figure, axes = panels(2.8, 1, 2)
-        system = view(DETECTORS["non-paralyzable"])
-        flux = incident(system)
-        assert flux.waveform is not None
-        arrivals = flux.waveform[0, 0] + BACKGROUND / system.bins
-        for ax, low, high in ((axes[0, 0], 0.0, 100.0), (axes[0, 1], 66.0, 82.0)):
-            _panel(ax, system, arrivals, shown)
-            ax.set(xlabel="time in the period, ns", xlim=(low, high), yscale="log")
-        axes[0, 0].set_ylabel("per period and ns")
-        axes[0, 0].set_title("fog, glass and wall")
-        axes[0, 1].set_title("the wall")
-        legend_below(figure, axes[0, :1], 4)
-        return save_figure(path, figure)
-
-
-def _panel(ax: Axes, system: System, arrivals: FloatArray, shown: list[Seen]) -> None:
-    ax.plot(system.time_ns, arrivals / system.bin_ns, color=INK, lw=0.7, ls=":", label="arrivals")
-    scale = 1.0 / (system.cycles * system.bin_ns)
-    for each, colour in zip(shown, [MUTED, *COLOURS], strict=False):
-        simulated = np.where(each.simulated > 0, each.simulated * scale, np.nan)
-        ax.plot(system.time_ns, simulated, ".", ms=1.8, color=colour)
-        ax.plot(system.time_ns, each.expected * scale, color=colour, lw=0.8, label=each.name)
+def _draw(shown: list[Seen], arrivals: FloatArray) -> Figure:
+    figure, axes = panels(2.8, 1, 2)
+    scale = 1.0 / (SYSTEM.cycles * SYSTEM.bin_ns)
+    for ax, low, high in ((axes[0, 0], 0.0, 100.0), (axes[0, 1], 66.0, 82.0)):
+        ax.plot(SYSTEM.time_ns, arrivals / SYSTEM.bin_ns, color=INK, lw=0.7, ls=":", label="arrivals")
+        for each, colour in zip(shown, [MUTED, *COLOURS], strict=False):
+            simulated = np.where(each.simulated > 0, each.simulated * scale, np.nan)
+            ax.plot(SYSTEM.time_ns, simulated, ".", ms=1.8, color=colour)
+            ax.plot(SYSTEM.time_ns, each.expected * scale, color=colour, lw=0.8, label=each.name)
+        ax.set(xlabel="time in the period, ns", xlim=(low, high), yscale="log")
+    axes[0, 0].set_ylabel("per period and ns")
+    axes[0, 0].set_title("fog, glass and wall")
+    axes[0, 1].set_title("the wall")
+    legend_below(figure, axes[0, :1], 4)
+    return figure

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import Detector, Flux, GaussianPulse, System, Table, simulate
+from mars_lidar import Flux, System, Table, simulate
 from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
+from studies.common.sample import PERIOD_NS, system_of
 from studies.common.windows import FEATURES, WINDOW, features
 
-PERIOD_NS = 1e3 / 7.5
-BINS, CYCLES, SIGMA_NS = 1024, 1000, 0.5
 SIGNAL, BACKGROUND = (0.1, 8.0), (0.1, 6.0)  # photons per period, log-uniform
 OUTPUTS = ("log S", "log B", "delay")
 GOLD = "sequential"
@@ -71,15 +70,9 @@ _TINY = replace(
 CONFIGS = {config.name: config for config in (_SMALL, _FULL, _TINY)}
 
 
-def system_of(dead: float) -> System:
+def instrument(dead: float) -> System:
     """The instrument with a dead time of `dead` periods."""
-    return System(
-        period_ns=PERIOD_NS,
-        cycles=CYCLES,
-        bins=BINS,
-        pulse=GaussianPulse(sigma_ns=SIGMA_NS),
-        detector=Detector(dead_time_ns=dead * PERIOD_NS),
-    )
+    return system_of(dead * PERIOD_NS, 1000)
 
 
 def light(pixels: int, random: np.random.Generator) -> Flux:

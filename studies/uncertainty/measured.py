@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,8 +13,6 @@ from scipy import stats
 
 from mars_lidar import Calibration, Detector, Flux, GaussianPulse, System, Timestamps, calibrate, simulate
 from mars_lidar._base.types import FloatArray
-from studies import Tell
-from studies.common.report import save_whole
 from studies.uncertainty.data import GOLD, Config
 from studies.uncertainty.network import IntervalNetwork, told, trained
 
@@ -22,22 +20,13 @@ UNIT_NS = 0.064  # of the times in the stream
 CYCLES, BINS, LEVELS = 100, 32, 64  # of an exposure; of light in the training, log-spaced
 DARKEST, BRIGHTEST = 0.4, 2.5  # over the light of the whole stream
 SIMULATORS = ("exact", "mars", "renewal", "poisson")
-FILE = "measured.json"
 
 
-def measured(path: Path, folder: Path, config: Config, tell: Tell) -> dict[str, Any]:
+def measured(path: Path, config: Config) -> dict[str, Any]:
     """By simulator: what a network trained on its data says of exposures of the stream, and of simulated ones."""
-    made = folder / FILE
-    if not made.exists():
-        tell(f"uncertainty: {path.name}")
-        save_whole(made, json.dumps(_measured(path, config)) + "\n")
-    found: dict[str, Any] = json.loads(made.read_text())
-    return found
-
-
-def _measured(path: Path, config: Config) -> dict[str, Any]:
     times = Timestamps.load(path, unit_ns=UNIT_NS)
-    dead_ns = _electronics_ns(path)
+    with h5py.File(path) as file:
+        dead_ns = float(np.asarray(file["DT_electronics"])[0, 0]) * UNIT_NS
     whole = calibrate(times, pulse="free", dead_time_ns=dead_ns)
     system = System(
         period_ns=times.period_ns,
@@ -75,13 +64,6 @@ def _measured(path: Path, config: Config) -> dict[str, Any]:
         "gold": len(gold),
     }
     return {"about": about, "rows": rows}
-
-
-def _electronics_ns(path: Path) -> float:
-    import h5py
-
-    with h5py.File(path) as file:
-        return float(np.asarray(file["DT_electronics"])[0, 0]) * UNIT_NS
 
 
 def _cut(times: Timestamps) -> NDArray[np.int64]:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from studies import Request
-from studies.common.report import Row, save_figure, write
+from studies import Facts
+from studies.common.kept import spread
+from studies.common.report import Row
 from studies.uncertainty import data, measured
-from studies.uncertainty.data import CONFIGS, Config, system_of
+from studies.uncertainty.data import CONFIGS, Config, instrument
 from studies.uncertainty.figures import exposures, maps, reliability
 from studies.uncertainty.prediction import at
 from studies.uncertainty.run import LEVELS, Run, by_simulator
@@ -22,40 +22,35 @@ WINDOWS = ((5.0, 0.5, 0.1), (2.0, 5.0, 0.95))  # S, B, t_d / t_r of the two vari
 LEFT, OFF = 0.01, 0.02  # by which exact-trained 90 % intervals, and the closed form, may be wrong
 
 
-def report(
-    request: Request,
+def facts(
     config: Config,
     found: Mapping[Run, Any],
     predicted: Mapping[float, Any],
     stream: Mapping[str, Any] | None,
-) -> list[Path]:
-    """uncertainty.md, uncertainty.csv and the figures."""
+) -> Facts:
+    """What the report states of the results by run, and the figures."""
     dead = sorted(config.dead)
     pictures = {"reliability": reliability(found, predicted, dead), "coverage": maps(found, predicted, dead, config)}
     if stream is not None:
         pictures["stream"] = exposures(stream)
-    figures = [save_figure(request.out / f"uncertainty_{name}.png", one) for name, one in pictures.items()]
-    facts = {
+    lights = [(d, one) for d, rows in predicted.items() for one in rows]
+    return {
         "c": config,
         "data": data,
+        "system": instrument(0.0),
         "dead": dead,
         "table_rows": [row for d in dead for row in _rows(found, predicted, d)],
         "differences": [_difference(found, predicted, config, d) for d in dead],
         "cells": [_cells(found, predicted, d) for d in dead],
-        "windows": [(s, b, d, at(s, b, system_of(d)).window) for s, b, d in WINDOWS],
-        "extremes": _extremes(predicted),
+        "windows": [(s, b, d, at(s, b, instrument(d)).window) for s, b, d in WINDOWS],
+        # where the variance of the window is furthest off in the map, either way
+        "extremes": [pick(lights, key=lambda pair: pair[1]["window"]) for pick in (min, max)],
         "stream": stream,
         "measured": measured,
         "minutes": sum(result["seconds"] for result in found.values()) / 60.0,
-        "figures": [path.name for path in figures],
+        "figures": pictures,
+        "rows": _csv(found),
     }
-    return write(request, "uncertainty", __name__, "report", facts, rows=_csv(found), figures=figures)
-
-
-def spread(values: list[float], digits: int) -> str:
-    """Mean, and the standard deviation between seeds where there are several."""
-    mean = f"{np.mean(values):.{digits}f}"
-    return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"
 
 
 def _of(results: list[Any], test: str, measure: str, output: str = "log S") -> list[float]:
@@ -102,22 +97,19 @@ def _difference(
     def less(a: list[float], b: list[float]) -> list[float]:
         return [x - y for x, y in zip(a, b, strict=False)]
 
-    steps = [*(str(step) for step in config.looks if step < config.steps["mars"])]
-    growth = [(step, float(np.mean(less(_look(mars, step), _look(exact, step))))) for step in steps]
+    growth = []
+    for step in (str(step) for step in config.looks if step < config.steps["mars"]):
+        one, other = ([result["looks"][step]["log S"]["loss"] for result in arm] for arm in (mars, exact))
+        growth.append((step, float(np.mean(less(one, other)))))
     final = less(_of(mars, "gold", "loss"), _of(exact, "gold", "loss"))
+    errors = zip(_of(mars, "gold", "rmse"), _of(exact, "gold", "rmse"), strict=False)
     covered = {name: float(np.mean(_covered(arms[name], "gold", 0.9))) for name in ("mars", "exact")}
     closed = _closed(predicted, dead, 0.9)
     return {
         "dead": dead,
         "loss": spread(final, 3),
         "loss_closed": float(np.mean([one["loss"] for one in predicted[dead]])),
-        "rmse": spread(
-            [
-                100.0 * (a / b - 1.0)
-                for a, b in zip(_of(mars, "gold", "rmse"), _of(exact, "gold", "rmse"), strict=False)
-            ],
-            1,
-        ),
+        "rmse": spread([100.0 * (a / b - 1.0) for a, b in errors], 1),
         "covered": spread(less(_covered(mars, "gold", 0.9), _covered(exact, "gold", 0.9)), 3),
         "growth": [*growth, (str(config.steps["mars"]), float(np.mean(final)))],
         "exact": covered["exact"],
@@ -126,10 +118,6 @@ def _difference(
         "closed": closed,
         "closed_holds": abs(covered["mars"] - closed) <= OFF,
     }
-
-
-def _look(results: list[Any], step: str) -> list[float]:
-    return [result["looks"][step]["log S"]["loss"] for result in results]
 
 
 def _cells(found: Mapping[Run, Any], predicted: Mapping[float, Any], dead: float) -> dict[str, Any]:
@@ -156,12 +144,6 @@ def _cells(found: Mapping[Run, Any], predicted: Mapping[float, Any], dead: float
 
 def _map(results: list[Any], which: str) -> Any:
     return np.mean([np.array(result["tests"]["gold"][which]).ravel() for result in results], axis=0)
-
-
-def _extremes(predicted: Mapping[float, Any]) -> list[tuple[float, Any]]:
-    """Where the variance of the window is furthest off in the map, either way."""
-    every = [(dead, one) for dead, rows in predicted.items() for one in rows]
-    return [pick(every, key=lambda pair: pair[1]["window"]) for pick in (min, max)]
 
 
 def _csv(found: Mapping[Run, Any]) -> list[Row]:

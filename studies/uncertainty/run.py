@@ -7,21 +7,19 @@ result in a file of its own, and a study that was stopped goes on with the next.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from scipy import stats
 
-from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from studies import OtherRunsError, Request, Tell
-from studies.common.report import save_whole
+from studies import Facts, Request
+from studies.common.kept import chosen, fixed, kept
 from studies.common.windows import FEATURES
 from studies.uncertainty.data import (
     BACKGROUND,
@@ -32,14 +30,14 @@ from studies.uncertainty.data import (
     Config,
     Pixels,
     Simulators,
+    instrument,
     light,
-    system_of,
 )
+from studies.uncertainty.measured import measured
 from studies.uncertainty.network import IntervalNetwork, told, trained
 from studies.uncertainty.prediction import predict
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-CONFIG, PREDICTED = "config.json", "predicted-{dead:g}.json"
 _TRAINING, _TEST = range(2)  # lights; the noise of a set has a seed of its own beside
 
 
@@ -64,88 +62,71 @@ def runs(config: Config) -> list[Run]:
     ]
 
 
-def run(request: Request) -> list[Path]:
-    """Train what is left, and write uncertainty.md, its CSV and its figures."""
-    from studies.uncertainty.measured import measured
-    from studies.uncertainty.report import report
+def run(request: Request) -> Facts:
+    """Train what is left, and report all."""
+    from studies.uncertainty import report
 
     torch.set_num_threads(1)  # the networks are too small to gain from more
-    name = "tiny" if request.quick else request.config
-    config = CONFIGS[checks.choice("config", name, tuple(CONFIGS))]
+    config, tell = chosen(CONFIGS, request), request.tell
     folder = request.out / f"uncertainty-{config.name}"
-    _fixed(folder, config)
-    for dead in config.dead:
-        _predictions(folder, config, dead, request.tell)
-        _networks(folder, config, dead, request.tell)
-    found = {one: json.loads((folder / one.file).read_text()) for one in runs(config)}
-    predicted = {dead: json.loads((folder / PREDICTED.format(dead=dead)).read_text()) for dead in config.dead}
-    stream = None if request.stream is None else measured(request.stream, folder, config, request.tell)
-    return report(request, config, found, predicted, stream)
+    fixed(folder, asdict(config))
+    predicted = {
+        dead: kept(folder / f"predicted-{dead:g}.json", partial(_predicted, dead, config.cells), tell)
+        for dead in config.dead
+    }
+    data = _Data(config)
+    found = {one: kept(folder / one.file, partial(_result, one, data, config), tell) for one in runs(config)}
+    stream = None
+    if request.stream is not None:
+        stream = kept(folder / "measured.json", partial(measured, request.stream, config), tell)
+    return {"study": report} | report.facts(config, found, predicted, stream)
 
 
-def _fixed(folder: Path, config: Config) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    record, path = json.dumps(asdict(config), indent=2) + "\n", folder / CONFIG
-    if path.exists() and path.read_text() != record:
-        raise OtherRunsError(f"{folder} holds runs of another configuration ({CONFIG}); give another --out")
-    save_whole(path, record)
+def _predicted(dead: float, cells: int) -> list[dict[str, Any]]:
+    """The closed form over the map."""
+    made = predict(instrument(dead), cells)
+    return [asdict(one) | {"loss": one.loss, "coverage": [one.coverage(level) for level in LEVELS]} for one in made]
 
 
-def _predictions(folder: Path, config: Config, dead: float, tell: Tell) -> None:
-    path = folder / PREDICTED.format(dead=dead)
-    if not path.exists():
-        tell(f"uncertainty: closed form at t_d = {dead:g} t_r")
-        made = predict(system_of(dead), config.cells)
-        rows = [asdict(one) | {"loss": one.loss, "coverage": [one.coverage(level) for level in LEVELS]} for one in made]
-        save_whole(path, json.dumps(rows) + "\n")
-
-
-def _networks(folder: Path, config: Config, dead: float, tell: Tell) -> None:
-    left = [one for one in runs(config) if one.dead == dead and not (folder / one.file).exists()]
-    if not left:
-        return
-    data = _Data(config, dead)
-    gold, exact = data.test(GOLD), data.test("exact")
-    for name in dict.fromkeys(one.name for one in left):
-        tell(f"uncertainty: {name} data at t_d = {dead:g} t_r")
-        training, own = data.training(name), data.test(name)
-        for one in (one for one in left if one.name == name):
-            began = time.process_time()
-            torch.manual_seed(one.seed)
-            network = IntervalNetwork(FEATURES, len(OUTPUTS))
-            looks: dict[int, Any] = {}
-            steps = config.steps[name]
-            for step in trained(
-                network, training.seen, training.wanted, steps=steps, batch=config.batch, seed=one.seed
-            ):
-                if step in config.looks or step == steps:
-                    looks[step] = judged(network, gold, config.cells)
-            seconds = time.process_time() - began
-            tests = {"gold": looks.pop(steps), "own": judged(network, own), "exact": judged(network, exact)}
-            result = {"run": asdict(one), "seconds": seconds, "tests": tests, "looks": looks}
-            save_whole(folder / one.file, json.dumps(result) + "\n")
-            covered = tests["gold"]["log S"]["coverage"][LEVELS.index(0.9)]
-            tell(f"uncertainty: {one.file}: 90 % intervals of log S cover {covered:.3f} of gold, {seconds:.0f} s")
+def _result(one: Run, data: _Data, config: Config) -> dict[str, Any]:
+    """One network, trained and judged."""
+    training, gold = data.pixels(one.dead, one.name, _TRAINING), data.pixels(one.dead, GOLD, _TEST)
+    began = time.process_time()
+    torch.manual_seed(one.seed)
+    network = IntervalNetwork(FEATURES, len(OUTPUTS))
+    looks: dict[int, Any] = {}
+    steps = config.steps[one.name]
+    for step in trained(network, training.seen, training.wanted, steps=steps, batch=config.batch, seed=one.seed):
+        if step in config.looks or step == steps:
+            looks[step] = judged(network, gold, config.cells)
+    seconds = time.process_time() - began
+    tests = {"gold": looks.pop(steps)}
+    for test, name in (("own", one.name), ("exact", "exact")):
+        tests[test] = judged(network, data.pixels(one.dead, name, _TEST))
+    return {"run": asdict(one), "seconds": seconds, "tests": tests, "looks": looks}
 
 
 class _Data:
-    """Training and test pixels at one dead time: the same light for every simulator, noise of its own for each."""
+    """Pixels of all simulators: at one dead time the same light for each, noise of its own."""
 
-    def __init__(self, config: Config, dead: float) -> None:
-        self._config, self._dead = config, config.dead.index(dead)
-        self._simulators = Simulators(system_of(dead), config)
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._simulators = {dead: Simulators(instrument(dead), config) for dead in config.dead}
+        self._held: dict[tuple[float, str, int], Pixels] = {}
 
-    def training(self, name: str) -> Pixels:
-        return self._pixels(name, self._config.pixels[name], _TRAINING)
-
-    def test(self, name: str) -> Pixels:
-        return self._pixels(name, self._config.test, _TEST)
-
-    def _pixels(self, name: str, number: int, purpose: int) -> Pixels:
-        source = (*self._config.steps, GOLD).index(name)
-        numbers = [self._config.seed, self._dead, purpose]
-        seed = int(np.random.default_rng([*numbers, source]).integers(2**62))
-        return self._simulators.pixels(name, light(number, np.random.default_rng(numbers)), seed)
+    def pixels(self, dead: float, name: str, purpose: int) -> Pixels:
+        """Training or test pixels; held are the tests of one dead time, and the last to train on."""
+        key, config = (dead, name, purpose), self._config
+        if key not in self._held:
+            kept_purposes = {_TEST} if purpose == _TRAINING else {_TEST, _TRAINING}
+            self._held = {old: made for old, made in self._held.items() if old[0] == dead and old[2] in kept_purposes}
+            number = config.pixels[name] if purpose == _TRAINING else config.test
+            numbers = [config.seed, config.dead.index(dead), purpose]
+            source = (*config.steps, GOLD).index(name)
+            seed = int(np.random.default_rng([*numbers, source]).integers(2**62))
+            flux = light(number, np.random.default_rng(numbers))
+            self._held[key] = self._simulators[dead].pixels(name, flux, seed)
+        return self._held[key]
 
 
 def judged(network: IntervalNetwork, pixels: Pixels, cells: int = 0) -> dict[str, Any]:

@@ -15,10 +15,10 @@ import mars_lidar as ml
 from mars_lidar.statistics import exposure_moments
 from studies import Request
 from studies.__main__ import main
+from studies.common.kept import fixed, spread
 from studies.downstream import data as downstream_data
 from studies.downstream import run as downstream
-from studies.downstream.counts import count_bias
-from studies.downstream.report import spread
+from studies.downstream.data import count_bias
 from studies.neural import NeuralEngine
 
 TINY = downstream_data.CONFIGS["tiny"]
@@ -61,8 +61,10 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
         if (row["arm"], row["tested"], row["model"], row["target"]) == ("poisson", "gold", "bins", "depth")
     )
     assert float(row["rmse"]) == pytest.approx(result["gold"]["bins"]["depth"]["rmse"], rel=1e-5)
+    record = json.loads((tmp_path / "downstream-tiny" / "config.json").read_text())
+    fixed(tmp_path / "downstream-tiny", record)
     with pytest.raises(ValueError, match="another configuration"):
-        downstream.fixed(tmp_path / "downstream-tiny", replace(small, photons=2.0))
+        fixed(tmp_path / "downstream-tiny", record | {"photons": 2.0})
 
 
 def test_declared_configurations():

@@ -12,6 +12,7 @@ from pathlib import Path
 import jinja2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import studies
 from studies import STUDIES, Request
@@ -71,10 +72,9 @@ def test_templates_parse_and_are_filled_by_a_module_beside_them(path: Path):
     environment = jinja2.Environment(autoescape=True)
     environment.filters |= dict.fromkeys(("f", "n", "each", "mean", "median", "quantile"), str)
     environment.parse(path.read_text(encoding="utf-8"))
-    assert any(
-        f'__name__, "{path.name.split(".")[0]}"' in module.read_text(encoding="utf-8")
-        for module in path.parent.glob("*.py")
-    )
+    stem = path.name.removesuffix(".md.jinja")
+    module = path.with_name(f"{'run' if stem == 'report' else stem}.py").relative_to(ROOT).with_suffix("")
+    assert ".".join(module.parts) in {studies.module_of(name) for name in STUDIES}
 
 
 def test_the_package_imports_no_study():
@@ -99,16 +99,20 @@ def test_a_template_is_filled_strictly(tmp_path: Path):
     assert "Quick" not in report.render(Request(tmp_path), template, facts)
 
 
-def test_a_report_has_the_template_and_the_constants_of_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(("stem", "template"), [("short", "short"), ("run", "report")])
+def test_a_report_has_the_template_and_the_constants_of_its_module(tmp_path: Path, stem: str, template: str):
     module = types.ModuleType("made_up")
-    module.__file__, module.LIMIT = str(tmp_path / "made_up.py"), 3  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "made_up", module)
-    (tmp_path / "short.md.jinja").write_text("{{ word }} {{ study.LIMIT }}{{ flag }}")
+    module.__file__, module.LIMIT = str(tmp_path / f"{stem}.py"), 3  # type: ignore[attr-defined]
+    (tmp_path / f"{template}.md.jinja").write_text("{{ word }} {{ study.LIMIT }}{{ flag }} {{ figures[1].name }}")
     request = Request(tmp_path, quick=True)
-    written = report.write(request, "x", "made_up", "short", {"word": "at"}, rows=[{"a": 1, "b": 0.1234567}])
-    assert [path.name for path in written] == ["x.md", "x.csv"]
-    assert written[0].read_text() == "at 3 --quick\n"
-    assert written[1].read_text() == "a,b\n1,0.123457\n"
+    facts = {"word": "at", "rows": [{"a": 1, "b": 0.1234567}], "figures": {"": Figure(), "map": Figure()}}
+    written = report.write(request, "x", module, facts | {"tables": {"wrong": [{"c": "?"}]}})
+    assert [path.name for path in written] == ["x.md", "x.png", "x_map.png", "x.csv", "x_wrong.csv"]
+    assert written[0].read_text() == "at 3 --quick x_map.png\n"
+    assert written[3].read_text() == "a,b\n1,0.123457\n"
+    written = report.write(request, "x", module, facts | {"tables": {"wrong": []}})
+    assert len(written) == 4
+    assert not (tmp_path / "x_wrong.csv").exists(), "what an earlier run left would be taken for this one's"
 
 
 def test_filters_and_tables():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 import mars_lidar as ml
 from mars_lidar.statistics import mean_histogram
 from studies.__main__ import main
+from studies.common.kept import fixed
 from studies.uncertainty import data, run
 from studies.uncertainty.measured import CYCLES, _cut
 from studies.uncertainty.prediction import at
@@ -98,8 +100,10 @@ def test_the_study_writes_its_report_and_goes_on(tmp_path: Path, monkeypatch: py
     with (tmp_path / "uncertainty.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 4 * 3 * 3
+    record = json.loads((tmp_path / "uncertainty-tiny" / "config.json").read_text())
+    fixed(tmp_path / "uncertainty-tiny", record)
     with pytest.raises(ValueError, match="another configuration"):
-        run._fixed(tmp_path / "uncertainty-tiny", replace(small, test=257))
+        fixed(tmp_path / "uncertainty-tiny", record | {"test": 257})
 
 
 def test_exposures_of_a_stream_are_whole():

@@ -1,0 +1,52 @@
+"""Results that a study keeps one by one in a folder, so that one that was stopped goes on with the next."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mars_lidar._base import checks
+from mars_lidar._base.files import TemporarySibling
+from studies import OtherRunsError, Request, Tell
+
+C = TypeVar("C")
+
+CONFIG = "config.json"
+
+
+def chosen(configs: Mapping[str, C], request: Request) -> C:
+    """The configuration asked for; the quick form's is called tiny."""
+    return configs[checks.choice("config", "tiny" if request.quick else request.config, tuple(configs))]
+
+
+def fixed(folder: Path, config: Mapping[str, Any]) -> None:
+    """Write the configuration, or refuse a folder with runs of another."""
+    folder.mkdir(parents=True, exist_ok=True)
+    record, path = json.dumps(config, indent=2) + "\n", folder / CONFIG
+    if path.exists() and path.read_text() != record:
+        raise OtherRunsError(f"{folder} holds runs of another configuration ({CONFIG}); give another --out")
+    _save_whole(path, record)
+
+
+def kept(path: Path, make: Callable[[], Any], tell: Tell) -> Any:
+    """What the JSON file `path` holds, made and written first where it is not there."""
+    if not path.exists():
+        _save_whole(path, json.dumps(make()) + "\n")
+        tell(f"{path.parent.name}: {path.stem}")
+    return json.loads(path.read_text())
+
+
+def _save_whole(path: Path, text: str) -> None:
+    """Write a text that is whole or not there, whatever stops the process."""
+    with TemporarySibling(path).writing() as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
+def spread(values: Sequence[float], digits: int) -> str:
+    """Mean, and the standard deviation between seeds where there are several."""
+    mean = f"{np.mean(values):.{digits}f}"
+    return mean if len(values) < 2 else f"{mean} ± {np.std(values, ddof=1):.{digits}f}"

@@ -280,10 +280,7 @@ def by_rows(function: Any, info: Any, in_dims: tuple[int | None, ...], given: tu
 def registered(
     photons: Rows, source: Rows, delay: Delay, tolerance: float = TOLERANCE, known: Rows | None = None
 ) -> Rows:
-    """h (pixels, bins) of (1) from photons and sources (pixels, bins), in double; differentiable in both.
-
-    `known`: h itself, where it was found before and only derivatives are wanted.
-    """
+    """h of (1), differentiable in photons and sources, (pixels, bins) in double; `known`: h, if it was found before."""
     h: Rows = _Solution.apply(photons, source, known, delay, tolerance, False)  # type: ignore[no-untyped-call]
     return h
 

@@ -97,13 +97,8 @@ def verify(
 def _labels(dataset: Dataset) -> Iterator[str]:
     """What is wrong with the coordinates and labels of a dataset: all of them follow from its recipe and scenes."""
     names = dataset.scene_names()
-    wanted: dict[str, Any] = {}
-    for name, values, dims, told, unit in coordinates(dataset.recipe, names, dataset.histogram.shape[2:4]):
-        wanted[name] = values
-        array = dataset.group[name]
-        labels = array.attrs.get("long_name"), array.attrs.get("units"), array.metadata.dimension_names
-        if labels != (told, unit, dims):
-            yield f"the labels of {name} are not its own"
+    lists = coordinates(dataset.recipe, names, dataset.histogram.shape[2:4])
+    wanted: dict[str, Any] = {name: values for name, values, *_ in lists}
     if "scene_name" in dataset.group:  # not in stores of version 0.1
         wanted["scene_name"] = np.array(scene_names(dataset.recipe, names), object)
     for name, values in wanted.items():
@@ -112,6 +107,11 @@ def _labels(dataset: Dataset) -> Iterator[str]:
                 yield f"{name} is not that of the recipe"
         except Exception as error:  # whatever the codecs make of a damaged chunk
             yield f"{name} cannot be read ({error})"
+    for name, _, dims, told, unit in lists:
+        array = dataset.group[name]
+        labels = array.attrs.get("long_name"), array.attrs.get("units"), array.metadata.dimension_names
+        if labels != (told, unit, dims):
+            yield f"the labels of {name} are not its own"
 
 
 def _compare(maker: Maker, region: tuple[slice, ...]) -> str:

@@ -92,15 +92,24 @@ class Compared:
 
     @property
     def stretch(self) -> float:
-        """Variance of the difference of the mean counts, over that by sampling alone."""
+        """Variance of the difference of the mean counts, over that by sampling alone.
+
+        A fit to the measured photons takes nothing of what a simulated prediction scatters by.
+        """
         share = 1.0 / self.size + self.law.noise("count")
-        return max(1.0 + float(self.fit.sum()) / max(self.law.variance * share, 1e-300), 0.0)
+        return max(1.0 + float(self.fit.sum()) / max(self.law.variance * share, 1e-300), self._predicted_share)
+
+    @property
+    def _predicted_share(self) -> float:
+        """Of the variance by sampling alone, the part of the prediction's own."""
+        return self.law.noise("count") / (1.0 / self.size + self.law.noise("count"))
 
     def checks(self, shape: bool) -> list[Check]:
         """All tests; with that of the shape where it is not fitted bin by bin."""
         law, size = self.law, self.size
         count, joint = 1.0 / size + law.noise("count"), 1.0 / size + law.noise("joint")
-        error = math.sqrt(max(law.variance * count * max(self.stretch, LEAST_LEFT), 0.0))
+        least = LEAST_LEFT + (1.0 - LEAST_LEFT) * self._predicted_share
+        error = math.sqrt(max(law.variance * count * max(self.stretch, least), 0.0))
         found = [
             Check("counts, G-test", math.nan, math.nan, math.nan, self._count_test()),
             _check("mean count", float(self.counts.mean()), law.mean, error),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
+from mars_lidar.calibrate.armed_time import armed_time
 from mars_lidar.calibrate.calibration import Calibration, _system_of, calibrate
 from mars_lidar.calibrate.detector_model import is_plain, moves_records, stream_detector
 from mars_lidar.calibrate.fit_tests import Check, Compared
@@ -195,7 +196,11 @@ def validate(
     label = 2 * law.groups + law.window
     table, histogram = cut(stream, system, label)
     counts, measured = table.sum(1), Pmf.of_counts(table.sum(1))
-    compared = Compared.of(law, counts, table[:, 1::2].sum(1), histogram, light, dead, number)
+    blind = dead
+    if (slow := calibration.armed.sensitivity) is not None:  # what a registration costs with its recovery, in the mean
+        watched = float(armed_time(stream, dead, 1, slow).passes[0])
+        blind = max(dead, (stream.cycles - watched) * stream.period_ns / max(stream.registrations, 1))
+    compared = Compared.of(law, counts, table[:, 1::2].sum(1), histogram, light, blind, number)
     tests = compared.checks(shape=calibration.waveform is None)
     ages = age_table(stream, light, dead, calibration.hold_off_ns, like=law.ages)
     tests += [Check(name, math.nan, math.nan, math.nan, p) for name, p in ages.p_values(light, law.ages).items()]

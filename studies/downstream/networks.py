@@ -1,6 +1,7 @@
 """Small networks that use the bins: cubes in, means and log-variances of the delay and of reflectivity out.
 
-Both see counts as they are: none is divided by a pixel's own total, which would hide what dead time does to it.
+Both see counts as they are: none is divided by a pixel's own total, which would hide what dead time does to it. Cubes
+may lie on the CPU: what is told lies where the network does.
 """
 
 from __future__ import annotations
@@ -79,12 +80,13 @@ class WindowNetwork(nn.Module):
 
     def forward(self, cube: Tensor) -> Told:
         """What cubes (N, H, W, bins) of counts tell."""
-        seen, middle = features(cube.reshape(-1, self.bins).numpy())
-        image = self.standard(torch.from_numpy(seen)).reshape(*cube.shape[:3], FEATURES)
+        found = features(cube.reshape(-1, self.bins).cpu().numpy())
+        seen, middle = (torch.from_numpy(one).to(self.stem.weight.device) for one in found)
+        image = self.standard(seen).reshape(*cube.shape[:3], FEATURES)
         x = self.stem(image.permute(0, 3, 1, 2))
         for block in self.blocks:
             x = x + block(x)
-        return _told(self.bins, torch.from_numpy(middle), self.head(x).permute(1, 0, 2, 3).flatten(1))
+        return _told(self.bins, middle, self.head(x).permute(1, 0, 2, 3).flatten(1))
 
 
 class BinNetwork(nn.Module):
@@ -103,22 +105,23 @@ class BinNetwork(nn.Module):
 
     def forward(self, cube: Tensor) -> Told:
         """What cubes (N, H, W, bins) of counts tell."""
-        counts = cube.reshape(-1, self.bins).float()
+        at = self.filter.device
+        counts = cube.reshape(-1, self.bins).to(at).float()
         x = counts.sqrt()
         scores = self._filtered(x)
         peak = scores.detach().argmax(1, keepdim=True)
-        near = x.gather(1, (peak + torch.arange(-WINDOW // 2, WINDOW // 2)) % self.bins)
+        near = x.gather(1, (peak + torch.arange(-WINDOW // 2, WINDOW // 2, device=at)) % self.bins)
         blocks = self.bins // _BLOCK
         sums = counts.reshape(-1, blocks, _BLOCK).sum(-1)
-        sums = sums.gather(1, (peak // _BLOCK + torch.arange(blocks)) % blocks)
+        sums = sums.gather(1, (peak // _BLOCK + torch.arange(blocks, device=at)) % blocks)
         scales = torch.log1p(torch.stack([sums.sum(1), (near * near).sum(1)], 1))
         out = self.mend(self.standard(torch.cat([near, sums.sqrt(), scales], 1)))
-        local = torch.arange(-_LOCAL, _LOCAL + 1)
+        local = torch.arange(-_LOCAL, _LOCAL + 1, device=at)
         places = (peak + local) % self.bins
         scores = scores.scatter_add(1, places, out[:, 4:])
         share = torch.softmax(scores.gather(1, places), 1)
         middle = peak[:, 0] + 0.5 + share @ local.to(share.dtype)
-        return _told(self.bins, middle, out[:, :4].T * torch.tensor([[0.0], [1.0], [1.0], [1.0]]), scores)
+        return _told(self.bins, middle, out[:, :4].T * torch.tensor([[0.0], [1.0], [1.0], [1.0]], device=at), scores)
 
     def _filtered(self, x: Tensor) -> Tensor:
         """Round the period, `_BLOCK` bins at a time: a matrix product."""

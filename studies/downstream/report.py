@@ -14,6 +14,7 @@ from studies import Facts
 from studies.common.kept import spread
 from studies.common.report import Row
 from studies.downstream import run
+from studies.downstream.budget import arithmetic
 from studies.downstream.data import CONFIGS, QUARTERS, SYSTEM, WORDS, Config, crop
 from studies.downstream.run import MODELS, TARGETS, Run, by_arm
 
@@ -51,6 +52,7 @@ def facts(
         "c": config,
         "full": CONFIGS["full"],
         "system": SYSTEM,
+        "arithmetic": arithmetic,
         "minutes": sum(result["seconds"] for result in found.values()) / 60.0,
         "arms": list(by_arm(found)),
         "models": MODELS,

@@ -1,7 +1,8 @@
 """Study "downstream", T5 of the MaRS paper: what is trained on every simulator's data, tested on gold-standard data.
 
 For each simulator, ratio and seed, one stream of fresh exposures trains a polynomial, a window network and a bin
-network side by side. Each leaves its result in a file of its own, and a study that was stopped goes on with the next.
+network side by side. Each leaves its result in a file of its own, and a study that was stopped goes on where it was: at
+the last hundred steps of the stream that it was at.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import Scene, cramer_rao, reconstruct
+from mars_lidar._base.files import TemporarySibling
 from mars_lidar._base.types import FloatArray
 from studies import Facts, Request
 from studies.common.kept import chosen, fixed, kept
@@ -28,6 +30,8 @@ TARGETS = ("reflectivity", "depth")
 MODELS = {"polynomial": "polynomial", "window": "window network", "bins": "bin network"}
 METHODS = ("peak", "matched_filter", "generalised_coates", "maximum_likelihood")  # that need no training
 DEGREE = 4  # of the polynomial, in log(1 + total) and log(1 + counts of the window)
+POLYNOMIAL_STEPS = 300  # that it is fitted to: its fifteen numbers gain nothing from more
+KEPT_EVERY = 100  # steps after which a stream's training is put on disk, to go on from
 LIGHT_M_PER_NS = 0.299792458 / 2.0  # of depth
 _TRAINING, _OWN, _GOLD = range(3)  # streams of noise
 
@@ -70,6 +74,8 @@ def run(request: Request) -> Facts:
     left = sum(not path.exists() for path in files.values())
     request.tell(f"downstream: {left} of {len(files)} streams to train on")
     found = {one: kept(path, partial(train_and_test, one, data, folder), request.tell) for one, path in files.items()}
+    for made in folder.glob("*.partial"):  # of streams whose results are there
+        made.unlink()
     references, counts = (
         kept(folder / f"{name}.json", make, request.tell)
         for name, make in (("references", data.references), ("counts", data.count_bias))
@@ -133,22 +139,35 @@ def train_and_test(one: Run, data: Data, folder: Path) -> dict[str, Any]:
     torch.set_num_threads(1)  # the networks are too small to gain from more
     torch.manual_seed(one.seed)
     config, began = data.config, time.process_time()
-    networks = {"window": WindowNetwork(SYSTEM.bins), "bins": BinNetwork(SYSTEM.bins)}
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    networks = {"window": WindowNetwork(SYSTEM.bins).to(device), "bins": BinNetwork(SYSTEM.bins).to(device)}
     steps = dict(zip(networks, config.steps, strict=True))
     crops = {"window": config.batch, "bins": max(1, config.batch // 2)}  # pixel by pixel, one crop tells enough
     optimizers = {name: Steps(network, steps[name]) for name, network in networks.items()}
     polynomial = Polynomial()
     stream = data.simulators.stream(one.arm, one.sbr, (config.seed << 8) + 16 * one.seed + _TRAINING)
-    for step, batch in zip(range(max(config.steps)), stream, strict=False):
-        delay = batch["flux"]["delay"] / SYSTEM.bin_ns
-        light = batch["flux"]["signal"] / config.photons  # the reflectivity that gives these photons
-        polynomial.take(batch["cube"].numpy(), light.numpy())
+    halfway = folder / f"{one.name}.partial"
+    first, before = 0, 0.0
+    if halfway.exists():  # written below, by this program: whole objects, so that nothing of them is left out
+        kept = torch.load(halfway, map_location=device, weights_only=False)
+        first, before, networks, optimizers, polynomial, place = kept
+        stream.load_state_dict(place)
+    for step, batch in zip(range(first, max(config.steps)), stream, strict=False):
+        delay = batch["flux"]["delay"].to(device) / SYSTEM.bin_ns
+        light = batch["flux"]["signal"].to(device) / config.photons  # the reflectivity that gives these photons
+        if step < POLYNOMIAL_STEPS:
+            polynomial.take(batch["cube"].numpy(), light.cpu().numpy())
         for name, network in networks.items():
             if step < steps[name]:
                 some = slice(crops[name])
                 told = network(batch["cube"][some])
                 optimizers[name].step(told.loss(delay[some].flatten(), light[some].flatten()))
-    result: dict[str, Any] = {"run": asdict(one), "seconds": time.process_time() - began}
+        if (step + 1) % KEPT_EVERY == 0:
+            spent = before + time.process_time() - began
+            with TemporarySibling(halfway).writing() as unfinished:
+                torch.save((step + 1, spent, networks, optimizers, polynomial, stream.state_dict()), unfinished)
+    result: dict[str, Any] = {"run": asdict(one), "device": device.type}
+    result["seconds"] = before + time.process_time() - began
     shown: dict[str, FloatArray] = {}
     for where, cubes in (("own", data.own(one.arm, one.sbr)), ("gold", data.gold(one.sbr))):
         result[where] = {"polynomial": tested({"reflectivity": polynomial.told(cubes)}, {}, data.test, config)}
@@ -200,7 +219,7 @@ def predicted(network: Any, cubes: NDArray[Any]) -> tuple[dict[str, FloatArray],
                 ("reflectivity spread", torch.exp(0.5 * told.reflectivity_log_variance)),
                 ("depth spread", metres * torch.exp(0.5 * told.delay_log_variance)),
             ):
-                parts.setdefault(name, []).append(values.double().numpy().reshape(cube.shape[:2]))
+                parts.setdefault(name, []).append(values.double().cpu().numpy().reshape(cube.shape[:2]))
     maps = {name: np.stack(values) for name, values in parts.items()}
     return {name: maps[name] for name in TARGETS}, {name: maps[f"{name} spread"] for name in TARGETS}
 

@@ -15,9 +15,13 @@ import mars_lidar as ml
 from mars_lidar.statistics import exposure_moments
 from studies import Request
 from studies.__main__ import main
+from studies.common.intervals import Steps
 from studies.common.kept import fixed, spread
+from studies.common.windows import FEATURES
 from studies.downstream import data as downstream_data
+from studies.downstream import networks
 from studies.downstream import run as downstream
+from studies.downstream.budget import GPU_HOURS, budget, flop_of_a_step
 from studies.downstream.data import count_bias
 from studies.neural import NeuralEngine
 
@@ -65,6 +69,72 @@ def test_the_study_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pyt
     fixed(tmp_path / "downstream-tiny", record)
     with pytest.raises(ValueError, match="another configuration"):
         fixed(tmp_path / "downstream-tiny", record | {"photons": 2.0})
+
+
+@pytest.mark.parametrize("last", [2, 3])
+def test_a_stream_goes_on_from_the_steps_it_has_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: int):
+    """Stopped in the middle of its training, before and after a step that is kept: the same result, to the bit."""
+    monkeypatch.setattr(downstream, "KEPT_EVERY", 2)
+    monkeypatch.setattr(downstream, "POLYNOMIAL_STEPS", 3)
+    data, one = downstream.Data(replace(TINY, steps=(4, 3))), downstream.Run("exact", 1.0, 1)
+    folders = [tmp_path / name for name in ("whole", "stopped")]
+    for folder in folders:
+        folder.mkdir()
+    downstream.train_and_test(one, data, folders[0])
+    made = 0
+
+    def step(self: Steps, loss: torch.Tensor) -> None:
+        nonlocal made
+        made += 1
+        if made == 2 * last:
+            raise KeyboardInterrupt
+        taken(self, loss)
+
+    taken = Steps.step
+    with monkeypatch.context() as stopping:
+        stopping.setattr(Steps, "step", step)
+        with pytest.raises(KeyboardInterrupt):
+            downstream.train_and_test(one, data, folders[1])
+    partial = folders[1] / f"{one.name}.partial"
+    assert partial.exists() == (last > 2)
+    assert not (folders[1] / f"{one.name}.json").exists()
+    downstream.train_and_test(one, data, folders[1])
+    results = [json.loads((folder / f"{one.name}.json").read_text()) for folder in folders]
+    for result in results:
+        assert result.pop("seconds") > 0.0
+    assert results[0] == results[1]
+    assert not list(folders[1].glob("*.partial*"))
+
+
+def test_the_budget_of_full():
+    """Operations by hand, three times those of a forward pass but for what no gradient needs; hours as stated."""
+    full = downstream_data.CONFIGS["full"]
+    flop = flop_of_a_step(full)
+    pixels, width = full.batch * full.crop**2, 64
+    forward = 2.0 * pixels * (FEATURES * width + 4 * 9 * width**2 + 4 * width)
+    assert flop["window"] == pytest.approx(3.0 * forward - 2.0 * pixels * FEATURES * width, rel=1e-9)
+    cost = budget(full, flop)
+    assert cost.steps == 36 * 3000
+    assert cost.flop == 36 * 3000 * sum(flop.values())
+    assert cost.gpu_s == pytest.approx(cost.flop / 1e13 + 0.01 * cost.steps)
+    assert cost.hours == cost.gpu_s / 3600.0 < GPU_HOURS
+    parts = dict.fromkeys(("crops, s", "features, s", "polynomial, s", "test scene, s"), 0.1)
+    data = budget(full, flop, dict.fromkeys(full.arms, parts)).data_s
+    assert data == pytest.approx(36 * (0.2 * 3000 + 0.1 * downstream.POLYNOMIAL_STEPS + 0.1 * full.test[1]))
+
+
+def test_networks_run_where_their_weights_are(monkeypatch: pytest.MonkeyPatch):
+    """On the device "meta", which holds no numbers and, as a GPU does, refuses what lies elsewhere."""
+    monkeypatch.setattr(networks._Standard, "forward", lambda self, x: x - self.mean)
+    for kind in (networks.WindowNetwork, networks.BinNetwork):
+        network = kind(256).to("meta")
+        told = network(torch.ones(1, 4, 4, 256, dtype=torch.int16))
+        found = (told.delay, told.delay_log_variance, told.reflectivity, told.reflectivity_log_variance)
+        sum(one.sum() for one in found).backward()
+        assert {one.device.type for one in found} == {"meta"}
+        assert told.away(torch.ones(16, device="meta")).device.type == "meta"
+        with pytest.raises(RuntimeError, match="meta"):
+            told.away(torch.ones(16))
 
 
 def test_declared_configurations():

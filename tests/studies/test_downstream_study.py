@@ -81,24 +81,24 @@ def test_a_stream_goes_on_from_the_steps_it_has_made(tmp_path: Path, monkeypatch
     for folder in folders:
         folder.mkdir()
     downstream.train_and_test(one, data, folders[0])
-    made = 0
+    made, stop_at = 0, 2 * last  # two networks a step
 
     def step(self: Steps, loss: torch.Tensor) -> None:
         nonlocal made
         made += 1
-        if made == 2 * last:
+        if made == stop_at:
             raise KeyboardInterrupt
         taken(self, loss)
 
     taken = Steps.step
-    with monkeypatch.context() as stopping:
-        stopping.setattr(Steps, "step", step)
-        with pytest.raises(KeyboardInterrupt):
-            downstream.train_and_test(one, data, folders[1])
-    partial = folders[1] / f"{one.name}.partial"
-    assert partial.exists() == (last > 2)
+    monkeypatch.setattr(Steps, "step", step)
+    with pytest.raises(KeyboardInterrupt):
+        downstream.train_and_test(one, data, folders[1])
+    assert (folders[1] / f"{one.name}.partial").exists() == (last > 2)
     assert not (folders[1] / f"{one.name}.json").exists()
+    made, stop_at = 0, -1
     downstream.train_and_test(one, data, folders[1])
+    assert made == (3 if last > 2 else 7)  # the window network has four steps, the bin network three
     results = [json.loads((folder / f"{one.name}.json").read_text()) for folder in folders]
     for result in results:
         assert result.pop("seconds") > 0.0

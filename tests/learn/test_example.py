@@ -5,6 +5,8 @@ from __future__ import annotations
 import runpy
 from pathlib import Path
 
+import torch
+
 PATH = Path(__file__).parents[2] / "examples" / "train_depth.py"
 
 
@@ -24,3 +26,39 @@ def test_it_is_as_short_as_the_issue_wants():
     text = PATH.read_text()
     core = text[text.index("PULSE") : text.index("def within_a_bin")]
     assert len([line for line in core.splitlines() if line.strip()]) <= 22
+
+
+def test_learned_prior(deepinv):
+    """Shortened: the denoiser learns; its gradient is that of the likelihood; it mends depths that noise displaced."""
+    example = runpy.run_path(str(PATH.with_name("learned_prior.py")))
+    denoiser, losses = example["train"](100, 24)
+    assert losses[-1] < 0.8 * sum(losses[:10]) / 10
+    rows, shown = example["compared"](denoiser, "random", 2, 24, 12)
+    assert [len(row) for row in rows] == 7 * [6]
+    assert set(example["SHOWN"]) <= set(shown)
+    depth, reflectivity = ({row[0]: float(row[k]) for row in rows} for k in (1, 5))
+    assert depth["learned prior"] < 0.5 * depth[example["ALONE"]]
+    assert reflectivity["learned prior"] < reflectivity[example["ALONE"]]
+    true = shown["truth"]
+    noisy = true + 0.5 * torch.randn(true.shape, generator=torch.Generator().manual_seed(3))
+    mended = denoiser(noisy, 0.5).detach()
+    assert (mended - true).square().mean() < 0.6 * (noisy - true).square().mean()
+
+
+def test_the_data_term_of_the_learned_prior_is_the_likelihood(deepinv):
+    """The gradient that deepinv follows beside that of the native likelihood, to 2 % of its standard deviation."""
+    from mars_lidar.learn import LidarPhysics
+    from mars_lidar.reconstruct import log_likelihood
+
+    example = runpy.run_path(str(PATH.with_name("learned_prior.py")))
+    system, physics = example["SYSTEM"], LidarPhysics(example["SYSTEM"])
+    light = example["scenes"]("room", 8, [0]).double()
+    y = physics(light, seed=1)
+    gradient = example["Likelihood"]().grad(example["images"](light), y, physics)[0].detach()
+    units = (light[0, 0], light[0, 1], torch.tensor(example["PULSE_NS"]).expand(8, 8))
+    for row, column in ((0, 0), (3, 4), (7, 2), (5, 5)):
+        _, slope, information = log_likelihood(y[0, :, row, column].numpy(), system, *light[0, :, row, column].numpy())
+        for channel, unit in enumerate(units):
+            told = -slope[channel] * unit[row, column].item()
+            deviation = information[channel, channel] ** 0.5 * unit[row, column].item()
+            assert abs(gradient[channel, row, column].item() - told) < 0.02 * deviation

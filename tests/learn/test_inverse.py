@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import torch
 
 import mars_lidar as ml
 
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")  # torch's own forward mode calls it
 SYSTEM = ml.System(
     period_ns=100.0,
     cycles=300,
@@ -19,15 +22,7 @@ SYSTEM = ml.System(
 
 
 @pytest.fixture
-def physics():
-    try:
-        import deepinv  # noqa: F401
-    except ImportError as error:
-        pytest.skip(f"needs deepinv ({error})")
-    except RuntimeError as error:  # torchvision of another build than torch
-        with pytest.raises(ImportError, match="torchvision that was built for PyTorch"):
-            from mars_lidar.learn import LidarPhysics
-        pytest.skip(f"needs the torchvision that belongs to this build of torch ({error})")
+def physics(deepinv):
     from mars_lidar.learn import LidarPhysics
 
     return LidarPhysics(SYSTEM, seed=5)
@@ -91,14 +86,12 @@ def test_reconstruction_with_deepinv(physics):
     assert (after < before).all()
 
 
-def test_without_deepinv_the_error_says_what_to_install():
-    try:
-        import deepinv  # noqa: F401
-    except RuntimeError as error:
-        pytest.skip(f"torchvision does not belong to this build of torch ({error})")
-    except ImportError:
-        with pytest.raises(ImportError, match="deepinv: pip install"):
-            from mars_lidar.learn import LidarPhysics  # noqa: F401
+def test_without_deepinv_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "deepinv", None)
+    monkeypatch.delitem(sys.modules, "deepinv.physics", raising=False)
+    monkeypatch.delitem(sys.modules, "mars_lidar.learn.inverse", raising=False)
+    with pytest.raises(ImportError, match="deepinv: pip install"):
+        from mars_lidar.learn import LidarPhysics  # noqa: F401
 
 
 def test_a_seed_that_is_given_is_honoured(physics):

@@ -149,8 +149,8 @@ def train_and_test(one: Run, data: Data, folder: Path) -> dict[str, Any]:
     halfway = folder / f"{one.name}.partial"
     first, before = 0, 0.0
     if halfway.exists():  # written below, by this program: whole objects, so that nothing of them is left out
-        kept = torch.load(halfway, map_location=device, weights_only=False)
-        first, before, networks, optimizers, polynomial, place = kept
+        state = torch.load(halfway, map_location=device, weights_only=False)
+        first, before, networks, optimizers, polynomial, place = state
         stream.load_state_dict(place)
     for step, batch in zip(range(first, max(config.steps)), stream, strict=False):
         delay = batch["flux"]["delay"].to(device) / SYSTEM.bin_ns

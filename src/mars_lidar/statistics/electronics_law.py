@@ -7,7 +7,6 @@ generating function of their number, and that on the unit circle the law. Equati
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.count_window import Pmf
-from mars_lidar.statistics.electronics import refined, without_effect
+from mars_lidar.statistics.electronics import refined, without_electronics
 from mars_lidar.statistics.electronics_grid import LAW_EFFORT, RecordGrid, RecordRun, Rows
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
@@ -32,13 +31,11 @@ _LIKE_MOMENTS = 3.0  # times the tolerance by which the pmf's mean and variance 
 
 def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
-    alike, slower = without_effect(cells)
-    if alike is not None:  # a pixel with the longer of the two dead times
-        found = refined_moments(alike, 1, tolerance=min(tolerance, 1e-4), threads=threads)
-        return exact_windows(alike, found.cumulants.reshape(-1, 4), found.bins.reshape(-1), threads)
-    bare = cells.system.detector.without("electronics_dead_time_ns")
-    alone = replace(cells, system=cells.system.replace(detector=bare))
-    return [_window(alone.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
+    bare, slower = without_electronics(cells)
+    if slower == 0.0:
+        found = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
+        return exact_windows(bare, found.cumulants.reshape(-1, 4), found.bins.reshape(-1), threads)
+    return [_window(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
 
 
 def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:

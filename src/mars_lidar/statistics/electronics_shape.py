@@ -15,7 +15,7 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.electronics import coarsest_grid, rebinned, without_effect
+from mars_lidar.statistics.electronics import coarsest_grid, rebinned, without_electronics
 from mars_lidar.statistics.electronics_grid import LAW_EFFORT, RecordGrid
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.stationary import stationary_histogram
@@ -32,11 +32,10 @@ def stationary_records(cells: Cells, out: int, *, tolerance: float, threads: int
     The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
     """
     tolerance = max(checks.real("tolerance", tolerance, low=1e-9, high=0.1), _LEAST_TOLERANCE)
-    alike, slower = without_effect(cells)
-    if alike is not None:  # a pixel with the longer of the two dead times
-        return stationary_histogram(alike, out, tolerance=tolerance, threads=threads)
-    bare = cells.system.detector.without("electronics_dead_time_ns")
-    alone = replace(cells, system=cells.system.replace(detector=bare, start="armed"))  # no start is needed
+    bare, slower = without_electronics(cells)
+    if slower == 0.0:
+        return stationary_histogram(bare, out, tolerance=tolerance, threads=threads)
+    alone = replace(bare, system=bare.system.replace(start="armed"))  # no start is needed
     return np.stack([_shape(alone.part(slice(k, k + 1)), slower, out, tolerance) for k in range(cells.size)])
 
 

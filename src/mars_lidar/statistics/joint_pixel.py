@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 
@@ -113,26 +112,7 @@ class Pixel:
         return columns
 
 
-class Seen(Protocol):
-    """A pixel on one grid, its histogram in `out` bins."""
-
-    cells: Cells
-    out: int
-    mean: FloatArray
-
-    @property
-    def grid(self) -> FoldedGrid:
-        """That of the registrations."""
-
-    @property
-    def law(self) -> SettledLaw | None:
-        """The closed form; None where the exposure is run through."""
-
-    def monitored(self, weights: FloatArray) -> FloatArray:
-        """Variances (windows,) of the counts in windows `weights` (windows, bins)."""
-
-
-def movement(coarse: Seen, fine: Seen) -> float:
+def movement(coarse: Pixel, fine: Pixel) -> float:
     """`JointLaw.movement` from one grid to the next; infinite where a bin or a variance is negative."""
     n = coarse.out
     mean = fine.mean.reshape(n, -1).sum(-1)

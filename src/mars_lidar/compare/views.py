@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruct.quality import depth_lag_m
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
@@ -48,13 +49,9 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
     Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
     the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
     """
-    inside = np.zeros(flux.shape, bool)
-    rim = [n // 16 for n in flux.shape]
-    inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
-    lit = np.flatnonzero((flux.signal > 0) & inside)
-    if lit.size == 0:
+    inside, order = by_signal(flux)
+    if order.size == 0:
         return {"first": (0, 0)}
-    order = lit[np.argsort(flux.signal.ravel()[lit], kind="stable")]
     flat = {"bright": order[int(0.98 * (order.size - 1))]}
     dim = order[int(0.05 * (order.size - 1))]
     if flux.signal.flat[dim] < flux.signal.flat[flat["bright"]]:
@@ -64,7 +61,20 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
         slope[~np.isfinite(slope) | (flux.signal <= 0) | ~inside] = -1.0
         if slope.max() > 0:
             flat["edge"] = np.argmax(slope)
-    named: dict[str, tuple[int, int]] = {}
+    return with_pixels({}, flat, flux)
+
+
+def by_signal(flux: Flux) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """(H, W) pixels that do not belong to the rim of the image, and those with a return among them, flat, by signal."""
+    inside = np.zeros(flux.shape, bool)
+    rim = [n // 16 for n in flux.shape]
+    inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
+    lit = np.flatnonzero((flux.signal > 0) & inside)
+    return inside, lit[np.argsort(flux.signal.ravel()[lit], kind="stable")]
+
+
+def with_pixels(named: dict[str, tuple[int, int]], flat: dict[str, np.int64], flux: Flux) -> dict[str, tuple[int, int]]:
+    """Those `named` and those that `flat` names beside them, as (y, x)."""
     for name, k in flat.items():
         pixel = (int(k) // flux.shape[1], int(k) % flux.shape[1])
         if pixel not in named.values():
@@ -142,9 +152,7 @@ def law_arguments(flux: Flux, system: System, y: int, x: int) -> dict[str, Any]:
 
 def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing."""
-    span = cube.system.unambiguous_range_m
-    wrapped = (estimate_m - cube.depth_m + 0.5 * span) % span - 0.5 * span
-    return np.asarray(wrapped, dtype=np.float64)
+    return depth_lag_m(cube.system, estimate_m, cube.depth_m)
 
 
 def _peak_offset_ns(system: System) -> float:

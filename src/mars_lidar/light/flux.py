@@ -145,7 +145,7 @@ class Flux:
         counts are background: what a pixel registers of this flux is exactly what one without these two effects
         (`System.detected`) registers of the flux returned. This flux itself where neither is on.
         """
-        share, dark = system.detector.detection_efficiency, _dark_photons(system.detector.dark_count_hz, system)
+        share, dark = system.detector.detection_efficiency, system.detector.dark_count_hz * (system.period_ns * 1e-9)
         if share == 1.0 and dark == 0.0:
             return self
         return self._scaled(share, dark)
@@ -169,7 +169,7 @@ class Flux:
         common_shape(("flux", "rate_hz"), [self.shape, rate.shape])
         if np.broadcast_shapes(self.shape, rate.shape) != self.shape:
             raise ValueError(f"rate_hz must be a scalar or {self.shape}, got {rate.shape}")
-        return self._scaled(1.0, _dark_photons(rate, system) / system.detector.detection_efficiency)
+        return self._scaled(1.0, rate * (system.period_ns * 1e-9) / system.detector.detection_efficiency)
 
     def _scaled(self, share: float, more: float | FloatArray) -> Flux:
         """Signal and background times `share`, and more background."""
@@ -238,15 +238,9 @@ class Flux:
                 raise IndexError(f"index {k} is out of range for an axis of {n} pixels")
             if not isinstance(k, (int, np.integer, slice)):
                 raise IndexError(f"flux takes integers and slices, got {k!r}")
-        part = Flux.__new__(Flux)
-        _fill(
-            part,
-            self.returns_signal[(slice(None), *window)],
-            self.returns_delay_ns[(slice(None), *window)],
-            self.background[window],
-            None if self.waveform is None else self.waveform[window],
-            self.info,
-        )
+        part, returns, wave = Flux.__new__(Flux), (slice(None), *window), self.waveform
+        signal, delay = self.returns_signal[returns], self.returns_delay_ns[returns]
+        _fill(part, signal, delay, self.background[window], None if wave is None else wave[window], self.info)
         if 0 in part.shape:
             raise IndexError(f"flux{list(keys)} selects no pixel of {self.shape}")
         return part
@@ -272,11 +266,6 @@ def _each_return(signal: Any, delay_ns: Any) -> Iterator[tuple[Any, Any]]:
         told = "None" if delay_ns is None else f"shape {np.shape(delay_ns)}"
         raise ValueError(f"delay_ns must be (R, H, W) as signal of shape {np.shape(signal)} is, got {told}")
     return zip(signal, delay_ns, strict=True)
-
-
-def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatArray:
-    """Dark counts per period."""
-    return rate_hz * (system.period_ns * 1e-9)
 
 
 def _fill(

@@ -1,7 +1,7 @@
 """Reconstruction: depth, signal and background of every pixel of a cube, with errors and bounds."""
 
-from mars_lidar.reconstruct.coates import Coates, coates_rates
-from mars_lidar.reconstruct.generalised_coates import GeneralisedCoates, generalised_coates_rates
+from mars_lidar.reconstruct.centroid import Peak
+from mars_lidar.reconstruct.coates import Coates, GeneralisedCoates, coates_rates, generalised_coates_rates
 from mars_lidar.reconstruct.histogram_bound import (
     HistogramBound,
     cramer_rao,
@@ -14,7 +14,6 @@ from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood, log_lik
 from mars_lidar.reconstruct.mchc import ChainCorrection, mchc_rates
 from mars_lidar.reconstruct.method import Flags, Method
 from mars_lidar.reconstruct.methods import METHODS
-from mars_lidar.reconstruct.peak import Peak
 from mars_lidar.reconstruct.reconstruction import Reconstruction, reconstruct
 from mars_lidar.reconstruct.returns import Returns
 

@@ -1,4 +1,4 @@
-"""The centre of mass of the counts round the largest bin: depth finer than a bin without a model of the noise.
+"""The largest bin, the simplest estimate of depth; and the centre of mass of the counts round it, finer than a bin.
 
 With b the counts that the background leaves in each bin and w the bins of the pulse's core round the peak at t_0::
 
@@ -25,16 +25,27 @@ _BLOCK = 2**22  # counts gathered at a time
 
 
 @dataclass(frozen=True)
-class Centroid(Method):
-    """Delay at the centre of mass (1) of the counts round the largest bin, less those of the background."""
+class Peak(Method):
+    """Delay at the centre of the largest bin, the first of several equal ones, less the offset of the pulse's peak."""
 
-    name = "centroid"
+    name = "peak"
     modes = ("nonparalyzable", "paralyzable", "synchronous", "gated")
     assumes = "so little light that dead time loses nothing, many signal photons"
 
     def estimate(self, histograms: Histograms) -> Estimates:
+        """Delay, and signal and background of its window."""
+        return window_estimates(histograms, "peak")
+
+
+@dataclass(frozen=True)
+class Centroid(Peak):
+    """Delay at the centre of mass (1) of the counts round the largest bin, less those of the background."""
+
+    name = "centroid"
+
+    def estimate(self, histograms: Histograms) -> Estimates:
         """Delay, and signal and background of the window round the peak."""
-        found = window_estimates(histograms, "peak")
+        found = super().estimate(histograms)
         delay = found.delay.copy()
         rows = max(1, _BLOCK // (2 * _reach(histograms.system) + 1))
         for first in range(0, delay.size, rows):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from mars_lidar.io.cube import Cube
@@ -23,11 +25,9 @@ def fitted(cube: Cube, realization: int) -> Cube:
     counts = np.asarray(cube.histogram[realization])
     names = ("maximum_likelihood", *(name for name in METHODS if name != "maximum_likelihood"))
     for name in names:
-        try:
+        with suppress(ValueError):
             METHODS[name].check(system)
-        except ValueError:
-            continue
-        break
+            break
     found = reconstruct(counts, system, name)
     seen = found.seen & np.isfinite(found.signal)
     flux = Flux(

@@ -1,6 +1,5 @@
 """Reconstruction: depth, signal and background of every pixel of a cube, with errors and bounds."""
 
-from mars_lidar.reconstruct.centroid import Peak
 from mars_lidar.reconstruct.coates import Coates, GeneralisedCoates, coates_rates, generalised_coates_rates
 from mars_lidar.reconstruct.histogram_bound import (
     HistogramBound,
@@ -9,7 +8,7 @@ from mars_lidar.reconstruct.histogram_bound import (
     window_error,
     window_weights,
 )
-from mars_lidar.reconstruct.matched_filter import MatchedFilter
+from mars_lidar.reconstruct.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood, log_likelihood
 from mars_lidar.reconstruct.mchc import ChainCorrection, mchc_rates
 from mars_lidar.reconstruct.method import Flags, Method

@@ -1,4 +1,4 @@
-"""The largest bin, the simplest estimate of depth; and the centre of mass of the counts round it, finer than a bin.
+"""The centre of mass of the counts round the largest bin: depth finer than a bin without a model of the noise.
 
 With b the counts that the background leaves in each bin and w the bins of the pulse's core round the peak at t_0::
 
@@ -19,22 +19,10 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import core_ns
 from mars_lidar.reconstruct.histograms import Histograms
-from mars_lidar.reconstruct.method import Estimates, Method, window_estimates
+from mars_lidar.reconstruct.matched_filter import Peak
+from mars_lidar.reconstruct.method import Estimates
 
 _BLOCK = 2**22  # counts gathered at a time
-
-
-@dataclass(frozen=True)
-class Peak(Method):
-    """Delay at the centre of the largest bin, the first of several equal ones, less the offset of the pulse's peak."""
-
-    name = "peak"
-    modes = ("nonparalyzable", "paralyzable", "synchronous", "gated")
-    assumes = "so little light that dead time loses nothing, many signal photons"
-
-    def estimate(self, histograms: Histograms) -> Estimates:
-        """Delay, and signal and background of its window."""
-        return window_estimates(histograms, "peak")
 
 
 @dataclass(frozen=True)

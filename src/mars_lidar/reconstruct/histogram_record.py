@@ -28,7 +28,7 @@ def recording_of(system: System) -> _core.HistogramRecord:
     from mars_lidar.statistics.grid import whole_bins
 
     low, cell, energy, slope = _curve(system.pulse, system.period_ns)
-    knots = low + cell * np.arange(energy.size, dtype=np.float64)
+    peak = low + cell * (int(np.argmax(np.diff(energy))) + 0.5)
     core = core_ns(system)
     sharpness = float(np.sum(np.diff(energy) ** 2)) / cell  # integral of s^2
     whole, shift, fraction = whole_bins(system.dead_time_periods, system.bins)
@@ -45,7 +45,7 @@ def recording_of(system: System) -> _core.HistogramRecord:
         pulse_cell=cell,
         energy=energy,
         slope=slope,
-        peak=_peak(system.pulse, knots, energy),
+        peak=0.0 if isinstance(system.pulse, GaussianPulse) else peak,
         width=pulse_width(sharpness),
         core_low=core[0] / system.period_ns,
         core_high=core[1] / system.period_ns,
@@ -118,13 +118,6 @@ def _monotone_slopes(energy: FloatArray, cell: float) -> FloatArray:
         return np.diff(energy).repeat(2) / cell
     knots = cell * np.arange(energy.size)
     return np.ascontiguousarray(PchipInterpolator(knots, energy).derivative()(knots), dtype=np.float64)
-
-
-def _peak(pulse: Pulse, knots: FloatArray, energy: FloatArray) -> float:
-    if isinstance(pulse, GaussianPulse):
-        return 0.0
-    k = int(np.argmax(np.diff(energy)))
-    return float(0.5 * (knots[k] + knots[k + 1]))
 
 
 def open_bins(system: System) -> tuple[FloatArray, FloatArray]:

@@ -14,8 +14,7 @@ from mars_lidar.calibrate.calibration_fit import Fit, covariance, fit, initial
 from mars_lidar.calibrate.calibration_light import Light
 from mars_lidar.calibrate.calibration_rapp import split, total_of
 from mars_lidar.calibrate.calibration_result import Calibration
-from mars_lidar.calibrate.intervals import SHAPE_BINS, Stream, fine_bins, free_bins
-from mars_lidar.calibrate.stream_summary import Summary
+from mars_lidar.calibrate.intervals import SHAPE_BINS, Stream, Summary, fine_bins, free_bins
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 
 _CROWDED, _FINER = 0.05, 64  # photons of a bin of a free shape above which light within it matters; parts of it

@@ -13,8 +13,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import ArmedTime
 from mars_lidar.calibrate.calibration_light import Light
 from mars_lidar.calibrate.calibration_rapp import RappEstimate
+from mars_lidar.calibrate.intervals import Summary
 from mars_lidar.calibrate.jittered import normal_kernel, unblurred
-from mars_lidar.calibrate.stream_summary import Summary
 from mars_lidar.instrument.effects import Jitter
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import Detector, System

@@ -1,19 +1,21 @@
-"""What the pictures show: maps and rates computed from a cube, without matplotlib."""
+"""What the pictures show: maps and rates computed from a cube, or from the light fitted to it, without matplotlib."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.instrument.system import System
+from mars_lidar.io.cube import Cube
+from mars_lidar.io.layout import MEASURED
+from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruct import METHODS, reconstruct
 from mars_lidar.reconstruct.quality import depth_lag_m
-
-if TYPE_CHECKING:
-    from mars_lidar.io import Cube
 
 _READ_BYTES = 64 * 2**20
 _PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 10 us a period
@@ -162,3 +164,35 @@ def _peak_offset_ns(system: System) -> float:
     edges = np.linspace(low, high, fine + 1)
     peak = int(np.argmax(np.diff(system.pulse.cumulative(edges))))
     return float(0.5 * (edges[peak] + edges[peak + 1]))
+
+
+def fitted(cube: Cube, realization: int) -> Cube:
+    """One exposure of a measured cube with the flux that maximum likelihood finds in it; a simulated one as it is.
+
+    The flux is that of detectable photons, so the system is `System.detected`. Depth is NaN where no return is seen.
+    Detectors that maximum likelihood does not hold for are fitted by the first of the other methods that does.
+    """
+    if not cube.measured:
+        return cube
+    system = cube.system
+    counts = np.asarray(cube.histogram[realization])
+    names = ("maximum_likelihood", *(name for name in METHODS if name != "maximum_likelihood"))
+    for name in names:
+        with suppress(ValueError):
+            METHODS[name].check(system)
+            break
+    found = reconstruct(counts, system, name)
+    seen = found.seen & np.isfinite(found.signal)
+    flux = Flux(
+        np.where(seen, found.signal, 0.0),
+        np.where(np.isfinite(found.background), found.background, 0.0),
+        np.where(seen, found.delay_ns, 0.0),
+    )
+    recipe = Recipe(
+        system=system.detected(),
+        flux=flux,
+        engine=MEASURED,
+        depth_m=np.where(seen, found.depth_m, np.nan),
+        source=cube.recipe.source,
+    )
+    return Cube(histogram=counts[None], recipe=recipe, version=cube.version)

@@ -12,8 +12,7 @@ from mars_lidar.reconstruct.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood, log_likelihood
 from mars_lidar.reconstruct.mchc import ChainCorrection, mchc_rates
 from mars_lidar.reconstruct.method import Flags, Method
-from mars_lidar.reconstruct.methods import METHODS
-from mars_lidar.reconstruct.reconstruction import Reconstruction, reconstruct
+from mars_lidar.reconstruct.reconstruction import METHODS, Reconstruction, reconstruct
 from mars_lidar.reconstruct.returns import Returns
 
 __all__ = [

@@ -14,7 +14,7 @@ from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cell_input import broadcast, flat, photons, reals
+from mars_lidar.statistics.cell_input import broadcast, flat, photons, with_delays
 from mars_lidar.statistics.gate import PLAIN, CellLight, photons_before, require_mode
 from mars_lidar.statistics.grid import whole_bins
 from mars_lidar.statistics.narrow_pulse import followed_bins, followed_edges, meets_itself, needed_bins
@@ -88,12 +88,7 @@ class Cells(CellLight):
             )
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-        total = photons("signal", signal) * share
-        given = reals("delay_ns", 0.5 * system.period_ns if delay_ns is None else delay_ns)
-        total, back, delay = broadcast(("signal", "background", "delay_ns"), total, back, given)
-        bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (total == 0))
-        if bad.any():
-            raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}")
+        total, back, delay = with_delays(photons("signal", signal) * share, back, delay_ns, system.period_ns)
         phase = np.nan_to_num(flat(delay) / system.period_ns)
         phase -= np.floor(phase)
         return cls(system, total.shape, flat(total), flat(back), phase, None, np.zeros(total.size, np.int64))

@@ -29,8 +29,8 @@ def stage(progress: Progress | None, start: float, end: float) -> Progress | Non
 
 def _pixels_of(flux: Flux, pixels: NDArray[np.int64]) -> Flux:
     """The flux of some pixels (n,), as an image of one row."""
-    wave, number = flux.waveform, len(flux.returns_signal)
-    signal, delay = (a.reshape(number, 1, -1)[..., pixels] for a in (flux.returns_signal, flux.returns_delay_ns))
+    wave, number, every = flux.waveform, len(flux.returns_signal), flux.background.size
+    signal, delay = (a.reshape(number, 1, every)[..., pixels] for a in (flux.returns_signal, flux.returns_delay_ns))
     background = flux.background.reshape(1, -1)[:, pixels]
     return made(signal, delay, background, None if wave is None else wave.reshape(1, -1, wave.shape[-1])[:, pixels])
 

@@ -13,7 +13,7 @@ from harness import ledger
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.calibrate.response import responses
+from mars_lidar.calibrate.light_error import responses
 from mars_lidar.statistics import mean_histogram
 from mars_lidar.statistics.distance import Pmf, g_test
 

@@ -85,7 +85,7 @@ def test_histograms_are_those_of_the_engine(mode: str, pulse: str, returns: int,
     out = np.empty((asked.items, 64), np.uint16)
     machine = Host()
     exact.exact_histogram(asked, out, machine)
-    assert machine.launched == [Variant.of(asked, Sink.BLOCK16).expression] * 2
+    assert machine.launched == [Variant.of(asked, Sink.BLOCK16).kernel.expression] * 2
     wanted = expected(asked)
     assert wanted.sum() > 1000
     np.testing.assert_array_equal(out, wanted)
@@ -101,7 +101,7 @@ def test_every_way_to_count(sink: Sink, bins: int, monkeypatch: pytest.MonkeyPat
     out = np.empty((asked.items, bins), dtype)
     machine = Host()
     exact.exact_histogram(asked, out, machine, in_block="BLOCK" in sink.name)
-    assert set(machine.launched) == {Variant.of(asked, sink).expression}
+    assert set(machine.launched) == {Variant.of(asked, sink).kernel.expression}
     wanted = expected(asked, dtype)
     assert (wanted > 512).any()
     np.testing.assert_array_equal(out, wanted)
@@ -112,7 +112,7 @@ def test_histograms_that_fit_no_block_are_counted_in_the_memory_of_the_device():
     out = np.empty((asked.items, 64), np.uint16)
     machine = Host(shared_bytes=1 << 10)
     exact.exact_histogram(asked, out, machine)
-    assert set(machine.launched) == {Variant.of(asked, Sink.ROWS16).expression}
+    assert set(machine.launched) == {Variant.of(asked, Sink.ROWS16).kernel.expression}
     np.testing.assert_array_equal(out, expected(asked))
 
 

@@ -13,7 +13,7 @@ from scipy.io import savemat
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.compare.fitted import fitted
+from mars_lidar.compare.views import fitted
 
 SYSTEM = ml.System(
     period_ns=50.0,

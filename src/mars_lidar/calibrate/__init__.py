@@ -6,8 +6,8 @@ from mars_lidar.calibrate.calibration_bound import Bound, calibration_bound
 from mars_lidar.calibrate.calibration_rapp import RappEstimate, rapp_total
 from mars_lidar.calibrate.fit_tests import Check
 from mars_lidar.calibrate.inspection import Inspection, inspect
+from mars_lidar.calibrate.intervals import Summary, summary
 from mars_lidar.calibrate.recovery import Recovery, recovery
-from mars_lidar.calibrate.stream_summary import Summary, summary
 from mars_lidar.calibrate.validation import Validation, validate
 
 __all__ = [

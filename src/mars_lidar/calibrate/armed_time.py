@@ -18,6 +18,9 @@ from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.intervals import CHUNK, Stream
 
+_COARSE = 1024  # bins of the coarsest light
+_ENOUGH = 32  # registrations of a bin that is halved
+
 
 @dataclass(frozen=True)
 class Sensitivity:
@@ -91,8 +94,7 @@ class ArmedTime:
 
         The generalised Coates estimate (Gupta, Ingle, Gupta, ICCV 2019) with the armed time measured.
         """
-        seen = self.passes > 0
-        return np.where(seen, self.registrations / np.where(seen, self.passes, 1.0), 0.0)
+        return np.divide(self.registrations, self.passes, out=np.zeros(self.passes.size), where=self.passes > 0)
 
 
 def armed_time(stream: Stream, hold_off_ns: float, bins: int, sensitivity: Sensitivity | None = None) -> ArmedTime:
@@ -104,23 +106,20 @@ def armed_time(stream: Stream, hold_off_ns: float, bins: int, sensitivity: Sensi
     events = np.zeros(bins)
     passes = np.zeros(bins)
     used = 0
-    for opens, closes in _gathered(_waits(stream, hold_off_ns)):
-        used += _watch(events, passes, opens, closes, stream.period_ns, closed_by_photon=True)
-        passes -= _lost(sensitivity, opens, closes, hold_off_ns, stream.period_ns, bins)
-    for opens, closes in _gathered(_tails(stream, hold_off_ns)):
-        _watch(events, passes, opens, closes, stream.period_ns, closed_by_photon=False)
-        passes -= _lost(sensitivity, opens, closes, hold_off_ns, stream.period_ns, bins)
+    for photon, stretches in ((True, _waits(stream, hold_off_ns)), (False, _tails(stream, hold_off_ns))):
+        for opens, closes in _gathered(stretches):
+            kept = closes > opens
+            cycle_a, bin_a, part_a = places(opens[kept], stream.period_ns, bins)
+            cycle_b, bin_b, part_b = places(closes[kept], stream.period_ns, bins)
+            passes += float((cycle_b - cycle_a).sum()) + begun(bin_b, part_b, 1, bins)[0]
+            passes -= begun(bin_a, part_a, 1, bins)[0]
+            if sensitivity is not None:
+                slow = kept & (opens > 0.0)  # those from 0 on have no registration before
+                passes -= sensitivity.lost(opens[slow], closes[slow], hold_off_ns, stream.period_ns, bins)
+            if photon:
+                events += np.bincount(bin_b, minlength=bins)
+                used += bin_b.size
     return ArmedTime(events, passes, used, stream.registrations - used, hold_off_ns, sensitivity)
-
-
-def _lost(
-    law: Sensitivity | None, opens: FloatArray, closes: FloatArray, hold_off_ns: float, period_ns: float, bins: int
-) -> FloatArray | float:
-    """Passes (bins,) that are lost in stretches [opens, closes); those from 0 on have no registration before."""
-    if law is None:
-        return 0.0
-    slow = (closes > opens) & (opens > 0.0)
-    return law.lost(opens[slow], closes[slow], hold_off_ns, period_ns, bins)
 
 
 def _waits(stream: Stream, hold_off_ns: float) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -144,43 +143,42 @@ def _tails(stream: Stream, hold_off_ns: float) -> Iterator[tuple[FloatArray, Flo
             yield np.zeros(1), np.array([piece.end_ns])
 
 
-def _gathered(
-    parts: Iterator[tuple[FloatArray, FloatArray]],
-) -> Iterator[tuple[FloatArray, FloatArray]]:
+def _gathered(parts: Iterator[tuple[FloatArray, FloatArray]]) -> Iterator[FloatArray]:
     """Small parts joined, so that thousands of short pieces cost no more than a long one."""
-    first: list[FloatArray] = []
-    second: list[FloatArray] = []
+    held: list[FloatArray] = []  # (2, n): where they open and close
     size = 0
-    for a, b in parts:
-        first.append(a)
-        second.append(b)
-        size += a.size
+    for part in parts:
+        held.append(np.stack(part))
+        size += part[0].size
         if size >= CHUNK:
-            yield np.concatenate(first), np.concatenate(second)
-            first, second, size = [], [], 0
+            yield np.concatenate(held, axis=1)
+            held, size = [], 0
     if size:
-        yield np.concatenate(first), np.concatenate(second)
+        yield np.concatenate(held, axis=1)
 
 
-def _watch(
-    events: FloatArray,
-    passes: FloatArray,
-    opens: FloatArray,
-    closes: FloatArray,
-    period_ns: float,
-    *,
-    closed_by_photon: bool,
-) -> int:
-    """Add the stretches [opens, closes) to `events` and `passes`; returns how many there were."""
-    kept = closes > opens
-    opens, closes = opens[kept], closes[kept]
-    cycle_a, bin_a, part_a = places(opens, period_ns, passes.size)
-    cycle_b, bin_b, part_b = places(closes, period_ns, passes.size)
-    passes += float((cycle_b - cycle_a).sum()) + begun(bin_b, part_b, 1, passes.size)[0]
-    passes -= begun(bin_a, part_a, 1, passes.size)[0]
-    if closed_by_photon:
-        events += np.bincount(bin_b, minlength=passes.size)
-    return int(closes.size)
+def fine_light(
+    stream: Stream, hold_off_ns: float, bins: int, coarse: int = _COARSE, sensitivity: Sensitivity | None = None
+) -> FloatArray:
+    """Photons per period (bins,): h / D of `coarse` (1024) bins that are halved where photons abound.
+
+    `bins` are a power of two times `coarse`. A pulse much narrower than a bin of the coarsest grid is seen as it is,
+    and faint light does not fall apart into single photons.
+    """
+    seen = armed_time(stream, hold_off_ns, bins, sensitivity)
+    number = min(coarse, bins)
+    rate, photons = np.zeros(bins), np.full(number, np.inf)
+    while True:
+        each = bins // number
+        h, passes = seen.registrations.reshape(number, each).sum(1), seen.passes.reshape(number, each).mean(1)
+        finer = np.divide(h, passes, out=np.zeros(number), where=passes > 0.0) / each
+        kept = np.repeat(photons >= _ENOUGH, number // photons.size)
+        rate = np.where(np.repeat(kept, each), np.repeat(finer, each), rate)
+        if number == bins:
+            return rate
+        # what was not halved stays as it is
+        photons = np.where(kept, h, 0.0)
+        number *= 2
 
 
 def places(t: FloatArray, period_ns: float, bins: int) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:

@@ -197,6 +197,7 @@ def _blurred(dt: FloatArray, width: float) -> tuple[float, float, float]:
     """Middle and sigma of an edge n (1 + erf) / 2 of constant height: each of two records has the jitter once."""
     from scipy.optimize import minimize
     from scipy.special import log_ndtr, ndtr
+    from scipy.stats import norm
 
     low, high = float(dt[0]) - 0.5 * width, float(dt[0]) + 3.0 * width
     seen = dt[dt < high]
@@ -204,30 +205,17 @@ def _blurred(dt: FloatArray, width: float) -> tuple[float, float, float]:
     def minus(x: FloatArray) -> float:
         middle, sigma = float(x[0]), math.exp(float(x[1]))
         # the height that fits best is taken: intervals over the integral of the edge
-        a, b = (high - middle) / sigma, (low - middle) / sigma
-        area = sigma * (
-            a * ndtr(a)
-            + math.exp(-0.5 * a * a) / math.sqrt(2 * math.pi)
-            - (b * ndtr(b) + math.exp(-0.5 * b * b) / math.sqrt(2 * math.pi))
-        )
+        b, a = (np.array([low, high]) - middle) / sigma
+        area = sigma * float(a * ndtr(a) + norm.pdf(a) - b * ndtr(b) - norm.pdf(b))
         return -float(log_ndtr((seen - middle) / sigma).sum()) + seen.size * math.log(max(area, 1e-300))
 
     found = minimize(minus, [float(dt[0]) + 0.5 * width, math.log(0.2 * width)], method="Nelder-Mead")
     middle, sigma = float(found.x[0]), math.exp(float(found.x[1]))
-    step = 0.05 * sigma
-    curve = np.array(
-        [[minus(np.array([middle + i * step, math.log(sigma) + j * 0.05])) for j in (-1, 0, 1)] for i in (-1, 0, 1)]
-    )
-    second = np.array(
-        [
-            [
-                (curve[2, 1] - 2 * curve[1, 1] + curve[0, 1]) / step**2,
-                (curve[2, 2] - curve[2, 0] - curve[0, 2] + curve[0, 0]) / (4 * step * 0.05),
-            ],
-            [0.0, (curve[1, 2] - 2 * curve[1, 1] + curve[1, 0]) / 0.05**2],
-        ]
-    )
-    second[1, 0] = second[0, 1]
+    steps = np.array([0.05 * sigma, 0.05])
+    curve = np.array([[minus(found.x + steps * (i, j)) for j in (-1, 0, 1)] for i in (-1, 0, 1)])
+    along = np.array([curve[2, 1] + curve[0, 1], curve[1, 2] + curve[1, 0]]) - 2.0 * curve[1, 1]
+    across = 0.25 * (curve[2, 2] - curve[2, 0] - curve[0, 2] + curve[0, 0])
+    second = np.array([[along[0], across], [across, along[1]]]) / np.outer(steps, steps)
     covariance = np.linalg.pinv(second)
     return middle, math.sqrt(max(float(covariance[0, 0]), 0.0)), sigma / math.sqrt(2.0)
 

@@ -99,7 +99,7 @@ class Light:
         k = self.returns
         signal, delay = theta[1 : 1 + k], theta[1 + k : 1 + 2 * k] + self.shift_ns
         pulse, jitter = self.before_jitter(theta)
-        step = _SPREAD * pulse.sigma_ns if isinstance(pulse, GaussianPulse) else 0.5 * _sample_ns(pulse)
+        step = 0.5 * pulse.bin_ns if isinstance(pulse, SampledPulse) else _SPREAD * getattr(pulse, "sigma_ns", 0.0)
         energy = pulse.bin_energy(delay, self.period_ns, self.bins)
         later = pulse.bin_energy(delay + step, self.period_ns, self.bins)
         earlier = pulse.bin_energy(delay - step, self.period_ns, self.bins)
@@ -183,7 +183,3 @@ class Light:
 
     def _records(self, rate: FloatArray, jitter_ns: float) -> Records:
         return Records(rate, normal_kernel(jitter_ns, self.period_ns, self.bins))
-
-
-def _sample_ns(pulse: Pulse) -> float:
-    return pulse.bin_ns if isinstance(pulse, SampledPulse) else 0.0

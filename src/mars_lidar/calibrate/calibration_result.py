@@ -13,8 +13,8 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import ArmedTime
 from mars_lidar.calibrate.calibration_light import Light
 from mars_lidar.calibrate.calibration_rapp import RappEstimate
+from mars_lidar.calibrate.intervals import Summary
 from mars_lidar.calibrate.jittered import normal_kernel, unblurred
-from mars_lidar.calibrate.stream_summary import Summary
 from mars_lidar.instrument.effects import Jitter
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 from mars_lidar.instrument.system import Detector, System
@@ -216,7 +216,7 @@ class Calibration:
 
     def _even(self, waveform: FloatArray) -> FloatArray:
         """A waveform in the bins of `armed`."""
-        each = self._bins // waveform.size
+        each = self.armed.passes.size // waveform.size
         return np.asarray(np.repeat(waveform / each, each), dtype=np.float64)
 
     def flux(self, pixels: int = 1) -> Flux:
@@ -258,11 +258,11 @@ class Calibration:
         if self.returns_signal.size == 1:
             delay = self.delay_ns + self._light.shift_ns
             return {"signal": self.signal, "background": self.background, "delay_ns": delay}
-        return {"signal": None, "background": self.background, "waveform": self.arriving - self.background / self._bins}
-
-    @property
-    def _bins(self) -> int:
-        return self.armed.passes.size
+        return {
+            "signal": None,
+            "background": self.background,
+            "waveform": self.arriving - self.background / self.armed.passes.size,
+        }
 
 
 def nearest(found: Calibration, step: FloatArray) -> FloatArray:

@@ -9,12 +9,12 @@ import numpy as np
 
 from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch
 from mars_lidar.calibrate.calibration_result import Calibration, nearest
-from mars_lidar.calibrate.departure import SIGNIFICANT, departure_of, too_coarse
 from mars_lidar.calibrate.hidden_dead_time import EDGE
-from mars_lidar.calibrate.hidden_light import SHUT, with_hidden, without_pulse
 from mars_lidar.calibrate.recovery_edge import ORDINARY, REACH, Edge, Law, edge_of
+from mars_lidar.calibrate.same_phase import SIGNIFICANT, departure_of, too_coarse
 from mars_lidar.calibrate.sharp_edge import ALL, WIDEST, SharpEdge, width_of
-from mars_lidar.calibrate.shortest_intervals import FEW, Ages, Underlying, extrapolated, is_sharp
+from mars_lidar.calibrate.shortest_intervals import FEW, Ages, extrapolated, is_sharp
+from mars_lidar.calibrate.unknowns import SHUT, with_hidden, without_pulse
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 
 SHARP = 0.01  # false-alarm probability of a blurred edge
@@ -73,7 +73,7 @@ class Unknown(SharpEdge):
             widths = [reach * part for part in _STARTS]
         else:
             widths = [math.sqrt(2.0) * self.jitter_ns]
-        found = (self._from(first, self._rough(sharp, width), width) for width in widths)
+        found = (self._from(first, extrapolated(self._ages(8.0 * width), sharp, width), width) for width in widths)
         return False, next((one for one in found if one is not None), None)
 
     def _by_a_pulse(self) -> Calibration | None:
@@ -87,10 +87,6 @@ class Unknown(SharpEdge):
             found.dead_time_ns, hold, found.jitter_ns, found.jitter_error_ns, found.dead_time_error_ns, "edge"
         )
         return replace(self._pass(watch), jitter_limit_ns=found.jitter_limit_ns)
-
-    def _rough(self, sharp: Underlying, width: float) -> float:
-        """A rough dead time, for an edge of that width."""
-        return extrapolated(self._ages(8.0 * width), sharp, width)
 
     def _from(self, first: Calibration, dead: float, width: float) -> Calibration | None:
         """The edge and the light, from a rough edge: the light of a jitter leads to an edge of that jitter."""
@@ -109,11 +105,9 @@ class Unknown(SharpEdge):
             if found.armed.used < FEW or failed > 1:
                 return None
             edge = self._edge(ages, found, dead, width)
-            if edge is None:
+            if edge is None or not self._is_step(found, edge, self._light.bins(width)):
                 return None
-            if not self._is_step(found, edge, self._light.bins(width)):
-                return None
-            if _is_clock(edge, ages):
+            if ages.clock_ns > 0.0 and edge.jitter_ns < max(ages.clock_ns, 2.0 * edge.jitter_error_ns):
                 return self._clocked(first, edge, ages)
             shift = abs(edge.dead_time_ns - dead) / edge.dead_time_error_ns
             tried.append((jitter, edge.jitter_ns))
@@ -122,7 +116,7 @@ class Unknown(SharpEdge):
             if shift < _SAME and off <= _SAME * edge.jitter_error_ns:
                 break
             jitter = _nearer(tried)
-        if edge is None or not _within_pulse(edge, found):
+        if edge is None or not edge.jitter_ns - 3.0 * edge.jitter_error_ns < width_of(found):  # the pulse holds it
             return None
         if self.jitter_ns is None and edge.jitter_error_ns > 0.0:
             follows = self._follows(ages, found, edge, width)
@@ -220,13 +214,3 @@ def _nearer(tried: list[tuple[float, float]]) -> float:
         if slope < 0.9:
             got = float(np.clip(jitter + (got - jitter) / (1.0 - slope), 0.5 * jitter, 2.0 * jitter))
     return got
-
-
-def _is_clock(edge: Edge, ages: Ages) -> bool:
-    """Whether the clock alone makes an edge as wide."""
-    return ages.clock_ns > 0.0 and edge.jitter_ns < max(ages.clock_ns, 2.0 * edge.jitter_error_ns)
-
-
-def _within_pulse(edge: Edge, found: Calibration) -> bool:
-    """Whether the edge is no wider than the pulse, which holds the jitter."""
-    return edge.jitter_ns - 3.0 * edge.jitter_error_ns < width_of(found)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibrate.light_error import LEAST_LEFT, Fitted, tested
-from mars_lidar.calibrate.prediction import Prediction
-from mars_lidar.calibrate.response import fit_covariance
+from mars_lidar.calibrate.light_error import LEAST_LEFT, Fitted, chi_square, fit_covariance
+from mars_lidar.calibrate.prediction import Prediction, group_weights
 from mars_lidar.statistics.distance import KL_FLOOR, Pmf, g_test, kl_divergence, two_sample_g_test
 
 _BOOTSTRAPS = 400
@@ -58,32 +58,22 @@ class Compared:
         (realizations,) registrations of each, and those in the signal window.
     histogram
         (bins,) mean registrations.
-    fit
-        (groups, groups) what the error of the fitted light adds to the covariance of measured - predicted registrations
-        of the groups of bins.
+    light, dead_time_ns, cycles
+        That it was predicted with, and periods of a realization.
     """
 
     law: Prediction
     counts: NDArray[np.int64]
     inside: NDArray[np.int64]
     histogram: FloatArray
-    fit: FloatArray
+    light: Fitted
+    dead_time_ns: float
+    cycles: int
 
-    @classmethod
-    def of(
-        cls,
-        law: Prediction,
-        counts: NDArray[np.int64],
-        inside: NDArray[np.int64],
-        histogram: FloatArray,
-        light: Fitted,
-        dead_time_ns: float,
-        cycles: int,
-    ) -> Compared:
-        """With the error of the light that `law` was predicted with."""
-        groups = (law.groups == np.arange(int(law.groups.max()) + 1)[:, None]).astype(np.float64)
-        fit = fit_covariance(light, dead_time_ns, groups, cycles, counts.size)
-        return cls(law, counts, inside, histogram, fit)
+    @cached_property
+    def fit(self) -> FloatArray:
+        """What the error of the light adds to the covariance (groups, groups) of measured - predicted registrations."""
+        return fit_covariance(self.light, self.dead_time_ns, group_weights(self.law.groups), self.cycles, self.size)
 
     @property
     def size(self) -> int:
@@ -106,24 +96,21 @@ class Compared:
 
     def checks(self, shape: bool) -> list[Check]:
         """All tests; with that of the shape where it is not fitted bin by bin."""
-        law, size = self.law, self.size
+        law, size, measured = self.law, self.size, Pmf.of_counts(self.counts)
         count, joint = 1.0 / size + law.noise("count"), 1.0 / size + law.noise("joint")
         least = LEAST_LEFT + (1.0 - LEAST_LEFT) * self._predicted_share
         error = math.sqrt(max(law.variance * count * max(self.stretch, least), 0.0))
+        if "count" in law.exact:  # of the counts but for their mean, which has its own test
+            p = g_test(law.count, measured, size, any_mean=True)
+        else:
+            p = two_sample_g_test(measured, size, law.count, law.simulated, any_mean=True)
         found = [
-            Check("counts, G-test", math.nan, math.nan, math.nan, self._count_test()),
+            Check("counts, G-test", math.nan, math.nan, math.nan, p),
             _check("mean count", float(self.counts.mean()), law.mean, error),
             _variance("count variance", self.counts, law.variance, count * size, law.count),
             _variance("window variance", self.inside, law.window_variance, joint * size, Pmf.of_counts(self.inside)),
         ]
         return [*found, self._shape_check()] if shape else found
-
-    def _count_test(self) -> float:
-        """Test of the counts against their law, or simulated ones, but for their mean, which has its own test."""
-        measured, law = Pmf.of_counts(self.counts), self.law
-        if "count" in law.exact:
-            return g_test(law.count, measured, self.size, any_mean=True)
-        return two_sample_g_test(measured, self.size, law.count, law.simulated, any_mean=True)
 
     @property
     def _shape_share(self) -> float:
@@ -131,15 +118,9 @@ class Compared:
 
     def _shape_check(self) -> Check:
         """Chi-square of the mean histogram in groups of equal expected counts, with their covariance."""
-        from scipy.stats import chi2
-
         law = self.law
-        starts = np.flatnonzero(np.diff(law.groups, prepend=-1))
-        off = np.add.reduceat(self.histogram - law.histogram, starts)
-        square, freedom = tested(off, law.group_covariance * self._shape_share, self.fit)
-        if law.simulated:  # the inverse of a sample covariance is too large (Hartlap et al., A&A 464, 399, 2007)
-            square *= (law.simulated - freedom - 2) / (law.simulated - 1)
-        p = float(chi2.sf(square, freedom)) if freedom else 1.0
+        off = group_weights(law.groups) @ (self.histogram - law.histogram)
+        square, freedom, p = chi_square(off, law.group_covariance * self._shape_share, self.fit, law.simulated)
         return Check("histogram, chi²", square, float(freedom), math.sqrt(2.0 * freedom), p)
 
     @property

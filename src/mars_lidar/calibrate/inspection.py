@@ -12,10 +12,10 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import armed_time
 from mars_lidar.calibrate.calibration import Calibration, calibrate
 from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch, fitted
-from mars_lidar.calibrate.departure import departure_of, too_coarse
 from mars_lidar.calibrate.intervals import Stream, stream_of
 from mars_lidar.calibrate.periodicity import other_period
 from mars_lidar.calibrate.recovery import Recovery, recovery_of
+from mars_lidar.calibrate.same_phase import departure_of, too_coarse
 from mars_lidar.calibrate.slow_recovery import SlowRecovery, slow_recovery
 from mars_lidar.light.timestamps import Timestamps
 
@@ -225,6 +225,5 @@ def _shared(stream: Stream) -> float:
         return 0.0
     cells = int(min(max(round(stream.period_ns / stream.unit_ns), 1), _MOST_CELLS))
     seen = armed_time(stream, 0.0, cells)
-    light = np.where(seen.passes > 0.0, seen.registrations / np.maximum(seen.passes, 1e-300), 0.0)
-    mean = float((seen.registrations * light).sum()) * stream.unit_ns * cells / stream.period_ns
+    mean = float((seen.registrations * seen.rate).sum()) * stream.unit_ns * cells / stream.period_ns
     return mean + 5.0 * math.sqrt(mean)

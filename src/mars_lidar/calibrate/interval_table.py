@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import begun, places
 from mars_lidar.calibrate.intervals import Stream
-from mars_lidar.calibrate.light_error import Fitted, tested
+from mars_lidar.calibrate.light_error import Fitted, chi_square
 
 _MOST = 4_000_000  # intervals looked at
 _CHUNK = 2**18
@@ -97,7 +97,7 @@ def age_table(
     for first in range(0, start.size, _CHUNK):
         part = slice(first, first + _CHUNK)
         _count(observed, start[part], dt[part], phases, edges, bright, light.period_ns)
-        for age, passes in enumerate(_passes(start[part], dt[part], phases, edges, bright.size, light.period_ns)):
+        for age, passes in enumerate(passes_of(start[part], dt[part], phases, edges, bright.size, light.period_ns)):
             fell[:, age] += passes @ both
     split = fell.reshape(*shape, 2, weights.shape[1])
     seen = np.array([light.registrations[~bright].sum(), light.registrations[bright].sum()])
@@ -168,7 +168,7 @@ def _phase(start: FloatArray, phases: FloatArray, period_ns: float) -> IntArray:
     return np.asarray(np.searchsorted(phases, x - np.floor(x), side="right") - 1, dtype=np.int64)
 
 
-def _passes(
+def passes_of(
     start: FloatArray, dt: FloatArray, phases: FloatArray, edges: FloatArray, bins: int, period_ns: float
 ) -> list[FloatArray]:
     """For each age: how often each bin was passed, (p, bins), while a pixel had that age."""
@@ -204,8 +204,6 @@ def _compared(table: AgeTable, other: AgeTable | None) -> tuple[FloatArray, Floa
 
 
 def _p_of_cells(table: AgeTable, light: Fitted, other: AgeTable | None) -> float:
-    from scipy.stats import chi2
-
     off, variance, ratio = _compared(table, other)
     least = table.expected if other is None else ratio * np.minimum(table.expected, other.expected)
     judged = (least >= _LEAST) & table.judged
@@ -213,8 +211,7 @@ def _p_of_cells(table: AgeTable, light: Fitted, other: AgeTable | None) -> float
         return 1.0
     slopes = (ratio[..., None] * table.slopes)[judged]
     watched = slopes * np.broadcast_to(table.watched[:, None], judged.shape)[judged][:, None]
-    square, freedom = tested(off[judged], variance[judged], light.correction(slopes, watched))
-    return float(chi2.sf(square, freedom)) if freedom else 1.0
+    return chi_square(off[judged], variance[judged], light.correction(slopes, watched))[2]
 
 
 def _p_of_trends(table: AgeTable, light: Fitted, other: AgeTable | None) -> float:
@@ -246,21 +243,21 @@ def _p_of_unseen(table: AgeTable, light: Fitted, other: AgeTable | None) -> floa
     parts = (np.arange(_PARTS) + 0.5) / _PARTS
     start = (table.phases[:-1, None] + np.diff(table.phases)[:, None] * parts) * light.period_ns  # (p, parts)
     cumulative = np.concatenate([[0.0], np.cumsum(light.rate)])
-    ends = light_before(start + dead, cumulative, light.period_ns)[..., None]
+
+    def before(time_ns: FloatArray) -> FloatArray:
+        """Photons from time 0 on."""
+        x = time_ns / light.period_ns
+        cycle = np.floor(x)
+        phase = np.interp(x - cycle, np.linspace(0.0, 1.0, cumulative.size), cumulative)
+        return np.asarray(phase + cumulative[-1] * cycle, dtype=np.float64)
+
+    ends = before(start + dead)[..., None]
     weights = []
     for first, blind in ((0.0, dead), *((share * dead, share * dead) for share in _SHARES)):
         begin = np.minimum(np.maximum(first, age - blind), dead)
-        fell = ends - light_before(start[..., None] + begin, cumulative, light.period_ns)
+        fell = ends - before(start[..., None] + begin)
         weights.append(np.broadcast_to(fell.mean(1)[..., None], table.expected.shape))
     return _p_of_scores(table, light, other, np.stack(weights))
-
-
-def light_before(time_ns: FloatArray, cumulative: FloatArray, period_ns: float) -> FloatArray:
-    """Photons from time 0 on, of the cumulative light (n + 1,) of a period."""
-    x = time_ns / period_ns
-    cycle = np.floor(x)
-    phase = np.interp(x - cycle, np.linspace(0.0, 1.0, cumulative.size), cumulative)
-    return np.asarray(phase + cumulative[-1] * cycle, dtype=np.float64)
 
 
 def _p_of_scores(table: AgeTable, light: Fitted, other: AgeTable | None, weight: FloatArray) -> float:
@@ -268,8 +265,6 @@ def _p_of_scores(table: AgeTable, light: Fitted, other: AgeTable | None, weight:
 
     Neyman's smooth test (Skand. Aktuarietidskr. 20, 149, 1937) of a model with fitted parameters.
     """
-    from scipy.stats import chi2
-
     off, variance, ratio = _compared(table, other)
     judged = variance > 0 if other is None else np.minimum(table.expected, other.expected) >= _LEAST
     weight = weight * (judged & table.judged)
@@ -281,5 +276,4 @@ def _p_of_scores(table: AgeTable, light: Fitted, other: AgeTable | None, weight:
     slopes = ratio[..., None] * table.slopes
     slope = np.einsum("qpmk,pmkt->qt", weight, slopes)
     watched = np.einsum("qpmk,pmkt->qt", weight, slopes * table.watched[:, None, None])
-    found, freedom = tested(np.einsum("qpmk,pmk->q", weight, off), spread, light.correction(slope, watched))
-    return float(chi2.sf(found, freedom)) if freedom else 1.0
+    return chi_square(np.einsum("qpmk,pmk->q", weight, off), spread, light.correction(slope, watched))[2]

@@ -79,13 +79,10 @@ class Records:
 
     def _convolved(self, values: FloatArray, kernel: FloatArray) -> FloatArray:
         """Values (n,) of the period, blurred by a kernel at `_place`."""
-        around = values[np.arange(-self._high, self._n - self._low) % self._n]
-        if self._total >= _BRIGHT:
-            return np.convolve(around, kernel, "valid")
-        from scipy.fft import irfft, next_fast_len, rfft
+        from scipy.signal import convolve
 
-        size = next_fast_len(around.size, real=True)  # a period is often a prime number of bins
-        return np.asarray(irfft(rfft(around, size) * rfft(kernel, size), size)[kernel.size - 1 : around.size])
+        around = values[np.arange(-self._high, self._n - self._low) % self._n]
+        return np.asarray(convolve(around, kernel, "valid", "direct" if self._total >= _BRIGHT else "fft"))
 
 
 def split_sigma(recorded_ns: float, jitter_ns: float) -> tuple[float, float]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
+from mars_lidar.calibrate.armed_time import fine_light
 from mars_lidar.calibrate.calibration_result import Calibration
-from mars_lidar.calibrate.fine_light import fine_light
 from mars_lidar.calibrate.intervals import Stream
 from mars_lidar.calibrate.jittered import normal_kernel, unblurred
 from mars_lidar.calibrate.recovery_edge import Law

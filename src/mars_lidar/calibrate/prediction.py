@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
+from mars_lidar.calibrate.armed_time import places
 from mars_lidar.calibrate.calibration import Calibration
 from mars_lidar.calibrate.detector_model import is_plain, pulse_of_the_light
 from mars_lidar.calibrate.interval_table import AgeTable, age_table
@@ -19,7 +21,7 @@ from mars_lidar.calibrate.recovery import Recovery, recovery_of
 from mars_lidar.instrument.detector import Detector
 from mars_lidar.instrument.pulse import SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics import ConvergenceError, JointLaw, count_law, joint_law, mean_histogram
+from mars_lidar.statistics import ConvergenceError, count_law, joint_law, mean_histogram
 from mars_lidar.statistics.distance import Pmf
 
 WINDOW_SIGMAS = 3.0
@@ -123,7 +125,7 @@ def predict(calibration: Calibration, system: System, realizations: int, light: 
         float(law.window(window)[1]),
         window,
         groups,
-        _law_covariance(law, groups),
+        np.asarray(law.covariance_of(group_weights(groups)[:, None], group_weights(groups)[None])),
         recovery=recovery,
         ages=ages,
     )
@@ -151,9 +153,7 @@ def cut(stream: Stream, system: System, labels: NDArray[np.integer]) -> tuple[ND
         number = int((piece.end_ns / stream.period_ns + 1e-9) // system.cycles)
         table = np.zeros((number, kinds), np.int64)
         for start in range(0, piece.times_ns.size, 2**20):
-            x = piece.times_ns[start : start + 2**20] / stream.period_ns
-            cycle = np.floor(x)
-            place = np.minimum(((x - cycle) * system.bins).astype(np.int64), system.bins - 1)
+            cycle, place, _ = places(piece.times_ns[start : start + 2**20], stream.period_ns, system.bins)
             item = (cycle / system.cycles).astype(np.int64)
             kept = (item >= 0) & (item < number)
             item, place = item[kept], place[kept]
@@ -190,18 +190,12 @@ def _simulated(calibration: Calibration, system: System, realizations: int, ligh
     arguments = calibration.light_arguments()
     exact: list[str] = []
     count, moments = Pmf.of_counts(number), (float(number.mean()), float(number.var(ddof=1)))
-    try:
+    with suppress(ValueError, ConvergenceError):
         law = count_law(**arguments, system=system)
-    except (ValueError, ConvergenceError):
-        pass
-    else:
         count, moments = Pmf(int(law.support[0]), law.pmf), (float(law.mean), float(law.variance))
         exact.append("count")
-    try:
+    with suppress(ValueError, ConvergenceError):
         mean = np.asarray(mean_histogram(**arguments, system=system), dtype=np.float64)
-    except (ValueError, ConvergenceError):
-        pass
-    else:
         exact.append("histogram")
     return Prediction(
         count,
@@ -251,6 +245,6 @@ def _groups_of(mean: FloatArray) -> NDArray[np.int64]:
     return np.asarray(np.unique(group, return_inverse=True)[1], dtype=np.int64)
 
 
-def _law_covariance(law: JointLaw, groups: NDArray[np.int64]) -> FloatArray:
-    weights = (groups == np.arange(int(groups.max()) + 1)[:, None]).astype(np.float64)
-    return np.asarray(law.covariance_of(weights[:, None], weights[None]))
+def group_weights(groups: NDArray[np.int64]) -> FloatArray:
+    """(groups, bins) 1 where a bin is of the group."""
+    return np.asarray(groups == np.arange(int(groups.max()) + 1)[:, None], dtype=np.float64)

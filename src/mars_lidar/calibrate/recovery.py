@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
-from mars_lidar.calibrate.interval_table import intervals_of, light_before
+from mars_lidar.calibrate.interval_table import intervals_of, passes_of
 from mars_lidar.calibrate.intervals import Stream, stream_of
 from mars_lidar.calibrate.same_phase import SamePhase
 from mars_lidar.light.timestamps import Timestamps
@@ -152,18 +152,10 @@ def recovery_of(
     ages = dead_time_ns + step * np.arange(_AGES + 1)
     before = np.arange(dead_time_ns, begin - 1e-9 * step, -step)[1:][::-1]
     edges = np.concatenate([before[before >= 0.0], ages])
-    cumulative = np.concatenate([[0.0], np.cumsum(rate)])
     start, dt = intervals_of(stream, _MOST)
     observed = np.histogram(dt, edges)[0].astype(np.float64)
-    expected = np.zeros(edges.size - 1)
-    alive = dt > edges[0]
-    start, dt = start[alive], dt[alive]
-    light = light_before(start + edges[0], cumulative, stream.period_ns)
-    for k, edge in enumerate(edges[1:]):
-        later = light_before(start + np.minimum(dt, edge), cumulative, stream.period_ns)
-        expected[k] = float((later - light).sum())
-        alive = dt > edge
-        start, dt, light = start[alive], dt[alive], later[alive]
+    passed = passes_of(start, dt, np.array([0.0, 1.0]), edges, rate.size, stream.period_ns)
+    expected = np.array([float((passes[0] * rate).sum()) for passes in passed])
     return Recovery(edges, observed, expected, dead_time_ns, hold_off_ns)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.shortest_intervals import FEW, WIDEST, Ages, Underlying
+from mars_lidar.statistics.distance import neighbours
 
 Law = Callable[[float], Underlying]
 """What lies behind a stream whose edge is so wide, ns: the same records from a narrower pulse and a wider jitter."""
@@ -223,21 +224,8 @@ class _Window:
         width = math.exp(theta[1])
         sigma = math.sqrt(0.5 * max(width**2 - self.ages.clock_ns**2, 1e-30))
         scale = np.array([1.0, 0.5 * width * width / sigma])  # d sigma / d log width
-        grouped = _grouped(expected, 10.0)
+        grouped = neighbours(expected, 10.0)
         got, wanted = np.add.reduceat(self.counts, grouped), np.add.reduceat(expected, grouped)
         square = float(((got - wanted) ** 2 / wanted).sum())
         fits = float(chi2.sf(square, max(len(grouped) - 3, 1)))
         return Edge(float(theta[0]), sigma, matrix * scale * scale[:, None], fits)
-
-
-def _grouped(expected: FloatArray, least: float) -> Sequence[int]:
-    """Starts of groups of neighbouring cells of which at least so much is expected."""
-    starts, held = [0], 0.0
-    for k, value in enumerate(expected[:-1]):
-        held += value
-        if held >= least:
-            starts.append(k + 1)
-            held = 0.0
-    if len(starts) > 1 and expected[starts[-1] :].sum() < least:
-        starts.pop()
-    return starts

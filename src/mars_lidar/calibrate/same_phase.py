@@ -18,12 +18,17 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
+from mars_lidar.calibrate.calibration_pass import CERTAIN
+from mars_lidar.calibrate.calibration_result import Calibration
 from mars_lidar.calibrate.interval_table import intervals_of
 from mars_lidar.calibrate.intervals import Stream
 
 _MOST = 250_000  # intervals looked at
 _CLASSES = 32
 _CHUNK = 2**15  # registrations at a time
+SIGNIFICANT = 5.0  # standard deviations
+_NARROW = 0.2  # units, of which a bin is one of a coarse clock
+_BRIGHT = 0.005  # photons of a unit of a clock that runs free: the phase alone does not tell their rate
 _LEAST = 12.0  # variance of a sum that a normal law is taken for
 
 
@@ -81,6 +86,26 @@ def same_phase(stream: Stream, begin_ns: float, reach_ns: float) -> SamePhase:
         expected += part.sum(1)
         second += part @ part.T
     return SamePhase(edges, observed, expected, np.diag(expected) - second)
+
+
+def departure_of(stream: Stream, found: Calibration) -> SamePhase:
+    """Registrations by age against those at the same phases, up to four dead times or two periods more.
+
+    From the age on from which the rate of an ideal pixel depends on the phase alone, with any jitter seen or hidden.
+    """
+    jitter = found.jitter_ns + 2.0 * found.jitter_error_ns if found.jitter_ns else found.jitter_limit_ns
+    first = found.summary.smallest_ns[0] if found.dead_time_by == "smallest interval" else found.dead_time_ns
+    begin = float(max(found.hold_off_ns, first + CERTAIN * np.nan_to_num(jitter)) + 2.0 * stream.unit_ns)
+    return same_phase(stream, begin, max(4.0 * begin, begin + 2.0 * stream.period_ns))
+
+
+def too_coarse(stream: Stream, rate: FloatArray) -> bool:
+    """Whether much light (n,) falls within one unit of a clock that does not run with the laser."""
+    if stream.unit_ns == 0.0 or stream.units > 0:
+        return False
+    bins = stream.unit_ns / stream.period_ns * rate.size  # of a unit
+    # of a bin that is hardly wider than a unit all light may be that of one unit
+    return bool(rate.max(initial=0.0) * (max(bins, 1.0) if bins > _NARROW else bins) > _BRIGHT)
 
 
 def _phases(t: FloatArray, period_ns: float) -> tuple[FloatArray, FloatArray]:

@@ -17,9 +17,8 @@ from mars_lidar.calibrate.calibration import Calibration, _system_of, calibrate
 from mars_lidar.calibrate.detector_model import is_plain, moves_records, stream_detector
 from mars_lidar.calibrate.fit_tests import Check, Compared
 from mars_lidar.calibrate.interval_table import age_table
-from mars_lidar.calibrate.intervals import stream_of
+from mars_lidar.calibrate.intervals import free_bins, stream_of
 from mars_lidar.calibrate.light_error import Fitted
-from mars_lidar.calibrate.phase_bins import free_bins
 from mars_lidar.calibrate.prediction import Prediction, cut, predict, system_of
 from mars_lidar.calibrate.recovery import Recovery, recovery_of
 from mars_lidar.instrument.detector import Detector
@@ -200,11 +199,12 @@ def validate(
     if (slow := calibration.armed.sensitivity) is not None:  # what a registration costs with its recovery, in the mean
         watched = float(armed_time(stream, dead, 1, slow).passes[0])
         blind = max(dead, (stream.cycles - watched) * stream.period_ns / max(stream.registrations, 1))
-    compared = Compared.of(law, counts, table[:, 1::2].sum(1), histogram, light, blind, number)
+    compared = Compared(law, counts, table[:, 1::2].sum(1), histogram, light, blind, number)
     tests = compared.checks(shape=calibration.waveform is None)
     ages = age_table(stream, light, dead, calibration.hold_off_ns, like=law.ages)
     tests += [Check(name, math.nan, math.nan, math.nan, p) for name, p in ages.p_values(light, law.ages).items()]
     floors, expected = compared.floors(), law.histogram
+    low, high = min(measured.first, law.count.first), max(measured.last, law.count.last)
     return Validation(
         calibration,
         system,
@@ -214,7 +214,7 @@ def validate(
         measured,
         total_variation(measured, law.count),
         floors[0],
-        _kl(measured, law.count),
+        float(kl_divergence(measured.on(low, high)[None], law.count.on(low, high))[0]),
         floors[1],
         histogram,
         0.5 * float(np.abs(histogram / histogram.sum() - expected / expected.sum()).sum()),
@@ -223,8 +223,3 @@ def validate(
         recovery_of(stream, calibration.rate, dead, calibration.hold_off_ns),
         alpha,
     )
-
-
-def _kl(measured: Pmf, predicted: Pmf) -> float:
-    low, high = min(measured.first, predicted.first), max(measured.last, predicted.last)
-    return float(kl_divergence(measured.on(low, high)[None], predicted.on(low, high))[0])

@@ -13,7 +13,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.compare.expected import PixelLaw
 from mars_lidar.compare.sample import Distance, Estimate, Moments, Sample, law_distance, ratio, score, shape_distance
-from mars_lidar.compare.views import example_pixels, incident_rate
+from mars_lidar.compare.views import by_signal, example_pixels, incident_rate, with_pixels
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
@@ -87,19 +87,12 @@ def telling_pixels(flux: Flux, depth_m: NDArray[np.float64], number: int) -> dic
     """
     count = checks.integer("pixels", number, low=1, high=6)
     named = example_pixels(flux, depth_m)
-    inside = np.zeros(flux.shape, bool)
-    rim = [n // 16 for n in flux.shape]  # as `example_pixels` leaves it out
-    inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
-    lit = np.flatnonzero((flux.signal > 0) & inside)
-    some = lit if lit.size else np.flatnonzero(inside)
-    by_signal = some[np.argsort(flux.signal.ravel()[some], kind="stable")]
+    inside, order = by_signal(flux)
+    order = order if order.size else np.flatnonzero(inside)
+    some = np.sort(order)
     by_total = some[np.argsort(flux.total.ravel()[some], kind="stable")]
-    more = {"median": by_signal[(by_signal.size - 1) // 2], "most": by_total[-1], "least": by_total[0]}
-    for name, flat in more.items():
-        pixel = (int(flat) // flux.shape[1], int(flat) % flux.shape[1])
-        if pixel not in named.values():
-            named[name] = pixel
-    return dict(list(named.items())[:count])
+    more = {"median": order[(order.size - 1) // 2], "most": by_total[-1], "least": by_total[0]}
+    return dict(list(with_pixels(named, more, flux).items())[:count])
 
 
 def signal_window(flux: Flux, system: System, y: int, x: int) -> NDArray[np.bool_]:

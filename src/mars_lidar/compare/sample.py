@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.distance import Pmf, sampling_floor, total_variation
+from mars_lidar.statistics.distance import Pmf, neighbours, sampling_floor, total_variation
 
 SIGNIFICANT = 5.0  # standard scores from which a deviation is called wrong: 6e-7 by chance
 _LARGEST_SCORE = 37.0  # of a p-value that a double still holds
@@ -101,14 +101,13 @@ class Sample:
         value = float(product.sum()) / (self.size - 1)
         return Estimate(value / total, float(product.std(ddof=1)) / math.sqrt(self.size) / total)
 
-    def shape_noise(self, cells: NDArray[np.intp], random: np.random.Generator) -> FloatArray:
-        """Errors (draws, cells) of the shape summed over `cells`, by the multiplier bootstrap.
+    def shape_noise(self, starts: NDArray[np.int64], random: np.random.Generator) -> FloatArray:
+        """Errors (draws, cells) of the shape summed over cells that begin at `starts`, by the multiplier bootstrap.
 
         Whatever the bins' dependence: whole exposures are reweighted, groups of them together where there are many,
         whose sums have the same covariance. The count of an exposure leaves the shape alone, so that residuals are
         taken from the shape times the count.
         """
-        starts = np.flatnonzero(np.diff(cells, prepend=-1))
         step = -(-self.size // _GROUPS)
         groups = np.arange(0, self.size, step)
         summed = np.stack([self.histograms[k : k + step].sum(0, dtype=np.uint32) for k in groups])
@@ -197,10 +196,10 @@ def shape_distance(sample: Sample, goal: Sample | FloatArray, random: np.random.
     else:
         total = float(goal.sum())
         known, other = (goal / total if total > 0 else goal), []
-    cells = _cells(np.minimum(sample.size, min((o.size for o in other), default=sample.size)) * sample.mean_histogram)
-    starts = np.flatnonzero(np.diff(cells, prepend=-1))
+    size = min(sample.size, *(o.size for o in other)) if other else sample.size
+    starts = neighbours(size * sample.mean_histogram, _LEAST)
     difference = np.add.reduceat(sample.shape - known, starts)
-    noise = np.sum([s.shape_noise(cells, random) for s in (sample, *other)], axis=0)
+    noise = np.sum([s.shape_noise(starts, random) for s in (sample, *other)], axis=0)
     return _distance(0.5 * float(np.abs(difference).sum()), 0.5 * np.abs(noise).sum(1))
 
 
@@ -228,20 +227,6 @@ def _distance(value: float, null: FloatArray) -> Distance:
         return Distance(value, mean, 0.0 if value <= mean + 1e-9 else _LARGEST_SCORE)
     p = gammaincc(mean * mean / variance, value * mean / variance)
     return Distance(value, mean, float(np.clip(-ndtri(p), -_LARGEST_SCORE, _LARGEST_SCORE)))
-
-
-def _cells(registrations: FloatArray) -> NDArray[np.intp]:
-    """Cell of each bin (bins,): neighbours join until a cell holds `_LEAST` registrations."""
-    cells = np.empty(registrations.size, np.intp)
-    number, held = 0, 0.0
-    for j, value in enumerate(registrations):
-        cells[j] = number
-        held += float(value)
-        if held >= _LEAST:
-            number, held = number + 1, 0.0
-    if number > 0:
-        cells[cells == number] = number - 1  # what is left over at the end
-    return cells
 
 
 def worst(estimates: Sequence[Estimate | Distance]) -> float:

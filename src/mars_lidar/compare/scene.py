@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from mars_lidar.compare.views import bin_depth_m
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruct.quality import depth_lag_m
 from mars_lidar.simulate import simulate
 
 
@@ -101,7 +101,8 @@ def scene_statistics(
         seconds.append(time.perf_counter() - began)
         total = cube[0].sum(-1, dtype=np.int64)
         counts.append(total)
-        errors.append(_depth_errors(cube[0], total, system, depth_m))
+        found = np.where(total > 0, bin_depth_m(system, cube[0].argmax(-1)), np.nan)
+        errors.append(depth_lag_m(system, found, depth_m))
     drawn = np.array(counts, dtype=np.float64)
     bias, dispersion = _against(expected, drawn)
     missed = np.abs(np.concatenate([e.ravel() for e in errors]))
@@ -149,12 +150,6 @@ def _mean(values: FloatArray, goal: float) -> Estimate:
     """Mean of independent values (n,)."""
     mean, error = float(values.mean()), float(values.std(ddof=1)) / math.sqrt(values.size)
     return Estimate(mean, error, score(mean - goal, error))
-
-
-def _depth_errors(cube: NDArray[Any], total: NDArray[np.int64], system: System, depth_m: FloatArray) -> FloatArray:
-    span = system.unambiguous_range_m
-    found = np.where(total > 0, bin_depth_m(system, cube.argmax(-1)), np.nan)
-    return np.asarray((found - depth_m + 0.5 * span) % span - 0.5 * span, dtype=np.float64)
 
 
 def _pulse_deviation_ns(system: System) -> float:

@@ -1,18 +1,21 @@
-"""What the pictures show: maps and rates computed from a cube, without matplotlib."""
+"""What the pictures show: maps and rates computed from a cube, or from the light fitted to it, without matplotlib."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar.instrument.system import System
+from mars_lidar.io.cube import Cube
+from mars_lidar.io.layout import MEASURED
+from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
-
-if TYPE_CHECKING:
-    from mars_lidar.io import Cube
+from mars_lidar.reconstruct import METHODS, reconstruct
+from mars_lidar.reconstruct.quality import depth_lag_m
 
 _READ_BYTES = 64 * 2**20
 _PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 10 us a period
@@ -48,13 +51,9 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
     Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
     the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
     """
-    inside = np.zeros(flux.shape, bool)
-    rim = [n // 16 for n in flux.shape]
-    inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
-    lit = np.flatnonzero((flux.signal > 0) & inside)
-    if lit.size == 0:
+    inside, order = by_signal(flux)
+    if order.size == 0:
         return {"first": (0, 0)}
-    order = lit[np.argsort(flux.signal.ravel()[lit], kind="stable")]
     flat = {"bright": order[int(0.98 * (order.size - 1))]}
     dim = order[int(0.05 * (order.size - 1))]
     if flux.signal.flat[dim] < flux.signal.flat[flat["bright"]]:
@@ -64,7 +63,20 @@ def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[
         slope[~np.isfinite(slope) | (flux.signal <= 0) | ~inside] = -1.0
         if slope.max() > 0:
             flat["edge"] = np.argmax(slope)
-    named: dict[str, tuple[int, int]] = {}
+    return with_pixels({}, flat, flux)
+
+
+def by_signal(flux: Flux) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """(H, W) pixels that do not belong to the rim of the image, and those with a return among them, flat, by signal."""
+    inside = np.zeros(flux.shape, bool)
+    rim = [n // 16 for n in flux.shape]
+    inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
+    lit = np.flatnonzero((flux.signal > 0) & inside)
+    return inside, lit[np.argsort(flux.signal.ravel()[lit], kind="stable")]
+
+
+def with_pixels(named: dict[str, tuple[int, int]], flat: dict[str, np.int64], flux: Flux) -> dict[str, tuple[int, int]]:
+    """Those `named` and those that `flat` names beside them, as (y, x)."""
     for name, k in flat.items():
         pixel = (int(k) // flux.shape[1], int(k) % flux.shape[1])
         if pixel not in named.values():
@@ -142,9 +154,7 @@ def law_arguments(flux: Flux, system: System, y: int, x: int) -> dict[str, Any]:
 
 def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing."""
-    span = cube.system.unambiguous_range_m
-    wrapped = (estimate_m - cube.depth_m + 0.5 * span) % span - 0.5 * span
-    return np.asarray(wrapped, dtype=np.float64)
+    return depth_lag_m(cube.system, estimate_m, cube.depth_m)
 
 
 def _peak_offset_ns(system: System) -> float:
@@ -154,3 +164,35 @@ def _peak_offset_ns(system: System) -> float:
     edges = np.linspace(low, high, fine + 1)
     peak = int(np.argmax(np.diff(system.pulse.cumulative(edges))))
     return float(0.5 * (edges[peak] + edges[peak + 1]))
+
+
+def fitted(cube: Cube, realization: int) -> Cube:
+    """One exposure of a measured cube with the flux that maximum likelihood finds in it; a simulated one as it is.
+
+    The flux is that of detectable photons, so the system is `System.detected`. Depth is NaN where no return is seen.
+    Detectors that maximum likelihood does not hold for are fitted by the first of the other methods that does.
+    """
+    if not cube.measured:
+        return cube
+    system = cube.system
+    counts = np.asarray(cube.histogram[realization])
+    names = ("maximum_likelihood", *(name for name in METHODS if name != "maximum_likelihood"))
+    for name in names:
+        with suppress(ValueError):
+            METHODS[name].check(system)
+            break
+    found = reconstruct(counts, system, name)
+    seen = found.seen & np.isfinite(found.signal)
+    flux = Flux(
+        np.where(seen, found.signal, 0.0),
+        np.where(np.isfinite(found.background), found.background, 0.0),
+        np.where(seen, found.delay_ns, 0.0),
+    )
+    recipe = Recipe(
+        system=system.detected(),
+        flux=flux,
+        engine=MEASURED,
+        depth_m=np.where(seen, found.depth_m, np.nan),
+        source=cube.recipe.source,
+    )
+    return Cube(histogram=counts[None], recipe=recipe, version=cube.version)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar.cuda.kernels import Sink, Variant, block_bytes
-from mars_lidar.cuda.machine import Machine
+from mars_lidar.cuda.machine import Cuda
 from mars_lidar.engines.engine import Records, Task
 
 _WARP = 32
@@ -18,7 +18,7 @@ _LAUNCH_ITEMS = 1 << 22
 _LEAST_WARPS = 3  # of histograms that must fit into a multiprocessor, else they are counted in the device's memory
 
 
-def exact_histogram(task: Task, out: Any, machine: Machine, *, in_block: bool | None = None) -> None:
+def exact_histogram(task: Task, out: Any, machine: Cuda, *, in_block: bool | None = None) -> None:
     """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor.
 
     `in_block` says where histograms are counted: in the memory of a block (True), in the device's (False), or
@@ -32,7 +32,7 @@ def exact_histogram(task: Task, out: Any, machine: Machine, *, in_block: bool | 
     _run(task, sink, {"out": out}, _arrays(task, machine), machine)
 
 
-def exact_records(task: Task, machine: Machine) -> Records:
+def exact_records(task: Task, machine: Cuda) -> Records:
     """Timestamps: counted, then drawn again with a place to go; the records are copied to the processor."""
     arrays = _arrays(task, machine)
     counts = machine.empty((task.items,), np.int64)
@@ -49,7 +49,7 @@ def exact_records(task: Task, machine: Machine) -> Records:
     return Records(offsets, *(machine.host(there[name]) for name in ("times", "cycles", "bins")))
 
 
-def _arrays(task: Task, machine: Machine) -> dict[str, Any]:
+def _arrays(task: Task, machine: Cuda) -> dict[str, Any]:
     """What the kernel reads, by name: flux, tables of the pulse, order of the pixels, starts of the exposures."""
     here: dict[str, NDArray[Any]] = {
         **task.pixel_arrays(),
@@ -63,7 +63,7 @@ def _arrays(task: Task, machine: Machine) -> dict[str, Any]:
     return {name: machine.array(array) for name, array in here.items() if array.size}
 
 
-def _run(task: Task, sink: Sink, to: dict[str, Any], arrays: dict[str, Any], machine: Machine) -> None:
+def _run(task: Task, sink: Sink, to: dict[str, Any], arrays: dict[str, Any], machine: Cuda) -> None:
     addresses = {name: machine.address(array) for name, array in (arrays | to).items() if array.size}
     in_block = sink in (Sink.BLOCK16, Sink.BLOCK32)
     lanes = _WARP if in_block else _ROW_THREADS

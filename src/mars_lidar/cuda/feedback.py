@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import IndexArray, Progress
 from mars_lidar.cuda.kernels import feedback_histograms, overflow
-from mars_lidar.cuda.machine import Machine
+from mars_lidar.cuda.machine import Cuda
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.feedback_grid import near_pulse
 from mars_lidar.engines.feedback_rule import Grid, Plan, sweep_pixels
@@ -25,7 +25,7 @@ _STREAMS_EACH = 4  # batches for each warp in flight, where there are realizatio
 Draw = Callable[[Task, Any], None]
 
 
-def feedback_histogram(task: Task, out: Any, machine: Machine, draw_exactly: Draw, *, warps: int | None = None) -> None:
+def feedback_histogram(task: Task, out: Any, machine: Cuda, draw_exactly: Draw, *, warps: int | None = None) -> None:
     """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor.
 
     What the sweeps are not tried on, what they refuse, and single exposures that do not settle are drawn by
@@ -52,7 +52,7 @@ def feedback_histogram(task: Task, out: Any, machine: Machine, draw_exactly: Dra
         task.progress(task.items, task.items)
 
 
-def _arrays(task: Task, machine: Machine) -> dict[str, Any]:
+def _arrays(task: Task, machine: Cuda) -> dict[str, Any]:
     """What the kernel reads of the pixels and the pulse."""
     here: dict[str, NDArray[Any]] = {
         **task.pixel_arrays(),
@@ -64,7 +64,7 @@ def _arrays(task: Task, machine: Machine) -> dict[str, Any]:
 
 
 def _launch(
-    task: Task, out: Any, pixels: IndexArray, grid: Grid, common: dict[str, Any], machine: Machine, warps: int | None
+    task: Task, out: Any, pixels: IndexArray, grid: Grid, common: dict[str, Any], machine: Cuda, warps: int | None
 ) -> NDArray[np.uint8]:
     """Draw some pixels (n,) on one internal grid; the status (realizations, n) of each exposure."""
     on = (grid.merge, grid.parts, near_pulse(task.system, grid.merge), grid.laps)

@@ -91,13 +91,8 @@ class Variant:
     @property
     def kernel(self) -> Kernel:
         """As it is compiled."""
-        return Kernel("cuda/exact.h", self.expression)
-
-    @property
-    def expression(self) -> str:
-        """Name of the kernel in C++."""
         flags = ", ".join(str(flag).lower() for flag in (self.gaussian, self.whole, self.single))
-        return f"mars::exact_items<{self.mode}, {flags}, {int(self.sink)}, {self.ahead}>"
+        return Kernel("cuda/exact.h", f"mars::exact_items<{self.mode}, {flags}, {int(self.sink)}, {self.ahead}>")
 
 
 def overflow(itemsize: int) -> OverflowError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,41 +35,16 @@ def cupy_with_device() -> Any:
     return cupy
 
 
-class Machine(Protocol):
-    """Arrays and launches, in the order of one stream."""
-
-    shared_bytes: int  # of memory that a block can have
-    key: Any  # names the device
-
-    def array(self, host: NDArray[Any]) -> Any:
-        """A copy there."""
-
-    def zeros(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """An array there."""
-
-    def empty(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        """Room for an array of anything."""
-
-    def host(self, array: Any) -> NDArray[Any]:
-        """A copy here, when everything queued before is done."""
-
-    def address(self, array: Any) -> int:
-        """Address of an array's memory."""
-
-    def resident(self, kernel: Kernel, lanes: int, shared: int) -> int:
-        """Blocks that the machine runs at the same time."""
-
-    def launch(self, kernel: Kernel, blocks: int, lanes: int, argument: bytes, shared: int = 0) -> None:
-        """Queue a kernel of one argument."""
-
-
 class Cuda:
-    """CuPy's current device and stream."""
+    """Arrays and launches, in the order of one stream: CuPy's current device and stream.
+
+    `shared_bytes` of memory can a block have; `key` names the device.
+    """
 
     def __init__(self) -> None:
         self._cupy = cupy_with_device()
         self._device = self._cupy.cuda.Device()
-        self.key = int(self._device.id)
+        self.key: Any = int(self._device.id)
         self.shared_bytes = int(self._device.attributes["MaxSharedMemoryPerBlockOptin"])
 
     def array(self, host: NDArray[Any]) -> Any:

@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.cuda.kernels import MARS_LAWS, mars_histograms, overflow
-from mars_lidar.cuda.machine import Machine
-from mars_lidar.engines.alignment import Frame, pulse_frame
+from mars_lidar.cuda.machine import Cuda
+from mars_lidar.engines.alignment import Frame, pulse_frame, shift_of
 from mars_lidar.engines.counts import Streams
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.parts import part_of
 from mars_lidar.engines.pixels import single_return
 from mars_lidar.engines.synthesis import Run
-from mars_lidar.engines.table_laws import exact_laws
-from mars_lidar.engines.table_reader import TableReader
+from mars_lidar.engines.table_reader import TableReader, exact_laws
 
 if TYPE_CHECKING:
     from mars_lidar.engines.mars import MarsEngine
@@ -56,7 +55,7 @@ def check_mars(task_flux_most: float, cycles: int, dead_time_periods: float) -> 
         )
 
 
-def mars_histogram(engine: MarsEngine, task: Task, out: Any, machine: Machine) -> None:
+def mars_histogram(engine: MarsEngine, task: Task, out: Any, machine: Cuda) -> None:
     """Fill `out` (items, bins), a C-contiguous array of the machine, with the bits of the processor."""
     reader = engine.reader
     assert reader is not None  # see cuda.check
@@ -82,7 +81,7 @@ def _on_grid(table: Table, signal: FloatArray, background: FloatArray) -> tuple[
 class _Launches:
     """One task's kernels, and the arrays between them."""
 
-    def __init__(self, engine: MarsEngine, reader: TableReader, task: Task, machine: Machine) -> None:
+    def __init__(self, engine: MarsEngine, reader: TableReader, task: Task, machine: Cuda) -> None:
         self.engine, self.reader, self.task, self.machine = engine, reader, task, machine
         self.cycles = task.system.cycles
         self.frame = pulse_frame(task.system)
@@ -102,15 +101,12 @@ class _Launches:
         task, machine, n = self.task, self.machine, pixels.size
         signal, background, delay_ns = self._light(pixels)
         period = task.system.period_ns
-        shift = delay_ns / period - 0.5  # as Alignment.of
-        shift -= np.floor(shift)
-        shift[shift >= 1.0] = 0.0
         phase = (0.5 * period - delay_ns) / period  # as Table.lookup
         phase -= np.floor(phase)
         here: dict[str, NDArray[Any]] = {
             "signal": signal,
             "background": background,
-            "shift": shift,
+            "shift": shift_of(delay_ns, period),
             "phase": phase,
             "place": pixels,
             "pixel_index": np.ascontiguousarray(task.pixel_index[pixels]),
@@ -221,7 +217,7 @@ class _Launches:
         return {name: self.machine.address(array) for name, array in self.arrays.items() if array.size}
 
 
-def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, machine: Machine) -> TableThere:
+def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, machine: Cuda) -> TableThere:
     """The table on the machine; that of the last number of cycles stays as long as the table lives."""
     kept = _tables.setdefault(table, {})
     key = machine.key
@@ -252,7 +248,7 @@ def _table_there(table: Table, cycles: int, dead_time: float, frame: Frame, mach
     return there
 
 
-def _on_host(engine: MarsEngine, task: Task, out: Any, machine: Machine, pixels: IndexArray) -> None:
+def _on_host(engine: MarsEngine, task: Task, out: Any, machine: Cuda, pixels: IndexArray) -> None:
     """Pixels beyond the table: evaluated and drawn by the processor, then copied."""
     from mars_lidar.engines.mars import MarsEngine
 

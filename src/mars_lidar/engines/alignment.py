@@ -58,16 +58,21 @@ class Alignment:
         cls, system: System, signal: FloatArray, background: FloatArray, delay_ns: FloatArray, rate: FloatArray
     ) -> Alignment:
         """From the pixels' own S, B, delays and registrations per period."""
-        shift = np.nan_to_num(delay_ns / system.period_ns) - 0.5
-        shift -= np.floor(shift)
-        shift[shift >= 1.0] = 0.0
-        return cls(shift, signal, background, rate, pulse_frame(system))
+        return cls(shift_of(delay_ns, system.period_ns), signal, background, rate, pulse_frame(system))
 
     def part(self, pixels: slice) -> Alignment:
         """That of some of the pixels."""
         return Alignment(
             self.shift[pixels], self.signal[pixels], self.background[pixels], self.rate[pixels], self.frame
         )
+
+
+def shift_of(delay_ns: FloatArray, period_ns: float) -> FloatArray:
+    """By how much delays (pixels,) are behind the canonical one: periods in [0, 1)."""
+    shift = np.nan_to_num(delay_ns / period_ns) - 0.5
+    shift -= np.floor(shift)
+    shift[shift >= 1.0] = 0.0
+    return shift
 
 
 def pulse_frame(system: System) -> Frame:

@@ -11,8 +11,7 @@ from mars_lidar.engines.counts import CountLaws, Matched, Mended, Poisson, Round
 from mars_lidar.engines.options import Count, Interpolation, Outside
 from mars_lidar.engines.pixels import Group, groups
 from mars_lidar.engines.synthesis import Batch, Run
-from mars_lidar.engines.table_laws import exact_laws, untrusted
-from mars_lidar.engines.table_reader import Entries, TableReader
+from mars_lidar.engines.table_reader import Entries, TableReader, exact_laws, untrusted
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 

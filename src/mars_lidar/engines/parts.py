@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import Progress
 from mars_lidar.engines.engine import Engine, Task
-from mars_lidar.light.flux import Flux
+from mars_lidar.light.flux import Flux, made
 
 _TICKS = 1000
 _BUFFER_BYTES = 64 << 20  # of histograms drawn aside before they are put in place
@@ -29,18 +29,10 @@ def stage(progress: Progress | None, start: float, end: float) -> Progress | Non
 
 def _pixels_of(flux: Flux, pixels: NDArray[np.int64]) -> Flux:
     """The flux of some pixels (n,), as an image of one row."""
-    n = pixels.size
-    background = flux.background.reshape(-1)[pixels].reshape(1, n)
-    if flux.waveform is not None:
-        return Flux(waveform=flux.waveform.reshape(-1, flux.waveform.shape[-1])[pixels][None], background=background)
-    number = len(flux.returns_signal)
-    signal = flux.returns_signal.reshape(number, -1)[:, pixels]
-    delay = flux.returns_delay_ns.reshape(number, -1)[:, pixels]
-    if number == 1:
-        return Flux(signal, background, delay)
-    dark = np.zeros_like(background)
-    every = enumerate(zip(signal, delay, strict=True))
-    return Flux.multi(*(Flux(s[None], dark if k else background, tau[None]) for k, (s, tau) in every))
+    wave, number, every = flux.waveform, len(flux.returns_signal), flux.background.size
+    signal, delay = (a.reshape(number, 1, every)[..., pixels] for a in (flux.returns_signal, flux.returns_delay_ns))
+    background = flux.background.reshape(1, -1)[:, pixels]
+    return made(signal, delay, background, None if wave is None else wave.reshape(1, -1, wave.shape[-1])[:, pixels])
 
 
 def part_of(

@@ -83,19 +83,15 @@ def _laws(system: System, signal: FloatArray, background: FloatArray) -> CountLa
 
 def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:
     """Shapes (cells, bins) and registrations per period (cells,)."""
-    from mars_lidar.statistics.chain import PhaseChain
-    from mars_lidar.statistics.methods import pixel_of
+    from mars_lidar.statistics.shape import chain_of
 
     cells, system = group.cells, run.task.system
     shapes, rates = np.zeros((cells.size, system.bins)), np.zeros(cells.size)
     for k in range(cells.size):
         if run.waiting is not None:
             run.waiting(k, cells.size)
-        background = float(cells.background[k])
-        signal, waveform, delay = pixel_of(cells, k)
-        if cells.signal[k] + background == 0.0:
-            continue
-        chain = PhaseChain.from_flux(signal, background, system, delay_ns=delay, waveform=waveform)
-        stationary = chain.stationary()
-        shapes[k], rates[k] = stationary.pdf.reshape(system.bins, -1).sum(-1), stationary.rate
+        chain = chain_of(cells, k)
+        if chain is not None:
+            stationary = chain.stationary()
+            shapes[k], rates[k] = stationary.pdf.reshape(system.bins, -1).sum(-1), stationary.rate
     return as_shapes(shapes), rates

@@ -1,4 +1,7 @@
-"""What engines ask of a lookup table: that it fits the system, the entries of pixels, a record for a cube's file."""
+"""What engines ask of a lookup table: that it fits the system, the entries of pixels, a record for a cube's file.
+
+And exact laws of the count for pixels whose four cumulants do not fix it.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,16 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.engines.alignment import Alignment
-from mars_lidar.engines.counts import CountLaws
+from mars_lidar.engines.counts import CountLaws, Tabulated
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.pixels import single_return
-from mars_lidar.engines.synthesis import Batch
+from mars_lidar.engines.synthesis import Batch, Run
+from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.count_window import Pmf
+from mars_lidar.statistics.pmf import guessed_windows
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table
@@ -170,3 +177,58 @@ def table_record(table: Table) -> dict[str, Any]:
         "signal": [float(signal[0]), float(signal[-1]), signal.size],
         "background": [float(background[0]), float(background[-1]), background.size],
     }
+
+
+def untrusted(run: Run, reader: TableReader, entries: Entries) -> IndexArray:
+    """Which of the pixels (ascending) need an exact law: `statistics.matched.trusted`. None of a table of Gaussians."""
+    if reader.table.method == "mars" or run.task.system.dead_time_periods == 0.0:
+        return np.empty(0, np.int64)
+    from mars_lidar.statistics.matched import trusted
+
+    return np.flatnonzero(~trusted(entries.cumulants, threads=run.task.threads))
+
+
+def exact_laws(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> Tabulated:
+    """Laws of the pixels `at`, each distinct one evaluated once; those that the table keeps are taken from it."""
+    keys = _keys(run, reader, entries, at)
+    _, first, law = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    windows = _kept(run, reader, entries, at[first], keys[first])
+    left = np.array([k for k, window in enumerate(windows) if window is None], np.int64)
+    if left.size:
+        signal, background, phase = keys[first[left]].T
+        system, chosen = run.task.system, at[first[left]]
+        cells = Cells.of(
+            signal, background, system, delay_ns=phase * system.period_ns, effects=LIGHT_EFFECTS + TIMING_EFFECTS
+        )
+        own = reader.table.entries.bins[entries.rows[chosen]]
+        bins = np.where(entries.weights[chosen] > 0.0, own, 0).max(-1)  # the finest grid that a corner needed
+        tell = run.waiting
+        waiting = None if tell is None else lambda done: tell(done, left.size)
+        found = guessed_windows(cells, entries.cumulants[chosen], bins, run.task.threads, waiting)
+        for k, window in zip(left, found, strict=True):
+            windows[k] = window
+    run.count("laws_evaluated", left.size)
+    return Tabulated.of([window for window in windows if window is not None], law.reshape(-1).astype(np.int64))
+
+
+def _keys(run: Run, reader: TableReader, entries: Entries, at: IndexArray) -> FloatArray:
+    """S, B and delay in periods (pixels, 3): of the pixel, or with the nearest entry's law of that one."""
+    table = reader.table
+    signal, background = entries.signal[at], entries.background[at]
+    if reader.interpolation == "nearest":
+        node = entries.rows[at, 0]
+        signal, background = table.signal[node // table.background.size], table.background[node % table.background.size]
+    phase = entries.delay_ns[at] / run.task.system.period_ns
+    return np.stack([signal, background, np.where(signal > 0.0, phase - np.floor(phase), 0.5)], axis=-1)
+
+
+def _kept(run: Run, reader: TableReader, entries: Entries, pixels: IndexArray, keys: FloatArray) -> list[Pmf | None]:
+    """Laws that the table keeps: of its entries, for its own number of cycles, at its delay."""
+    table = reader.table
+    if run.task.system.cycles != table.entries.cycles:
+        return [None] * pixels.size
+    heaviest = entries.weights[pixels].argmax(-1)
+    rows = entries.rows[pixels, heaviest]
+    signal, background = table.signal[rows // table.background.size], table.background[rows % table.background.size]
+    same = (keys[:, 0] == signal) & (keys[:, 1] == background) & (keys[:, 2] == 0.5)
+    return [table.laws.window(int(row)) if kept else None for row, kept in zip(rows, same, strict=True)]

@@ -81,21 +81,22 @@ class Flux:
             if signal is not None or delay_ns is not None:
                 raise ValueError("waveform replaces signal and delay_ns: give it alone, or with background")
             wave, back = waveform_maps(waveform, background)
-            _fill(self, np.empty((0, *back.shape)), np.empty((0, *back.shape)), back, wave, info)
+            none = np.empty((0, *back.shape))
+            vars(self).update(vars(made(none, none, back, wave, info)))
             return
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
         if np.ndim(signal) == 3:
             returns = _each_return(signal, delay_ns)
             both = Flux.multi(*(Flux(s, background if k == 0 else 0.0, tau) for k, (s, tau) in enumerate(returns)))
-            _fill(self, both.returns_signal, both.returns_delay_ns, both.background, None, info)
+            vars(self).update(vars(both), info=dict(info or {}))
             return
         maps = [light_map("signal", signal), light_map("background", background)]
         maps.append(light_map("delay_ns", 0.0 if delay_ns is None else delay_ns, photons=False))
         s, b, tau = broadcast(("signal", "background", "delay_ns"), maps)
         if delay_ns is None and (s > 0).any():
             raise ValueError("delay_ns must be given where signal > 0")
-        _fill(self, s[None], tau[None], b, None, info)
+        vars(self).update(vars(made(s[None], tau[None], b, None, info)))
 
     @classmethod
     def multi(cls, *fluxes: Flux, info: dict[str, Any] | None = None) -> Flux:
@@ -111,18 +112,15 @@ class Flux:
             raise ValueError("multi cannot mix waveforms with returns; write the returns into the waveform")
         shape = common_shape(tuple(f"fluxes[{k}]" for k in range(len(fluxes))), [f.shape for f in fluxes])
         back = np.sum([np.broadcast_to(f.background, shape) for f in fluxes], axis=0)
-        self = cls.__new__(cls)
         if waves:
             lengths = {w.shape[-1] for w in waves}
             if len(lengths) > 1:
                 raise ValueError(f"waveforms must have equal lengths to add up, got {sorted(lengths)}")
             wave = np.sum([np.broadcast_to(w, (*shape, w.shape[-1])) for w in waves], axis=0)
-            _fill(self, np.empty((0, *shape)), np.empty((0, *shape)), back, wave, info)
-            return self
+            return made(np.empty((0, *shape)), np.empty((0, *shape)), back, wave, info)
         s = np.concatenate([np.broadcast_to(f.returns_signal, (len(f.returns_signal), *shape)) for f in fluxes])
         tau = np.concatenate([np.broadcast_to(f.returns_delay_ns, (len(f.returns_delay_ns), *shape)) for f in fluxes])
-        _fill(self, s, tau, back, None, info)
-        return self
+        return made(s, tau, back, None, info)
 
     @classmethod
     def from_transient(
@@ -145,7 +143,7 @@ class Flux:
         counts are background: what a pixel registers of this flux is exactly what one without these two effects
         (`System.detected`) registers of the flux returned. This flux itself where neither is on.
         """
-        share, dark = system.detector.detection_efficiency, _dark_photons(system.detector.dark_count_hz, system)
+        share, dark = system.detector.detection_efficiency, system.detector.dark_count_hz * (system.period_ns * 1e-9)
         if share == 1.0 and dark == 0.0:
             return self
         return self._scaled(share, dark)
@@ -169,15 +167,14 @@ class Flux:
         common_shape(("flux", "rate_hz"), [self.shape, rate.shape])
         if np.broadcast_shapes(self.shape, rate.shape) != self.shape:
             raise ValueError(f"rate_hz must be a scalar or {self.shape}, got {rate.shape}")
-        return self._scaled(1.0, _dark_photons(rate, system) / system.detector.detection_efficiency)
+        return self._scaled(1.0, rate * (system.period_ns * 1e-9) / system.detector.detection_efficiency)
 
     def _scaled(self, share: float, more: float | FloatArray) -> Flux:
         """Signal and background times `share`, and more background."""
         background = self.background * share + more
         check_photons("background with dark counts", background)
-        flux, wave = Flux.__new__(Flux), None if self.waveform is None else self.waveform * share
-        _fill(flux, self.returns_signal * share, self.returns_delay_ns, background, wave, self.info)
-        return flux
+        wave = None if self.waveform is None else self.waveform * share
+        return made(self.returns_signal * share, self.returns_delay_ns, background, wave, self.info)
 
     @checked
     def in_fog(
@@ -238,14 +235,9 @@ class Flux:
                 raise IndexError(f"index {k} is out of range for an axis of {n} pixels")
             if not isinstance(k, (int, np.integer, slice)):
                 raise IndexError(f"flux takes integers and slices, got {k!r}")
-        part = Flux.__new__(Flux)
-        _fill(
-            part,
-            self.returns_signal[(slice(None), *window)],
-            self.returns_delay_ns[(slice(None), *window)],
-            self.background[window],
-            None if self.waveform is None else self.waveform[window],
-            self.info,
+        returns, wave = (slice(None), *window), None if self.waveform is None else self.waveform[window]
+        part = made(
+            self.returns_signal[returns], self.returns_delay_ns[returns], self.background[window], wave, self.info
         )
         if 0 in part.shape:
             raise IndexError(f"flux{list(keys)} selects no pixel of {self.shape}")
@@ -274,37 +266,27 @@ def _each_return(signal: Any, delay_ns: Any) -> Iterator[tuple[Any, Any]]:
     return zip(signal, delay_ns, strict=True)
 
 
-def _dark_photons(rate_hz: float | FloatArray, system: System) -> float | FloatArray:
-    """Dark counts per period."""
-    return rate_hz * (system.period_ns * 1e-9)
-
-
-def _fill(
-    flux: Flux,
+def made(
     signal: FloatArray,
-    delay: FloatArray,
+    delay_ns: FloatArray,
     background: FloatArray,
     waveform: FloatArray | None,
-    info: dict[str, Any] | None,
-) -> None:
-    lost = np.isnan(delay)
+    info: dict[str, Any] | None = None,
+) -> Flux:
+    """A flux of checked parts: returns (K, H, W), background (H, W), and waveforms (H, W, T) or None."""
+    lost = np.isnan(delay_ns)
     if lost.any() and (lost := lost & (signal > 0)).any():
         where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
         raise ValueError(f"delay_ns must be finite where signal > 0, got NaN at pixel {where}")
     if waveform is not None:
         total, nearest = waveform.sum(-1), np.full(background.shape, np.nan)
     elif len(signal) == 1:
-        total, nearest = signal[0], delay[0]
+        total, nearest = signal[0], delay_ns[0]
     else:
         total = signal.sum(0)
-        nearest = np.take_along_axis(delay, signal.argmax(0)[None], axis=0)[0]
-    for name, array in {
-        "signal": total,
-        "background": background,
-        "delay_ns": nearest,
-        "returns_signal": signal,
-        "returns_delay_ns": delay,
-    }.items():
-        object.__setattr__(flux, name, frozen(array))
-    object.__setattr__(flux, "waveform", None if waveform is None else frozen(waveform))
-    object.__setattr__(flux, "info", dict(info or {}))
+        nearest = np.take_along_axis(delay_ns, signal.argmax(0)[None], axis=0)[0]
+    flux, maps = Flux.__new__(Flux), {"signal": total, "background": background, "delay_ns": nearest}
+    maps |= {"returns_signal": signal, "returns_delay_ns": delay_ns}
+    vars(flux).update({name: frozen(array) for name, array in maps.items()})
+    vars(flux).update(waveform=None if waveform is None else frozen(waveform), info=dict(info or {}))
+    return flux

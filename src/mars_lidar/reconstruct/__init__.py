@@ -1,7 +1,6 @@
 """Reconstruction: depth, signal and background of every pixel of a cube, with errors and bounds."""
 
-from mars_lidar.reconstruct.coates import Coates, coates_rates
-from mars_lidar.reconstruct.generalised_coates import GeneralisedCoates, generalised_coates_rates
+from mars_lidar.reconstruct.coates import Coates, GeneralisedCoates, coates_rates, generalised_coates_rates
 from mars_lidar.reconstruct.histogram_bound import (
     HistogramBound,
     cramer_rao,
@@ -9,13 +8,11 @@ from mars_lidar.reconstruct.histogram_bound import (
     window_error,
     window_weights,
 )
-from mars_lidar.reconstruct.matched_filter import MatchedFilter
+from mars_lidar.reconstruct.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood, log_likelihood
 from mars_lidar.reconstruct.mchc import ChainCorrection, mchc_rates
 from mars_lidar.reconstruct.method import Flags, Method
-from mars_lidar.reconstruct.methods import METHODS
-from mars_lidar.reconstruct.peak import Peak
-from mars_lidar.reconstruct.reconstruction import Reconstruction, reconstruct
+from mars_lidar.reconstruct.reconstruction import METHODS, Reconstruction, reconstruct
 from mars_lidar.reconstruct.returns import Returns
 
 __all__ = [

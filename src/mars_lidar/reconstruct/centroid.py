@@ -19,22 +19,21 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.histogram_record import core_ns
 from mars_lidar.reconstruct.histograms import Histograms
-from mars_lidar.reconstruct.method import Estimates, Method, window_estimates
+from mars_lidar.reconstruct.matched_filter import Peak
+from mars_lidar.reconstruct.method import Estimates
 
 _BLOCK = 2**22  # counts gathered at a time
 
 
 @dataclass(frozen=True)
-class Centroid(Method):
+class Centroid(Peak):
     """Delay at the centre of mass (1) of the counts round the largest bin, less those of the background."""
 
     name = "centroid"
-    modes = ("nonparalyzable", "paralyzable", "synchronous", "gated")
-    assumes = "so little light that dead time loses nothing, many signal photons"
 
     def estimate(self, histograms: Histograms) -> Estimates:
         """Delay, and signal and background of the window round the peak."""
-        found = window_estimates(histograms, "peak")
+        found = super().estimate(histograms)
         delay = found.delay.copy()
         rows = max(1, _BLOCK // (2 * _reach(histograms.system) + 1))
         for first in range(0, delay.size, rows):

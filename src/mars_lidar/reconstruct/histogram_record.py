@@ -25,12 +25,13 @@ _OUTSIDE_CORE = 0.0015  # of the energy on either side of the window in which th
 def recording_of(system: System) -> _core.HistogramRecord:
     """The native form of a system whose gate, if any, does not move; times in laser periods."""
     from mars_lidar._base.native import _core
+    from mars_lidar.statistics.grid import whole_bins
 
     low, cell, energy, slope = _curve(system.pulse, system.period_ns)
-    knots = low + cell * np.arange(energy.size, dtype=np.float64)
+    peak = low + cell * (int(np.argmax(np.diff(energy))) + 0.5)
     core = core_ns(system)
     sharpness = float(np.sum(np.diff(energy) ** 2)) / cell  # integral of s^2
-    whole, shift, fraction = _dead_time(system)
+    whole, shift, fraction = whole_bins(system.dead_time_periods, system.bins)
     open_low, open_high = open_bins(system)
     return _core.HistogramRecord(
         bins=system.bins,
@@ -44,7 +45,7 @@ def recording_of(system: System) -> _core.HistogramRecord:
         pulse_cell=cell,
         energy=energy,
         slope=slope,
-        peak=_peak(system.pulse, knots, energy),
+        peak=0.0 if isinstance(system.pulse, GaussianPulse) else peak,
         width=pulse_width(sharpness),
         core_low=core[0] / system.period_ns,
         core_high=core[1] / system.period_ns,
@@ -117,27 +118,6 @@ def _monotone_slopes(energy: FloatArray, cell: float) -> FloatArray:
         return np.diff(energy).repeat(2) / cell
     knots = cell * np.arange(energy.size)
     return np.ascontiguousarray(PchipInterpolator(knots, energy).derivative()(knots), dtype=np.float64)
-
-
-def _peak(pulse: Pulse, knots: FloatArray, energy: FloatArray) -> float:
-    if isinstance(pulse, GaussianPulse):
-        return 0.0
-    k = int(np.argmax(np.diff(energy)))
-    return float(0.5 * (knots[k] + knots[k + 1]))
-
-
-def _dead_time(system: System) -> tuple[int, int, float]:
-    """Whole periods, whole bins of the rest, and the fraction of a bin that is left."""
-    dead, bins = system.dead_time_periods, system.bins
-    whole = math.floor(dead)
-    position = (dead - whole) * bins
-    shift = math.floor(position)
-    fraction = position - shift
-    if fraction < 1e-9:
-        fraction = 0.0
-    elif fraction > 1.0 - 1e-9:
-        shift, fraction = shift + 1, 0.0
-    return (whole + 1, 0, fraction) if shift == bins else (whole, shift, fraction)
 
 
 def open_bins(system: System) -> tuple[FloatArray, FloatArray]:

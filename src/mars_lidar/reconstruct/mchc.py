@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.reconstruct.histograms import Histograms, checked
-from mars_lidar.reconstruct.method import _CHAIN, Estimates, RateMethod, corrected_rates, window_estimates
+from mars_lidar.reconstruct.method import _CHAIN, RateMethod
 
 
 @dataclass(frozen=True)
@@ -54,11 +52,10 @@ class ChainCorrection(RateMethod):
                 f"{system.detector.dead_time_ns:g} ns; use 'generalised_coates'"
             )
 
-    def estimate(self, histograms: Histograms) -> Estimates:
-        """Delay by the filter, signal and background by its window."""
-        return window_estimates(
-            histograms, self.filter, self.correction, steps=self.iterations, tolerance=self.tolerance
-        )
+    @property
+    def settings(self) -> dict[str, float]:
+        """Steps and the movement at which they end."""
+        return {"steps": self.iterations, "tolerance": self.tolerance}
 
 
 def mchc_rates(
@@ -75,13 +72,4 @@ def mchc_rates(
     `total`: photons per period in all, a scalar or (...), where they are known, from the times between registrations
     for instance.
     """
-    method = ChainCorrection(iterations=iterations, tolerance=tolerance)
-    given, shape = checked(cube, system, threads)
-    method.check(system)
-    flat = None
-    if total is not None:
-        flat = np.ascontiguousarray(np.broadcast_to(np.asarray(total, np.float64), shape).reshape(-1))
-        if not ((flat > 0) & np.isfinite(flat)).all():
-            raise ValueError("total must be finite and positive, photons per period")
-    rates = corrected_rates(given, _CHAIN, steps=iterations, tolerance=tolerance, total=flat)
-    return rates.reshape(*shape, system.bins)
+    return ChainCorrection(iterations=iterations, tolerance=tolerance).rates(cube, system, threads, total)

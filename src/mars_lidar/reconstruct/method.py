@@ -126,25 +126,43 @@ class RateMethod(Method):
     def __post_init__(self) -> None:
         checks.choice("filter", self.filter, FILTERS)
 
+    @property
+    def settings(self) -> dict[str, float]:
+        """Of the correction, as the native core names them."""
+        return {"steps": 0, "tolerance": 0.0}
+
     def estimate(self, histograms: Histograms) -> Estimates:
         """Delay by the filter, signal and background by its window, and their standard errors."""
-        return window_estimates(histograms, self.filter, self.correction)
+        return window_estimates(histograms, self.filter, self.correction, **self.settings)
 
-    def rates(self, cube: ArrayLike, system: System, threads: int | None) -> FloatArray:
-        """Photons per period in each bin (..., bins) behind the histograms (..., bins)."""
+    def rates(self, cube: ArrayLike, system: System, threads: int | None, total: ArrayLike | None = None) -> FloatArray:
+        """Photons per period in each bin (..., bins) behind the histograms (..., bins); `total` (...) of each."""
+        from mars_lidar._base.native import _core
+
         given, shape = checked(cube, system, threads)
         self.check(system)
-        return corrected_rates(given, self.correction).reshape(*shape, system.bins)
+        flat = None
+        if total is not None:
+            flat = np.ascontiguousarray(np.broadcast_to(np.asarray(total, np.float64), shape).reshape(-1))
+            if not ((flat > 0) & np.isfinite(flat)).all():
+                raise ValueError("total must be finite and positive, photons per period")
+        out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)
+        settings: Any = self.settings
+        _core.corrected_rates(
+            given.recording,
+            given.counts,
+            correction=self.correction,
+            **settings,
+            total=flat,
+            out=out,
+            flags=flags,
+            threads=given.threads,
+        )
+        return out.reshape(*shape, system.bins)
 
 
 def window_estimates(
-    given: Histograms,
-    locator: str,
-    correction: int = _NONE,
-    *,
-    steps: int = 0,
-    tolerance: float = 0.0,
-    total: FloatArray | None = None,
+    given: Histograms, locator: str, correction: int = _NONE, *, steps: float = 0, tolerance: float = 0.0
 ) -> Estimates:
     """Delay by a filter or the peak, signal and background by the window around it, of corrected rates."""
     from mars_lidar._base.native import _core
@@ -155,9 +173,9 @@ def window_estimates(
         given.counts,
         correction=correction,
         locator=_LOCATORS[locator],
-        steps=steps,
+        steps=int(steps),
         tolerance=tolerance,
-        total=total,
+        total=None,
         out=out,
         flags=flags,
         threads=given.threads,
@@ -167,24 +185,3 @@ def window_estimates(
     if correction != _PASSES:
         return Estimates(signal, background, delay, flags)
     return Estimates(signal, background, delay, flags, signal_error, background_error)
-
-
-def corrected_rates(
-    given: Histograms, correction: int, *, steps: int = 0, tolerance: float = 0.0, total: FloatArray | None = None
-) -> FloatArray:
-    """Photons per period in each bin (pixels, bins)."""
-    from mars_lidar._base.native import _core
-
-    out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)
-    _core.corrected_rates(
-        given.recording,
-        given.counts,
-        correction=correction,
-        steps=steps,
-        tolerance=tolerance,
-        total=total,
-        out=out,
-        flags=flags,
-        threads=given.threads,
-    )
-    return out

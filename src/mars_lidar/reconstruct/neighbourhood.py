@@ -64,7 +64,12 @@ class Neighbourhood(Method):
                 f"{histograms.image}"
             )
         height, width = histograms.image[-2:]
-        _require_dim(histograms)
+        blind = float(_blind(histograms).mean())
+        if blind > _MOST_BLIND:
+            raise ValueError(
+                f"neighbourhood is for dim cubes: dead times take {100.0 * blind:.3g} % of this exposure, more than "
+                f"{100.0 * _MOST_BLIND:g} %; each pixel has photons enough of its own"
+            )
         images = histograms.counts.reshape(-1, height * width, histograms.system.bins)
         parts = [
             self._image(replace(histograms, counts=counts, image=(height, width)), height, width) for counts in images
@@ -163,25 +168,16 @@ def _blind(given: Histograms) -> FloatArray:
     return np.asarray(given.counts.sum(-1, dtype=np.float64) * given.system.dead_time_periods / given.system.cycles)
 
 
-def _require_dim(given: Histograms) -> None:
-    blind = float(_blind(given).mean())
-    if blind > _MOST_BLIND:
-        raise ValueError(
-            f"neighbourhood is for dim cubes: dead times take {100.0 * blind:.3g} % of this exposure, more than "
-            f"{100.0 * _MOST_BLIND:g} %; each pixel has photons enough of its own"
-        )
-
-
 def _first_planes(given: Histograms, counts: NDArray[np.int64]) -> FloatArray:
     """Planes (pixels, 4) that lie flat, by maximum likelihood of the 3 x 3 pixels around each."""
-    height, width, bins = counts.shape
-    total = np.zeros((height + 1, width + 1, bins), np.int64)
-    total[1:, 1:] = counts.cumsum(0).cumsum(1)
-    top, bottom = np.maximum(np.arange(height) - 1, 0), np.minimum(np.arange(height) + 2, height)
-    left, right = np.maximum(np.arange(width) - 1, 0), np.minimum(np.arange(width) + 2, width)
-    rows = total[bottom] - total[top]
-    pooled = (rows[:, right] - rows[:, left]).reshape(-1, bins).astype(np.uint32)
-    pixels = np.outer(bottom - top, right - left).ravel()
+    from scipy.ndimage import convolve1d
+
+    def around(values: NDArray[np.int64]) -> NDArray[np.int64]:
+        rows = convolve1d(values, np.ones(3, np.int64), axis=0, mode="constant")
+        return np.asarray(convolve1d(rows, np.ones(3, np.int64), axis=1, mode="constant"))
+
+    pooled = around(counts).reshape(-1, counts.shape[-1]).astype(np.uint32)
+    pixels = around(np.ones(counts.shape[:2], np.int64)).ravel()
     planes = np.zeros((len(pooled), 4))
     for number in np.unique(pixels):
         here = pixels == number

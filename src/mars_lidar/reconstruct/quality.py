@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mars_lidar._base.optional import MissingLibraryError
+from mars_lidar._base.optional import needed
 from mars_lidar._base.types import FloatArray
+from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
@@ -40,7 +41,7 @@ class MapError:
 
 def map_error(truth: FloatArray, estimate: FloatArray) -> MapError:
     """Errors of `estimate` (..., H, W) against `truth` (H, W); NaN is unknown in either."""
-    metrics = _skimage_metrics()
+    metrics = needed("skimage.metrics", "a comparison by PSNR and SSIM", "estimate")
     truth, estimate = np.asarray(truth, np.float64), np.asarray(estimate, np.float64)
     if truth.ndim != 2 or estimate.shape[-2:] != truth.shape:
         raise ValueError(
@@ -82,9 +83,8 @@ def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:
         return out
     lit = cube.flux.signal > 0
     if (lit & np.isfinite(cube.depth_m)).any():
-        span = cube.system.unambiguous_range_m
         truth = np.where(lit, cube.depth_m, np.nan)
-        lag = (found.depth_m - truth + 0.5 * span) % span - 0.5 * span
+        lag = depth_lag_m(cube.system, found.depth_m, truth)
         out["depth"] = map_error(truth, np.where(found.seen, truth + lag, np.nan))
     if lit.any():
         if cube.reflectivity is not None:
@@ -96,11 +96,7 @@ def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:
     return out
 
 
-def _skimage_metrics() -> Any:
-    try:
-        from skimage import metrics
-    except ImportError as error:
-        raise MissingLibraryError(
-            f"PSNR and SSIM need scikit-image: pip install 'mars-lidar[estimate]' ({error})"
-        ) from error
-    return metrics
+def depth_lag_m(system: System, estimate_m: FloatArray, truth_m: FloatArray) -> FloatArray:
+    """Estimated minus true depth (...), m, modulo the unambiguous range; NaN where either is missing."""
+    span = system.unambiguous_range_m
+    return np.asarray((estimate_m - truth_m + 0.5 * span) % span - 0.5 * span, dtype=np.float64)

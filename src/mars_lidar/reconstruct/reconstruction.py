@@ -13,14 +13,30 @@ from mars_lidar._base.brief import brief
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
+from mars_lidar.reconstruct.centroid import Centroid
+from mars_lidar.reconstruct.coates import Coates, GeneralisedCoates
 from mars_lidar.reconstruct.histograms import checked
+from mars_lidar.reconstruct.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood
+from mars_lidar.reconstruct.mchc import ChainCorrection
 from mars_lidar.reconstruct.method import Estimates, Flags, Method, tell_effects
-from mars_lidar.reconstruct.methods import METHODS
 from mars_lidar.reconstruct.neighbourhood import Neighbourhood
 from mars_lidar.reconstruct.returns import MOST_RETURNS, Returns, returns_of
 
 ATTENUATIONS = ("none", "inverse_square")
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        MaximumLikelihood(),
+        GeneralisedCoates(),
+        ChainCorrection(),
+        Coates(),
+        MatchedFilter(),
+        Centroid(),
+        Peak(),
+    )
+}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -40,6 +40,18 @@ def broadcast(names: tuple[str, ...], *arrays: NDArray[Any]) -> list[NDArray[Any
         raise ValueError(f"shapes must broadcast, got {told}") from None
 
 
+def with_delays(
+    signal: FloatArray, background: FloatArray, delay_ns: ArrayLike | None, period_ns: float
+) -> list[NDArray[Any]]:
+    """Signal, background and delays, ns, of one shape; delays of None are half the period, NaN is for no return."""
+    given = reals("delay_ns", 0.5 * period_ns if delay_ns is None else delay_ns)
+    signal, background, delay = broadcast(("signal", "background", "delay_ns"), signal, background, given)
+    bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (signal == 0))
+    if bad.any():
+        raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}")
+    return [signal, background, delay]
+
+
 def flat(array: NDArray[Any]) -> FloatArray:
     """(cells,) doubles, contiguous."""
     return np.ascontiguousarray(array.reshape(-1), dtype=np.float64)

@@ -14,9 +14,9 @@ from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cell_input import broadcast, flat, photons, reals
-from mars_lidar.statistics.gate import PLAIN, require_mode
-from mars_lidar.statistics.gated_light import photons_before
+from mars_lidar.statistics.cell_input import broadcast, flat, photons, with_delays
+from mars_lidar.statistics.gate import PLAIN, CellLight, photons_before, require_mode
+from mars_lidar.statistics.grid import whole_bins
 from mars_lidar.statistics.narrow_pulse import followed_bins, followed_edges, meets_itself, needed_bins
 
 if TYPE_CHECKING:
@@ -38,22 +38,8 @@ _SETTLED = 1e-12  # relative change of the state per period (20)
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
-    """Pixels (S, B, delay or waveform) seen by one system, flat, with the shape they came in.
-
-    `signal`, `background`, `delay` (periods) are (cells,); `waveform` is (rows, T) of unit sum with `row`
-    (cells,) its row of each cell, or None. Where `follow` is not 0, bins of grids are narrow on the pulse, and those of
-    a histogram of `follow` bins are whole numbers of them.
-    """
-
-    system: System
-    shape: tuple[int, ...]
-    signal: FloatArray
-    background: FloatArray
-    delay: FloatArray
-    waveform: FloatArray | None
-    row: IndexArray
-    follow: int = 0
+class Cells(CellLight):
+    """Pixels with their grids: what the statistics of all modes are computed from."""
 
     @classmethod
     def of(
@@ -102,20 +88,10 @@ class Cells:
             )
         if signal is None:
             raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-        total = photons("signal", signal) * share
-        given = reals("delay_ns", 0.5 * system.period_ns if delay_ns is None else delay_ns)
-        total, back, delay = broadcast(("signal", "background", "delay_ns"), total, back, given)
-        bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (total == 0))
-        if bad.any():
-            raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad].flat[0]}")
+        total, back, delay = with_delays(photons("signal", signal) * share, back, delay_ns, system.period_ns)
         phase = np.nan_to_num(flat(delay) / system.period_ns)
         phase -= np.floor(phase)
         return cls(system, total.shape, flat(total), flat(back), phase, None, np.zeros(total.size, np.int64))
-
-    @property
-    def size(self) -> int:
-        """Number of cells."""
-        return self.signal.size
 
     @property
     def native_flux(self) -> tuple[FloatArray, FloatArray]:
@@ -217,17 +193,7 @@ class Cells:
         """The native grid of `bins` bins per period; a cell is given up after `steps` bins x periods (None: many)."""
         from mars_lidar._base.native import _core
 
-        dead = self.system.dead_time_periods
-        whole = math.floor(dead)
-        position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
-        shift = math.floor(position)
-        fraction = position - shift
-        if fraction < 1e-9:
-            fraction = 0.0
-        elif fraction > 1.0 - 1e-9:
-            shift, fraction = shift + 1, 0.0
-        if shift == bins:
-            whole, shift = whole + 1, 0
+        whole, shift, fraction = whole_bins(self.system.dead_time_periods, bins)
         return _core.ExposureGrid(
             cycles=self.system.cycles,
             max_periods=max(10_000, _MAX_STEPS // bins) if steps is None else max(1, steps // bins),

@@ -214,7 +214,7 @@ class PhaseChain:
         before = np.zeros((n, n))
         np.cumsum(met[:, :-1], axis=1, out=before[:, 1:])
         first = np.exp(-before) * -np.expm1(-self.photons[order]) / self.loss
-        first[:, 0] = self.refire + self._again()
+        first[:, 0] = self.refire + self.again()
         base = np.empty((n, n))
         np.put_along_axis(base, order, first, axis=1)
         return np.roll(base, -self.shift, axis=0)
@@ -228,10 +228,10 @@ class PhaseChain:
         exposure = flux[:-1][None, :] - start[:, None] + flux[-1] * (j[None, :] < arm[:, None])
         exposure[j, arm] = 0.0
         matrix = np.exp(-exposure) * -np.expm1(-self.photons) / self.loss
-        matrix[j, arm] = (self.refire + self._again())[arm]
+        matrix[j, arm] = (self.refire + self.again())[arm]
         return np.asarray(matrix, dtype=np.float64)
 
-    def _again(self) -> FloatArray:
+    def again(self) -> FloatArray:
         """Probability of passing the re-arming bin and firing in it one or more periods later (2.1)."""
         lead = np.exp(self.fraction * self.photons - self.total)
         return np.asarray(lead * self.fire / self.loss, dtype=np.float64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.count_window import Pmf as Pmf
@@ -95,6 +96,20 @@ def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int
         square -= float((first.on(low, high) - second.on(low, high)) @ counts) ** 2 / max(variance, 1e-300)
         freedom -= 1
     return float(chi2.sf(max(square, 0.0), freedom))
+
+
+def neighbours(expected: FloatArray, least: float) -> NDArray[np.int64]:
+    """(groups,) where groups of neighbouring cells (n,) begin of which at least so much is expected; what is left over
+    at the end belongs to the last of them."""
+    starts, held = [0], 0.0
+    for k, value in enumerate(expected[:-1]):
+        held += float(value)
+        if held >= least:
+            starts.append(k + 1)
+            held = 0.0
+    if len(starts) > 1 and held + float(expected[-1]) < least:
+        starts.pop()
+    return np.array(starts, np.int64)
 
 
 def mean_score(law_mean: float, law_variance: float, mean: float, size: int) -> float:

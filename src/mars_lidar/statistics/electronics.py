@@ -22,7 +22,7 @@ from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.electronics_grid import MOST_EFFORT, Effort, RecordGrid, RecordRun
 from mars_lidar.statistics.exposure import refined_moments
 from mars_lidar.statistics.exposure_result import Moments
-from mars_lidar.statistics.gated_light import photons_before
+from mars_lidar.statistics.gate import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 
@@ -89,21 +89,18 @@ def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> Ele
     timing = Timing(out, cells.finest) if is_timed(out) else None
     if timing is not None:
         cells = replace(cells, system=timing.untimed)
-    system, bins = cells.system, cells.system.bins
+    bins = cells.system.bins
     mean, variance, grid = np.empty(cells.size), np.empty(cells.size), np.empty(cells.size, np.int64)
     histogram = np.empty((cells.size, bins))
-    alike, slower = without_effect(cells)
-    if alike is not None:
-        found = refined_moments(alike, bins, tolerance=min(tolerance, 1e-4), threads=None)
+    bare, slower = without_electronics(cells)
+    if slower == 0.0:
+        found = refined_moments(bare, bins, tolerance=min(tolerance, 1e-4), threads=None)
         flat = found.cumulants.reshape(-1, found.cumulants.shape[-1])
         mean, variance, histogram = flat[:, 0], flat[:, 1], found.histogram.reshape(-1, bins)
         grid = found.bins.reshape(-1)
     else:
-        alone = replace(cells, system=system.replace(detector=system.detector.without("electronics_dead_time_ns")))
         for k in range(cells.size):
-            mean[k], variance[k], histogram[k], grid[k] = refined(
-                alone.part(slice(k, k + 1)), slower, tolerance, effort
-            )
+            mean[k], variance[k], histogram[k], grid[k] = refined(bare.part(slice(k, k + 1)), slower, tolerance, effort)
     if timing is not None:
         histogram = timing.forward(histogram)
     shape = cells.shape
@@ -112,17 +109,17 @@ def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> Ele
     )
 
 
-def without_effect(cells: Cells) -> tuple[Cells | None, float]:
-    """Alike cells without electronics, if one of the dead times has no effect, and the longer one, ns.
+def without_electronics(cells: Cells) -> tuple[Cells, float]:
+    """Cells without electronics, and the dead time, ns, of those behind them; 0 where one of the two has no effect.
 
     Without a dead time of its own a pixel's avalanches are Poisson, and where it is the longer one they are far enough
-    apart.
+    apart: then the cells have the longer of the two dead times.
     """
     detector = cells.system.detector
     slower = max(detector.dead_time_ns, detector.electronics_dead_time_ns)
-    if detector.dead_time_ns != 0.0 and slower != detector.dead_time_ns:
-        return None, slower
-    bare = replace(detector.without("electronics_dead_time_ns"), dead_time_ns=slower)
+    bare = detector.without("electronics_dead_time_ns")
+    if detector.dead_time_ns == 0.0 or slower == detector.dead_time_ns:
+        bare, slower = replace(bare, dead_time_ns=slower), 0.0
     return replace(cells, system=cells.system.replace(detector=bare)), slower
 
 

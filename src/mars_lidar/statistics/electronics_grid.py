@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.gated_light import photons_before
+from mars_lidar.statistics.gate import photons_before
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.stationary import stationary_histogram
 

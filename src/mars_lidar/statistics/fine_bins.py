@@ -14,7 +14,7 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.gated_light import photons_before
+from mars_lidar.statistics.gate import photons_before
 
 MANY_BINS = 2**17  # from which it is worth while
 _CELLS = (2**15, 2**17)  # tried in turn

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cell_input import MAX_PHOTONS
 
 _MAX_BINS = 2**20
-_MAX_PHOTONS = 1e6
 _MAX_COMMON = 2**14
 _MIN_BINS = 512  # below it the chain's own discretisation shows in the count variance
 _BINS_PER_WIDTH = 7.5  # of the equivalent width 1 / max s, 2.507 sigma for a Gaussian: a third of sigma
@@ -46,7 +46,7 @@ def photons_per_bin(
     NDArray
         (bins,).
     """
-    back = checks.real("background", background, low=0.0, high=_MAX_PHOTONS)
+    back = checks.real("background", background, low=0.0, high=MAX_PHOTONS)
     if bins is not None:
         bins = checks.integer("bins", bins, low=1, high=_MAX_BINS)
     if waveform is not None:
@@ -60,17 +60,17 @@ def photons_per_bin(
         return _detected(np.maximum(energy, 0.0) + back / n, system)
     if signal is None:
         raise ValueError("signal must be given (photons per period), or a waveform instead of it")
-    total = checks.real("signal", signal, low=0.0, high=_MAX_PHOTONS)
+    total = checks.real("signal", signal, low=0.0, high=MAX_PHOTONS)
     delay = 0.5 * system.period_ns if delay_ns is None else checks.real("delay_ns", delay_ns)
     n = bins or default_bins(system)
     energy = system.pulse.bin_energy(delay, system.period_ns, n)
     return _detected(total * np.maximum(energy, 0.0) + back / n, system)
 
 
-def _detected(photons: FloatArray, system: System) -> FloatArray:
+def _detected(light: FloatArray, system: System) -> FloatArray:
     """`Flux.detected` on a grid (bins,)."""
     dark = system.detector.dark_count_hz * system.period_ns * 1e-9
-    return np.asarray(photons * system.detector.detection_efficiency + dark / photons.size, dtype=np.float64)
+    return np.asarray(light * system.detector.detection_efficiency + dark / light.size, dtype=np.float64)
 
 
 def default_bins(system: System) -> int:
@@ -88,6 +88,19 @@ def _bins_for_waveform(samples: int, bins: int) -> int:
     return step * math.ceil(max(_MIN_BINS, samples) / step)
 
 
+def whole_bins(dead: float, bins: int) -> tuple[int, int, float]:
+    """A dead time in periods as whole periods, whole bins of the rest, and the fraction of a bin that is left."""
+    whole = math.floor(dead)
+    position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
+    shift = math.floor(position)
+    fraction = position - shift
+    if fraction < 1e-9:
+        fraction = 0.0
+    elif fraction > 1.0 - 1e-9:
+        shift, fraction = shift + 1, 0.0
+    return (whole + 1, 0, fraction) if shift == bins else (whole, shift, fraction)
+
+
 def cell_name(signal: float | None, background: float, system: System) -> str:
     """(S, B, t_d) in words, for warnings and errors; a signal of None is a waveform."""
     what = "waveform" if signal is None else f"S = {signal:g}"
@@ -100,10 +113,8 @@ def _waveform(waveform: ArrayLike) -> FloatArray:
         raise TypeError(f"waveform must be real numbers, got dtype {wave.dtype}")
     if wave.ndim != 1 or wave.size == 0:
         raise ValueError(f"waveform must be (T,) with T >= 1, got shape {wave.shape}")
-    bad = ~((wave >= 0) & (wave <= _MAX_PHOTONS))
+    bad = ~((wave >= 0) & (wave <= MAX_PHOTONS))
     if bad.any():
         k = int(np.argmax(bad))
-        raise ValueError(
-            f"waveform must lie in [0, {_MAX_PHOTONS:g}] photons per period, got waveform[{k}] = {wave[k]}"
-        )
+        raise ValueError(f"waveform must lie in [0, {MAX_PHOTONS:g}] photons per period, got waveform[{k}] = {wave[k]}")
     return wave.astype(np.float64)

@@ -24,10 +24,10 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.fine_bins import MANY_BINS, light_before, misplaced
-from mars_lidar.statistics.joint_fine import FinePixel
 from mars_lidar.statistics.joint_pixel import INSTEAD, Pixel, movement
-from mars_lidar.statistics.joint_timed import TimedPixel
+from mars_lidar.statistics.joint_seen import FinePixel, TimedPixel
 from mars_lidar.statistics.narrow_pulse import meets_itself
+from mars_lidar.statistics.no_dead_time import recorded_light
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 
@@ -95,7 +95,7 @@ def joint_law(
         return replace(_law(cells, tolerance), system=system)
     timing = Timing(cells.system, cells.finest)
     law = _law(replace(cells, system=timing.untimed), tolerance)
-    pixel = TimedPixel(law._pixel, law.mean, timing) if isinstance(law._pixel, Pixel | FinePixel) else None
+    pixel = None if law._pixel is None else TimedPixel(law._pixel, law.mean, timing)
     return replace(law, system=system, mean=timing.forward(law.mean), _pixel=pixel)
 
 
@@ -103,7 +103,8 @@ def _law(cells: Cells, tolerance: float) -> JointLaw:
     """The law of registrations of checked cells."""
     out = cells.system.bins
     if cells.system.dead_time_periods == 0.0 or cells.signal[0] + cells.background[0] == 0.0:
-        return _poisson(cells)
+        mean = cells.system.cycles * recorded_light(cells, out)[0]  # independent Poisson bins
+        return JointLaw(cells.system, mean, 0.0, out, 0, _pixel=None)
     if out <= MANY_BINS:
         law, _ = _refined(cells, out, tolerance)
         return law
@@ -176,7 +177,7 @@ class JointLaw:
     movement: float
     grid_bins: int
     settled: int
-    _pixel: Pixel | FinePixel | TimedPixel | None = field(repr=False)
+    _pixel: Pixel | None = field(repr=False)
 
     __repr__ = brief
 
@@ -293,12 +294,3 @@ class JointLaw:
         if not np.isfinite(rows).all():
             raise ValueError(f"{name} must be finite, got {rows[~np.isfinite(rows)][0]}")
         return rows, array.shape[:-1]
-
-
-def _poisson(cells: Cells) -> JointLaw:
-    """No dead time, or no photons: independent Poisson bins."""
-    out = cells.system.bins
-    energy, row = cells.energies(out * math.ceil(512 / out))
-    shape = energy[row[0]].reshape(out, -1).sum(-1)
-    mean = cells.system.cycles * (cells.signal[0] * shape + cells.background[0] / out)
-    return JointLaw(cells.system, mean, 0.0, out, 0, _pixel=None)

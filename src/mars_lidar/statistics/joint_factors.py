@@ -1,4 +1,4 @@
-"""The feedback equation of one pixel on one grid solved at once, by sparse factors, where sweeps take too many.
+"""The feedback equation of one pixel on one grid, and its solution by sparse factors, where sweeps take too many.
 
 Equation numbers are those of docs/joint_law.md.
 """
@@ -6,11 +6,12 @@ Equation numbers are those of docs/joint_law.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
@@ -23,29 +24,49 @@ MOST_FACTORED = 2**14  # bins of an equation that is factorised: a second
 GOOD = 1e-9  # relative residual with which a solution is accepted
 
 
-class FeedbackEquation(Protocol):
-    """The equation of one pixel on one grid, as `statistics.joint_grid.FoldedGrid` has it."""
+@dataclass(eq=False)
+class FeedbackEquation:
+    """The equation (4.4) of one pixel on n bins; dead time K + (d + f)/n periods; `response` (6, n) is (4.1)."""
 
-    __dataclass_fields__: ClassVar[dict[str, Any]]
+    whole: int
+    shift: int
+    fraction: float
+    response: FloatArray
 
     @property
     def bins(self) -> int:
-        """Number n of bins."""
+        """Bins of the grid n."""
+        return int(self.response.shape[1])
 
-    @property
-    def shift(self) -> int:
-        """Whole bins d of the dead time without whole periods."""
-
-    @property
-    def response(self) -> FloatArray:
-        """(6, n): (4.1)."""
-
-    @property
+    @cached_property
     def maps(self) -> tuple[FloatArray, FloatArray]:
-        """The 2 x 2 maps `near` and `far` of a shift by a fraction of a bin."""
+        """The 2 x 2 maps `near` and `far` of a shift by f bins."""
+        f = self.fraction
+        g, c = f * (1.0 - f), 1.0 - 2.0 * f
+        near = [[1.0 - f, -3.0 * g], [g, 0.5 * (1.0 + c**3) - 6.0 * f * g]]
+        far = [[f, 3.0 * g], [-g, 0.5 * (1.0 - c**3) - 6.0 * (1.0 - f) * g]]
+        return np.array(near), np.array(far)
+
+    def rearmed(self, x: FloatArray, near: ArrayLike = 1.0, far: ArrayLike = 1.0) -> FloatArray:
+        """(2, n) of what registrations `x` (2, n) re-arm in each bin, its two parts weighted."""
+        a, b = self.maps
+        stays, goes_on = a @ np.roll(x, self.shift, -1), b @ np.roll(x, self.shift + 1, -1)
+        return np.asarray(np.asarray(near) * stays + np.asarray(far) * goes_on, dtype=np.float64)
+
+    def blind(self, x: FloatArray) -> FloatArray:
+        """(n,) registrations that keep the pixel blind at the start of each bin, whole periods included (4.3)."""
+        mass, n, d = x[0], self.bins, self.shift
+        below = np.concatenate([[0.0], np.cumsum(np.concatenate([mass, mass]))])
+        j = np.arange(n)
+        last = (self.maps[1] @ np.roll(x, d + 1, -1))[0]
+        return np.asarray(below[j + n] - below[j + n - d] + last + self.whole * mass.sum())
 
     def apply(self, x: FloatArray) -> FloatArray:
-        """The left side of (4.4) for `x` (2, n)."""
+        """The left side of (4.4), without whole periods of dead time, by prefix sums: no code of the sweeps."""
+        pa, p0, p1, qa, q0, q1 = self.response
+        total, slope = self.rearmed(x)
+        blind = self.blind(x) - self.whole * x[0].sum()
+        return np.array([x[0] + pa * blind - p0 * total - p1 * slope, x[1] + qa * blind - q0 * total - q1 * slope])
 
 
 def factorised(grid: FeedbackEquation) -> Callable[..., FloatArray]:

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.joint_factors import GOOD, factorised, left_over
+from mars_lidar.statistics.grid import whole_bins
+from mars_lidar.statistics.joint_factors import GOOD, FeedbackEquation, factorised, left_over
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
 _CHECKED = 3  # windows of those that are solved together, by a residual: first, last and between
@@ -24,19 +24,14 @@ _TOLERANCE = 1e-10  # of a solution, relative to its largest value
 
 
 @dataclass(eq=False)
-class FoldedGrid:
-    """One pixel on n bins; dead time K + (d + f)/n periods. Made by `FoldedGrid.of`.
+class FoldedGrid(FeedbackEquation):
+    """The exposure of one pixel on n bins. Made by `FoldedGrid.of`.
 
-    `response` (6, n) is (4.1); `sweeps` tells what the slowest solution so far took, `residual` what the worst of those
-    that were checked left.
+    `sweeps` tells what the slowest solution so far took, `residual` what the worst of those that were checked left.
     """
 
-    cycles: int
-    warm: bool
-    whole: int
-    shift: int
-    fraction: float
-    response: FloatArray
+    cycles: int = 1
+    warm: bool = False
     sweeps: int = 0
     residual: float = 0.0
     direct: bool = False
@@ -47,55 +42,16 @@ class FoldedGrid:
         """The only cell of `cells` on `bins` bins."""
         from mars_lidar._base.native import _core
 
-        dead = cells.system.dead_time_periods
-        whole = int(np.floor(dead))
-        position = (dead - whole) * bins  # whole periods apart first: else they cost digits of the fraction
-        if cells.system.start == "armed":  # a dead time beyond the end of the exposure is as good as one up to it
-            whole = min(whole, cells.system.cycles)
-        shift = int(np.floor(position))
-        fraction = position - shift
-        if fraction < 1e-9:
-            fraction = 0.0
-        elif fraction > 1.0 - 1e-9:
-            shift, fraction = shift + 1, 0.0
-        if shift == bins:
-            whole, shift = whole + 1, 0
+        system = cells.system
+        whole, shift, fraction = whole_bins(system.dead_time_periods, bins)
+        if system.start == "armed":  # a dead time beyond the end of the exposure is as good as one up to it
+            whole = min(whole, system.cycles)
         energy, row = cells.energies(bins)
         signal, background = cells.native_flux
         photons = signal[0] * energy[row[0]] + background[0] / energy.shape[-1]
         response = np.empty((6, bins))
         _core.joint_response(photons, response)
-        return cls(cells.system.cycles, cells.system.start == "stationary", whole, shift, fraction, response)
-
-    @property
-    def bins(self) -> int:
-        """Bins of the grid n."""
-        return int(self.response.shape[1])
-
-    # What re-arms (4.2), and who is blind
-
-    @cached_property
-    def maps(self) -> tuple[FloatArray, FloatArray]:
-        """The 2 x 2 maps `near` and `far` of a shift by f bins."""
-        f = self.fraction
-        g, c = f * (1.0 - f), 1.0 - 2.0 * f
-        near = [[1.0 - f, -3.0 * g], [g, 0.5 * (1.0 + c**3) - 6.0 * f * g]]
-        far = [[f, 3.0 * g], [-g, 0.5 * (1.0 - c**3) - 6.0 * (1.0 - f) * g]]
-        return np.array(near), np.array(far)
-
-    def rearmed(self, x: FloatArray, near: ArrayLike = 1.0, far: ArrayLike = 1.0) -> FloatArray:
-        """(2, n) of what registrations `x` (2, n) re-arm in each bin, its two parts weighted."""
-        a, b = self.maps
-        stays, goes_on = a @ np.roll(x, self.shift, -1), b @ np.roll(x, self.shift + 1, -1)
-        return np.asarray(np.asarray(near) * stays + np.asarray(far) * goes_on, dtype=np.float64)
-
-    def blind(self, x: FloatArray) -> FloatArray:
-        """(n,) registrations that keep the pixel blind at the start of each bin, whole periods included (4.3)."""
-        mass, n, d = x[0], self.bins, self.shift
-        below = np.concatenate([[0.0], np.cumsum(np.concatenate([mass, mass]))])
-        j = np.arange(n)
-        last = (self.maps[1] @ np.roll(x, d + 1, -1))[0]
-        return np.asarray(below[j + n] - below[j + n - d] + last + self.whole * mass.sum())
+        return cls(whole, shift, fraction, response, system.cycles, system.start == "stationary")
 
     def noise(self, x: FloatArray, armed: FloatArray, again: FloatArray) -> FloatArray:
         """(3, n) covariance of the noise of (mass, moment) in a bin: (5.2)."""
@@ -109,8 +65,6 @@ class FoldedGrid:
                 mass / 3 - qa**2 * armed - q0**2 * total - 2 * q0 * q1 * slope - q1**2 * total / 3,
             ]
         )
-
-    # Solutions
 
     @cached_property
     def _unit(self) -> FloatArray:
@@ -226,13 +180,6 @@ class FoldedGrid:
         self.residual = max(self.residual, left)
         if not left <= GOOD:
             raise ConvergenceError(f"the feedback equation is left with a relative residual of {left:.1e}")
-
-    def apply(self, x: FloatArray) -> FloatArray:
-        """The left side of (4.4), without whole periods of dead time, by prefix sums: no code of the sweeps."""
-        pa, p0, p1, qa, q0, q1 = self.response
-        total, slope = self.rearmed(x)
-        blind = self.blind(x) - self.whole * x[0].sum()
-        return np.array([x[0] + pa * blind - p0 * total - p1 * slope, x[1] + qa * blind - q0 * total - q1 * slope])
 
     def _apply_transposed(self, y: FloatArray) -> FloatArray:
         """The left side of (5.4) for `y` (m, 2, n), without whole periods of dead time."""

@@ -14,7 +14,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.instrument.detector import MODES, Mode
+from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import LAW_STEPS, Cells
@@ -23,19 +23,13 @@ from mars_lidar.statistics.electronics_law import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects
-from mars_lidar.statistics.methods import pixel_of, rearm_of
 from mars_lidar.statistics.pmf import exact_windows
+from mars_lidar.statistics.shape import chain_of, rearm_of
 from mars_lidar.statistics.shape import registration_pdf as registration_pdf
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
 _METHODS = ("exact", "mars", "renewal", "poisson")
-_LAW_MODES: dict[str, tuple[Mode, ...]] = {
-    "exact": MODES,
-    "mars": PLAIN,
-    "renewal": PLAIN,
-    "poisson": MODES,
-}
 
 
 class CountLaw:
@@ -187,7 +181,7 @@ def count_law(
         delay_ns=delay_ns,
         waveform=waveform,
         what=f"count_law of method {method!r}",
-        modes=_LAW_MODES[method],
+        modes=PLAIN if method in ("mars", "renewal") else MODES,
         effects=histogram_effects(system) if method == "exact" else LIGHT_EFFECTS + TIMING_EFFECTS,
     )
     team = thread_count(threads)
@@ -220,12 +214,12 @@ def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]
         from mars_lidar.statistics.baselines import renewal_moments
 
         return renewal_moments(cells.signal, cells.background, cells.system)
-    from mars_lidar.statistics.renewal import mars_moments
+    from mars_lidar.statistics.renewal import holding_times
 
-    mean, variance = np.empty(cells.size), np.empty(cells.size)
+    mean, variance = np.zeros(cells.size), np.zeros(cells.size)
     for k in range(cells.size):
-        signal, waveform, delay = pixel_of(cells, k)
-        mean[k], variance[k] = mars_moments(
-            signal, cells.background[k], cells.system, rearm=edge, delay_ns=delay, waveform=waveform
-        )
+        chain = chain_of(cells, k, edge)
+        if chain is not None:
+            times = holding_times(chain)
+            mean[k], variance[k] = cells.system.cycles / times.mu, cells.system.cycles * times.sigma2 / times.mu**3
     return mean, variance

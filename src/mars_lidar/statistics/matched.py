@@ -5,11 +5,10 @@ The law is native/laws/matched_law.h, which engines draw from: here its probabil
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.count_window import Pmf
 
@@ -46,7 +45,7 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
     saturation: an integer, plus a Panjer count, less a Poisson one (or the mirror image), times a polynomial.
     The least variance that an integer can have: two integers. `trusted` tells where this is the exact law.
     """
-    given, team = _checked(cumulants), _team(threads)
+    given, team = _checked(cumulants), thread_count(threads)
     first, last, _ = _support(given, team)
     size = last - first + 1
     if (size > _MAX_COUNTS).any():
@@ -79,7 +78,7 @@ def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | N
     NDArray
         (cells, draws) int64, not falling with `uniform`.
     """
-    given, team = _checked(cumulants), _team(threads)
+    given, team = _checked(cumulants), thread_count(threads)
     u = np.ascontiguousarray(uniform, dtype=np.float64)
     if u.ndim != 2 or u.shape[0] != given.shape[0]:
         raise ValueError(f"uniform must be of shape ({given.shape[0]}, draws), got {u.shape}")
@@ -97,13 +96,7 @@ def trusted(cumulants: ArrayLike, *, threads: int | None = None) -> NDArray[np.b
 
     A criterion on the cumulants (cells, 4) alone; docs/studies/matched.md has how often it errs.
     """
-    return _support(_checked(cumulants), _team(threads))[2]
-
-
-def _team(threads: int | None) -> int:
-    from mars_lidar._base.threads import thread_count
-
-    return thread_count(threads)
+    return _support(_checked(cumulants), thread_count(threads))[2]
 
 
 def _checked(cumulants: ArrayLike) -> FloatArray:
@@ -123,8 +116,7 @@ def _checked(cumulants: ArrayLike) -> FloatArray:
 def _support(given: FloatArray, team: int) -> tuple[IndexArray, IndexArray, NDArray[np.bool_]]:
     from mars_lidar._base.native import _core
 
-    cells: tuple[Any] = (given.shape[0],)
-    first, last = np.empty(cells, np.int64), np.empty(cells, np.int64)
-    close = np.empty(cells, np.bool_)
+    cells = len(given)
+    first, last, close = np.empty(cells, np.int64), np.empty(cells, np.int64), np.empty(cells, np.bool_)
     _core.matched_support(cumulants=given, first=first, last=last, trusted=close, threads=team)
     return first, last, close

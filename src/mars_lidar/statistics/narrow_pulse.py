@@ -13,7 +13,7 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import SampledPulse
-from mars_lidar.statistics.gated_light import CellLight
+from mars_lidar.statistics.gate import CellLight
 
 _PROBE = 2**12  # parts of a pulse's record
 _SEEN = 8.0  # standard deviations of bins that see a pulse: the refinement of the grid finds the rest

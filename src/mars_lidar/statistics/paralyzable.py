@@ -17,7 +17,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure_result import Moments
-from mars_lidar.statistics.gated_light import photons_before
+from mars_lidar.statistics.gate import photons_before
 from mars_lidar.statistics.narrow_pulse import knots
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 
@@ -103,7 +103,9 @@ def _refined(cells: Cells, tolerance: float, *, with_variance: bool) -> Paralyza
         while True:
             fine = _Grid(cell, n, knots(cell, usual, n / start), with_variance)
             limit = fine.mean + (fine.mean - coarse.mean) / 3.0  # grids err by the square of their step
-            still = with_variance or abs(limit - before) <= _total_allowed(limit, tolerance)
+            still = with_variance or abs(limit - before) <= max(
+                10.0 * tolerance * min(limit, _LEAST_SPREAD * math.sqrt(limit)), _ROUNDING * limit
+            )
             if still and _moved(coarse, fine) <= tolerance:
                 break
             coarse, before, n = fine, limit, 2 * n
@@ -211,11 +213,6 @@ class _Grid:
         )
         apart = now - before
         return float(np.sum(0.5 * (apart[1:] + apart[:-1]) * np.diff(now)))
-
-
-def _total_allowed(mean: float, tolerance: float) -> float:
-    """By how much the mean may move: the standard deviation may be a thousandth of a Poisson count's."""
-    return max(10.0 * tolerance * min(mean, _LEAST_SPREAD * math.sqrt(mean)), _ROUNDING * mean)
 
 
 def _moved(coarse: _Grid, fine: _Grid) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.gated_light import photons_before
+from mars_lidar.statistics.gate import photons_before
 
 _PARTS = 4  # of a bin, in each of which the rates of arrivals now and a dead time ago are taken as constant
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)

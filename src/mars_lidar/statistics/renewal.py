@@ -93,14 +93,12 @@ def moment_matrices(chain: PhaseChain) -> MomentMatrices:
     arm = (j + chain.shift) % n
     ahead = (j[None, :] - arm[:, None]) % n
     # M and Sigma away from the re-arming bin: a geometric number of further periods (3.1, 3.2)
-    loss, passed = -math.expm1(-chain.total), math.exp(-chain.total)
+    loss, passed = chain.loss, math.exp(-chain.total)
     mean = (chain.blind_bins + ahead) / n + passed / loss
     variance = np.full((n, n), passed / loss**2)
     # the re-arming bin is met once in part, then whole every period (3.3)
-    p, refire = -np.expm1(-chain.photons), -np.expm1(-(1.0 - chain.fraction) * chain.photons)
-    lead = p * np.exp(chain.fraction * chain.photons) / loss
-    again = lead * passed
-    there = refire + again
+    again = chain.again()
+    there = chain.refire + again
     with np.errstate(invalid="ignore", divide="ignore"):
         first = np.where(there > 0, again / loss / there, 0.0)
         second = np.where(there > 0, again * (1.0 + passed) / loss**2 / there, 0.0)

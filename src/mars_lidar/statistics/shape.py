@@ -15,11 +15,11 @@ from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.electronics_shape import stationary_records
+from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics.electronics_law import stationary_records
 from mars_lidar.statistics.exposure_result import normalised
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects, mean_histograms
-from mars_lidar.statistics.methods import pixel_of, rearm_of
 from mars_lidar.statistics.stationary import stationary_histogram
 from mars_lidar.statistics.timing import recorded
 
@@ -86,18 +86,37 @@ def registration_pdf(
     return normalised(shape).reshape(*cells.shape, system.bins)
 
 
+def rearm_of(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"]:
+    """Where the chain re-arms; a choice only where the chain is `used`."""
+    if rearm is None:
+        return "centre"
+    if not used:
+        raise ValueError(f"rearm must be None for {by}, which has no such choice, got {rearm!r}")
+    return "edge" if checks.choice("rearm", rearm, ("centre", "edge")) == "edge" else "centre"
+
+
+def pixel_of(cells: Cells, k: int) -> tuple[float | None, FloatArray | None, float | None]:
+    """Signal, waveform and delay of one cell as the chain takes them."""
+    if cells.waveform is not None:
+        return None, cells.signal[k] * cells.waveform[cells.row[k]], None
+    return float(cells.signal[k]), None, float(cells.delay[k]) * cells.system.period_ns
+
+
+def chain_of(cells: Cells, k: int, edge: Literal["centre", "edge"] = "centre") -> PhaseChain | None:
+    """The chain of one cell; None where there is no flux."""
+    background = float(cells.background[k])
+    if cells.signal[k] + background == 0.0:
+        return None
+    signal, waveform, delay = pixel_of(cells, k)
+    return PhaseChain.from_flux(signal, background, cells.system, rearm=edge, delay_ns=delay, waveform=waveform)
+
+
 def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
     """Registrations per period (cells, bins), by the chain on its grid, summed into histogram bins."""
-    from mars_lidar.statistics.chain import PhaseChain
-
     bins = cells.system.bins
     out = np.zeros((cells.size, bins))
     for k in range(cells.size):
-        if cells.signal[k] + cells.background[k] == 0.0:
-            continue
-        signal, waveform, delay = pixel_of(cells, k)
-        chain = PhaseChain.from_flux(
-            signal, float(cells.background[k]), cells.system, rearm=edge, delay_ns=delay, waveform=waveform
-        )
-        out[k] = chain.stationary().pdf.reshape(bins, -1).sum(-1)
+        chain = chain_of(cells, k, edge)
+        if chain is not None:
+            out[k] = chain.stationary().pdf.reshape(bins, -1).sum(-1)
     return out

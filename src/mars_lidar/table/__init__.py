@@ -1,7 +1,6 @@
 """The lookup table over (S, B), its storage and its cache."""
 
-from mars_lidar.table.error import QuantisationError
-from mars_lidar.table.law import LawError
+from mars_lidar.table.error import LawError, QuantisationError
 from mars_lidar.table.lookup import Lookup
 from mars_lidar.table.table import Table
 

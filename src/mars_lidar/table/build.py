@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,22 +16,32 @@ from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.gate import require_mode
-from mars_lidar.table.axes import Grid, axis_values, describe
-from mars_lidar.table.entries import progress_of_part
-from mars_lidar.table.error import QuantisationError, long_error, quantisation_error
-from mars_lidar.table.law import law_error
+from mars_lidar.table.axes import MAX_POINTS, Grid, axis_values, describe, inserted, midpoints, thinned
+from mars_lidar.table.entries import Entries, progress_of_part
+from mars_lidar.table.error import (
+    QuantisationError,
+    deviations,
+    law_error,
+    law_variation,
+    long_error,
+    quantisation_error,
+)
+from mars_lidar.table.lookup import evaluate
 from mars_lidar.table.node_laws import NodeLaws, node_laws
 from mars_lidar.table.nodes import Method, N
 from mars_lidar.table.recipe import Recipe
-from mars_lidar.table.refine import refined_axes
-from mars_lidar.table.request import request_key
 from mars_lidar.table.start_phase import StartPhases, start_phases
+from mars_lidar.table.storage import request_key
 
 _METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
 _ERROR_SAMPLES = 128  # pixels on which a table is checked when it is built
 _ATTEMPTS = 4  # of refining, each with half the error of the one before
 
+_LINES = 8  # values of the other axis at which one is looked at
+_ROUNDS = 12
+
 Axes = tuple[FloatArray, FloatArray]
+Evaluate = Callable[[FloatArray, FloatArray], Entries]
 
 
 def build(
@@ -66,11 +77,11 @@ def build(
     began = time.perf_counter()
     if goal is None:
         table = _evaluated(make, system, axes, recipe, progress)
-        error = quantisation_error(table, "bilinear", _ERROR_SAMPLES, 0, None, recipe.threads)
+        error = quantisation_error(table, samples=_ERROR_SAMPLES, threads=recipe.threads)
     else:
         table, error = _refined(make, system, axes, recipe, goal, progress)
     longest = long_error(table, _ERROR_SAMPLES, recipe.threads)
-    law = law_error(table, 50, 0, None, recipe.threads).to_dict() if check_law else None
+    law = law_error(table, threads=recipe.threads).to_dict() if check_law else None
     table.provenance.update(
         key=request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
         refine=goal,
@@ -130,13 +141,72 @@ def _refined(
 ) -> tuple[N, QuantisationError]:
     inner = goal
     for _ in range(_ATTEMPTS):
-        axes = refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
+        axes = _refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
         table = _evaluated(make, system, axes, recipe, progress)
-        error = quantisation_error(table, "bilinear", 4 * _ERROR_SAMPLES, 0, None, recipe.threads)
+        error = quantisation_error(table, samples=4 * _ERROR_SAMPLES, threads=recipe.threads)
         if error.largest <= goal:
             return table, error
         inner *= 0.5
     raise ValueError(
         f"refine must be an error that can be met, got {goal:g}: reached {error.largest:.2g} with "
         f"{axes[0].size} x {axes[1].size} points at S = {error.worst_signal:g}, B = {error.worst_background:g}"
+    )
+
+
+def _refined_axes(
+    signal: FloatArray, background: FloatArray, evaluated: Evaluate, goal: float
+) -> tuple[FloatArray, FloatArray]:
+    """Axes with points inserted, where the error in the middle between two is above half of `goal`.
+
+    The error is in total variation, of the count law (two normal laws to first order) and of the shape; half of it
+    for each axis. Looked at along a few lines in the direction of each axis, in the canonical delay.
+    """
+    lines = _lines(background)
+    signal = _refined_axis(signal, lambda s: evaluated(np.repeat(s, lines.size), np.tile(lines, s.size)), lines, goal)
+    across = _lines(signal)
+    background = _refined_axis(
+        background, lambda b: evaluated(np.tile(across, b.size), np.repeat(b, across.size)), across, goal
+    )
+    return signal, background
+
+
+def _lines(axis: FloatArray) -> FloatArray:
+    positive = axis[axis > 0]
+    span = np.log(positive[-1] / positive[0]) if positive.size else 0.0
+    some = axis[thinned(axis, max(span / (_LINES - 1), 1e-9))]
+    return some[some > 0] if positive.size else some
+
+
+def _refined_axis(
+    axis: FloatArray, along: Callable[[FloatArray], Entries], lines: FloatArray, goal: float
+) -> FloatArray:
+    """One axis. `along` evaluates points x lines; lines are the exact nodes of a table's second axis here."""
+    for _ in range(_ROUNDS):
+        if axis.size < 2:
+            return axis
+        between = midpoints(axis)
+        nodes, exact = along(axis), along(between)
+        rows, weights, cumulants = evaluate(
+            (axis, lines),
+            nodes.cumulants,
+            StartPhases.none(),
+            True,
+            np.repeat(between, lines.size),
+            np.tile(lines, between.size),
+            np.zeros(between.size * lines.size),
+            False,
+            1,
+        )
+        law = law_variation(deviations(cumulants, exact.cumulants))
+        mixed = np.stack([w @ nodes.shape[r] for r, w in zip(rows, weights, strict=True)])
+        shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
+        bad = np.maximum(law, shape).reshape(between.size, lines.size).max(1) > 0.5 * goal
+        if not bad.any():
+            return axis
+        if axis.size + int(bad.sum()) > MAX_POINTS:
+            break
+        axis = inserted(axis, between[bad])
+    raise ValueError(
+        f"refine must be an error that {MAX_POINTS} points of an axis and {_ROUNDS} rounds can meet, got {goal:g}: "
+        f"{axis.size} points in [{axis[0]:g}, {axis[-1]:g}] do not meet it; choose a larger error or a smaller range"
     )

@@ -16,8 +16,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.table.axes import Grid, axis_values
 from mars_lidar.table.build import build
 from mars_lidar.table.nodes import N, Nodes
-from mars_lidar.table.request import KEY_LENGTH, request_key
-from mars_lidar.table.storage import load, save
+from mars_lidar.table.storage import KEY_LENGTH, load, request_key, save
 
 SUFFIX = ".h5"
 
@@ -73,14 +72,7 @@ def _search(
     if unknown:
         raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
     axes = axis_values("signal", signal), axis_values("background", background)
-    key = request_key(
-        system,
-        axes,
-        method=chosen["method"],
-        rearm=chosen["rearm"],
-        refine=chosen["refine"],
-        tolerance=chosen["tolerance"],
-    )
+    key = request_key(system, axes, **{name: chosen[name] for name in ("method", "rearm", "refine", "tolerance")})
     folder = directory()
     own = folder / f"{key}-{system.cycles}{SUFFIX}"
     others = sorted(folder.glob(f"{key}-*{SUFFIX}")) if folder.is_dir() else []

@@ -1,4 +1,4 @@
-"""How well a table answers between its nodes: measured on random pixels against the exact law of each."""
+"""How well a table answers between its nodes, and how close its count laws are: on random pixels, by exact laws."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments
 from mars_lidar.statistics.exposure_result import normalised
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
-from mars_lidar.table.nodes import Interpolation, Nodes
+from mars_lidar.table.nodes import INTERPOLATIONS, Interpolation, Nodes
 from mars_lidar.table.recipe import Recipe
 
 # total variation between normal laws that differ a little: 0.399 per standard deviation of the mean, 0.242 per
@@ -96,15 +97,31 @@ def long_error(table: Nodes, samples: int, threads: int | None) -> QuantisationE
     if table.system.cycles != MOST_CYCLES and not table.entries.serves(MOST_CYCLES).all():
         return None
     try:
-        return quantisation_error(table, "bilinear", samples, 0, MOST_CYCLES, threads)
+        return quantisation_error(table, samples=samples, cycles=MOST_CYCLES, threads=threads)
     except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
         return None
 
 
 def quantisation_error(
-    table: Nodes, interpolation: Interpolation, samples: int, seed: int, cycles: int | None, threads: int | None
+    table: Nodes,
+    *,
+    interpolation: Interpolation = "bilinear",
+    samples: int = 200,
+    seed: int = 0,
+    cycles: int | None = None,
+    threads: int | None = None,
 ) -> QuantisationError:
-    """Errors on random pixels between the nodes of a table: `Table.quantisation_error`."""
+    """Errors on random pixels between the nodes, against the law of each evaluated directly.
+
+    Parameters
+    ----------
+    interpolation, cycles
+        As `lookup`.
+    samples, seed
+        Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
+        and the lowest value, where the axis has a 0.
+    """
+    checks.choice("interpolation", interpolation, INTERPOLATIONS)
     samples = checks.integer("samples", samples, low=1, high=1_000_000)
     rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
     periods = table.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
@@ -116,13 +133,12 @@ def quantisation_error(
     found = table.lookup(signal, background, cycles=periods, interpolation=interpolation)
     shapes = table.shapes(periods)
     mixed = np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
-    scale = np.maximum(np.sqrt(exact.cumulants[:, 1]), _LEAST_SPREAD)[:, None] ** np.arange(1, 5)
-    error = np.abs(found.cumulants - exact.cumulants) / scale
+    error = deviations(found.cumulants, exact.cumulants)
     shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
     delayed, delayed_shape = error, shape
     if table.method == "exposure":
         delayed, delayed_shape = _delayed(table, interpolation, rng, signal, background, mixed, periods, threads)
-    law = np.maximum(*((e[:, 0] * _TV_MEAN + e[:, 1] * _TV_VARIANCE) for e in (error, delayed)))
+    law = np.maximum(law_variation(error), law_variation(delayed))
     worst = int(np.argmax(np.maximum(law, shape)))
     return QuantisationError(
         interpolation=interpolation,
@@ -143,6 +159,16 @@ def quantisation_error(
         worst_signal=float(signal[worst]),
         worst_background=float(background[worst]),
     )
+
+
+def deviations(cumulants: FloatArray, exact: FloatArray) -> FloatArray:
+    """Errors (P, 4) of cumulants in powers of the standard deviation, of at least half a count."""
+    return np.abs(cumulants - exact) / np.maximum(np.sqrt(exact[:, 1:2]), _LEAST_SPREAD) ** np.arange(1, 5)
+
+
+def law_variation(error: FloatArray) -> FloatArray:
+    """Total variation (P,) between two normal laws with such `deviations`, to first order."""
+    return error[:, 0] * _TV_MEAN + error[:, 1] * _TV_VARIANCE
 
 
 def random_pixels(rng: np.random.Generator, axis: FloatArray, samples: int, below: bool) -> FloatArray:
@@ -174,6 +200,78 @@ def _delayed(
     delay = 0.5 * system.period_ns + shift * system.bin_ns
     exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads)
     found = table.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
-    scale = np.maximum(np.sqrt(exact.variance), _LEAST_SPREAD)[:, None] ** np.arange(1, 5)
     turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
-    return np.abs(found.cumulants - exact.cumulants) / scale, 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
+    return deviations(found.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
+
+
+@dataclass(frozen=True)
+class LawError:
+    """Total variation between count laws at random pixels: that with the table's four cumulants, and the exact one.
+
+    Interpolation, start-phase correction and the law itself (`statistics.matched.matched_pmf`) err together here.
+
+    Attributes
+    ----------
+    samples, cycles
+        Pixels, and periods of the exposure.
+    mean, largest
+        Of the total variation.
+    within
+        Share of pixels within 0.002.
+    trusted
+        Share of pixels that `statistics.matched.trusted` holds to be within 0.002.
+    largest_trusted
+        Largest total variation among those.
+    worst_signal, worst_background, worst_delay_ns
+        The pixel of `largest`.
+    """
+
+    samples: int
+    cycles: int
+    mean: float
+    largest: float
+    within: float
+    trusted: float
+    largest_trusted: float
+    worst_signal: float
+    worst_background: float
+    worst_delay_ns: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return dataclasses.asdict(self)
+
+
+def law_error(
+    table: Nodes, *, samples: int = 50, seed: int = 0, cycles: int | None = None, threads: int | None = None
+) -> LawError:
+    """Total variation, on random pixels, between the count law that the table leads to and the exact one.
+
+    Some 10 to 20 ms a pixel. Parameters as `quantisation_error`.
+    """
+    from mars_lidar.statistics.law import count_law
+    from mars_lidar.statistics.matched import matched_pmf
+
+    samples = checks.integer("samples", samples, low=1, high=100_000)
+    rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
+    system = table.system if cycles is None else table.system.replace(cycles=cycles)
+    signal, background = (random_pixels(rng, axis, samples, True) for axis in (table.signal, table.background))
+    delay = rng.uniform(0.0, system.period_ns, samples)
+    found = table.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
+    exact = count_law(signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads)
+    matched = matched_pmf(found.cumulants, threads=threads)
+    off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
+    good = found.trusted()
+    worst = int(off.argmax())
+    return LawError(
+        samples=samples,
+        cycles=system.cycles,
+        mean=float(off.mean()),
+        largest=float(off[worst]),
+        within=float(np.mean(off <= 0.002)),
+        trusted=float(good.mean()),
+        largest_trusted=float(off[good].max()) if good.any() else 0.0,
+        worst_signal=float(signal[worst]),
+        worst_background=float(background[worst]),
+        worst_delay_ns=float(delay[worst]),
+    )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.cell_input import broadcast, reals
+from mars_lidar.statistics.cell_input import flat, reals, with_delays
 from mars_lidar.table.start_phase import StartPhases
 
 
@@ -61,15 +61,8 @@ def read_pixels(
     The phase, in [0, 1) periods, is by how much the return comes before the canonical delay, half a period; 0 where
     there is no return.
     """
-    canonical = 0.5 * period_ns
-    given = reals("delay_ns", canonical if delay_ns is None else delay_ns)
-    parts = broadcast(
-        ("signal", "background", "delay_ns"), reals("signal", signal), reals("background", background), given
-    )
-    s, b, delay = (np.ascontiguousarray(part.reshape(-1), dtype=np.float64) for part in parts)
-    bad = ~np.isfinite(delay) & ~(np.isnan(delay) & (s == 0))
-    if bad.any():
-        raise ValueError(f"delay_ns must be finite (NaN for no return where signal is 0), got {delay[bad][0]}")
+    parts = with_delays(reals("signal", signal), reals("background", background), delay_ns, period_ns)
+    s, b, delay = (flat(part) for part in parts)
     beyond = np.zeros(s.size, dtype=bool)
     for name, values, axis in (("signal", s, axes[0]), ("background", b, axes[1])):
         if not (values >= 0).all():
@@ -82,6 +75,7 @@ def read_pixels(
                 "the table over that range, or leave them to the exact engine with outside='exact'"
             )
         beyond |= out
+    canonical = 0.5 * period_ns
     phase = (canonical - np.where(np.isnan(delay), canonical, delay)) / period_ns
     phase -= np.floor(phase)
     return s, b, phase, beyond

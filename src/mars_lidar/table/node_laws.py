@@ -52,11 +52,6 @@ class NodeLaws:
         """Laws of no entry."""
         return cls.of(np.empty(0, np.int64), [])
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the arrays."""
-        return int(self.row.nbytes + self.first.nbytes + self.offsets.nbytes + self.pmf.nbytes)
-
     def window(self, row: int) -> Pmf | None:
         """Law of an entry; None where its cumulants are enough."""
         k = int(np.searchsorted(self.row, row))

@@ -126,19 +126,9 @@ class Nodes:
     @property
     def nbytes(self) -> int:
         """Size of its arrays."""
-        phases, entries = self.start_phases, self.entries
-        startup = 0 if entries.startup is None else entries.startup.nbytes
-        return int(
-            entries.shape.nbytes
-            + startup
-            + entries.cumulants.nbytes
-            + entries.rates.nbytes
-            + entries.enough.nbytes
-            + entries.bins.nbytes
-            + phases.correction.nbytes
-            + phases.settled.nbytes
-            + self.laws.nbytes
-        )
+        parts = vars(self.entries) | vars(self.laws)
+        parts |= {name: getattr(self.start_phases, name) for name in ("correction", "settled")}
+        return sum(each.nbytes for each in parts.values() if isinstance(each, np.ndarray))
 
     def _cycles(self, cycles: int | None) -> int:
         return self.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)

@@ -2,30 +2,64 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import TemporarySibling, check_target, reading, whole
 from mars_lidar._base.hdf5 import new_file, open_hdf5, seal
+from mars_lidar._base.types import FloatArray
+from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.table.entries import Entries
 from mars_lidar.table.node_laws import NodeLaws
 from mars_lidar.table.nodes import N, Nodes
-from mars_lidar.table.request import FORMAT
 from mars_lidar.table.start_phase import StartPhases
 
+FORMAT = 2
+KEY_LENGTH = 24
 _KIND = "mars-lidar table"
 _SUFFIXES = (".h5", ".hdf5")
 _MAPPED = ("shape", "startup")
 _READABLE = (1, FORMAT)  # the first kept no laws of entries
 
 
-def save(table: Nodes, path: Path, *, overwrite: bool) -> None:
-    """Write all of a table; the file gets its name when it is complete."""
+def request_key(
+    system: System,
+    axes: tuple[FloatArray, FloatArray],
+    *,
+    method: str,
+    rearm: str,
+    refine: float | None,
+    tolerance: float,
+) -> str:
+    """Hash of all that decides a table but its cycles, which many tables do not depend on."""
+    instrument = system.to_dict()
+    del instrument["cycles"]
+    request = {
+        "format": FORMAT,
+        "version": __version__,
+        "system": instrument,
+        "axes": [[value.hex() for value in axis.tolist()] for axis in axes],
+        "method": method,
+        "rearm": rearm,
+        "refine": refine,
+        "tolerance": tolerance,
+    }
+    text = json.dumps(request, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
+
+
+@checked
+def save(table: Nodes, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
+    path = Path(path)
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
     check_target(path, folder=False, overwrite=overwrite)
@@ -50,15 +84,10 @@ def _loaded(make: type[N], path: Path, system: System | None) -> N:
     made_for = System.from_json(header["system"])
     system = made_for if system is None else system.detected()
     _compare(path, made_for, system)
-    entries = Entries(
-        cycles=made_for.cycles,
-        **{name: arrays[name] for name in ("cumulants", "rates", "enough", "bins", "shape")},
-        startup=arrays.get("startup"),
-    )
-    phases = StartPhases(
-        **{n: arrays["phase_" + n] for n in ("signal", "background", "phase", "correction", "settled")}
-    )
-    laws = NodeLaws(**{name: arrays["law_" + name] for name in ("row", "first", "offsets", "pmf")})
+    own = {each.name: arrays[each.name] for each in fields(Entries) if each.name not in ("cycles", "startup")}
+    entries = Entries(cycles=made_for.cycles, **own, startup=arrays.get("startup"))
+    phases = StartPhases(**{each.name: arrays["phase_" + each.name] for each in fields(StartPhases)})
+    laws = NodeLaws(**{each.name: arrays["law_" + each.name] for each in fields(NodeLaws)})
     table = make(
         system,
         header["method"],
@@ -117,29 +146,10 @@ def _header(table: Nodes) -> dict[str, Any]:
 
 
 def _arrays(table: Nodes) -> dict[str, NDArray[Any]]:
-    entries, phases = table.entries, table.start_phases
-    arrays: dict[str, NDArray[Any]] = {
-        "signal": table.signal,
-        "background": table.background,
-        "cumulants": entries.cumulants,
-        "rates": entries.rates,
-        "enough": entries.enough,
-        "bins": entries.bins,
-        "phase_signal": phases.signal,
-        "phase_background": phases.background,
-        "phase_phase": phases.phase,
-        "phase_correction": phases.correction,
-        "phase_settled": phases.settled.astype(np.uint8),
-        "shape": entries.shape,
-        **_laws(table.laws),
-    }
-    if entries.startup is not None:
-        arrays["startup"] = entries.startup
-    return arrays
-
-
-def _laws(laws: NodeLaws) -> dict[str, NDArray[Any]]:
-    return {"law_row": laws.row, "law_first": laws.first, "law_offsets": laws.offsets, "law_pmf": laws.pmf}
+    arrays: dict[str, NDArray[Any]] = {"signal": table.signal, "background": table.background}
+    for prefix, part in (("", table.entries), ("phase_", table.start_phases), ("law_", table.laws)):
+        arrays |= {prefix + name: each for name, each in vars(part).items() if isinstance(each, np.ndarray)}
+    return arrays | {"phase_settled": arrays["phase_settled"].astype(np.uint8)}
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -158,7 +168,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         arrays = {name: _mapped(path, data) if name in _MAPPED else _own(whole(data)) for name, data in file.items()}
     arrays["phase_settled"] = arrays["phase_settled"].astype(bool)
     if "law_row" not in arrays:
-        arrays.update(_laws(NodeLaws.none()))
+        arrays |= {f"law_{name}": each for name, each in vars(NodeLaws.none()).items()}
     return header, arrays
 
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import Progress
 from mars_lidar.instrument.system import System
@@ -19,9 +18,8 @@ from mars_lidar.statistics.chain import Rearm
 from mars_lidar.table.axes import PAPER_GRID, Grid
 from mars_lidar.table.build import build
 from mars_lidar.table.cache import cached
-from mars_lidar.table.error import QuantisationError, quantisation_error
-from mars_lidar.table.law import LawError, law_error
-from mars_lidar.table.nodes import INTERPOLATIONS, Interpolation, Method, Nodes
+from mars_lidar.table.error import law_error, quantisation_error
+from mars_lidar.table.nodes import Method, Nodes
 from mars_lidar.table.storage import load, save
 
 
@@ -110,41 +108,9 @@ class Table(Nodes):
             progress=progress,
         )
 
-    def quantisation_error(
-        self,
-        *,
-        interpolation: Interpolation = "bilinear",
-        samples: int = 200,
-        seed: int = 0,
-        cycles: int | None = None,
-        threads: int | None = None,
-    ) -> QuantisationError:
-        """Errors on random pixels between the nodes, against the law of each evaluated directly.
-
-        Parameters
-        ----------
-        interpolation, cycles
-            As `lookup`.
-        samples, seed
-            Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
-            and the lowest value, where the axis has a 0.
-        """
-        checks.choice("interpolation", interpolation, INTERPOLATIONS)
-        return quantisation_error(self, interpolation, samples, seed, cycles, threads)
-
-    def law_error(
-        self, *, samples: int = 50, seed: int = 0, cycles: int | None = None, threads: int | None = None
-    ) -> LawError:
-        """Total variation, on random pixels, between the count law that the table leads to and the exact one.
-
-        Some 10 to 20 ms a pixel. Parameters as `quantisation_error`.
-        """
-        return law_error(self, samples, seed, cycles, threads)
-
-    @checked
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
-        save(self, Path(path), overwrite=overwrite)
+    quantisation_error = quantisation_error
+    law_error = law_error
+    save = save
 
     @classmethod
     @checked

@@ -8,6 +8,7 @@ are independent. Equation numbers: docs/detectors.md.
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -143,20 +144,25 @@ class _Grid:
         photons = np.diff(self.before)
         # photons within the dead time before each edge, t_d = K + f (1)
         shifted = self.edges - self.rest
-        earlier = self._photons(np.where(shifted < 0.0, shifted + 1.0, shifted))
-        within = self.before - earlier + self.total * ((shifted < 0.0) + self.whole)
-        keep = np.exp(-within)
-        rise = np.diff(within)
+        self.early = early = int(np.searchsorted(shifted, 0.0))  # edges whose dead time began a period earlier
+        shifted[:early] += 1.0
+        within = self.before - self._photons(shifted)
+        within[:early] += self.total
+        within += self.total * self.whole
         # integral of exp(-within) over a bin where it is linear in the exponent: (1 - e^-d) / d
-        flat = rise == 0.0
-        mean_keep = np.where(flat, 1.0, -np.expm1(-rise) / np.where(flat, 1.0, rise))
-        self.rate = photons * keep[:-1] * mean_keep  # registrations of each bin and period, warmed up
+        rise = np.diff(within)
+        mean_keep = np.divide(np.expm1(-rise), -rise, out=np.ones_like(rise), where=rise != 0.0)
+        self.rate = np.exp(-within[:-1]) * mean_keep  # registrations of each bin and period, warmed up
+        self.rate *= photons
         self.alone = np.exp(-self.before[:-1]) * -np.expm1(-photons)  # the first arrival is there, one period
-        self.below = np.concatenate([[0.0], np.cumsum(self.rate)])
-        place = np.minimum(np.searchsorted(out, self.edges[:-1], side="right") - 1, system.bins - 1)
-        self.histogram = np.bincount(place, self._exposure(), minlength=system.bins)
+        self.histogram = np.add.reduceat(self._exposure(), np.searchsorted(self.edges, out[:-1]))
         self.mean = float(self.histogram.sum())
         self.variance = max(0.0, self.mean - 2.0 * self._pairs()) if with_variance else self.mean
+
+    @cached_property
+    def below(self) -> FloatArray:
+        """Registrations before each edge in a period, warmed up."""
+        return np.concatenate([[0.0], np.cumsum(self.rate)])
 
     def _photons(self, at: FloatArray) -> FloatArray:
         return np.asarray(photons_before(self.cell, at)[0], dtype=np.float64)
@@ -169,10 +175,10 @@ class _Grid:
         empty = math.expm1(-start * self.total) / math.expm1(-self.total) if self.total > 0.0 else float(start)
         total = empty * self.alone
         if self.cycles > self.whole:
-            first = self.edges[:-1] < self.rest
-            total = total + np.where(first, math.exp(-self.whole * self.total) * self.alone, self.rate)
+            total[: self.early] += math.exp(-self.whole * self.total) * self.alone[: self.early]
+            total[self.early :] += self.rate[self.early :]
             total += (self.cycles - self.whole - 1) * self.rate
-        return np.asarray(total, dtype=np.float64)
+        return total
 
     def _registered(self, period: int, phase: FloatArray) -> FloatArray:
         """R(t): registrations expected in [0, t), t = period + phase, 0 before the exposure."""

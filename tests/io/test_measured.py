@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import h5py
@@ -14,6 +15,7 @@ from scipy.io import savemat
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.compare.views import fitted
+from mars_lidar.io.foreign import read_counts
 
 SYSTEM = ml.System(
     period_ns=50.0,
@@ -237,3 +239,28 @@ def test_files_that_cannot_be_read_name_themselves(tmp_path: Path) -> None:
         io.foreign_cube(tmp_path / "none.npy", SYSTEM)
     with pytest.raises(ValueError, match="are read from"):
         io.foreign_cube(tmp_path / "none.doc", SYSTEM)
+
+
+@pytest.mark.parametrize(
+    ("shape", "warned"),
+    [
+        ((1024, 80, 48), True),
+        ((512, 64, 64), True),
+        ((96, 96, 512), False),
+        ((80, 48, 1024), False),
+        ((64, 64, 16), False),
+    ],
+)
+def test_time_that_may_be_first_is_told(tmp_path: Path, shape: tuple[int, ...], warned: bool) -> None:
+    """Without the number of bins the last dimension is time; an image far from even is likely none."""
+    np.save(tmp_path / "a.npy", np.ones(shape, np.uint8))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        counts = read_counts(tmp_path / "a.npy").counts
+    assert counts is not None
+    assert counts.shape[1:] == shape
+    assert [("axes (--axes) is 'tyx'" in str(w.message)) for w in caught] == [True] * warned
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_counts(tmp_path / "a.npy", axes="yxt")
+        read_counts(tmp_path / "a.npy", bins=shape[0] if warned else shape[-1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -143,7 +144,20 @@ def _guessed(path: Path, shape: tuple[int, ...], bins: int | None) -> str:
         raise ValueError(f"{path}: an array of shape {shape} is no cube of histograms")
     fitting = [k for k, size in enumerate(shape) if size == bins]
     place = fitting[0] if len(fitting) == 1 else len(shape) - 1
-    return "".join([*image[:place], "t", *image[place:]])
+    axes = "".join([*image[:place], "t", *image[place:]])
+    if axes == "yxt" and _uneven(*shape[:2]) > 2.0 * _uneven(*shape[1:]):
+        height, width, length = shape
+        warnings.warn(
+            f"{path}: an array of shape {shape} was taken for {height} x {width} pixels of {length} bins; where time "
+            f"is its first dimension, axes (--axes) is 'tyx'",
+            stacklevel=2,
+        )
+    return axes
+
+
+def _uneven(height: int, width: int) -> float:
+    """How many times an image is longer than it is wide, or wider than long."""
+    return max(height, width) / max(min(height, width), 1)
 
 
 def _npz(path: Path) -> dict[str, Any]:

@@ -51,18 +51,9 @@ def reconstruction(cube: Cube, results: Mapping[str, Reconstruction], *, realiza
     with style():
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(columns * (_MAP_INCHES + 0.75) + 0.2, rows * (image + 0.32) + 0.1), dpi=DPI)
-        grid = figure.add_gridspec(
-            rows,
-            columns,
-            left=0.02,
-            right=1.0 - 0.62 / figure.get_figwidth(),
-            bottom=0.02,
-            top=1.0 - 0.26 / figure.get_figheight(),
-            wspace=0.32,
-            hspace=0.32 / image,
-        )
-        axes: Any = grid.subplots(squeeze=False)
+        size = columns * (_MAP_INCHES + 0.85) + 0.2, rows * (image + 0.32) + 0.1
+        figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+        axes: Any = figure.subplots(rows, columns, squeeze=False)
         if known:
             _draw_map(axes[0, 0], depth, "depth (m)", "viridis", depth_limits, "Truth: depth")
             axes[0, 1].set_axis_off()

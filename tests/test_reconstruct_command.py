@@ -170,6 +170,7 @@ def test_nothing_is_overwritten_unasked(cube, tmp_path):
 
 def test_without_scikit_image_the_maps_are_written_all_the_same(cube, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage", None)
+    monkeypatch.setitem(sys.modules, "skimage.metrics", None)  # where another test has imported it
     done = run("reconstruct", cube, "--no-picture", "-o", tmp_path / "m.npz")
     assert done.exit_code == 0
     assert "mars-lidar[estimate]" in done.stderr

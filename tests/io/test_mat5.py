@@ -50,7 +50,7 @@ def test_a_type_that_there_is_not_is_refused(tmp_path: Path):
     with pytest.raises(FileError, match=r"a\.mat.*no element is of type 1033"):
         read_mat5(path)
     with pytest.raises(FileError, match="no element is of type"):
-        io.read_transient(path, bin_ns=1.0)
+        io.read_transient(path, bin_ns=1.0, name="a")
 
 
 def test_a_packed_type_that_there_is_not_is_refused(tmp_path: Path):

@@ -19,7 +19,7 @@ from mars_lidar.statistics.warm import NOT_WARM, warm_history
 _UNSETTLED = -2
 _MAX_STEPS, _LANES = 80_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
 # A history of more bytes, or a dead time below a bin, makes a step cost as many; one beyond every cache four times that
-_NEAR_BYTES, _FAR_BYTES, _FAR = 1 << 20, 1 << 25, 4.0
+_NEAR_BYTES, _FAR_BYTES, _FAR = 1 << 20, 1 << 26, 4.0
 _PERIOD_BINS = 128.0  # bins that cost as much as what is done once a period
 
 

@@ -18,7 +18,7 @@ from mars_lidar.statistics.warm import NOT_WARM, warm_history
 
 _UNSETTLED = -2
 _MAX_STEPS, _LANES = 80_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
-# A history of more bytes, or a dead time below a bin, makes a step cost as many; one beyond every cache four times that
+# A history of more bytes, or a dead time below a bin, makes a step cost as many; one beyond every cache six times that
 _NEAR_BYTES, _FAR_BYTES, _FAR = 1 << 20, 1 << 26, 4.0
 _PERIOD_BINS = 128.0  # bins that cost as much as what is done once a period
 
@@ -43,7 +43,7 @@ def characteristic(
     purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
     dead = cells.system.dead_time_periods
     reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
-    dear = 4.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
+    dear = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
     dear *= 1.0 + _PERIOD_BINS / bins
     # at real points the blind of every period of a dead time are summed
     dear *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)

@@ -34,7 +34,7 @@ def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> Flo
     result = np.empty((cells.size, out_bins))
     pending = np.arange(cells.size)
     bins = cells.first_bins(out_bins)
-    most = max(MOST_BINS, 2 * out_bins)
+    most = max(MOST_BINS, out_bins)
     shared = math.gcd(bins // 2, out_bins)
     coarse = _stationary(cells, bins // 2, shared, team)
     while pending.size:

@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 from harness import (
-    COUNTS,
+    EVERYTHING,
+    GATE,
     INTERVALS,
-    JOINT,
     PERIOD_NS,
-    SHAPE,
+    WAVE,
     Case,
+    case,
     check,
     draw,
     flux_of,
     require,
     two_lobes,
     two_mean_vectors,
-    waveform_flux,
 )
 from scipy import stats
 from test_reproducibility import image
@@ -34,40 +34,11 @@ from mars_lidar.engines import ENGINES
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.statistics import constant_light_rate
 
-EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
 BOTH = ["exact", "sequential"]
 EXPONENTIAL = ml.Afterpulsing(probability=0.3, delay_ns=60.0)
-WAVE = np.concatenate([np.full(40, 0.02), np.zeros(30), np.linspace(0.0, 0.08, 30)])  # 2 photons
 SAMPLED = ml.Afterpulsing(probability=0.5, delays=(0.0, 3.0, 0.0, 1.0), bin_ns=37.0, generations=2)
 
 
-def case(
-    signal: Any,
-    background: float,
-    start: str = "armed",
-    *,
-    items: int | None = None,
-    pulse: ml.Pulse | None = None,
-    cycles: int = 60,
-    bins: int = 64,
-    delay: Any = 0.37,
-    **detector: Any,
-) -> Case:
-    system = ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=bins,
-        pulse=pulse or ml.GaussianPulse(sigma_ns=2.0),
-        start=start,
-        detector=ml.Detector(**detector),
-    )
-    flux = waveform_flux(WAVE, background) if signal is WAVE else flux_of(signal, background, delay)
-    shown = "waveform" if signal is WAVE else f"S {signal}"
-    name = f"{shown}, B {background}, {start}, {sorted(detector)}, {detector.get('mode', '')}"
-    return Case(name, flux, system, items or (4000 if start == "armed" else 1600))
-
-
-GATE = {"mode": "gated", "gate_start_ns": 83.0, "gate_width_ns": 40.0}
 CASES = [
     case(2.0, 1.0, dead_time_ns=75.0, afterpulsing=EXPONENTIAL),
     case(8.0, 0.3, "stationary", dead_time_ns=99.0, afterpulsing=SAMPLED, twilight_ns=9.0),

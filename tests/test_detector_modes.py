@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from harness import (
     COUNTS,
-    INTERVALS,
+    EVERYTHING,
     JOINT,
     PERIOD_NS,
     SHAPE,
@@ -29,7 +29,6 @@ from mars_lidar.engines import ENGINES
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.statistics import count_law, exposure_moments
 
-EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
 BOTH = ["exact", "sequential"]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from harness import (
     COUNTS,
-    INTERVALS,
+    EVERYTHING,
     JOINT,
     PERIOD_NS,
     SHAPE,
@@ -36,7 +36,6 @@ from mars_lidar.statistics import electronics_moments, mean_histogram
 TAIL = Jitter(sigma_ns=1.0, tail_ns=6.0, tail_fraction=0.3)
 SAMPLED = SampledJitter([5.0, 1, 0, 0, 2, 7, 1, 0, 0, 3], 2.5)
 CODES = (1.0, 0.3, 0.0, 2.0, 1.7, 0.5, 1.0, 1.0)
-EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
 MODES: dict[str, dict[str, Any]] = {
     "nonparalyzable": {},
     "paralyzable": {},

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from harness import (
-    COUNTS,
-    INTERVALS,
-    JOINT,
-    SHAPE,
+    EVERYTHING,
     Case,
     armed_count_pmf,
     check,
@@ -26,7 +23,6 @@ from mars_lidar.engines import ENGINES
 from mars_lidar.instrument.system import MAX_CYCLES
 
 GAUSSIAN = ml.GaussianPulse(sigma_ns=1.0)
-EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
 LONGEST = MAX_CYCLES
 
 

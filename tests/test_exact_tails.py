@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from harness import (
-    COUNTS,
-    INTERVALS,
-    JOINT,
-    SHAPE,
+    EVERYTHING,
     Case,
     check,
     first_arrival,
@@ -24,7 +21,6 @@ from scipy import special, stats
 import mars_lidar as ml
 from mars_lidar.engines import ENGINES
 
-EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
 GAUSSIAN = ml.GaussianPulse(sigma_ns=1.0)
 # Sampled pulses begin abruptly; phases are float32, so an edge on a bin's edge would leak 2^-25 of a period.
 DELAY_NS = 50.003

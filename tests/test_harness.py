@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from harness import (
     COUNTS,
-    INTERVALS,
+    EVERYTHING,
     JOINT,
     LEVEL,
     PERIOD_NS,
@@ -45,7 +45,6 @@ from mars_lidar.engines import ENGINES, Engine
 from mars_lidar.engines.engine import Records, Task
 
 EXACT = ENGINES["exact"]
-EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
 HISTOGRAMS = {COUNTS, SHAPE, JOINT}
 MID = Case(
     "mid",

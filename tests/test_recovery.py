@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from harness import (
-    COUNTS,
+    EVERYTHING,
+    GATE,
     INTERVALS,
-    JOINT,
     PERIOD_NS,
-    SHAPE,
+    WAVE,
     Case,
+    case,
     check,
     draw,
     flux_of,
@@ -32,10 +33,7 @@ from mars_lidar.engines.engine import Engine, Records, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.instrument.effects import EFFECTS
 
-EVERYTHING = {COUNTS, SHAPE, JOINT, INTERVALS}
 BOTH = ["exact", "sequential"]
-WAVE = np.concatenate([np.full(40, 0.02), np.zeros(30), np.linspace(0.0, 0.08, 30)])  # 2 photons
-GATE = {"mode": "gated", "gate_start_ns": 83.0, "gate_width_ns": 40.0}
 
 
 class EveryArrival(Engine):
@@ -99,32 +97,6 @@ class EveryArrival(Engine):
 
 def pixels_of(flux: ml.Flux) -> int:
     return flux.shape[0] * flux.shape[1]
-
-
-def case(
-    signal: Any,
-    background: float,
-    start: str = "armed",
-    *,
-    items: int | None = None,
-    pulse: ml.Pulse | None = None,
-    cycles: int = 60,
-    bins: int = 64,
-    delay: Any = 0.37,
-    **detector: Any,
-) -> Case:
-    system = ml.System(
-        period_ns=PERIOD_NS,
-        cycles=cycles,
-        bins=bins,
-        pulse=pulse or ml.GaussianPulse(sigma_ns=2.0),
-        start=start,
-        detector=ml.Detector(**detector),
-    )
-    flux = waveform_flux(WAVE, background) if signal is WAVE else flux_of(signal, background, delay)
-    shown = "waveform" if signal is WAVE else f"S {signal}"
-    name = f"{shown}, B {background}, {start}, {detector}"
-    return Case(name, flux, system, items or (4000 if start == "armed" else 1600))
 
 
 ARMED = [

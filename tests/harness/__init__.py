@@ -11,8 +11,11 @@ new choice of seeds, with a probability of at most N x LEVEL; the terminal summa
 """
 
 from harness.cases import (
+    GATE,
     PERIOD_NS,
+    WAVE,
     Case,
+    case,
     flux_of,
     measured_pulse,
     random_cases,
@@ -20,7 +23,7 @@ from harness.cases import (
     two_lobes,
     waveform_flux,
 )
-from harness.check import COUNTS, INTERVALS, JOINT, SHAPE, check, compare
+from harness.check import COUNTS, EVERYTHING, INTERVALS, JOINT, SHAPE, check, compare
 from harness.joint import JointLaw
 from harness.laws import Law, armed_count_pmf, constant_rate_moments, first_arrival, stationary_count_pmf
 from harness.ledger import FAMILY_LEVEL, LEVEL, rejected, require
@@ -30,13 +33,16 @@ from harness.sample import Sample, draw, task_of
 
 __all__ = [
     "COUNTS",
+    "EVERYTHING",
     "FAMILY_LEVEL",
+    "GATE",
     "INTERVALS",
     "JOINT",
     "LEVEL",
     "PERIOD_NS",
     "REFERENCE_NAMES",
     "SHAPE",
+    "WAVE",
     "Case",
     "JointLaw",
     "Law",
@@ -54,6 +60,7 @@ __all__ = [
     "goodness",
     "mean_vector",
     "measured_pulse",
+    "case",
     "random_cases",
     "rejected",
     "require",

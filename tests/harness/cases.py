@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from numpy.typing import ArrayLike
 from mars_lidar import Detector, Flux, GaussianPulse, Pulse, SampledPulse, System
 
 PERIOD_NS = 100.0
+WAVE = np.concatenate([np.full(40, 0.02), np.zeros(30), np.linspace(0.0, 0.08, 30)])  # 2 photons
+GATE = {"mode": "gated", "gate_start_ns": 83.0, "gate_width_ns": 40.0}
 _SHARED = Path(__file__).parents[3] / "shared"
 _PIXELS = 4  # all alike: the same law from neighbouring streams
 
@@ -52,6 +55,34 @@ def waveform_flux(waveform: ArrayLike, background: float = 0.0) -> Flux:
         waveform=np.broadcast_to(np.asarray(waveform, float), (1, _PIXELS, np.size(waveform))),
         background=background,
     )
+
+
+def case(
+    signal: Any,
+    background: float,
+    start: str = "armed",
+    *,
+    items: int | None = None,
+    pulse: Pulse | None = None,
+    cycles: int = 60,
+    bins: int = 64,
+    delay: Any = 0.37,
+    **detector: Any,
+) -> Case:
+    """A case by the fields of its detector; the waveform `WAVE` in the place of a signal is taken for one."""
+    system = System(
+        period_ns=PERIOD_NS,
+        cycles=cycles,
+        bins=bins,
+        pulse=pulse or GaussianPulse(sigma_ns=2.0),
+        start=start,
+        detector=Detector(**detector),
+    )
+    flux = waveform_flux(WAVE, background) if signal is WAVE else flux_of(signal, background, delay)
+    shown = "waveform" if signal is WAVE else f"S {signal}"
+    told = [f"{k} {v}" if isinstance(v, int | float | str) else k for k, v in sorted(detector.items())]
+    name = f"{shown}, B {background}, {start}, {', '.join(told)}"
+    return Case(name, flux, system, items or (4000 if start == "armed" else 1600))
 
 
 def two_lobes() -> np.ndarray:

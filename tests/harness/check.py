@@ -29,6 +29,7 @@ COUNTS = "counts"  # the law of the number of registrations
 SHAPE = "shape"  # the mean histogram
 JOINT = "joint"  # variances and covariances of the bins
 INTERVALS = "intervals"  # single registrations: times between them, and when they happen
+EVERYTHING = frozenset((COUNTS, SHAPE, JOINT, INTERVALS))
 
 _MOST_CELLS = 80
 _OFTEN = 500  # exposures that must differ from the rest before a number is as good as Gaussian

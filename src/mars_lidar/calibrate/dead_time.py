@@ -10,11 +10,11 @@ import numpy as np
 from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch
 from mars_lidar.calibrate.calibration_result import Calibration, nearest
 from mars_lidar.calibrate.hidden_dead_time import EDGE
+from mars_lidar.calibrate.hidden_light import SHUT, with_hidden, without_pulse
 from mars_lidar.calibrate.recovery_edge import ORDINARY, REACH, Edge, Law, edge_of
 from mars_lidar.calibrate.same_phase import SIGNIFICANT, departure_of, too_coarse
 from mars_lidar.calibrate.sharp_edge import ALL, WIDEST, SharpEdge, width_of
 from mars_lidar.calibrate.shortest_intervals import FEW, Ages, extrapolated, is_sharp
-from mars_lidar.calibrate.unknowns import SHUT, with_hidden, without_pulse
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 
 SHARP = 0.01  # false-alarm probability of a blurred edge

@@ -9,10 +9,11 @@ from typing import Literal
 from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch, fitted
 from mars_lidar.calibrate.calibration_result import Calibration
 from mars_lidar.calibrate.hidden_dead_time import excess, hidden
+from mars_lidar.calibrate.hidden_light import SHUT, may_shut, with_hidden, with_later
 from mars_lidar.calibrate.intervals import Stream, Summary
 from mars_lidar.calibrate.light_behind import LightBehind
 from mars_lidar.calibrate.shortest_intervals import FEW, LEAST_REACH, Ages, shortest
-from mars_lidar.calibrate.unknowns import SHUT, is_seen, may_shut, with_hidden, with_later
+from mars_lidar.calibrate.unknowns import is_seen
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse
 
 _BRIGHT = 1.0  # photons of a pulse of which a pixel may see the first alone

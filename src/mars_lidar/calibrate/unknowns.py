@@ -1,22 +1,15 @@
-"""What a stream cannot tell of what was calibrated from it: an error of NaN, and a sentence that says why.
-
-And what a jitter too small to be seen changes of a calibrated light: part of its error, or a reason to state none.
-"""
+"""What a stream cannot tell of what was calibrated from it: an error of NaN, and a sentence that says why."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration_fit import log_likelihood
-from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch
-from mars_lidar.calibrate.calibration_result import Calibration, nearest
-from mars_lidar.calibrate.light_behind import MATTERS
-from mars_lidar.calibrate.shortest_intervals import FEW
+from mars_lidar.calibrate.calibration_result import Calibration
 from mars_lidar.instrument.pulse import GaussianPulse
 
 _MISFIT = 1e-5  # false-alarm probability of light that is told not to be that of the pulse
@@ -24,7 +17,7 @@ _GROUPS, _EXPECTED = 128, 10.0  # of the bins at most, registrations in each at 
 _SEEN = 15.0  # gain of log likelihood by which returns of unknown width are seen: chance peaks gain less
 _HIDDEN = 5.0  # standard errors of a constant light that a pulse which is not seen may have
 _UNIT = 1.0  # units of the clock that a pulse must be wide
-_UNSEEN = 0.5  # passes below which the light of a bin is not known
+UNSEEN = 0.5  # passes below which the light of a bin is not known
 _BIASED = 0.5  # standard errors
 
 
@@ -65,10 +58,10 @@ def told(found: Calibration, *, edge: bool) -> Calibration:
 
 def _free(found: Calibration, lost: set[str]) -> list[str]:
     passes = found.armed.passes
-    if (passes >= _UNSEEN).all() and not _crowded(found, found.armed.rate):
+    if (passes >= UNSEEN).all() and not _crowded(found, found.armed.rate):
         return []
     lost.update(found.names)
-    dark = int((passes < _UNSEEN).sum())
+    dark = int((passes < UNSEEN).sum())
     if dark:
         return [f"all of the light is not known: {dark:,} of {passes.size:,} bins of the period were never watched"]
     return [_CROWDED]
@@ -144,72 +137,3 @@ def misfit(found: Calibration) -> float:
     judged = wanted > 0.5 * _EXPECTED
     square = float(((got - wanted)[judged] ** 2 / wanted[judged]).sum())
     return float(chi2.sf(square, max(int(judged.sum()) - len(found.names), 1)))
-
-
-Again = Callable[[Watch, Calibration | None], Calibration]
-"""The light of the same stream for another detector, begun with that of another calibration."""
-
-_BRIGHT = 0.02  # photons of signal from which on a jitter moves the light by more than its error
-SHUT = 4.0  # photons of signal of which the pixel sees the first alone
-_PARTS = (0.6, 1.0)  # of a hidden jitter that are tried
-_HIDES = (
-    "signal, delay and width are not known: the pulse is bright, only its first photons are seen, and how much of its "
-    "width is jitter is not"
-)
-_LATER = (
-    "all of the light is not known: a jitter may hide after which, to be safe, hardly a registration is left: give the "
-    "dead time and the jitter"
-)
-
-
-def with_hidden(found: Calibration, jitter: float, again: Again, *, known: bool) -> Calibration:
-    """`found` with what jitters of sigma up to `jitter`, ns, would change of its light added to the covariance.
-
-    `again` fits the light for another detector; `known`: the shape of the pulse was given. No error is stated of
-    signal, delay and width of a pulse so bright that only its first photons are seen.
-    """
-    if not isinstance(found.pulse, GaussianPulse) or jitter < MATTERS * found.pulse.sigma_ns:
-        return found
-    if found.signal < _BRIGHT or known:
-        return found
-    if found.signal > SHUT:
-        return without_pulse(found)
-    covariance = found.covariance
-    for part in _PARTS:
-        # armed for certain later than without it
-        hold = max(found.armed.hold_off_ns, found.dead_time_ns + CERTAIN * part * jitter)
-        other = again(Watch(found.armed.hold_off_ns, hold, part * jitter, by=found.dead_time_by), found)
-        if other.armed.used < FEW or not other.converged:
-            return without_pulse(found)
-        moved = nearest(found, other.parameters - found.parameters)
-        covariance = covariance + np.outer(moved, moved)
-    found = replace(found, covariance=covariance)
-    return without_pulse(found) if may_shut(found) else found
-
-
-def may_shut(found: Calibration) -> bool:
-    """Whether the pulse may be so bright that the pixel sees its first photons alone: by three standard errors."""
-    lights = [k for k, name in enumerate(found.names) if name.startswith("signal")]
-    error = math.sqrt(max(float(found.covariance[np.ix_(lights, lights)].sum()), 0.0))
-    return not found.signal + 3.0 * error <= SHUT
-
-
-def with_later(found: Calibration, jitter: float, again: Again, *, bright: bool) -> Calibration:
-    """`with_hidden` for a free shape: watched only from where the pixel is armed for certain with such a jitter.
-
-    Of a `bright` pulse what is not watched then is light too.
-    """
-    hold = found.dead_time_ns + CERTAIN * jitter
-    if not hold > found.armed.hold_off_ns:
-        return found
-    other = again(Watch(hold, hold, by=found.dead_time_by), None)
-    if other.armed.used < FEW or (bright and (other.armed.passes < _UNSEEN).any()):
-        return replace(found, covariance=np.full_like(found.covariance, math.nan), unknown=(*found.unknown, _LATER))
-    return replace(found, covariance=found.covariance + (other.total - found.total) ** 2)
-
-
-def without_pulse(found: Calibration) -> Calibration:
-    """Without errors of signal, delay and width, and a sentence that says why."""
-    lost = np.array([name.startswith(("signal", "delay", "sigma")) for name in found.names])
-    covariance = np.where(lost | lost[:, None], math.nan, found.covariance)
-    return replace(found, covariance=covariance, unknown=(*found.unknown, _HIDES))

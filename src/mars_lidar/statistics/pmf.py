@@ -106,12 +106,18 @@ def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int)
 def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
     """The window if it holds all of the law: nothing at its ends, no negative probability, the mean where it was."""
     away = float(pmf @ (first + np.arange(pmf.size))) - mean
-    ends = max(abs(float(pmf[-1])), abs(float(pmf[0])) if first > 0 else 0.0)
+    ends = _ends(pmf, first)
     if not (ends <= _EDGE and abs(away) <= _LIKE_CUMULANTS * max(spread, 0.5) and float(pmf.min()) >= -_CONSISTENT):
         return None
     if not abs(float(pmf.sum()) - 1.0) <= _CONSISTENT:
         return None
     return Pmf(first, np.maximum(pmf, 0.0), pmf.size * _EDGE)
+
+
+def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
+    """The larger probability of a window's first and last count, of those that others may lie beyond."""
+    low = abs(float(pmf[0])) if first > 0 else 0.0
+    return max(low, abs(float(pmf[-1])) if first + pmf.size - 1 < most else 0.0)
 
 
 def _alone(cell: Cells, threads: int) -> Pmf:
@@ -228,15 +234,13 @@ def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
     pmf: NDArray[np.float64] = window.p
     offset = window.first + np.arange(pmf.size) - cumulants[0]
     spread = max(math.sqrt(cumulants[1]), 1e-3)
-    if window.outside > TAIL * 4.0:  # a guessed support
-        whole = window.first + pmf.size - 1 >= _most(cells)
-        ends = max(0.0 if whole else abs(float(pmf[-1])), abs(float(pmf[0])) if window.first > 0 else 0.0)
-        if ends > _EDGE + _CONSISTENT_PER_CYCLE * cells.system.cycles:
-            raise ConvergenceError(
-                f"count law of {cells.name(cell)}: it reaches beyond {window.first} .. {window.first + pmf.size - 1}, "
-                f"where mean and variance let expect its end; mean, variance and cumulants are known; for the law "
-                f"{cells.instead}"
-            )
+    edge = _EDGE + _CONSISTENT_PER_CYCLE * cells.system.cycles
+    if window.outside > TAIL * 4.0 and _ends(pmf, window.first, _most(cells)) > edge:  # a guessed support
+        raise ConvergenceError(
+            f"count law of {cells.name(cell)}: it reaches beyond {window.first} .. {window.first + pmf.size - 1}, "
+            f"where mean and variance let expect its end; mean, variance and cumulants are known; for the law "
+            f"{cells.instead}"
+        )
     total, mean = float(pmf.sum()), float((pmf * offset).sum())
     variance, least = float((pmf * offset**2).sum()), float(pmf.min())
     # rounding and extrapolation err in probabilities, whatever the width: for a locked count, more than its variance

@@ -16,7 +16,7 @@ from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.electronics_law import stationary_records
+from mars_lidar.statistics.electronics_shape import stationary_records
 from mars_lidar.statistics.exposure_result import normalised
 from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.histogram import histogram_effects, mean_histograms

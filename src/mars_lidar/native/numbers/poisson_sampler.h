@@ -1,4 +1,4 @@
-// Exact Poisson numbers of any mean from 0 to 1e12, each a pure function of (stream, event).
+// Exact Poisson numbers of any mean from 0 to 1e12: each a pure function of (stream, event), or the next of a generator.
 //
 // Means below 10: inversion. Above: transformed rejection with squeeze, algorithm PTRS of W. Hormann, "The
 // transformed rejection method for generating Poisson random variables", Insurance: Mathematics and Economics
@@ -52,10 +52,22 @@ class PoissonSampler {
     }
 
     int64_t operator()(const EventStream& stream, uint32_t event) {
-        return mean_ < kInversionBelow ? invert(stream.word(event, 0)) : transform(stream, event);
+        return number([&](uint32_t step) { return stream.word(event, step); });
+    }
+
+    // `random` gives 64 random bits a call.
+    template <class Random>
+    int64_t operator()(Random& random) {
+        return number([&](uint32_t) { return random(); });
     }
 
  private:
+    // `word` gives the random bits of a step; steps are asked for in order.
+    template <class Word>
+    int64_t number(const Word& word) {
+        return mean_ < kInversionBelow ? invert(word(0)) : transform(word);
+    }
+
     static constexpr double kInversionBelow = 10.0;
 
     // The number of k with v < P(N > k), v uniform. From the upper tail, because v is fine near 0: right for
@@ -77,10 +89,11 @@ class PoissonSampler {
         return k;
     }
 
-    int64_t transform(const EventStream& stream, uint32_t event) const {
+    template <class Word>
+    int64_t transform(const Word& word) const {
         for (uint32_t step = 0;; step += 2) {
-            const double u = open_uniform(stream.word(event, step)) - 0.5;
-            const double v = open_uniform(stream.word(event, step + 1));
+            const double u = open_uniform(word(step)) - 0.5;
+            const double v = open_uniform(word(step + 1));
             const double us = 0.5 - std::fabs(u);
             const double x = (2.0 * a_ / us + b_) * u + mean_ + 0.43;
             if (us >= 0.07 && v <= squeeze_) return static_cast<int64_t>(x);

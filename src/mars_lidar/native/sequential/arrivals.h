@@ -1,18 +1,19 @@
 // Every photon that reaches one pixel: drawn block by block of laser periods, then sorted.
 //
-// Plain textbook sampling with libm and <random> in double precision. The exact engine must share nothing
-// with this file but the parameters of the pulse: the two check each other.
+// Plain textbook sampling with libm in double precision. The exact engine must share nothing with this file but the
+// parameters of the pulse: the two check each other. Numbers of photons come from numbers/poisson_sampler.h, which the
+// exact engine does not use; std::poisson_distribution calls lgamma, which writes to a global that threads share.
 #pragma once
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <random>
 #include <utility>
 #include <vector>
 
 #include "instrument/job.h"
 #include "instrument/pulse.h"
+#include "numbers/poisson_sampler.h"
 #include "sequential/xoshiro.h"
 
 namespace mars {
@@ -73,7 +74,7 @@ class Arrivals {
         times.clear();
         for (Source& source : sources_) {
             if (source.cycles != cycles) {
-                source.number = Number(source.photons * static_cast<double>(cycles));
+                source.number = PoissonSampler(source.photons * static_cast<double>(cycles));
                 source.cycles = cycles;
             }
             const size_t begin = times.size();
@@ -104,19 +105,17 @@ class Arrivals {
 
  private:
     enum class Shape { uniform, gaussian, sampled, waveform };
-    using Number = std::poisson_distribution<int64_t>;
-
     struct Source {
         double photons;  // per period
         Shape shape;
         double delay;
         int64_t cycles;  // block length for which `number` is set up
-        Number number;
+        PoissonSampler number;
     };
 
     void add(double photons, Shape shape, double delay) {
         if (!(photons > 0.0)) return;
-        sources_.push_back({photons, shape, delay, 0, Number()});
+        sources_.push_back({photons, shape, delay, 0, PoissonSampler(0.0)});
         photons_ += photons;
     }
 

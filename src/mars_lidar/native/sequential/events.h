@@ -5,10 +5,10 @@
 #include <cmath>
 #include <cstdint>
 #include <queue>
-#include <random>
 #include <utility>
 #include <vector>
 
+#include "numbers/poisson_sampler.h"
 #include "sequential/pixel.h"
 #include "sequential/recorder.h"
 #include "sequential/warm_up.h"
@@ -183,7 +183,7 @@ class EventSimulator {
     void avalanche(Member& member, const Arrival& cause) {
         const Traps& traps = job_.traps;
         if (traps.mean > 0.0 && cause.generation < traps.generations) {
-            for (int64_t left = std::poisson_distribution<int64_t>(traps.mean)(member.random); left > 0; --left) {
+            for (int64_t left = PoissonSampler(traps.mean)(member.random); left > 0; --left) {
                 const Time released = cause.time.plus(delay(member.random));
                 if (released < Time{job_.cycles, 0})
                     queue_.push({released, cause.pixel, Arrival::Kind::carrier, cause.generation + 1});

@@ -16,7 +16,6 @@ import scipy
 import mars_lidar as ml
 from benchmarks.config import Config
 from mars_lidar import _core
-from studies.common.report import processor
 
 _QUIET = 0.1  # share of the processors
 
@@ -82,6 +81,17 @@ class Interference:
         own = os.times()
         user, nice, kernel, _, _, interrupts, soft, steal = field[:8]
         return time.perf_counter(), sum(own[:4]), user + nice + kernel + interrupts + soft, steal
+
+
+def processor() -> str:
+    """Name of the processor."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith(("model name", "Model")):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
 
 
 def _memory_bytes() -> int:

@@ -1,6 +1,6 @@
 """The MaRS paper's whole pipeline in NumPy, stage by stage, in turn with the engines that do the same.
 
-The pipeline is `studies.runtime.numpy_pipeline`; its table holds the exact moments, 256 x 100 at full size.
+The pipeline is `benchmarks.numpy_pipeline`; its table holds the exact moments, 256 x 100 at full size.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import time
 from benchmarks.config import Config
 from benchmarks.engines import PAPER_MARS_S
 from benchmarks.floor import Bandwidth
+from benchmarks.numpy_pipeline import NumpyTable, synthesize
 from benchmarks.report import Goal, Section
 from benchmarks.rows import engine_row, timing_row
 from benchmarks.timing import in_turn
@@ -17,7 +18,6 @@ from benchmarks.workload import EngineRun, canonical
 from mars_lidar import _core
 from mars_lidar.engines import ANY_SYSTEM, MarsEngine
 from mars_lidar.table import Table
-from studies.runtime.numpy_pipeline import NumpyTable, synthesize
 
 _AXIS = (0.01, 10.0)
 GOAL_MARS = 25.0
@@ -30,7 +30,8 @@ def pipeline(config: Config, bandwidth: Bandwidth) -> Section:
     workload = canonical(config)
     points = (256, 100) if config.mode == "full" else (32, 24)
     began = time.perf_counter()
-    table = NumpyTable.build(workload.system, (*_AXIS, points[0]), (*_AXIS, points[1]))
+    entries = Table.build(workload.system, (*_AXIS, points[0]), (*_AXIS, points[1]))
+    table = NumpyTable.of(entries, workload.system)
     built = time.perf_counter() - began
     stages: dict[str, float] = {}
     out = workload.warm()
@@ -43,11 +44,11 @@ def pipeline(config: Config, bandwidth: Bandwidth) -> Section:
         if engine not in ("exact", "sequential", "mars", "renewal"):  # those need a table of their own, or arrivals
             runs[f"{engine}, all threads"] = EngineRun(workload, engine=engine, threads=every, out=out)
     cube = out.reshape(1, *workload.flux.shape, workload.system.bins)
-    mars = MarsEngine(Table.build(workload.system, (*_AXIS, points[0]), (*_AXIS, points[1])))
+    mars = MarsEngine(entries)
     cases = {
         **runs,
         _MARS: lambda: mars.histogram(workload.task(every), out),
-        _NAME: lambda: synthesize(table, workload.flux, stages=stages, out=cube),
+        _NAME: lambda: synthesize(table, workload.flux, cube, seed=0, stages=stages),
     }
     times = in_turn(cases, config)
     reference = times["exact, all threads"]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks.machine import processor
 from mars_lidar._base.optional import needed
 
 if TYPE_CHECKING:
@@ -170,14 +171,3 @@ def load() -> str:
         return f"{os.getloadavg()[0]:.1f} on {os.cpu_count()} processors"
     except OSError:
         return "not known on this system"
-
-
-def processor() -> str:
-    """Name of the processor."""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith(("model name", "Model")):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

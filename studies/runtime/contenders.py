@@ -9,9 +9,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from benchmarks.numpy_pipeline import NumpyTable, synthesize
 from mars_lidar import Flux, System, Table, simulate
 from mars_lidar.engines import ANY_SYSTEM, Engine, MarsEngine
-from studies.runtime.numpy_pipeline import NumpyTable, synthesize
 
 Run = Callable[[int, NDArray[Any]], dict[str, float]]  # seed, memory for the cube -> seconds of stages
 TABLE_RANGE = (0.01, 10.0)  # photons per period, of both axes of the tables
@@ -56,7 +56,7 @@ class Tables:
     def numpy(self, system: System) -> NumpyTable:
         """The same for the pipeline in NumPy; one is held at a time, a full one takes 210 MB."""
         if self._numpy is None or self._numpy.system != system:
-            self._numpy = NumpyTable.of_table(self.get(system), system)
+            self._numpy = NumpyTable.of(self.get(system), system)
         return self._numpy
 
 
@@ -67,7 +67,7 @@ def contenders(tables: Tables) -> list[Contender]:
         return _engine(MarsEngine(tables.get(system), outside="exact"), flux, system, realizations)
 
     def numpy(flux: Flux, system: System, realizations: int) -> Run:
-        return partial(_pipeline, tables.numpy(system), flux, realizations)
+        return partial(_pipeline, tables.numpy(system), flux)
 
     found = [
         Contender(name, "mars, no table" if name == "mars" else name, partial(_engine, name)) for name in ANY_SYSTEM
@@ -85,9 +85,9 @@ def _engine(engine: str | Engine, flux: Flux, system: System, realizations: int)
     return run
 
 
-def _pipeline(table: NumpyTable, flux: Flux, realizations: int, seed: int, out: NDArray[Any]) -> dict[str, float]:
+def _pipeline(table: NumpyTable, flux: Flux, seed: int, out: NDArray[Any]) -> dict[str, float]:
     stages: dict[str, float] = {}
-    synthesize(table, flux, realizations=realizations, seed=seed, stages=stages, out=out)
+    synthesize(table, flux, out, seed=seed, stages=stages)
     return stages
 
 

@@ -38,50 +38,21 @@ class NumpyTable:
     system: System
 
     @classmethod
-    def build(
-        cls,
-        system: System,
-        signal: tuple[float, float, int] = (0.01, 10.0, 256),
-        background: tuple[float, float, int] = (0.01, 10.0, 100),
-    ) -> NumpyTable:
-        """A new `Table` of axes (low, high, points), at least 2 points, in the form of this pipeline."""
-        return cls.of_table(Table.build(system, signal, background))
-
-    @classmethod
-    def of_table(cls, table: Table, system: System | None = None) -> NumpyTable:
-        """The entries of a `Table`, for `system` if that has another number of cycles; those of no flux left out."""
-        seen = table.system if system is None else system
+    def of(cls, table: Table, system: System) -> NumpyTable:
+        """The entries of a `Table` of logarithmic axes, for `system`, of its own cycles; those of no flux left out."""
         signal, background = (axis[axis > 0] for axis in (table.signal, table.background))
-        skipped = table.signal.size - signal.size, table.background.size - background.size
-        rows = np.arange(table.signal.size * table.background.size).reshape(table.signal.size, -1)
-        inner = rows[skipped[0] :, skipped[1] :].ravel()
-        nodes = np.repeat(signal, background.size), np.tile(background, signal.size)
-        moments = table.lookup(*nodes, cycles=seen.cycles, interpolation="nearest").cumulants
-        shapes = table.shapes(seen.cycles)[inner]
-        return cls.of(seen, signal, background, moments[:, 0], moments[:, 1], shapes)
-
-    @classmethod
-    def of(
-        cls,
-        system: System,
-        signal: FloatArray,
-        background: FloatArray,
-        mean: FloatArray,
-        variance: FloatArray,
-        shapes: NDArray[np.float32],
-    ) -> NumpyTable:
-        """From entries of logarithmic axes (nS,), (nB,): moments (nS * nB,), shapes (nS * nB, bins)."""
-        for name, axis in (("signal", signal), ("background", background)):
-            steps = np.diff(np.log(axis))
-            if axis.size < 2 or not np.allclose(steps, steps[0], rtol=1e-6):
-                raise ValueError(f"{name} must be a logarithmic axis of at least 2 points, got {axis[:3]}...")
         logs = np.log(signal), np.log(background)
+        rows = np.arange(table.signal.size * table.background.size).reshape(table.signal.size, -1)
+        inner = rows[-signal.size :, -background.size :].ravel()
+        nodes = np.repeat(signal, background.size), np.tile(background, signal.size)
+        moments = table.lookup(*nodes, cycles=system.cycles, interpolation="nearest").cumulants
+        shapes = table.shapes(system.cycles)[inner]
         return cls(
             low=(float(logs[0][0]), float(logs[1][0])),
             step=(float(logs[0][1] - logs[0][0]), float(logs[1][1] - logs[1][0])),
             points=(signal.size, background.size),
-            mean=mean,
-            spread=np.sqrt(variance),
+            mean=moments[:, 0],
+            spread=np.sqrt(moments[:, 1]),
             doubled=np.concatenate([shapes, shapes], axis=1, dtype=np.float32),
             system=system,
         )
@@ -95,35 +66,20 @@ class NumpyTable:
         return np.asarray(found[0] * self.points[1] + found[1], dtype=np.intp)
 
 
-def synthesize(
-    table: NumpyTable,
-    flux: Flux,
-    *,
-    realizations: int = 1,
-    seed: int = 0,
-    stages: dict[str, float] | None = None,
-    out: NDArray[Any] | None = None,
-) -> NDArray[Any]:
-    """A cube (realizations, H, W, bins) of counts x multinomial, in `out` if given.
-
-    To `stages` the seconds of each of `STAGES` are added.
-    """
-    spent = {} if stages is None else stages
+def synthesize(table: NumpyTable, flux: Flux, out: NDArray[Any], *, seed: int, stages: dict[str, float]) -> None:
+    """Fill a cube (realizations, H, W, bins) with counts x multinomial; adds the seconds of `STAGES` to `stages`."""
     random = np.random.default_rng(seed)
-    system = table.system
-    bins, pixels = system.bins, flux.shape[0] * flux.shape[1]
+    bins, period_ns, pixels = table.system.bins, table.system.period_ns, flux.shape[0] * flux.shape[1]
     windows = np.lib.stride_tricks.sliding_window_view(table.doubled, bins, axis=1)
     maps = [m.reshape(-1) for m in (flux.signal, flux.background, flux.delay_ns)]
-    if out is None:
-        out = np.empty((realizations, *flux.shape, bins), system.histogram_dtype)
-    cube = out.reshape(realizations, pixels, bins)
+    cube = out.reshape(len(out), pixels, bins)
     for start in range(0, pixels, _BLOCK):
         signal, background, delay = (m[start : start + _BLOCK] for m in maps)
         begun = time.perf_counter()
         rows = table.rows(signal, background)
         mean, spread = table.mean[rows], table.spread[rows]
         looked = time.perf_counter()
-        shift = np.rint((delay / system.period_ns - 0.5) * bins).astype(np.intp) % bins
+        shift = np.rint((delay / period_ns - 0.5) * bins).astype(np.intp) % bins
         shapes = windows[rows, (bins - shift) % bins].astype(np.float64)
         shapes /= shapes.sum(axis=1, keepdims=True)
         aligned = time.perf_counter()
@@ -132,5 +88,4 @@ def synthesize(
             one[start : start + _BLOCK] = random.multinomial(counts, shapes)
         done = time.perf_counter()
         for name, seconds in zip(STAGES, (looked - begun, aligned - looked, done - aligned), strict=True):
-            spent[name] = spent.get(name, 0.0) + seconds
-    return out
+            stages[name] = stages.get(name, 0.0) + seconds

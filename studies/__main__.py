@@ -30,7 +30,7 @@ def _parser(command: str) -> argparse.ArgumentParser:
     out = Path("study-results")
     add("--out", type=Path, default=out, metavar="DIR", help="folder to write into, made if missing (%(default)s)")
     add("--quick", action="store_true", help="small grids, few realizations: seconds, not for citing")
-    words = "folder of the reference cases, *.json (studies 'reference', 'joint-covariance', 'domain')"
+    words = "folder of the reference cases, *.json (studies 'reference', 'joint-covariance')"
     add("--data", type=Path, metavar="DIR", help=words)
     words = "measured photon stream: a .mat with times in units of 64 ps (studies 'hardware', 'uncertainty')"
     add("--stream", type=Path, metavar="FILE", help=words)

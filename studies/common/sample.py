@@ -128,7 +128,14 @@ def draw(
 
 
 def histograms(
-    engine: str | Engine, flux: Flux, system: System, *, realizations: int, seed: int
+    engine: str | Engine,
+    flux: Flux,
+    system: System,
+    *,
+    realizations: int,
+    seed: int,
+    threads: int | None = None,
+    report: dict[str, float] | None = None,
 ) -> Iterator[tuple[int, NDArray[Any]]]:
     """Blocks of a simulation: yields (number of the first realization, cube), the cube's memory used again."""
     pixels = flux.shape[0] * flux.shape[1]
@@ -137,5 +144,15 @@ def histograms(
     memory = np.empty((step, *flux.shape, system.bins), system.histogram_dtype)
     for start in range(0, realizations, step):
         cube = memory[: min(step, realizations - start)]
-        simulate(flux, system, engine=engine, realizations=len(cube), first_realization=start, seed=seed, out=cube)
+        simulate(
+            flux,
+            system,
+            engine=engine,
+            realizations=len(cube),
+            first_realization=start,
+            seed=seed,
+            threads=threads,
+            report=report,
+            out=cube,
+        )
         yield start, cube

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mars_lidar._base.types import FloatArray
+from mars_lidar.statistics.distance import neighbours
 from studies.domain.samples import Sample
 
 Numbers = NDArray[np.int64]
@@ -41,9 +42,9 @@ def against_law(sample: Sample, oracle: str, first: int, pmf: FloatArray) -> lis
     checks = [Check(sample.engine, oracle, "extremes of the count", 0.0 if beyond.any() else 1.0, stray)]
     inside = np.clip(sample.counts - first, 0, pmf.size - 1)
     expected = pmf * n
-    cell = merge(expected)
-    expected = np.bincount(cell, expected).astype(np.float64)
-    observed = np.bincount(cell[inside], minlength=expected.size)
+    groups = neighbours(expected, LEAST)
+    expected = np.add.reduceat(expected, groups)
+    observed = np.add.reduceat(np.bincount(inside, minlength=pmf.size), groups)
     if expected.size > 1 and expected.min() > 0.5 * LEAST:
         p = float(stats.chi2.sf(((observed - expected) ** 2 / expected).sum(), expected.size - 1))
         variation = 0.5 * float(np.abs(observed - expected).sum()) / n
@@ -166,28 +167,12 @@ def _log_variance_error(x: FloatArray) -> float | None:
 def homogeneous(a: str, b: str, what: str, table: NDArray[np.int64]) -> Check:
     """Chi-square of two rows of numbers of events, cells merged until each expects enough in either row."""
     share = min(table.sum(1)) / max(table.sum(), 1)
-    cell = merge(table.sum(0) * share)
-    merged = np.array([np.bincount(cell, row) for row in table])
+    merged = np.add.reduceat(table, neighbours(table.sum(0) * share, LEAST), axis=1)
     if merged.shape[1] < 2:
         return Check(a, b, what, 1.0, 0.0)
     p = float(stats.chi2_contingency(merged, correction=False).pvalue)
     rows = merged / merged.sum(1, keepdims=True)
     return Check(a, b, what, p, 0.5 * float(np.abs(rows[0] - rows[1]).sum()))
-
-
-def merge(weight: FloatArray, least: float = LEAST) -> NDArray[np.intp]:
-    """Cell of each outcome: neighbours join until a cell weighs `least`; the last joins the one before."""
-    below = np.cumsum(weight)
-    cell = np.empty(weight.size, np.intp)
-    number, held, start = 0, 0.0, 0
-    while start < weight.size:
-        end = int(np.searchsorted(below, held + least)) + 1
-        if end >= weight.size or below[-1] - below[end - 1] < least:
-            end = weight.size
-        cell[start:end] = number
-        number, start = number + 1, end
-        held = below[end - 1]
-    return cell
 
 
 def _poisson(events: FloatArray, expected: FloatArray, slack: FloatArray) -> FloatArray:

@@ -13,8 +13,7 @@ import numpy as np
 from mars_lidar._base.threads import thread_count
 from studies import Facts, Request
 from studies.common.report import number
-from studies.domain import judge, references, sweep, verdict, watch
-from studies.domain.checks import Check
+from studies.domain import judge, sweep, verdict, watch
 from studies.domain.figures import decades, maps
 from studies.domain.judge import Budget
 from studies.domain.sweep import Judged, Settings
@@ -23,12 +22,11 @@ from studies.domain.verdict import ENGINES, FAILED, LAWS, SLOW, SUBJECTS, VERIFI
 SEED = 20_261_122
 FULL = Settings(2000, SEED, Budget(4e5, 4e6, 800, 6e4), 100_000)
 QUICK = Settings(60, SEED, Budget(4e5, 4e6, 800, 6e4), 3_000)
-REFERENCE_LEVEL = 1e-6
 _LISTED = 40  # failures that the report names; all are in domain_failures.csv
 
 
 def run(request: Request) -> Facts:
-    """The sweep, the reference cases if there are any, and the maps."""
+    """The sweep and its maps."""
     settings = QUICK if request.quick else FULL
     if request.seed is not None:
         settings = replace(settings, seed=request.seed)
@@ -38,15 +36,13 @@ def run(request: Request) -> Facts:
         judged.append(case)
         if len(judged) % 50 == 0:
             request.tell(f"{len(judged)} of {settings.systems} systems, {time.monotonic() - began:.0f} s")
-    outside = references.compare(request.data, settings.seed)
     cases = [case_row(one) for one in judged]
-    failures = failure_rows(judged, outside)
+    failures = failure_rows(judged)
     return {
         "s": settings,
         "judged": judged,
         "judge": judge,
         "watch": watch,
-        "data": request.data,
         "second_level": verdict.second_level(settings.checks),
         "result": {subject: Counter(state for _, state in _states(judged, subject)) for subject in SUBJECTS},
         "failures": failures,
@@ -55,8 +51,6 @@ def run(request: Request) -> Facts:
         "ranges": [_range(judged, subject) for subject in SUBJECTS],
         "slow": [_slow(judged, subject) for subject in LAWS],
         "drawn": _drawn(judged),
-        "worst": min(outside, key=lambda check: check.p, default=None),
-        "outside": len(outside),
         "rows": cases,
         "figures": maps(cases),
     }
@@ -72,21 +66,13 @@ def case_row(judged: Judged) -> dict[str, Any]:
     )
 
 
-def failure_rows(judged: list[Judged], outside: list[Check]) -> list[dict[str, Any]]:
+def failure_rows(judged: list[Judged]) -> list[dict[str, Any]]:
     """Every failure: the case, who, and in what."""
-    rows = [
+    return [
         one.case.facts() | {"subject": outcome.subject, "note": outcome.note.replace("\n", " ")}
         for one in judged
         for outcome in one.outcomes
         if outcome.state == "failed"
-    ]
-    blank = dict.fromkeys(judged[0].case.facts(), "") if judged else {}
-    return rows + [
-        blank
-        | {"case": check.a, "subject": check.a.split(",")[0]}
-        | {"note": f"{check.what}: p {check.p:.1g} against the reference"}
-        for check in outside
-        if check.p < REFERENCE_LEVEL
     ]
 
 

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar import simulate
 from mars_lidar._base.types import FloatArray
+from studies.common.sample import histograms
 from studies.domain.case import PERIOD_NS, Case
 
 _PIXELS = 32
-_BLOCK_BYTES = 2**24
 MOST_CELLS = 40
 
 
@@ -89,30 +88,12 @@ def collect(engine: str, blocks: Any, windows: Windows) -> Sample:
 def simulated(engine: str, case: Case, items: int, seed: int, windows: Windows) -> Sample:
     """`items` exposures, rounded up to whole rows of pixels."""
     pixels = min(_PIXELS, items)
-    flux, system = case.flux(pixels), case.system
-    rounds = -(-items // pixels)
-    step = max(1, _BLOCK_BYTES // (pixels * system.bins * system.histogram_dtype.itemsize))
-    share = 0.0
-
-    def blocks() -> Any:
-        nonlocal share
-        for start in range(0, rounds, step):
-            report: dict[str, float] = {}
-            cube = simulate(
-                flux,
-                system,
-                engine=engine,
-                realizations=min(step, rounds - start),
-                first_realization=start,
-                seed=seed,
-                threads=1,
-                report=report,
-            )
-            share = max(share, handed(report) / pixels)
-            yield cube.reshape(-1, system.bins)
-
-    sample = collect(engine, blocks(), windows)
-    sample.handed = share
+    report: dict[str, float] = {}
+    drawn = histograms(
+        engine, case.flux(pixels), case.system, realizations=-(-items // pixels), seed=seed, threads=1, report=report
+    )
+    sample = collect(engine, (cube.reshape(-1, case.system.bins) for _, cube in drawn), windows)
+    sample.handed = handed(report) / pixels
     return sample
 
 

@@ -34,7 +34,6 @@ _SUSPECTS = (
     "timestamps",
     "exact",
     "sequential",
-    "reference",
     "simulator",
     "closed form",
 )

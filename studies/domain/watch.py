@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import time
+import signal
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -35,53 +34,39 @@ class Watched:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._stop()
+        if self.process is not None:
+            self.process.kill()
+            self._ended()
 
     def judge(self, case: Case, seed: int, budget: Budget, patience: float | None = None) -> list[Outcome]:
         """All outcomes of `case`, those of stopped steps among them."""
         stopped: list[Outcome] = []
         while True:
-            ended = self._once(case, seed, budget, [o.subject for o in stopped], patience or self.patience)
+            skip = [o.subject for o in stopped]
+            ended = self._once(case, seed, budget, skip, patience or self.patience)
             if isinstance(ended, list):
                 return stopped + ended
             stopped.append(ended)
+            if ended.subject == "between steps":
+                return stopped
 
     def _once(
         self, case: Case, seed: int, budget: Budget, skip: Sequence[str], patience: float
     ) -> list[Outcome] | Outcome:
-        """The outcomes, or the one outcome of the step that had to be stopped."""
-        if self.process is None:
+        """The outcomes, or the one outcome of the step that ended the process."""
+        if self.pipe is None:
             self._start()
         assert self.pipe is not None
-        self.pipe.send((case, seed, budget, list(skip)))
         subject = "between steps"
-        while True:
-            try:
-                if not self._heard(patience):
-                    self._stop()
-                    slow = Outcome(case.name, subject, SLOW, patience, f"stopped after {patience:g} s")
-                    return [slow] if subject == "between steps" else slow
-                told = self.pipe.recv()
-            except (EOFError, OSError):
-                self._stop()
-                ended = Outcome(case.name, subject, FAILED, 0.0, "the process ended")
-                return [ended] if subject == "between steps" else ended
-            if isinstance(told, list):
-                return told
-            subject = told[0] if told[1] == "begin" else "between steps"
-
-    def _heard(self, patience: float) -> bool:
-        """Wait for the next word of the process: False where it has worked for longer than `patience`."""
-        assert self.pipe is not None
-        assert self.process is not None
-        began, work = time.monotonic(), processor_seconds(self.process.pid)
-        while not self.pipe.poll(0.1):
-            worked = processor_seconds(self.process.pid)
-            if worked is not None and work is not None and worked - work > patience:
-                return False
-            if time.monotonic() - began > (_WALL if work is not None else 1.0) * patience:
-                return False
-        return True
+        try:
+            self.pipe.send((case, seed, budget, list(skip), patience))
+            while not isinstance(told := self.pipe.recv(), list):
+                subject = told
+        except (EOFError, OSError):
+            if self._ended() in (-signal.SIGPROF, -signal.SIGALRM):
+                return Outcome(case.name, subject, SLOW, patience, f"stopped after {patience:g} s")
+            return Outcome(case.name, subject, FAILED, 0.0, "the process ended")
+        return told
 
     def _start(self) -> None:
         context: Any = multiprocessing.get_context("spawn")
@@ -93,30 +78,36 @@ class Watched:
         self.process.start()
         theirs.close()
 
-    def _stop(self) -> None:
-        if self.process is not None:
-            self.process.kill()
-            self.process.join()
-        if self.pipe is not None:
-            self.pipe.close()
-        self.process = self.pipe = None
-
-
-def processor_seconds(pid: int | None) -> float | None:
-    """Processor time that a process has had so far; None where the system does not say (Linux does)."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    except (OSError, ValueError, IndexError):
-        return None
+    def _ended(self) -> int | None:
+        """Clear up after the process; its exit code, less than 0 of a signal."""
+        assert self.process is not None
+        assert self.pipe is not None
+        self.process.join()
+        self.pipe.close()
+        self.pipe = None
+        return self.process.exitcode
 
 
 def _work(pipe: Connection) -> None:
-    """The second process: case after case, until the pipe is closed."""
+    """The second process: case after case, until the pipe is closed; timers that run out end it, in native code too."""
     os.environ["OMP_NUM_THREADS"] = "1"
     while True:
         try:
-            case, seed, budget, skip = pipe.recv()
-            pipe.send(judge(case, seed, budget, lambda subject, what: pipe.send((subject, what)), skip))
+            case, seed, budget, skip, patience = pipe.recv()
+
+            def tell(subject: str, what: str, patience: float = patience) -> None:
+                _timers(patience)
+                pipe.send(subject if what == "begin" else "between steps")
+
+            _timers(patience)
+            outcomes = judge(case, seed, budget, tell, skip)
+            _timers(0.0)
+            pipe.send(outcomes)
         except (EOFError, KeyboardInterrupt, BrokenPipeError):
             return
+
+
+def _timers(patience: float) -> None:
+    """End this process after so many seconds of processor time, or times as many on the clock; 0 for never."""
+    signal.setitimer(signal.ITIMER_PROF, patience)
+    signal.setitimer(signal.ITIMER_REAL, _WALL * patience)

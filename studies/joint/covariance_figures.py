@@ -6,11 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mars_lidar import Flux, joint_law, simulate
 from mars_lidar._base.types import FloatArray
 from mars_lidar.plot.style import COLOURS, INK, MUTED
 from studies.common.draw import panels
-from studies.joint.covariance import PERIOD_NS, system_of
+from studies.joint.cases import Case
 
 _QUANTILES = {  # in words: key of the scores
     "count variance": "count, variance",
@@ -22,10 +21,8 @@ _QUANTILES = {  # in words: key of the scores
 
 def figure(scores: dict[str, FloatArray], exposures: int) -> Figure:
     """Variances, correlations, and quantiles of the `scores`; one system of so many exposures is simulated."""
-    system = system_of(0.01, 0.1, 1000, 64)
-    law = joint_law(2.0, 5.0, system)
-    flux = Flux(signal=2.0, background=5.0, delay_ns=0.5 * PERIOD_NS)
-    x = simulate(flux, system, realizations=exposures, seed=7).reshape(exposures, -1).astype(float)
+    case = Case("shown", 2.0, 5.0, 0.1, sigma=0.01)
+    law, x = case.law(64), case.histograms(64, "exact", exposures, 7).astype(np.float64)
     page, axes = panels(2.5, 1, 3)
     left, middle, right = axes[0]
 

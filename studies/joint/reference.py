@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from mars_lidar import JointLaw, joint_law
+from mars_lidar import JointLaw
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.joint_pixel import Pixel
-from studies.joint.covariance import OFTEN, PERIOD_NS, TOLERANCE, Outcome, system_of
+from studies.joint.cases import OFTEN, Case
+from studies.joint.covariance import Outcome, named
 
 
 def leading(law: JointLaw, weights: FloatArray) -> float:
@@ -27,45 +28,40 @@ def leading(law: JointLaw, weights: FloatArray) -> float:
 
 def reference_case(path: Path) -> Outcome:
     """A case simulated by another program, from its JSON file."""
-    case: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    signal, background, delay = float(case["S"]), float(case["B"]), case["tau"] * PERIOD_NS
-    size, bins = int(case["reals"]), int(case["bins"])
-    system = system_of(case["sigma"], case["dead"], case["cycles"], bins)
-    law = joint_law(signal, background, system, delay_ns=delay, tolerance=TOLERANCE)
-    edges = (case["tau"] + 3.0 * case["sigma"] * np.array([-1.0, 1.0])) % 1.0
+    data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    size, bins = int(data["reals"]), int(data["bins"])
+    case = Case(path.stem, data["S"], data["B"], data["dead"], data["tau"], data["sigma"], data["cycles"])
+    law = case.law(bins)
+    edges = (case.delay + 3.0 * case.sigma * np.array([-1.0, 1.0])) % 1.0
     fine = next(n for n in (400, 800, 1000, 2000, 4000, 8000) if np.abs(edges * n - np.round(edges * n)).max() < 1e-6)
     first, last = np.round(edges * fine).astype(int)
     window = ((np.arange(fine) - first) % fine < (last - first) % fine).astype(float)
-    wide = joint_law(signal, background, system.replace(bins=fine), delay_ns=delay, tolerance=TOLERANCE)
+    wide = case.law(fine)
     mean, variance = (float(v) for v in wide.window(window))
-    kurtosis = _excess(case["count"])
+    kurtosis = _excess(data["count"])
     often = law.variance * size >= OFTEN
     pairs = often & np.roll(often, -1)
     # Bins are binomial-like: kurtosis that of a Poisson number, an upper bound below it
     fourth = np.sqrt((2.0 + 1.0 / law.variance[often]) / size)
     v, lag = law.variance, law.lag(1)
+    off = (np.array(data["hist_cov_lag1"]) - lag) / np.sqrt((v * np.roll(v, -1) + lag**2) / size)
     return Outcome(
-        name=path.stem,
-        settings={"S": signal, "B": background, "t_d": case["dead"], "cycles": float(case["cycles"])},
-        law=law,
+        case,
+        law,
         single={
-            "count, mean": (case["count_mean"] - law.count_mean) / float(np.sqrt(law.count_variance / size)),
-            "count, variance": float(np.log(case["count_var"] / law.count_variance) / np.sqrt(kurtosis / size)),
-            "window, mean": (case["win_mean"] - mean) / float(np.sqrt(variance / size)),
-            "window, variance": float(np.log(case["win_var"] / variance) / np.sqrt((2.0 + 1.0 / variance) / size)),
+            "count, mean": (data["count_mean"] - law.count_mean) / float(np.sqrt(law.count_variance / size)),
+            "count, variance": float(np.log(data["count_var"] / law.count_variance) / np.sqrt(kurtosis / size)),
+            "window, mean": (data["win_mean"] - mean) / float(np.sqrt(variance / size)),
+            "window, variance": float(np.log(data["win_var"] / variance) / np.sqrt((2.0 + 1.0 / variance) / size)),
         },
-        bins=np.asarray(np.log(np.array(case["hist_var"])[often] / v[often]) / fourth),
-        bin_index=np.flatnonzero(often),
-        lags=np.asarray(
-            ((np.array(case["hist_cov_lag1"]) - lag) / np.sqrt((v * np.roll(v, -1) + lag**2) / size))[pairs]
-        ),
-        lag_index=np.flatnonzero(pairs),
+        bins=named("variance of bin", often, np.log(np.array(data["hist_var"])[often] / v[often]) / fourth),
+        lags=named("covariance at", pairs, off[pairs]),
         leading={
             "count": law.count_variance,
-            "count simulated": float(case["count_var"]),
+            "count simulated": float(data["count_var"]),
             "count leading": leading(law, np.ones(bins)),
             "window": variance,
-            "window simulated": float(case["win_var"]),
+            "window simulated": float(data["win_var"]),
             "window leading": leading(wide, window),
         },
     )

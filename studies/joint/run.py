@@ -17,10 +17,13 @@ from mars_lidar._base.types import FloatArray
 from studies import Facts, Request
 from studies.common.report import Row, crossed, marked, picked
 from studies.common.sample import PERIOD_NS
-from studies.joint import classifiers, outcomes
-from studies.joint.outcomes import ENGINES, FULL, QUICK, RATIOS, TESTS, Outcome, Settings
-from studies.joint.table import AGAIN
+from studies.joint import cases, classifiers, outcomes
+from studies.joint.cases import AGAIN
+from studies.joint.outcomes import ENGINES, FULL, QUICK, TESTS, Outcome, Settings
 
+__all__ = ["cases", "chance", "run"]  # the first for the report
+
+RATIOS = cases.RATIOS[:3]
 _SEEN = 4.0  # standard errors beyond which a figure is marked
 _WORST = 5  # random systems listed
 _LEAST_P = 1e-100  # told as a number

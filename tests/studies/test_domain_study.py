@@ -13,12 +13,13 @@ import mars_lidar as ml
 from mars_lidar.instrument.effects import EFFECTS
 from mars_lidar.reconstruct.histogram_bound import _variances
 from mars_lidar.statistics import ConvergenceError
+from mars_lidar.statistics.distance import neighbours
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.domain import judge as judging
-from studies.domain import verdict, watch
+from studies.domain import verdict
 from studies.domain.case import MOVING, PERIOD_NS, Case
-from studies.domain.checks import Check, merge, two_samples
+from studies.domain.checks import Check, two_samples
 from studies.domain.closed_forms import known
 from studies.domain.judge import Budget, judge
 from studies.domain.samples import Windows, simulated
@@ -151,7 +152,6 @@ def test_what_hangs_is_stopped_and_what_crashes_is_told(monkeypatch: pytest.Monk
         states = {o.subject: o.state for o in watched.judge(slow, 1, Budget(1e3, 1e3, 10, 1.0))}
         assert states["exact"] == verdict.SLOW
         assert time.monotonic() - began < 120.0
-    assert watch.processor_seconds(-1) is None
 
 
 @pytest.mark.parametrize(
@@ -194,9 +194,9 @@ def test_two_samples_keep_their_level() -> None:
 
 def test_merging_keeps_all_and_joins_the_few() -> None:
     weight = np.array([1.0, 50.0, 3.0, 3.0, 60.0, 1.0, 1.0])
-    cell = merge(weight, 40.0)
-    assert cell.tolist() == [0, 0, 1, 1, 1, 1, 1]
-    assert merge(np.ones(3), 40.0).tolist() == [0, 0, 0]
+    assert neighbours(weight, 40.0).tolist() == [0, 2]
+    assert neighbours(np.ones(3), 40.0).tolist() == [0]
+    assert neighbours(np.array([5, 1, 1, 1, 1, 9, 1]), 4).tolist() == [0, 1, 5]
 
 
 def test_errors_without_information_are_infinite() -> None:

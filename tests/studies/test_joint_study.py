@@ -12,9 +12,9 @@ from scipy import stats
 
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
+from studies.joint import cases as bins
 from studies.joint import classifiers, run
 from studies.joint import outcomes as joint
-from studies.joint import table as bins
 
 
 def test_auc_and_its_error():
@@ -65,16 +65,16 @@ def test_qda_sees_covariance():
 
 def test_features():
     case = bins.REFERENCE[0]
-    x, handed = joint.sample(case, 256, "feedback", 50, 1)
-    assert not handed
-    assert x.coarse.shape == (50, bins.COARSE)
     fine = joint.near(case, 256)
+    x = bins.Sample.of(case, 256, "feedback", 50, 1, fine)
+    assert not x.handed
+    assert x.coarse.shape == (50, bins.COARSE)
     assert {128 - 16, 128, 128 + 16} <= set(fine.tolist())
     echo = int(256 * (0.5 + 0.6375 - 1.0))
     assert {echo - 16, echo + 16} <= set(fine.tolist())
     assert x.fine.shape == (50, fine.size) == (50, 66)
     short = bins.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
-    assert joint.sample(short, 256, "feedback", 5, 1)[1], "given to exact"
+    assert bins.Sample.of(short, 256, "feedback", 5, 1, fine).handed, "given to exact"
 
 
 def test_pixels_given_to_exact_are_not_judged():

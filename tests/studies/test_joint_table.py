@@ -1,4 +1,4 @@
-"""The joint table: its statistics against closed forms, and its quick form."""
+"""The joint table: what samples are compared with, against independent bins and known figures, and its quick form."""
 
 import csv
 
@@ -10,71 +10,82 @@ from scipy import stats
 from mars_lidar.engines import ANY_SYSTEM
 from studies.__main__ import main
 from studies.joint import table as joint
+from studies.joint.cases import COARSE, RATIOS, REFERENCE, SEVEN, SEVEN_RATIOS, Case, Law, Sample
 
-POISSON = joint.Case("no dead time", 0.5, 0.5, 0.0, cycles=300)
+NONE = np.zeros(0, np.intp)
+
+
+def compared(case, engine, exposures, seed):
+    """Ratios to the closed form of a sample on 256 bins."""
+    return Law(case, 256).ratios(Sample.of(case, 256, engine, exposures, seed, NONE))
 
 
 def test_files(tmp_path):
     assert main(["joint-table", "--quick", "--out", str(tmp_path)]) == 0
     with (tmp_path / "joint_table.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == len(joint.QUICK.cases) * len(ANY_SYSTEM)  # exact: once more instead of once
-    assert {row["engine"] for row in rows} == {joint.AGAIN, *ANY_SYSTEM} - {"exact"}
+    assert len(rows) == len(joint.QUICK.cases) * len(ANY_SYSTEM)
+    assert {row["engine"] for row in rows} == set(ANY_SYSTEM)
     text = (tmp_path / "joint_table.md").read_text()
     assert all(f"| {case.name} |" in text for case in joint.QUICK.cases)
 
 
 def test_cases_are_the_declared_ones():
-    assert len(joint.REFERENCE) == 10
-    assert len(joint.SEVEN) == len(joint.SEVEN_RATIOS) == 7
-    assert [case.name for case in joint.FULL.cases] == [case.name for case in (*joint.REFERENCE, *joint.SEVEN)]
+    assert len(REFERENCE) == 10
+    assert len(SEVEN) == len(SEVEN_RATIOS) == 7
+    assert [case.name for case in joint.FULL.cases] == [case.name for case in (*REFERENCE, *SEVEN)]
 
 
 def test_window_goes_round_the_circle():
-    inside = joint.window(joint.REFERENCE[6], 1024)
+    inside = np.flatnonzero(REFERENCE[6].window(1024))
     assert {0, 1023} <= set(inside.tolist())
     assert inside.size == pytest.approx(6 * 0.00375 * 1024, abs=1)
+    assert Case("narrow", 1.0, 1.0, 0.5, sigma=1e-4).window(64).sum() == 2
 
 
-def test_moments_without_dead_time():
-    """Independent Poisson bins: variance = mean for window, count and bins, no correlation of neighbours."""
-    settings = joint.Settings((POISSON,), realizations=4000, bins=256)
-    found = joint.moments(settings, POISSON, "exact", 5)
-    other = joint.moments(settings, POISSON, "poisson", 6)
-    assert found.count[:, 0].mean() == pytest.approx(300.0, abs=6 * np.sqrt(300 / 4000))
+def test_without_dead_time_bins_are_independent():
+    """Poisson bins: both engines have the law's window, bins and count; no covariance of neighbours to compare."""
+    case = Case("no dead time", 0.5, 0.5, 0.0, cycles=300)
     outcomes = {}
-    for name, pair in (("count", found.count), ("window", found.window)):
-        ratio = pair[:, 1] / pair[:, 0].mean()
-        outcomes[f"{name}: variance is the mean"] = stats.ttest_1samp(ratio, 1.0).pvalue
-    score = joint.score(POISSON.name, "poisson", other, found)
-    for key, none in (("window", 1.0), ("count", 1.0), ("bin", 1.0), ("neighbour", 0.0), ("window_mean", 0.0)):
-        value, error = getattr(score, key)
-        outcomes[f"poisson against exact: {key}"] = 2 * stats.t.sf(abs(value - none) / error, 39)
+    for seed, engine in enumerate(("exact", "poisson")):
+        found = compared(case, engine, 4000, seed)
+        assert list(found) == list(RATIOS)
+        for key, none in (("window", 1.0), ("bin", 1.0), ("count", 1.0), ("window mean", 0.0)):
+            value, error = found[key]
+            outcomes[f"{engine}: {key}"] = 2 * stats.norm.sf(abs(value - none) / error)
+            assert not joint.beyond(found[key], key)
     require(outcomes, "joint table")
 
 
+def test_errors_are_the_scatter_of_samples():
+    """Standard errors of 60 samples of one law against the scatter of their ratios; 5 of its own errors."""
+    case, law = SEVEN[6], Law(SEVEN[6], 256)
+    found = [law.ratios(Sample.of(case, 256, "exact", 500, k, NONE)) for k in range(60)]
+    outcomes = {}
+    for key in RATIOS:
+        value, error = np.array([one[key] for one in found]).T
+        z = (value - (key != "window mean")) / error
+        outcomes[key] = 2 * min(stats.chi2.sf((z**2).sum(), z.size), stats.chi2.cdf((z**2).sum(), z.size))
+    require(outcomes, "errors of the joint table")
+
+
 def test_dead_time_is_seen():
-    settings = joint.Settings((joint.REFERENCE[0],), realizations=800, bins=256)
-    truth = joint.moments(settings, joint.REFERENCE[0], "exact", 1)
-    # closed form: docs/theory_exposure.md; the reference simulation of this case gave 140.2 and 273.6
-    assert truth.count[:, 1].mean() == pytest.approx(140.2, rel=0.3)
-    assert truth.window[:, 1].mean() == pytest.approx(273.6, rel=0.3)
-    score = joint.score("", "poisson", joint.moments(settings, joint.REFERENCE[0], "poisson", 2), truth)
-    assert score.count[0] > 5
-    assert score.bins == joint.COARSE
+    """The closed form, whose count and window variance the reference simulation gave as 140.2 and 273.6."""
+    law = Law(REFERENCE[0], 256)
+    assert law._count == pytest.approx(140.2, rel=0.05)
+    assert law._window[1] == pytest.approx(273.6, rel=0.05)
+    found = compared(REFERENCE[0], "poisson", 800, 2)
+    assert found["count"][0] > 5
+    assert all(joint.beyond(found[key], key) for key in ("window", "bin", "count", "window mean"))
+    assert compared(SEVEN[6], "mars", 800, 3)["window"][0] == pytest.approx(1.0 / SEVEN_RATIOS[6], rel=0.3)
 
 
 def test_bins_without_neighbours():
-    """Neighbours are compared only where both bins have counts; a lone pulse has none."""
-    case = joint.Case("pulse alone", 1.0, 0.0, 0.1, delay=0.5 + 0.5 / joint.COARSE, sigma=0.0005, cycles=100)
-    settings = joint.Settings((case,), realizations=400)
-    found = joint.moments(settings, case, "exact", 1)
-    score = joint.score("", "sequential", joint.moments(settings, case, "sequential", 2), found)
-    assert score.bins == 1
-    assert np.isnan(score.neighbour).all()
-    assert score.bin[0] == pytest.approx(1.0, abs=6 * score.bin[1])
-    near = joint.Case("on an edge", 1.0, 0.0, 0.1, delay=0.5, sigma=0.0005, cycles=100)
-    both = joint.moments(settings, near, "exact", 3)
-    again = joint.score("", "exact", joint.moments(settings, near, "exact", 4), both)
-    assert again.bins == 2
-    assert np.isfinite(again.neighbour).all()
+    """Neighbours are compared only where both bins vary; a lone pulse has none."""
+    case = Case("pulse alone", 1.0, 0.0, 0.1, delay=0.5 + 0.5 / COARSE, sigma=0.0005, cycles=100)
+    found = compared(case, "sequential", 400, 2)
+    assert np.isnan(found["neighbour"]).all()
+    assert not joint.beyond(found["neighbour"], "neighbour")
+    assert found["bin"][0] == pytest.approx(1.0, abs=6 * found["bin"][1])
+    near = Case("on an edge", 1.0, 0.0, 0.1, delay=0.5, sigma=0.0005, cycles=100)
+    assert np.isfinite(compared(near, "exact", 400, 3)["neighbour"]).all()

@@ -101,15 +101,13 @@ def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int
 def neighbours(expected: FloatArray, least: float) -> NDArray[np.int64]:
     """(groups,) where groups of neighbouring cells (n,) begin of which at least so much is expected; what is left over
     at the end belongs to the last of them."""
-    starts, held = [0], 0.0
-    for k, value in enumerate(expected[:-1]):
-        held += float(value)
-        if held >= least:
-            starts.append(k + 1)
-            held = 0.0
-    if len(starts) > 1 and held + float(expected[-1]) < least:
-        starts.pop()
-    return np.array(starts, np.int64)
+    below, starts, held = np.cumsum(expected, dtype=np.float64), [0], 0.0
+    while True:
+        end = int(np.searchsorted(below, held + least)) + 1
+        if end >= below.size or below[-1] - below[end - 1] < least:
+            return np.array(starts, np.int64)
+        starts.append(end)
+        held = float(below[end - 1])
 
 
 def mean_score(law_mean: float, law_variance: float, mean: float, size: int) -> float:

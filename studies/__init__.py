@@ -103,6 +103,7 @@ _STUDIES = {
         "downstream.run",
         "T5: networks trained on every simulator's data, tested on gold, beside what needs no training; --config",
     ),
+    "downstream-budget": ("downstream.budget", "what the sizes of the study downstream cost, of one core and of a GPU"),
     "uncertainty": (
         "uncertainty.run",
         "do 90 % intervals of networks trained on every simulator's data hold on gold? --stream adds a measured light",

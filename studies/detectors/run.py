@@ -13,6 +13,7 @@ from mars_lidar import Detector, Flux, GaussianPulse, System, count_law, simulat
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.effects import AVALANCHE_EFFECTS
 from mars_lidar.statistics import mean_histogram
+from mars_lidar.statistics.distance import Pmf, g_test
 from studies import Facts, Request
 from studies.common.sample import settings_of
 
@@ -133,18 +134,5 @@ def row(each: Outcome) -> dict[str, Any]:
         "z mean": (mean - each.moments[0]) / math.sqrt(each.moments[1] / n),
         "z variance": (variance - each.moments[1]) / math.sqrt((fourth - variance**2) / n),
         "worst z of a bin": float(np.abs(z).max()),
-        "p of the law": _fit(each.counts, each.law),
+        "p of the law": g_test(Pmf(0, each.law), Pmf.of_counts(each.counts), n),
     }
-
-
-def _fit(counts: NDArray[np.int64], law: FloatArray) -> float:
-    """Chi-squared test of counts against their law; neighbours are merged until at least 10 are expected."""
-    from scipy.stats import chisquare
-
-    size = max(int(counts.max()) + 1, law.size)
-    expected = np.pad(law, (0, size - law.size)) * counts.size
-    group = np.minimum((np.cumsum(expected) / 10.0).astype(np.int64), int(expected.sum() / 10.0) - 1)
-    group = np.unique(group, return_inverse=True)[1]
-    seen = np.bincount(group, np.bincount(counts, minlength=size))
-    wanted = np.bincount(group, expected)
-    return float(chisquare(seen, wanted * (seen.sum() / wanted.sum())).pvalue)

@@ -1,23 +1,20 @@
-"""What a configuration costs: arithmetic of its networks, counted, and processor time of its data, measured here.
+"""Study "downstream-budget": what sizes of T5 cost: arithmetic of the networks, counted, processor time of their data.
 
-``python -m studies.downstream.budget --out DIR`` writes downstream_budget.md. Networks train on a GPU where PyTorch has
-one; data are simulated on one core, and the GPU waits for them: the hours told are those of the one after the other.
+Networks train on a GPU where PyTorch has one; data are simulated on one core, and the GPU waits for them: the hours
+told are those of the one after the other.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from studies import Facts, Request
 from studies.common.intervals import Steps
-from studies.common.report import machine, table, versions
 from studies.common.windows import features
 from studies.downstream.data import CONFIGS, SYSTEM, WORDS, Config, Simulators, crop
 from studies.downstream.networks import BinNetwork, WindowNetwork
@@ -26,19 +23,6 @@ from studies.downstream.run import MODELS, POLYNOMIAL_STEPS, Polynomial, runs
 GPU_HOURS = 8.0  # that `full` may take
 FLOP_RATE = 1e13  # a second, that a GPU is assumed to keep up on these networks; nothing was measured on one
 STEP_S = 0.01  # assumed of each step beside its arithmetic: starting kernels, copying cubes
-
-HEAD = """# What the experiment T5 costs
-
-`python -m studies.downstream.budget` counts the arithmetic of the networks and measures, on this machine, the
-processor time of their data: crops of a step, features of the window network, the polynomial (of the first {fitted}
-steps only), the cubes of a test scene. **Nothing was measured on a GPU**: of one it is assumed that it keeps up
-{rate:g} TFLOP/s on these networks, takes {step:g} ms of a step for all else, and waits for one core while that makes
-the data. Not in it: tables and rooms, once, and the gold standard's cubes, once for each ratio.
-
-- machine: {machine}
-{versions}
-
-"""
 
 
 @dataclass(frozen=True)
@@ -134,41 +118,14 @@ def arithmetic(config: Config) -> str:
     )
 
 
-def told(config: Config) -> str:
-    """The cost of a configuration, as lines of Markdown; it is measured here."""
-    flop, data = flop_of_a_step(config), seconds_of_data(config)
-    cost = budget(config, flop, data)
-    rows: list[dict[str, Any]] = [{"data of": WORDS[arm]} | parts for arm, parts in data.items()]
-    counted = ", ".join(f"{MODELS[name]} {operations / 1e9:.3g} GFLOP" for name, operations in flop.items())
-    return f"""## `--config {config.name}`
-
-- {arithmetic(config)}
-- a step, counted by PyTorch: {counted}
-- processor time of the data: {cost.data_s / 3600:.2g} hours of one core
-- **a GPU is held for {cost.hours:.2g} hours**, its own {cost.gpu_s / 3600:.2g} and those of the data{
-        "" if config.name != "full" else f"; the budget is {GPU_HOURS:g}"
-    }
-
-{table(rows)}
-"""
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, and write downstream_budget.md."""
-    parser = argparse.ArgumentParser(
-        prog="python -m studies.downstream.budget", description="Write downstream_budget.md."
-    )
-    parser.add_argument("--out", type=Path, default=Path("study-results"), metavar="DIR", help="default: %(default)s")
-    out: Path = parser.parse_args(arguments).out
-    out.mkdir(parents=True, exist_ok=True)
+def run(request: Request) -> Facts:
+    """Every size, measured here."""
     torch.set_num_threads(1)
-    parts = [told(CONFIGS[name]) for name in ("small", "full")]
-    text = HEAD.format(
-        fitted=POLYNOMIAL_STEPS, rate=FLOP_RATE / 1e12, step=1e3 * STEP_S, machine=machine(), versions=versions()
-    )
-    (out / "downstream_budget.md").write_text(text + "\n".join(parts), encoding="utf-8")
-    print(out / "downstream_budget.md")
-
-
-if __name__ == "__main__":
-    main()
+    sizes = []
+    for name in ("tiny",) if request.quick else ("small", "full"):
+        config = CONFIGS[name]
+        flop, data = flop_of_a_step(config), seconds_of_data(config)
+        cost, rows = budget(config, flop, data), [{"data of": WORDS[arm]} | parts for arm, parts in data.items()]
+        sizes.append({"config": name, "arithmetic": arithmetic(config), "flop": flop, "cost": cost, "rows": rows})
+        request.tell(f"downstream-budget: {name}")
+    return {"sizes": sizes, "fitted": POLYNOMIAL_STEPS, "models": MODELS}

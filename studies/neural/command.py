@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from mars_lidar import Detector, GaussianPulse, System
+from mars_lidar import System
 from studies.neural.model import NeuralMap, check_target
-from studies.neural.pairs import FluxRange, Training
+from studies.neural.pairs import Training
 from studies.neural.training import save_curves, train
 
 _TRAINING = ("steps", "pairs", "seconds", "processor_seconds", "seed")  # of a network's record
@@ -44,18 +45,16 @@ def _parser(command: str) -> argparse.ArgumentParser:
     )
     add = learn.add_argument
     add("-o", "--out", type=Path, required=True, help="the network: .npz. Curves go beside it: .csv and .png")
-    add("--system", type=Path, metavar="FILE", help="YAML or JSON file (mars-lidar init writes one) to start from")
-    add("--period-ns", type=float, help="laser period, ns (133.33)")
-    add("--dead-time-ns", type=float, help="dead time after a registration, ns (75)")
-    add("--bins", type=int, help="histogram bins per period (1024)")
-    add("--pulse-sigma-ns", type=float, help="Gaussian pulse: standard deviation, ns (0.5); others: --system")
-    flux, plan = FluxRange(), Training()
-    for name in ("signal", "background"):
-        add(f"--{name}", type=_pair, default=getattr(flux, name), metavar="LOW,HIGH", help="range, photons per period")
-    add("--returns", type=int, default=flux.returns, help="most returns of a flux, 1 or 2")
+    add(
+        "--system",
+        type=Path,
+        metavar="FILE",
+        help="YAML or JSON file (mars-lidar init writes one); else as example.npz",
+    )
+    add("--dead-time-ns", type=float, help="dead time after a registration, ns, in place of that of the system")
+    plan = Training()
     add("--steps", type=int, default=plan.steps, help="steps of the training")
     add("--pairs", type=int, default=plan.pairs, help="pairs to learn from")
-    add("--seed", type=int, default=plan.seed, help="seed of pairs, weights and order")
     add("--overwrite", action="store_true", help="replace an existing network")
     info = verbs.add_parser("info", help="what a network was trained for, and how well it does")
     info.add_argument("file", type=Path, nargs="?", help="a network: .npz. Without it: the one of this folder")
@@ -64,29 +63,14 @@ def _parser(command: str) -> argparse.ArgumentParser:
 
 def _train(given: argparse.Namespace) -> None:
     check_target(given.out, given.overwrite)
-    fluxes = FluxRange(signal=given.signal, background=given.background, returns=given.returns)
-    plan = Training(fluxes=fluxes, steps=given.steps, pairs=given.pairs, seed=given.seed)
-    trained = train(_system(given), plan, tell=partial(print, file=sys.stderr, flush=True))
+    system = NeuralMap.example().system if given.system is None else System.load(given.system)
+    if given.dead_time_ns is not None:
+        system = system.replace(detector=replace(system.detector, dead_time_ns=given.dead_time_ns))
+    plan = Training(steps=given.steps, pairs=given.pairs)
+    trained = train(system, plan, tell=partial(print, file=sys.stderr, flush=True))
     trained.map.save(given.out, overwrite=given.overwrite)
     _show(given.out, trained.map)
     print(f"{'curves':<10}", *save_curves(trained, given.out.with_suffix("")))
-
-
-def _pair(text: str) -> tuple[float, float]:
-    """Range of photons per period, such as 0.002,12."""
-    low, high = text.split(",")
-    return float(low), float(high)
-
-
-def _system(given: argparse.Namespace) -> System:
-    """The system of the file, or that of the network of this folder, with the single values in place of its own."""
-    base = NeuralMap.example().system if given.system is None else System.load(given.system)
-    changes = {name: getattr(given, name) for name in ("period_ns", "bins")}
-    if given.pulse_sigma_ns is not None:
-        changes["pulse"] = GaussianPulse(sigma_ns=given.pulse_sigma_ns)
-    if given.dead_time_ns is not None:
-        changes["detector"] = Detector.from_dict(base.detector.to_dict() | {"dead_time_ns": given.dead_time_ns})
-    return base.replace(**{name: value for name, value in changes.items() if value is not None})
 
 
 def _show(path: Path | None, network: NeuralMap) -> None:

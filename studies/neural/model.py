@@ -85,7 +85,7 @@ class NeuralMap:
                 raise ValueError(
                     f"engine 'neural' was trained on a {name} of {low:g} to {high:g} photons per period, got "
                     f"{photons[out].min():.4g} to {photons[out].max():.4g} in {int(out.sum())} of {out.size} pixels; "
-                    "train on that range (python -m studies neural train), or use another engine"
+                    "train on that range (studies.neural.train), or use another engine"
                 )
 
     def pdf(self, photons: FloatArray) -> FloatArray:

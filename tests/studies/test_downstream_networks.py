@@ -1,4 +1,4 @@
-"""The small networks of the studies: what they see, that they learn it, and the measures they are told by."""
+"""The small networks of the studies: what they see, and that they learn it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import mars_lidar as ml
 from mars_lidar.learn import CubeStream, Uniform
 from studies.common.intervals import Steps
 from studies.common.windows import BOX, COARSE, FEATURES, WINDOW, features
-from studies.downstream.metrics import psnr, rmse, ssim
 from studies.downstream.networks import BinNetwork, Told, WindowNetwork
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -66,19 +65,3 @@ def test_networks_learn_delay_and_reflectivity_with_their_errors(kind):
     for off, spread in ((away, told.delay_log_variance[lit]), (error, told.reflectivity_log_variance[lit])):
         covered = (off.abs() <= 1.645 * torch.exp(0.5 * spread)).double().mean()
         assert 0.7 < float(covered) < 0.99
-
-
-def test_metrics():
-    true = np.tile(np.linspace(0.0, 1.0, 16), (16, 1))
-    assert psnr(true + 0.1, true, 1.0) == pytest.approx(20.0)
-    assert psnr(true + 0.1, true, 10.0) == pytest.approx(40.0)
-    assert psnr(true, true, 1.0) == np.inf
-    holed = true.copy()
-    holed[0, 0] = np.nan
-    assert rmse(true + 0.1, holed) == pytest.approx(0.1)
-    assert ssim(true, true, 1.0) == pytest.approx(1.0)
-    assert ssim(true[:, ::-1], true, 1.0) < 0.7
-    with pytest.raises(ValueError, match="shape"):
-        rmse(true[:4], true)
-    with pytest.raises(ValueError, match="data_range"):
-        psnr(true, true, 0.0)

@@ -120,6 +120,13 @@ def test_the_budget_of_full():
     assert data == pytest.approx(36 * (0.2 * 3000 + 0.1 * downstream.POLYNOMIAL_STEPS + 0.1 * full.test[1]))
 
 
+def test_the_budget_is_reported(tmp_path: Path):
+    assert main(["downstream-budget", "--quick", "--out", str(tmp_path)]) == 0
+    text = (tmp_path / "downstream_budget.md").read_text()
+    assert "## `--config tiny`" in text
+    assert all(f"| {downstream_data.WORDS[arm]} |" in text for arm in TINY.arms)
+
+
 def test_networks_run_where_their_weights_are(monkeypatch: pytest.MonkeyPatch):
     """On the device "meta", which holds no numbers and, as a GPU does, refuses what lies elsewhere."""
     monkeypatch.setattr(networks._Standard, "forward", lambda self, x: x - self.mean)
@@ -236,6 +243,18 @@ def test_errors_leave_out_pixels_without_return():
     assert found["rmse"] == pytest.approx(1.0 / np.sqrt(16 * 16 - 1), rel=1e-4)
     assert found["psnr"] == pytest.approx(20.0 * np.log10(TINY.depth_range_m / found["rmse"]), rel=1e-6)
     assert found["covered"] == pytest.approx(1.0 - 1.0 / (16 * 16 - 1))
+
+
+def test_measures_of_known_maps():
+    true = np.stack(
+        [scene.reflectivity for scene in (downstream_data.crop(1000, TINY), downstream_data.crop(1001, TINY))]
+    )
+    scenes = [ml.Scene(np.full(light.shape, 5.0), light) for light in true]
+    found = downstream.tested({"reflectivity": true + 0.1}, {}, scenes, TINY)["reflectivity"]
+    assert found["psnr"] == pytest.approx(20.0)
+    assert found["rmse"] == pytest.approx(0.1)
+    mirrored = downstream.tested({"reflectivity": true[..., ::-1]}, {}, scenes, TINY)["reflectivity"]
+    assert mirrored["ssim"] < 0.7 < found["ssim"] < 1.0
 
 
 def test_spread():

@@ -28,6 +28,7 @@ NAMES = {  # of every command that a committed report prints
     "detectors",
     "domain",
     "downstream",
+    "downstream-budget",
     "effects",
     "hardware",
     "joint",

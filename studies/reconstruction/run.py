@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -28,16 +27,15 @@ SYNCHRONOUS = PLAIN.replace(detector=Detector(dead_time_ns=0.0, mode="synchronou
 
 @dataclass(frozen=True)
 class Settings:
-    """Levels of signal photons per period, pixels at each, side of the picture's image, timed cubes."""
+    """Levels of signal photons per period, pixels at each, side of the picture's image."""
 
     signals: tuple[float, ...]
     pixels: int
     size: int
-    repeats: int
 
 
-FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 48, 2)
-QUICK = Settings((0.03, 0.3, 3.0), 100, 24, 1)
+FULL = Settings(tuple(float(s) for s in np.geomspace(0.003, 10.0, 15)), 1000, 48)
+QUICK = Settings((0.03, 0.3, 3.0), 100, 24)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +48,7 @@ class Picture:
 
 
 def run(request: Request) -> Facts:
-    """Sweeps over flux, near the bound, a picture, and times."""
+    """Sweeps over flux, near the bound, and a picture."""
     from studies.reconstruction.bounds import lines
     from studies.reconstruction.figures import TITLE, flux_figure, maps_figure
 
@@ -64,7 +62,6 @@ def run(request: Request) -> Facts:
     near = lines(2 * settings.pixels)
     request.tell("reconstruction: picture")
     shown = picture(settings)
-    request.tell("reconstruction: time")
     n = len(settings.signals)  # three fluxes: dim, ordinary, bright
     chosen = {settings.signals[k] for k in ((0, 1, 2) if n < 5 else (n // 4, (5 * n) // 8, n - 2))}
     words = {"matched_filter": "the matched filter", "maximum_likelihood": "maximum likelihood"}
@@ -78,7 +75,6 @@ def run(request: Request) -> Facts:
             for said, found in ((said, shown.found[name]) for name, said in words.items())
         ],
         "window": window_lines(settings),
-        "times": timings(settings),
         "rows": rows,
         "figures": {"flux": flux_figure(rows), "maps": maps_figure(shown)},
     }
@@ -168,32 +164,3 @@ def picture(settings: Settings) -> Picture:
     cube = simulate(flux, PLAIN, seed=SEED)[0]
     found = {name: reconstruct(cube, PLAIN, name) for name in ("matched_filter", "maximum_likelihood")}
     return Picture(scene.depth_m, flux.signal, found)
-
-
-def timings(settings: Settings) -> list[dict[str, Any]]:
-    """Seconds of each method for one 128 x 128 x 1024 cube (a quarter of the side in the quick form)."""
-    side = 128 if settings.repeats > 1 else 32
-    flux = Scene.example("room", size=side).flux(PLAIN, signal=1.0, sbr=SBR)
-    lines = []
-    for system in (PLAIN, SYNCHRONOUS):
-        cube = simulate(flux, system, seed=SEED)[0]
-        for name, method in METHODS.items():
-            if system.detector.mode not in method.modes:
-                continue
-            wall, processor = [], []
-            for _ in range(settings.repeats):
-                began, used = time.perf_counter(), time.process_time()
-                reconstruct(cube, system, method)
-                wall.append(time.perf_counter() - began)
-                processor.append(time.process_time() - used)
-            lines.append(
-                {
-                    "detector": system.detector.mode,
-                    "method": name,
-                    "pixels": side * side,
-                    "seconds": min(wall),
-                    "processor seconds": min(processor),
-                    "us a pixel": 1e6 * min(processor) / side**2,
-                }
-            )
-    return lines

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from studies.common.sample import PERIOD_NS, system_of
 from studies.runtime.contenders import Contender, Run, Tables, contenders
 
 DEAD_TIME_NS, SIGMA_NS = 85.0, 0.5
-_CUBE_PART = 64  # of the cube's pixels, one in so many foretells its time
 FLUX = (0.05, 1.0)  # S and B uniform on this, photons per period
 
 
@@ -42,7 +41,6 @@ class Settings:
     teaser: tuple[int, int]  # cycles, realizations of the single pixel
     repeats: int
     limit_s: float  # a point predicted to take longer is left out
-    cube_limit_s: float  # the same of the cube, predicted from a part of it
     enough_s: float  # repeats end once a contender has had so much
     cube_table: tuple[int, int]  # points in S and B
     axis_table: tuple[int, int]
@@ -71,7 +69,6 @@ FULL = Settings(
     teaser=(1000, 10_000),
     repeats=5,
     limit_s=8.0,
-    cube_limit_s=30.0,
     enough_s=0.5,
     cube_table=(256, 100),
     axis_table=(32, 24),
@@ -83,7 +80,6 @@ QUICK = Settings(
     teaser=(100, 50),
     repeats=1,
     limit_s=0.5,
-    cube_limit_s=1.0,
     enough_s=0.05,
     cube_table=(4, 3),
     axis_table=(4, 3),
@@ -117,28 +113,19 @@ def system(settings: Settings, cycles: int) -> System:
 def cube_stages(settings: Settings, tell: Tell) -> tuple[list[dict[str, Any]], Table]:
     """Every contender on one cube of side x side pixels, and the table that some of them used.
 
-    Least seconds, and the stages of that run; ``predicted`` where it would have taken too long: they are those of a
-    part of the pixels, scaled. ``prepared``: seconds spent before, on a table or nothing.
+    Least seconds, and the stages of that run. ``prepared``: seconds spent before, on a table or nothing.
     """
     flux, seen = image(settings.side**2, settings.seed), system(settings, 1000)
-    out, part = _memory(flux, seen, 1), max(1, settings.side**2 // _CUBE_PART)
-    found = []
+    out, found = _memory(flux, seen, 1), []
     tables = Tables(settings.cube_table)
     for one in contenders(tables):
         began = time.perf_counter()
         run = one.prepare(flux, seen, 1)
         prepared = time.perf_counter() - began
-        small = one.prepare(flux[:, :part], seen, 1)
-        seconds, stages = _least({one.name: small}, out[:, :, :part], replace(settings, repeats=1))[one.name]
-        scale = settings.side**2 / part
-        predicted = scale * seconds > settings.cube_limit_s
-        if predicted:
-            seconds, stages = scale * seconds, {name: scale * spent for name, spent in stages.items()}
-        else:
-            seconds, stages = _least({one.name: run}, out, settings)[one.name]
-        times = {"seconds": seconds, "predicted": predicted, "stages": stages, "prepared": prepared}
+        seconds, stages = _least({one.name: run}, out, settings)[one.name]
+        times = {"seconds": seconds, "stages": stages, "prepared": prepared}
         found.append({"contender": one.name, "words": one.words} | times)
-        tell(f"runtime: cube, {one.words}: {seconds:.3g} s{' (predicted)' if predicted else ''}")
+        tell(f"runtime: cube, {one.words}: {seconds:.3g} s")
     return found, tables.get(seen)
 
 

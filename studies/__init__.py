@@ -59,7 +59,7 @@ _STUDIES = {
         "the histogram's covariance in closed form against simulation; --data adds reference cases",
     ),
     "long-exposures": (
-        "long_exposures.run",
+        "joint.long_exposures",
         "the feedback engine at a million cycles and more against the closed form",
     ),
     "domain": (

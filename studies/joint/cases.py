@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mars_lidar import Flux, JointLaw, System, joint_law, simulate
 from mars_lidar._base.types import FloatArray
+from mars_lidar.engines import Engine
 from studies.common.sample import PERIOD_NS, system_of
 
 COARSE = 64  # bins in which single bins and neighbours are compared
@@ -42,17 +43,21 @@ class Case:
             self.dead * PERIOD_NS, self.cycles, bins=bins, sigma_ns=self.sigma * PERIOD_NS, start=self.start
         )
 
+    @property
+    def flux(self) -> Flux:
+        """The pixel."""
+        return Flux(self.signal, self.background, self.delay * PERIOD_NS)
+
     def law(self, bins: int) -> JointLaw:
         """The closed form of its histogram of so many bins."""
         light = {"delay_ns": self.delay * PERIOD_NS, "tolerance": TOLERANCE}
         return joint_law(self.signal, self.background, self.system(bins), **light)
 
     def histograms(
-        self, bins: int, engine: str, exposures: int, seed: int, report: dict[str, float] | None = None
+        self, bins: int, engine: str | Engine, exposures: int, seed: int, report: dict[str, float] | None = None
     ) -> NDArray[np.uint32]:
         """Histograms (exposures, bins) by an engine."""
-        flux = Flux(self.signal, self.background, self.delay * PERIOD_NS)
-        cube = simulate(flux, self.system(bins), engine=engine, realizations=exposures, seed=seed, report=report)
+        cube = simulate(self.flux, self.system(bins), engine=engine, realizations=exposures, seed=seed, report=report)
         return cube.reshape(exposures, bins)
 
     def window(self, bins: int) -> NDArray[np.bool_]:

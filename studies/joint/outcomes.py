@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar.statistics import ConvergenceError
 from studies import Tell
-from studies.joint.cases import AGAIN, REFERENCE, SEVEN, Case, Law, Sample, random_cases
+from studies.joint.cases import AGAIN, RATIOS, REFERENCE, SEVEN, Case, Law, Sample, random_cases
 from studies.joint.classifiers import CLASSIFIERS, QDA, require_sklearn, separate
 
 ENGINES = (AGAIN, "feedback", "mars", "renewal")
@@ -38,13 +39,14 @@ class Outcome:
     """One engine in one case.
 
     `ratios` of variances (or covariances) to the closed form and `aucs`, each with its standard error; no AUCs
-    for the exact sample that all others are told from, nor for an engine that gave the pixel to exact (`handed`).
+    for the exact sample that all others are told from, nor for an engine that is not judged: `instead` is then "exact",
+    to which it gave the pixel, or "refused".
     """
 
     case: Case
     random: bool
     engine: str
-    handed: bool
+    instead: str
     ratios: dict[str, tuple[float, float]]
     aucs: dict[str, tuple[float, float]]
 
@@ -69,11 +71,15 @@ def examine(
     """One case: the exact sample first, then every engine against it."""
     seed, law, fine = (settings.seed << 16) + 100 * number, Law(case, settings.bins), near(case, settings.bins)
     truth = Sample.of(case, settings.bins, "exact", exposures, seed, fine)
-    found = [Outcome(case, random, "exact", False, law.ratios(truth), {})]
+    found = [Outcome(case, random, "exact", "", law.ratios(truth), {})]
     for k, engine in enumerate(ENGINES, 1):
-        x = Sample.of(case, settings.bins, "exact" if engine == AGAIN else engine, exposures, seed + k, fine)
+        try:
+            x = Sample.of(case, settings.bins, "exact" if engine == AGAIN else engine, exposures, seed + k, fine)
+        except ConvergenceError:  # a law that would take too long
+            found.append(Outcome(case, random, engine, "refused", dict.fromkeys(RATIOS, (np.nan, np.nan)), {}))
+            continue
         aucs = {} if x.handed else {test: _auc(test, truth, x, number) for test in tests}
-        found.append(Outcome(case, random, engine, x.handed, law.ratios(x), aucs))
+        found.append(Outcome(case, random, engine, "exact" if x.handed else "", law.ratios(x), aucs))
     return found
 
 

@@ -61,11 +61,12 @@ def run(request: Request) -> Facts:
             if (here := [(o, test) for o in named if o.engine == engine and o.aucs for test in TESTS])
         ],
         "gone": given_to_exact(found),
+        "refused": [f"{o.engine} {o.case.name}" for o in found if o.instead == "refused"],
         "asked": sum(o.engine == "feedback" for o in found),
         "band": [2 * chance(n) for n in (settings.exposures, settings.random_exposures)],
         "aucs": {
             test: crossed(
-                (o.case.name, o.engine, marked(o.aucs[test], seen(o, test)) if o.aucs else "exact")
+                (o.case.name, o.engine, marked(o.aucs[test], seen(o, test)) if o.aucs else o.instead)
                 for o in named
                 if o.engine != "exact"
             )
@@ -82,7 +83,7 @@ def run(request: Request) -> Facts:
 
 def given_to_exact(found: Sequence[Outcome]) -> list[str]:
     """Cases whose pixel the feedback engine gave to the exact one: they are not judged."""
-    return [o.case.name for o in found if o.engine == "feedback" and o.handed]
+    return [o.case.name for o in found if o.engine == "feedback" and o.instead == "exact"]
 
 
 def _p(value: float) -> str:
@@ -132,7 +133,7 @@ def _random_row(drawn: list[Outcome], engine: str, test: str, settings: Settings
 
 def _spread_row(drawn: list[Outcome], engine: str) -> Row:
     row: dict[str, object] = {"engine": engine}
-    here = [o for o in drawn if o.engine == engine and not o.handed]
+    here = [o for o in drawn if o.engine == engine and not o.instead]
     row["systems"] = len(here)
     for key in RATIOS:
         pairs: FloatArray = np.array([o.ratios[key] for o in here]).reshape(-1, 2)
@@ -173,7 +174,8 @@ def _csv_row(o: Outcome) -> Row:
         "random": int(o.random),
         **picked(c, "signal background dead delay sigma cycles"),
         "engine": o.engine,
-        "given_to_exact": int(o.handed),
+        "given_to_exact": int(o.instead == "exact"),
+        "refused": int(o.instead == "refused"),
     }
     for test in TESTS:
         name = "auc_" + test.lower().replace(" ", "_")

@@ -10,6 +10,7 @@ import pytest
 from harness import require
 from scipy import stats
 
+from mars_lidar.statistics import ConvergenceError
 from studies.__main__ import main
 from studies.common.report import MAX_FIGURE_BYTES
 from studies.joint import cases as bins
@@ -82,7 +83,7 @@ def test_pixels_given_to_exact_are_not_judged():
     settings = joint.Settings((), 60, 0, 60, bins=256)
     case = bins.Case("too short", 1.0, 1.0, 0.6375, cycles=50)
     found = {o.engine: o for o in joint.examine(case, settings, 0, 300, joint.TESTS[:1])}
-    assert found["feedback"].handed
+    assert found["feedback"].instead == "exact"
     assert not found["feedback"].aucs
     assert found["mars"].aucs
     assert run.given_to_exact(list(found.values())) == ["too short"]
@@ -118,3 +119,21 @@ def test_without_scikit_learn(tmp_path, monkeypatch, capsys):
     assert main(["joint", "--quick", "--out", str(tmp_path)]) == 1
     assert "mars-lidar[studies]" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_an_engine_whose_law_takes_too_long_is_not_judged(monkeypatch):
+    pytest.importorskip("sklearn", reason="extra 'studies'")
+    sampled = bins.Sample.of
+
+    def refuses(case, many, engine, *rest):
+        if engine == "mars":
+            raise ConvergenceError("too long")
+        return sampled(case, many, engine, *rest)
+
+    monkeypatch.setattr(joint.Sample, "of", refuses)
+    found = joint.examine(bins.SEVEN[6], joint.Settings((), 60, 0, 60, bins=256), 0, 300, joint.TESTS[:1])
+    mars = next(o for o in found if o.engine == "mars")
+    assert mars.instead == "refused"
+    assert not mars.aucs
+    assert np.isnan(mars.ratios["window"]).all()
+    assert all(o.aucs for o in found if o.engine not in ("exact", "mars"))

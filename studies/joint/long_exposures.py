@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import mars_lidar as ml
 from mars_lidar.engines.engine import Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
 from mars_lidar.engines.feedback_grid import cell_cuts, internal_cells
 from mars_lidar.engines.feedback_rule import draw_rest
 from studies import Facts, Request
-from studies.common.report import Row
-from studies.common.sample import PERIOD_NS, system_of
+from studies.common.report import Row, picked
+from studies.joint.cases import Case
 
 GOAL = 0.05  # standard deviations of a bin that its mean may be off (engines/feedback_grid.py)
 
@@ -50,7 +49,7 @@ def run(request: Request) -> Facts:
     random = np.random.default_rng(settings.seed)
     rows = []
     for k in range(settings.systems):
-        rows.append(compare(*_system(random), settings.items, seed=k))
+        rows.append(compare(*_drawn(random, k), settings.items, seed=k))
         request.tell(f"{k + 1} of {settings.systems}: {rows[-1]}")
     drawn = [row for row in rows if row["cells"]]
     return {
@@ -61,38 +60,31 @@ def run(request: Request) -> Facts:
     }
 
 
-def _system(random: np.random.Generator) -> tuple[float, float, ml.System, float]:
+def _drawn(random: np.random.Generator, k: int) -> tuple[Case, int]:
+    """A random pixel, and its number of bins."""
     signal, background, dead, sigma = 10 ** random.uniform([-1.3, -2.0, -1.3, -2.7], [1.0, 1.0, 0.4, -1.7])
     cycles, bins = int(random.choice([10**6, 10**7, 10**8])), int(random.choice([64, 256, 1024]))
-    system = system_of(dead * PERIOD_NS, cycles, bins=bins, sigma_ns=sigma * PERIOD_NS)
-    return float(signal), float(background), system, float(random.uniform(0.0, PERIOD_NS))
+    delay = float(random.uniform())
+    return Case(f"r{k:02d}", float(signal), float(background), float(dead), delay, float(sigma), cycles), bins
 
 
-def compare(signal: float, background: float, system: ml.System, delay_ns: float, items: int, seed: int) -> Row:
+def compare(case: Case, bins: int, items: int, seed: int) -> Row:
     """A row of the study for one pixel: cells of 0 where the engine refuses it."""
-    flux = ml.Flux(signal, background, delay_ns)
     report: dict[str, float] = {}
-    cube = ml.simulate(flux, system, engine=_Sampled(), realizations=items, seed=seed, report=report)
-    x = cube.reshape(items, system.bins).astype(np.float64)
-    sigma = float(getattr(system.pulse, "sigma_ns", 0.0))
-    merge, parts = cell_cuts(flux, system)
+    x, system = case.histograms(bins, _Sampled(), items, seed, report).astype(np.float64), case.system(bins)
+    merge, parts = cell_cuts(case.flux, system)
     row: dict[str, Any] = {
-        "S": signal,
-        "B": background,
-        "t_d": system.dead_time_periods,
-        "sigma": sigma / PERIOD_NS,
-        "cycles": f"{system.cycles:.0e}",
-        "bins": system.bins,
-        "cells": int(internal_cells(flux, system)[0, 0]),
+        **picked(case, "S=signal B=background t_d=dead sigma"),
+        "cycles": f"{case.cycles:.0e}",
+        "bins": bins,
+        "cells": int(internal_cells(case.flux, system)[0, 0]),
         "cut": f"{merge[0, 0]} x {parts[0, 0]}",
     }
     if report["refused"]:
         keys = ("largest", "rms", "count", "window", "var count", "var window", "var bins")
         return row | {"cells": 0} | dict.fromkeys(keys, "")
-    law = ml.joint_law(signal, background, system, delay_ns=delay_ns, tolerance=1e-4)
-    apart = ((np.arange(system.bins) + 0.5) / system.bins - delay_ns / PERIOD_NS + 0.5) % 1.0 - 0.5
-    near = np.abs(apart) < max(3.0 * sigma / PERIOD_NS, 0.51 / system.bins)
-    weights = np.stack([np.ones(system.bins), near.astype(np.float64)])
+    law = case.law(bins)
+    weights = np.stack([np.ones(bins), case.window(bins).astype(np.float64)])
     mean, variance = law.window(weights)
     y = x @ weights.T
     off = (x.mean(0) - law.mean) / np.sqrt(law.variance)

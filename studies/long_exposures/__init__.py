@@ -1,1 +1,0 @@
-"""The feedback engine at a million cycles and more."""

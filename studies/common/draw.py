@@ -19,10 +19,7 @@ WIDTH = 7.0  # inches: two columns of a paper
 def panels(height: float, rows: int, columns: int, **options: Any) -> tuple[Figure, Any]:
     """A figure of the common width, `height` in inches, with its axes (rows, columns)."""
     figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
-    for ax in axes.flat:
-        ax.spines[["top", "right"]].set_visible(False)
-    return figure, axes
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
 def legend_below(figure: Any, axes: Iterable[Axes], columns: int, **options: Any) -> None:

@@ -110,7 +110,6 @@ def _inset(ax: Axes, cell: Cell) -> None:
     inset.minorticks_off()
     inset.tick_params(labelsize=5.5)
     inset.set_title("KL, nats (dots: floor)", fontsize=6.0)
-    inset.spines[["top", "right"]].set_visible(False)
 
 
 def shapes(settings: Settings, cells: Sequence[Cell], sweep: dict[str, FloatArray]) -> Figure:

@@ -36,7 +36,6 @@ def figure(settings: Settings, outcomes: Sequence[Outcome]) -> Figure:
 
 
 def _axis(ax: Any, band: float, lowest: float) -> None:
-    ax.spines[["top", "right"]].set_visible(False)
     ax.axvspan(-band, band, color=MISSING, alpha=0.6, lw=0)
     ax.set_xscale("symlog", linthresh=_LINEAR)
     ax.set(xlim=(min(-0.03, 1.1 * lowest), 0.7), xlabel="AUC")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,7 @@ def _predicted(dead: float, cells: int) -> list[dict[str, Any]]:
 
 def _result(one: Run, data: _Data, config: Config) -> dict[str, Any]:
     """One network, trained and judged."""
-    training, gold = data.pixels(one.dead, one.name, _TRAINING), data.pixels(one.dead, GOLD, _TEST)
+    training, gold = data.training(one.dead, one.name), data.test(one.dead, GOLD)
     began = time.process_time()
     torch.manual_seed(one.seed)
     network = IntervalNetwork(FEATURES, len(OUTPUTS))
@@ -102,7 +102,7 @@ def _result(one: Run, data: _Data, config: Config) -> dict[str, Any]:
     seconds = time.process_time() - began
     tests = {"gold": looks.pop(steps)}
     for test, name in (("own", one.name), ("exact", "exact")):
-        tests[test] = judged(network, data.pixels(one.dead, name, _TEST))
+        tests[test] = judged(network, data.test(one.dead, name))
     return {"run": asdict(one), "seconds": seconds, "tests": tests, "looks": looks}
 
 
@@ -112,21 +112,17 @@ class _Data:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._simulators = {dead: Simulators(instrument(dead), config) for dead in config.dead}
-        self._held: dict[tuple[float, str, int], Pixels] = {}
+        # held are the last to train on, and the tests of one dead time
+        self.training = lru_cache(1)(partial(self._pixels, _TRAINING))
+        self.test = lru_cache(len(config.steps) + 1)(partial(self._pixels, _TEST))
 
-    def pixels(self, dead: float, name: str, purpose: int) -> Pixels:
-        """Training or test pixels; held are the tests of one dead time, and the last to train on."""
-        key, config = (dead, name, purpose), self._config
-        if key not in self._held:
-            kept_purposes = {_TEST} if purpose == _TRAINING else {_TEST, _TRAINING}
-            self._held = {old: made for old, made in self._held.items() if old[0] == dead and old[2] in kept_purposes}
-            number = config.pixels[name] if purpose == _TRAINING else config.test
-            numbers = [config.seed, config.dead.index(dead), purpose]
-            source = (*config.steps, GOLD).index(name)
-            seed = int(np.random.default_rng([*numbers, source]).integers(2**62))
-            flux = light(number, np.random.default_rng(numbers))
-            self._held[key] = self._simulators[dead].pixels(name, flux, seed)
-        return self._held[key]
+    def _pixels(self, purpose: int, dead: float, name: str) -> Pixels:
+        config = self._config
+        number = config.pixels[name] if purpose == _TRAINING else config.test
+        numbers = [config.seed, config.dead.index(dead), purpose]
+        source = (*config.steps, GOLD).index(name)
+        seed = int(np.random.default_rng([*numbers, source]).integers(2**62))
+        return self._simulators[dead].pixels(name, light(number, np.random.default_rng(numbers)), seed)
 
 
 def judged(network: IntervalNetwork, pixels: Pixels, cells: int = 0) -> dict[str, Any]:

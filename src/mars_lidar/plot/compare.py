@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mars_lidar.compare.views import instrument
-from mars_lidar.plot.compare_panels import draw_points, draw_times, engine_colours, label_panels
+from mars_lidar.plot.compare_panels import draw_points, draw_times, engine_colours
 from mars_lidar.plot.figures import _draw_map
 from mars_lidar.plot.pixel import _steps, _zoom_ns, quiet_corner
 from mars_lidar.plot.style import DPI, INK, style
@@ -159,7 +159,6 @@ def _draw_histograms(figure: Figure, box: tuple[float, float], found: Comparison
     zoom.set_xlabel("around the return (ns)")
     rate = next(iter(lines.values()))
     whole.legend(loc=quiet_corner(rate), frameon=False, ncols=2, handlelength=1.6, columnspacing=1.0)
-    label_panels((whole, zoom))
 
 
 def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]) -> None:
@@ -204,7 +203,6 @@ def _draw_laws(figure: Figure, box: tuple[float, float], found: Comparison, colo
         ax.set_ylim(0.0, None)
         ax.locator_params(axis="both", nbins=5)
     axes[0].set_ylabel("probability")
-    label_panels(axes)
 
 
 def _draw_joint(figure: Figure, box: tuple[float, float], found: Comparison, colours: dict[str, str]) -> None:
@@ -230,7 +228,6 @@ def _draw_joint(figure: Figure, box: tuple[float, float], found: Comparison, col
     draw_points(shapes, distances, colours, None, against)
     shapes.set_title("Shape of the mean histogram: TV (– by chance)", loc="left")
     draw_times(times, found, colours)
-    label_panels((ratios, lags, shapes, times))
 
 
 def _first(engines: list[str], name: str) -> list[str]:

@@ -102,12 +102,6 @@ def draw_times(ax: Axes, found: Comparison, colours: dict[str, str]) -> None:
     ax.set_title(f"Time of one cube (ms), threads: {found.threads}", loc="left")
 
 
-def label_panels(axes: Iterable[Axes]) -> None:
-    """What all panels have in common."""
-    for ax in axes:
-        ax.spines[["top", "right"]].set_visible(False)
-
-
 def _range(rows: Mapping[str, Mapping[str, Estimate | Distance]], goal: float, always: str) -> tuple[float, float]:
     """Limits that keep small deviations visible: four times the median deviation, and all of engine `always`."""
     reach = {

@@ -168,6 +168,7 @@ def _draw_map(
     bar.set_label(label, labelpad=2.0)
     bar.outline.set_linewidth(0.5)
     ax.set_title(title, loc="left")
+    ax.spines[:].set_visible(True)  # an image has a frame
     ax.set_xticks([])
     ax.set_yticks([])
 

@@ -87,8 +87,6 @@ def draw_pixel(
         loc="left",
         color=colour,
     )
-    for ax in (whole, zoom):
-        ax.spines[["top", "right"]].set_visible(False)
 
 
 def quiet_corner(rate: NDArray[np.float64]) -> str:

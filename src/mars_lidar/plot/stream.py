@@ -122,7 +122,5 @@ def _phases(ax: Axes, found: Inspection) -> None:
 
 
 def _tidy(figure: Figure, title: str) -> None:
-    for ax in figure.axes:
-        ax.spines[["top", "right"]].set_visible(False)
     if title:
         figure.suptitle(title, fontsize=8.5, color=INK, x=0.01, ha="left")

@@ -29,6 +29,8 @@ _STYLE: dict[str, Any] = {
     "xtick.minor.width": 0.4,
     "ytick.minor.width": 0.4,
     "axes.edgecolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
     "text.color": INK,
     "axes.labelcolor": INK,
     "xtick.color": INK,

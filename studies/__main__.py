@@ -11,11 +11,11 @@ from functools import partial
 from pathlib import Path
 
 from mars_lidar._base.optional import MissingLibraryError
-from studies import STUDIES, OtherRunsError, Request
+from studies import STUDIES, OtherRunsError, Request, run
 
 
 def _parser(command: str) -> argparse.ArgumentParser:
-    told = "\n".join(f"  {name:<17} {words}" for name, (words, _) in STUDIES.items())
+    told = "\n".join(f"  {name:<17} {words}" for name, (_, words) in STUDIES.items())
     told += "\n\nthe network of the neural baseline:\n  neural train|info  see neural --help"
     parser = argparse.ArgumentParser(
         prog=command,
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
     try:
         for name in dict.fromkeys(given.studies):
             began = time.monotonic()
-            for path in STUDIES[name][1](request):
+            for path in run(name, request):
                 print(path)
             request.tell(f"{name}: done in {time.monotonic() - began:.0f} s")
     except (MissingLibraryError, OtherRunsError) as error:

@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 import mars_lidar as ml
+import studies
 from mars_lidar.statistics import ConvergenceError, count_law
 from mars_lidar.statistics.chain import PhaseChain
 from mars_lidar.statistics.count_window import gaussian_window
@@ -197,9 +198,9 @@ def test_reference_study(tmp_path):
     del case["tau"]
     (data / "made.json").write_text(json.dumps(case))
     with pytest.raises(ValueError, match=r"made\.json must hold .* lacks tau"):
-        STUDIES["reference"][1](Request(tmp_path, data=data))
+        studies.run("reference", Request(tmp_path, data=data))
     with pytest.raises(ValueError, match="data must be the folder"):
-        STUDIES["reference"][1](Request(tmp_path))
+        studies.run("reference", Request(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -224,7 +225,7 @@ def test_help_lists_the_studies(capsys):
         main(["--help"])
     assert stop.value.code == 0
     told = capsys.readouterr().out
-    assert all(name in told and words in told for name, (words, _) in STUDIES.items())
+    assert all(name in told and words in told for name, (_, words) in STUDIES.items())
 
 
 def test_table():

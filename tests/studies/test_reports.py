@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-import studies
 from studies import STUDIES, Request
 from studies.__main__ import main
 from studies.common import report
@@ -63,7 +62,7 @@ def test_every_name_that_a_report_prints_is_a_study():
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_every_study_has_a_module_that_runs(name: str):
     pytest.importorskip("torch", reason="extra 'learn'")
-    module = import_module(studies.module_of(name))
+    module = import_module(STUDIES[name][0])
     assert callable(module.run)
     assert f'"{name}"' in (module.__doc__ or "").splitlines()[0]
 
@@ -75,7 +74,7 @@ def test_templates_parse_and_are_filled_by_a_module_beside_them(path: Path):
     environment.parse(path.read_text(encoding="utf-8"))
     stem = path.name.removesuffix(".md.jinja")
     module = path.with_name(f"{'run' if stem == 'report' else stem}.py").relative_to(ROOT).with_suffix("")
-    assert ".".join(module.parts) in {studies.module_of(name) for name in STUDIES}
+    assert ".".join(module.parts) in {module for module, _ in STUDIES.values()}
 
 
 def test_the_package_imports_no_study():

@@ -72,7 +72,7 @@ def run(request: Request) -> Facts:
             for case, noted in zip(SEVEN, SEVEN_RATIOS, strict=True)
             if case in settings.cases
         ],
-        "tables": {
+        "compared": {
             key: crossed((*who, marked(one[key], beyond(one[key], key))) for who, one in found.items())
             for key in RATIOS
         },

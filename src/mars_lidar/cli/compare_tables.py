@@ -119,8 +119,6 @@ def _scene_table(console: Console, found: Comparison) -> None:
             "bias/sd",
             "bias %",
             "dispersion",
-            "depth mm",
-            "outliers %",
         ),
     )
     for name, s in found.scenes.items():
@@ -134,8 +132,6 @@ def _scene_table(console: Console, found: Comparison) -> None:
             cell(s.bias),
             cell(percent),
             cell(s.dispersion),
-            _number(1e3 * s.depth_error_m),
-            _number(100 * s.outliers),
         )
     console.print()
     console.print(shown)

@@ -116,7 +116,7 @@ def compare(
     pixels
         How many representative pixels are chosen, 1 to 6, or their (y, x) by name.
     depth_m
-        True depth (H, W), m; default that of the flux's delays.
+        True depth (H, W), m, by which a pixel at an edge is found; default that of the flux's delays.
     seed
         Integer in [0, 2**64).
     threads
@@ -174,7 +174,7 @@ def compare(
     for name, engine in list(whole.items()):
         try:
             scenes[name] = scene_statistics(
-                flux, system, engine, expected, depth, cubes, _stream(seed, name), team, budget, scenes.get(against)
+                flux, system, engine, expected, cubes, _stream(seed, name), team, budget, scenes.get(against)
             )
             steps.done()
         except (ValueError, ConvergenceError) as error:  # what an engine notices only at work

@@ -1,4 +1,4 @@
-"""One engine on a whole image: its time, how its counts deviate over all pixels, and what a peak picker makes of it."""
+"""One engine on a whole image: its time, and how its counts deviate over all pixels."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from mars_lidar._base.types import FloatArray
 from mars_lidar.compare.expected import Expected
 from mars_lidar.compare.sample import Estimate, score
-from mars_lidar.compare.views import bin_depth_m
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.reconstruct.quality import depth_lag_m
 from mars_lidar.simulate import simulate
 
 
@@ -38,9 +36,6 @@ class SceneStatistics:
         Total counts over the expected total - 1; over the reference engine's total where nothing is predicted.
     dispersion
         Mean of (count - expected)^2 / variance over pixels and cubes: 1 where mean and variance are right.
-    depth_error_m
-        Median of |depth at the largest bin - true depth|, m, and `outliers`, the share of pixels in which it
-        exceeds three standard deviations of the pulse or a bin; NaN without a true depth.
     report
         What the engine told beside the counts, of the last cube.
     """
@@ -52,8 +47,6 @@ class SceneStatistics:
     bias: Estimate
     relative_bias: Estimate
     dispersion: Estimate
-    depth_error_m: float
-    outliers: float
     report: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -72,7 +65,6 @@ def scene_statistics(
     system: System,
     engine: Engine,
     expected: Expected,
-    depth_m: FloatArray,
     repeats: int,
     seed: int,
     threads: int,
@@ -84,7 +76,6 @@ def scene_statistics(
     cube.fill(0)  # zeros alone is memory that is not there yet
     seconds: list[float] = []
     counts: list[NDArray[np.int64]] = []
-    errors: list[FloatArray] = []
     report: dict[str, float] = {}
     while len(seconds) < repeats and sum(seconds) < budget_s:
         began = time.perf_counter()
@@ -99,15 +90,9 @@ def scene_statistics(
             report=report,
         )
         seconds.append(time.perf_counter() - began)
-        total = cube[0].sum(-1, dtype=np.int64)
-        counts.append(total)
-        found = np.where(total > 0, bin_depth_m(system, cube[0].argmax(-1)), np.nan)
-        errors.append(depth_lag_m(system, found, depth_m))
+        counts.append(cube[0].sum(-1, dtype=np.int64))
     drawn = np.array(counts, dtype=np.float64)
     bias, dispersion = _against(expected, drawn)
-    missed = np.abs(np.concatenate([e.ravel() for e in errors]))
-    missed = missed[np.isfinite(missed)]
-    limit = max(3.0 * float(system.depth_m(_pulse_deviation_ns(system))), float(system.depth_m(system.bin_ns)))
     return SceneStatistics(
         engine=engine.name,
         seconds=tuple(seconds),
@@ -116,8 +101,6 @@ def scene_statistics(
         bias=bias,
         relative_bias=_relative(expected, drawn, reference),
         dispersion=dispersion,
-        depth_error_m=float(np.median(missed)) if missed.size else math.nan,
-        outliers=float((missed > limit).mean()) if missed.size else math.nan,
         report=report,
     )
 
@@ -150,13 +133,3 @@ def _mean(values: FloatArray, goal: float) -> Estimate:
     """Mean of independent values (n,)."""
     mean, error = float(values.mean()), float(values.std(ddof=1)) / math.sqrt(values.size)
     return Estimate(mean, error, score(mean - goal, error))
-
-
-def _pulse_deviation_ns(system: System) -> float:
-    low, high = system.pulse.support_ns()
-    edges = np.linspace(low, high, 4097)
-    weight = np.diff(system.pulse.cumulative(edges))
-    centres = 0.5 * (edges[1:] + edges[:-1])
-    weight = weight / weight.sum()
-    mean = float(weight @ centres)
-    return math.sqrt(float(weight @ (centres - mean) ** 2))

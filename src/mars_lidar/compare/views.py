@@ -36,13 +36,9 @@ def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDA
         counts = np.asarray(cube.histogram[realization, rows])
         totals[rows] = counts.sum(-1, dtype=np.int64)
         peaks[rows] = counts.argmax(-1)
-    return totals, np.where(totals > 0, bin_depth_m(cube.system, peaks), np.nan)
-
-
-def bin_depth_m(system: System, bins: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-    """Depth (...) in m of a return whose largest bins are `bins` (...), modulo the unambiguous range."""
-    delay = (system.time_ns[bins] - _peak_offset_ns(system)) % system.period_ns
-    return np.asarray(system.depth_m(delay), dtype=np.float64)
+    system = cube.system
+    delay = (system.time_ns[peaks] - _peak_offset_ns(system)) % system.period_ns
+    return totals, np.where(totals > 0, system.depth_m(delay), np.nan)
 
 
 def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[int, int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -23,6 +24,7 @@ from studies.covariance.run import (
 
 _DECAY = ((1.0, 1.0), (10.0, 0.1))  # S, B
 _DECAY_LAGS = 20
+_NOTE: dict[str, Any] = {"ha": "right", "fontsize": 7, "color": MUTED}
 _FLOOR = 1e-9  # of sigma_ss^2; below it covariances are not drawn
 
 
@@ -47,15 +49,7 @@ def decay(settings: Settings) -> Figure:
     axes[0, -1].legend(
         title="$t_d / t_r$", title_fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5)
     )
-    axes[0, 0].annotate(
-        "filled: positive\nopen: negative",
-        (0.97, 0.97),
-        xycoords="axes fraction",
-        ha="right",
-        va="top",
-        fontsize=7,
-        color=MUTED,
-    )
+    axes[0, 0].annotate("filled: positive\nopen: negative", (0.97, 0.97), xycoords="axes fraction", va="top", **_NOTE)
     return figure
 
 
@@ -77,15 +71,7 @@ def eigenvalues(settings: Settings, cells: Sequence[Cell]) -> Figure:
         ax.set_title(f"{grid.name}, {grid.size} cells", loc="left")
     axes[0, 0].set_ylabel(r"$|\lambda_k|$")
     axes[0, -1].legend(frameon=False, loc="upper right")
-    axes[0, 0].annotate(
-        "0.7",
-        (0.97, 0.7),
-        xycoords=("axes fraction", "data"),
-        ha="right",
-        va="bottom",
-        fontsize=7,
-        color=MUTED,
-    )
+    axes[0, 0].annotate("0.7", (0.97, 0.7), xycoords=("axes fraction", "data"), va="bottom", **_NOTE)
     return figure
 
 

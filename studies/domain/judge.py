@@ -24,7 +24,7 @@ from studies.domain.checks import (
 from studies.domain.predictions import TOLERANCE, Predictions
 from studies.domain.records import recorded
 from studies.domain.samples import Sample, Windows, collect, handed, simulated
-from studies.domain.verdict import FAILED, HANDED, LAWS, REFUSED, SLOW, UNJUDGED, VERIFIED, Outcome, refusal
+from studies.domain.verdict import FAILED, HANDED, REFUSED, SLOW, UNJUDGED, VERIFIED, Outcome, refusal
 
 LAW_SECONDS = 2.0  # a prediction that takes longer is slower than real use
 EXPOSURE_SECONDS = 2.0  # likewise one exposure of one pixel
@@ -32,6 +32,7 @@ _NS = {"exact": 5e-9, "sequential": 16e-9}  # rough seconds of a registration, o
 _LANES = 32  # exposures that the exact engine draws in the time of one
 _NEEDS = {"cramer_rao": ("mean_histogram",), "mars": ("count_law", "mean_histogram"), "pmf": ("count_law",)}
 _SLACK = {"feedback": 0.05, "auto": 0.05}  # standard deviations that the mean of a bin may be off (docs/feedback.md)
+_OWN = 0.15  # arrivals that the sweep's own simulator may draw, over the registrations of an engine
 _MARS_SECONDS = 0.03  # of its laws, beyond which engine "mars" is not asked for them again
 ENGINES = ("exact", "sequential", "feedback", "auto", "mars")  # in order of drawing; each has a seed of its own
 _PAIRS = (
@@ -48,16 +49,13 @@ Tell = Callable[[str, str], None]
 class Budget:
     """How much is drawn for a case: `registrations` by an engine, `cells` of histograms (exposures x bins)."""
 
-    registrations: float = 2e6
-    cells: float = 1.5e7
-    exposures: int = 1500
-    own_arrivals: float = 2e5
+    registrations: float
+    cells: float
+    exposures: int
 
     def times(self, factor: int) -> Budget:
         """A larger budget."""
-        return Budget(
-            self.registrations * factor, self.cells * factor, self.exposures * factor, self.own_arrivals * factor
-        )
+        return Budget(self.registrations * factor, self.cells * factor, self.exposures * factor)
 
 
 def judge(case: Case, seed: int, budget: Budget, tell: Tell, skip: Collection[str] = ()) -> list[Outcome]:
@@ -99,7 +97,7 @@ class _Judge:
         """Run one step and keep what became of it."""
         if subject in self.skip:
             return
-        outcome = Outcome(self.case.name, subject, UNJUDGED)
+        outcome = Outcome(subject, UNJUDGED)
         self.outcomes.append(outcome)
         needed = _NEEDS.get(subject, ())
         if stopped := [name for name in needed if name in self.skip]:
@@ -121,9 +119,7 @@ class _Judge:
             outcome.note = f"{type(error).__name__}: {error}"[:400]
         outcome.seconds = time.process_time() - began
         if outcome.state in (VERIFIED, UNJUDGED) and outcome.seconds > limit:
-            outcome.state, outcome.note = SLOW, f"{outcome.seconds:.1f} s"
-        if subject in LAWS and outcome.state == SLOW:
-            outcome.note = f"{outcome.seconds:.1f} s of processor time"
+            outcome.state, outcome.note = SLOW, f"{outcome.seconds:.1f} s of processor time"
         self.tell(subject, "end")
 
     def _engine(self, engine: str) -> list[Check]:
@@ -241,17 +237,15 @@ class _Judge:
     def _own(self) -> None:
         """The sweep's own simulator, where it is cheap."""
         each = max(simulator.arrivals(self.case), 1e-9)
-        items = int(min(self.budget.own_arrivals / each, 2000, self.budget.cells / 10 / self.case.system.bins))
+        items = int(min(_OWN * self.budget.registrations / each, 2000, self.budget.cells / 10 / self.case.system.bins))
         if not simulator.able(self.case) or items < 20 or each > 3000:
             return
         assert self.windows is not None
         self.tell("simulator", "begin")
-        self.samples["simulator"] = collect(
-            "simulator", [simulator.counts(self.case, items, self.seed + 5)], self.windows
-        )
-        self.outcomes.append(
-            Outcome(self.case.name, "simulator", VERIFIED, checks=self._against_predictions(self.samples["simulator"]))
-        )
+        drawn = simulator.counts(self.case, items, self.seed + 5)
+        self.samples["simulator"] = collect("simulator", [drawn], self.windows)
+        checks = self._against_predictions(self.samples["simulator"])
+        self.outcomes.append(Outcome("simulator", VERIFIED, checks=checks))
         self.tell("simulator", "end")
 
     def _pairs(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mars_lidar import CountLaw, JointLaw, count_law, cramer_rao, joint_law, registration_pdf
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics import mean_histogram
+from mars_lidar.statistics import mean_histogram, photons_per_bin
 from studies.domain.case import Case
 from studies.domain.checks import Check
 from studies.domain.closed_forms import known
@@ -123,8 +123,9 @@ class Predictions:
         dead = case.system.dead_time_periods
         plain = case.mode == "nonparalyzable" and not case.system.detector.effects
         if plain and dead == round(dead) and case.photons > 0.0:
-            flat = self._light_in_bins()
-            found.append(_agree("stationary shape", "closed form", "shape", 0.5 * float(np.abs(shape - flat).sum())))
+            flat = photons_per_bin(system=case.system, bins=case.system.bins, **case.light())
+            off = 0.5 * float(np.abs(shape - flat / flat.sum()).sum())
+            found.append(_agree("stationary shape", "closed form", "shape", off))
         if case.system.start == "stationary" and self.histogram is not None and self.histogram.sum() > 0.0:
             seen = self.histogram / self.histogram.sum()
             off = 0.5 * float(np.abs(shape - seen).sum())
@@ -165,18 +166,6 @@ class Predictions:
         assert self.law is not None
         sd = float(np.sqrt(max(float(self.law.variance), 0.0)))
         return (mean - float(self.law.mean)) / max(sd, 1e-3 * float(self.law.mean), 1e-9)
-
-    def _light_in_bins(self) -> FloatArray:
-        case, bins = self.case, self.case.system.bins
-        flat = np.full(bins, case.background / bins)
-        if case.waveform is not None:
-            below = np.concatenate([[0.0], np.cumsum(case.waveform)])
-            at = np.linspace(0.0, case.waveform.size, bins + 1)
-            flat = flat + np.diff(np.interp(at, np.arange(below.size), below))
-        else:
-            energy = case.system.pulse.bin_energy(case.delay[0] * case.system.period_ns, case.system.period_ns, bins)
-            flat = flat + case.signal[0] * energy
-        return np.asarray(flat / flat.sum())
 
 
 def _agree(a: str, b: str, what: str, off: Any) -> Check:

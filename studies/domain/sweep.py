@@ -94,11 +94,11 @@ def judge_case(case: Case, settings: Settings, watched: Watched, seed: int) -> J
             elif not found.p >= level:
                 failing.append(found)
     for party, checks in blamed(failing).items():
-        _blame(outcomes, case, party, checks)
+        _blame(outcomes, party, checks)
     return Judged(case, outcomes, failing, suspects, time.monotonic() - began)
 
 
-def _blame(outcomes: list[Outcome], case: Case, party: str, checks: list[Check]) -> None:
+def _blame(outcomes: list[Outcome], party: str, checks: list[Check]) -> None:
     words = "; ".join(f"{c.what} ({c.a} against {c.b}): p {c.p:.1g}, effect {c.effect:.3g}" for c in checks[:4])
     for outcome in outcomes:
         if outcome.subject == party:
@@ -106,4 +106,4 @@ def _blame(outcomes: list[Outcome], case: Case, party: str, checks: list[Check])
                 outcome.note = words + (f" [{outcome.state}]" if outcome.state not in (VERIFIED, UNJUDGED) else "")
             outcome.state = FAILED
             return
-    outcomes.append(Outcome(case.name, party, FAILED, note=words))
+    outcomes.append(Outcome(party, FAILED, note=words))

@@ -47,9 +47,8 @@ FAMILY_LEVEL = 1e-3  # of the sweep: both drawings of a check reject
 
 @dataclass
 class Outcome:
-    """What one subject did in one case."""
+    """What one subject did in a case."""
 
-    case: str
     subject: str
     state: str
     seconds: float = 0.0

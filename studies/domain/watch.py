@@ -64,8 +64,8 @@ class Watched:
                 subject = told
         except (EOFError, OSError):
             if self._ended() in (-signal.SIGPROF, -signal.SIGALRM):
-                return Outcome(case.name, subject, SLOW, patience, f"stopped after {patience:g} s")
-            return Outcome(case.name, subject, FAILED, 0.0, "the process ended")
+                return Outcome(subject, SLOW, patience, f"stopped after {patience:g} s")
+            return Outcome(subject, FAILED, 0.0, "the process ended")
         return told
 
     def _start(self) -> None:

@@ -69,7 +69,7 @@ def test_systems_are_functions_of_their_number_and_reach_the_ends() -> None:
 
 def test_a_right_engine_passes_and_wrong_ones_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """Engine "poisson", which knows no dead time, called "exact": every kind of comparison sees it."""
-    case, budget = pixel(), Budget(2e5, 1e6, 2000, 5e4)
+    case, budget = pixel(), Budget(2e5, 1e6, 2000)
     outcomes = judge(case, 1, budget, silent)
     assert {o.subject for o in outcomes} >= set(verdict.SUBJECTS)
     assert {o.state for o in outcomes if o.subject != "cramer_rao"} <= {
@@ -107,13 +107,13 @@ def test_the_second_drawing_decides() -> None:
     """Levels multiply; a chance deviation in the first drawing does not make a failure."""
     level = verdict.second_level(100_000)
     assert level * verdict.FIRST_LEVEL * 100_000 == pytest.approx(verdict.FAMILY_LEVEL)
-    settings = Settings(1, 1, Budget(2e4, 1e5, 100, 1e3), 100)
+    settings = Settings(1, 1, Budget(2e4, 1e5, 100), 100)
 
     class Odd(Watched):
         def judge(self, case, seed, budget, patience=None):
             first = budget.exposures == 100
             check = Check("exact", "pmf", "law of the count", 1e-6 if first else 0.3, 0.1)
-            return [verdict.Outcome(case.name, "exact", verdict.VERIFIED, checks=[check])]
+            return [verdict.Outcome("exact", verdict.VERIFIED, checks=[check])]
 
     judged = judge_case(pixel(), settings, Odd(), 1)
     assert judged.suspects
@@ -145,11 +145,11 @@ def test_what_hangs_is_stopped_and_what_crashes_is_told(monkeypatch: pytest.Monk
             return os._exit, (3,)
 
     with Watched(0.3) as watched:
-        [only] = [o for o in watched.judge(Ends(), 1, Budget()) if o.state == verdict.FAILED]  # type: ignore[arg-type]
+        [only] = [o for o in watched.judge(Ends(), 1, Budget(1e3, 1e3, 10)) if o.state == verdict.FAILED]  # type: ignore[arg-type]
         assert only.note == "the process ended"
         began = time.monotonic()
         slow = pixel(50.0, 50.0, 0.9999, 10**8)
-        states = {o.subject: o.state for o in watched.judge(slow, 1, Budget(1e3, 1e3, 10, 1.0))}
+        states = {o.subject: o.state for o in watched.judge(slow, 1, Budget(1e3, 1e3, 10))}
         assert states["exact"] == verdict.SLOW
         assert time.monotonic() - began < 120.0
 

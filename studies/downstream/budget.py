@@ -16,7 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from studies import Facts, Request
 from studies.common.intervals import Steps
 from studies.common.windows import features
-from studies.downstream.data import CONFIGS, SYSTEM, WORDS, Config, Simulators, crop
+from studies.downstream.data import CONFIGS, SYSTEM, WORDS, Config, Data
 from studies.downstream.networks import BinNetwork, WindowNetwork
 from studies.downstream.run import MODELS, POLYNOMIAL_STEPS, Polynomial, runs
 
@@ -65,9 +65,9 @@ def flop_of_a_step(config: Config) -> dict[str, float]:
 def seconds_of_data(config: Config, steps: int = 3) -> dict[str, dict[str, float]]:
     """Processor time by simulator, s: of a step's crops, of their features and the polynomial, of a test scene."""
     few = replace(config, train=(config.train[0], 8), table=(32, 16))
-    simulators, scene, found = Simulators(few), crop(few.test[0], few), {}
+    data, found = Data(replace(few, test=(few.test[0], 1))), {}
     for arm in few.arms:
-        stream = iter(simulators.stream(arm, few.sbr[-1], few.seed))
+        stream = iter(data.stream(arm, few.sbr[-1], 0))
         next(stream)  # casts the rooms and builds the tables
         began = time.process_time()
         batches = [next(stream) for _ in range(steps)]
@@ -79,7 +79,7 @@ def seconds_of_data(config: Config, steps: int = 3) -> dict[str, dict[str, float
         for cube, batch in zip(cubes, batches, strict=True):
             Polynomial().take(cube, batch["flux"]["signal"].numpy())
         fitted = time.process_time()
-        simulators.cubes(arm, [scene], few.sbr[-1], few.seed)
+        data.own(arm, few.sbr[-1])
         found[arm] = {
             "crops, s": (drawn - began) / steps,
             "features, s": (seen - drawn) / steps,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -108,11 +108,21 @@ def _random(config: Config, *numbers: int) -> np.random.Generator:
     return np.random.default_rng([config.seed, *numbers])
 
 
-class Simulators:
-    """The cubes of every arm; a table is built when an arm first needs it."""
+_TRAINING, _OWN, _GOLD = range(3)  # streams of noise
+
+
+class Data:
+    """Test scenes, and the cubes of every arm; a table is built when an arm first needs it."""
 
     def __init__(self, config: Config) -> None:
-        self._config = config
+        self.config = config
+        first, number = config.test
+        self.test = [crop(first + k, config) for k in range(number)]
+        self.gold = lru_cache(partial(self._tested, config.gold, stream=_GOLD))  # of the test scenes, by ratio
+        self.own = partial(self._tested, stream=_OWN)  # the same by an arm
+
+    def _tested(self, arm: str, sbr: float, stream: int) -> NDArray[Any]:
+        return self.cubes(arm, self.test, sbr, (self.config.seed << 8) + stream)
 
     def cubes(self, arm: str, scenes: Sequence[Scene], sbr: float, seed: int) -> NDArray[Any]:
         """Histograms (N, H, W, bins), one exposure of each scene; `arm` one of `WORDS`, or the gold standard."""
@@ -120,16 +130,16 @@ class Simulators:
         shape = (len(scenes), *scenes[0].shape, SYSTEM.bins)
         out = np.empty(shape, SYSTEM.histogram_dtype)
         for k, scene in enumerate(scenes):
-            flux = scene.flux(SYSTEM, signal=level(scene, self._config), sbr=sbr)
+            flux = scene.flux(SYSTEM, signal=level(scene, self.config), sbr=sbr)
             simulate(flux, SYSTEM, engine=engine, first_realization=k, seed=seed, threads=1, out=out[k : k + 1])
         return out
 
     def stream(self, arm: str, sbr: float, seed: int) -> CubeStream:
-        """Batches of crops of the training rooms, (N, H, W, bins) of counts, no exposure twice.
+        """To train on: batches of crops of the training rooms, (N, H, W, bins) of counts, no exposure twice.
 
         The mean signal is drawn from the range that whole rooms have: what a crop's own is, is for the network to see.
         """
-        config = self._config
+        config = self.config
         levels = [level(scene, config) for scene in self._rooms]
         return CubeStream(
             SYSTEM,
@@ -141,15 +151,15 @@ class Simulators:
             engine=self._engine(arm),
             axes="HWT",
             dtype=None,
-            seed=seed,
+            seed=(config.seed << 8) + 16 * seed + _TRAINING,
             threads=1,
             ahead=0,
         )
 
     @cached_property
     def _rooms(self) -> list[Scene]:
-        first, number = self._config.train
-        return [room(first + k, self._config) for k in range(number)]
+        first, number = self.config.train
+        return [room(first + k, self.config) for k in range(number)]
 
     def _engine(self, arm: str) -> str | Engine:
         if arm == "neural":
@@ -164,7 +174,7 @@ class Simulators:
 
     @cached_property
     def _table(self) -> Table:
-        s, b = self._config.table
+        s, b = self.config.table
         return Table.build(SYSTEM, (0.01, 10.0, s), (0.01, 10.0, b), threads=1)
 
     @cached_property
@@ -173,7 +183,7 @@ class Simulators:
 
         The map itself takes a millisecond a pixel; it too is asked for at one delay, and its answer is moved.
         """
-        s, b = (np.geomspace(0.01, 10.0, max(4, points // 4)) for points in self._config.table)
+        s, b = (np.geomspace(0.01, 10.0, max(4, points // 4)) for points in self.config.table)
         exact = Table.build(SYSTEM, s, b, threads=1)
         light = np.meshgrid(exact.signal, exact.background, indexing="ij")
         engine = NeuralEngine()
@@ -193,17 +203,17 @@ QUARTERS = ("dimmest", "second", "third", "brightest")
 _STREAMS = (5, 6, 7)  # of the arms and of two exposures by the gold standard; others than those of the networks' data
 
 
-def count_bias(config: Config, scenes: Sequence[Scene], simulators: Simulators) -> dict[str, dict[str, list[float]]]:
+def count_bias(data: Data) -> dict[str, dict[str, list[float]]]:
     """By ratio and arm: mean count over that of the gold standard, less 1, in quarters of the pixels by reflectivity.
 
     Key ``"scatter"`` stands for the gold standard's own standard deviation of a pixel's count, over its mean: what a
     bias is to be measured by.
     """
-    reflectivity = np.stack([scene.reflectivity for scene in scenes]).ravel()
+    config, reflectivity = data.config, np.stack([scene.reflectivity for scene in data.test]).ravel()
     quarters = np.array_split(np.argsort(reflectivity, kind="stable"), len(QUARTERS))
 
     def totals(arm: str, sbr: float, stream: int) -> NDArray[np.float64]:
-        cubes = simulators.cubes(arm, scenes, sbr, (config.seed << 8) + stream)
+        cubes = data.cubes(arm, data.test, sbr, (config.seed << 8) + stream)
         return np.asarray(cubes.sum(axis=-1, dtype=np.float64)).ravel()
 
     def by_quarter(values: NDArray[np.float64]) -> NDArray[np.float64]:

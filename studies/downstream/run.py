@@ -24,7 +24,7 @@ from mars_lidar._base.types import FloatArray
 from studies import Facts, Request
 from studies.common.kept import chosen, fixed, kept
 from studies.common.windows import features
-from studies.downstream.data import CONFIGS, SYSTEM, Config, Simulators, count_bias, crop, level, truths
+from studies.downstream.data import CONFIGS, SYSTEM, Config, Data, count_bias, level, truths
 
 TARGETS = ("reflectivity", "depth")
 MODELS = {"polynomial": "polynomial", "window": "window network", "bins": "bin network"}
@@ -33,7 +33,6 @@ DEGREE = 4  # of the polynomial, in log(1 + total) and log(1 + counts of the win
 POLYNOMIAL_STEPS = 300  # that it is fitted to: its fifteen numbers gain nothing from more
 KEPT_EVERY = 100  # steps after which a stream's training is put on disk, to go on from
 LIGHT_M_PER_NS = 0.299792458 / 2.0  # of depth
-_TRAINING, _OWN, _GOLD = range(3)  # streams of noise
 _GAUSSIAN: dict[str, Any] = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}  # SSIM's window
 
 
@@ -77,57 +76,30 @@ def run(request: Request) -> Facts:
     found = {one: kept(path, partial(train_and_test, one, data, folder), request.tell) for one, path in files.items()}
     for made in folder.glob("*.partial"):  # of streams whose results are there
         made.unlink()
-    references, counts = (
-        kept(folder / f"{name}.json", make, request.tell)
-        for name, make in (("references", data.references), ("counts", data.count_bias))
-    )
-    return {"study": report} | report.facts(folder, config, found, references, counts)
+    unlearned = kept(folder / "references.json", partial(references, data), request.tell)
+    counts = kept(folder / "counts.json", partial(count_bias, data), request.tell)
+    return {"study": report} | report.facts(folder, config, found, unlearned, counts)
 
 
-class Data:
-    """Test scenes, their cubes, and what needs no training on them."""
-
-    def __init__(self, config: Config) -> None:
-        self.config = config
-        first, number = config.test
-        self.test = [crop(first + k, config) for k in range(number)]
-        self.simulators = Simulators(config)
-        self._gold: dict[float, NDArray[Any]] = {}
-
-    def own(self, arm: str, sbr: float) -> NDArray[Any]:
-        """Cubes of the test scenes by `arm`."""
-        return self.simulators.cubes(arm, self.test, sbr, (self.config.seed << 8) + _OWN)
-
-    def gold(self, sbr: float) -> NDArray[Any]:
-        """Cubes of the test scenes by the gold standard."""
-        if sbr not in self._gold:
-            seed = (self.config.seed << 8) + _GOLD
-            self._gold[sbr] = self.simulators.cubes(self.config.gold, self.test, sbr, seed)
-        return self._gold[sbr]
-
-    def count_bias(self) -> dict[str, Any]:
-        """How far the counts of each arm are off, see `studies.downstream.data.count_bias`."""
-        return count_bias(self.config, self.test, self.simulators)
-
-    def references(self) -> dict[str, dict[str, float]]:
-        """By ratio: RMSE of depth, m, of each method on gold-standard cubes, and the Cramer-Rao bound's."""
-        found: dict[str, dict[str, float]] = {}
-        true, _ = truths(self.test)
-        for sbr in self.config.sbr:
-            rows: dict[str, float] = {}
-            for method in METHODS:
-                depth = reconstruct(self.gold(sbr), SYSTEM, method, threads=1).depth_m
-                away = np.where(np.isfinite(depth), depth, 0.5 * SYSTEM.unambiguous_range_m)
-                rows[method.replace("_", " ")] = rmse(away, true)
-            bounds = []
-            for scene in self.test:
-                flux = scene.flux(SYSTEM, signal=level(scene, self.config), sbr=sbr)
-                lit = flux.signal > 0
-                bound = cramer_rao(flux.signal[lit], flux.background[lit], SYSTEM, delay_ns=flux.delay_ns[lit])
-                bounds.append(bound.depth_m)
-            rows["Cramer-Rao bound"] = float(np.sqrt(np.mean(np.concatenate(bounds) ** 2)))
-            found[f"{sbr:g}"] = rows
-        return found
+def references(data: Data) -> dict[str, dict[str, float]]:
+    """By ratio: RMSE of depth, m, of each method on gold-standard cubes, and the Cramer-Rao bound's."""
+    found: dict[str, dict[str, float]] = {}
+    true, _ = truths(data.test)
+    for sbr in data.config.sbr:
+        rows: dict[str, float] = {}
+        for method in METHODS:
+            depth = reconstruct(data.gold(sbr), SYSTEM, method, threads=1).depth_m
+            away = np.where(np.isfinite(depth), depth, 0.5 * SYSTEM.unambiguous_range_m)
+            rows[method.replace("_", " ")] = rmse(away, true)
+        bounds = []
+        for scene in data.test:
+            flux = scene.flux(SYSTEM, signal=level(scene, data.config), sbr=sbr)
+            lit = flux.signal > 0
+            bound = cramer_rao(flux.signal[lit], flux.background[lit], SYSTEM, delay_ns=flux.delay_ns[lit])
+            bounds.append(bound.depth_m)
+        rows["Cramer-Rao bound"] = float(np.sqrt(np.mean(np.concatenate(bounds) ** 2)))
+        found[f"{sbr:g}"] = rows
+    return found
 
 
 def train_and_test(one: Run, data: Data, folder: Path) -> dict[str, Any]:
@@ -146,7 +118,7 @@ def train_and_test(one: Run, data: Data, folder: Path) -> dict[str, Any]:
     crops = {"window": config.batch, "bins": max(1, config.batch // 2)}  # pixel by pixel, one crop tells enough
     optimizers = {name: Steps(network, steps[name]) for name, network in networks.items()}
     polynomial = Polynomial()
-    stream = data.simulators.stream(one.arm, one.sbr, (config.seed << 8) + 16 * one.seed + _TRAINING)
+    stream = data.stream(one.arm, one.sbr, one.seed)
     halfway = folder / f"{one.name}.partial"
     first, before = 0, 0.0
     if halfway.exists():  # written below, by this program: whole objects, so that nothing of them is left out

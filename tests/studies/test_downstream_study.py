@@ -154,7 +154,7 @@ def test_the_tabulated_neural_map_is_the_map():
     """Counts and shape of the stand-in from its table, beside the network itself; 4 standard errors."""
     config = replace(TINY, table=(160, 64))
     light = ml.Flux(np.full((1, 400), 1.3), 0.9, 41.0)
-    engine = downstream_data.Simulators(config)._engine("neural")
+    engine = downstream_data.Data(config)._engine("neural")
     counts = [
         ml.simulate(light, downstream_data.SYSTEM, engine=one, seed=7, threads=1)[0, 0].astype(np.float64)
         for one in (engine, NeuralEngine())
@@ -168,7 +168,7 @@ def test_the_tabulated_neural_map_is_the_map():
 
 
 def test_a_stream_has_the_light_of_the_study():
-    batch = next(iter(downstream_data.Simulators(TINY).stream("poisson", 1.0, 3)))
+    batch = next(iter(downstream_data.Data(TINY).stream("poisson", 1.0, 3)))
     assert batch["cube"].shape == (2, 8, 8, 1024)
     light = batch["flux"]["signal"].mean((1, 2))
     torch.testing.assert_close(batch["flux"]["background"].mean((1, 2)), light)
@@ -190,8 +190,8 @@ def test_data_mean_what_the_configuration_says():
     scenes = [downstream_data.crop(1000 + k, TINY) for k in range(2)]
     assert not np.array_equal(scenes[0].depth_m, scenes[1].depth_m)
     assert np.array_equal(scenes[0].depth_m, downstream_data.crop(1000, TINY).depth_m)
-    simulators = downstream_data.Simulators(TINY)
-    cubes = {arm: simulators.cubes(arm, scenes, 1.0, 5) for arm in ("poisson", "exact", "mars", "neural")}
+    data = downstream_data.Data(TINY)
+    cubes = {arm: data.cubes(arm, scenes, 1.0, 5) for arm in ("poisson", "exact", "mars", "neural")}
     # Poisson's counts are the arrivals: S = photons x reflectivity, B of the same mean, N_r cycles
     mean = np.mean([scene.reflectivity.mean() for scene in scenes])
     arrivals = 2.0 * TINY.photons * mean * downstream_data.SYSTEM.cycles
@@ -208,8 +208,9 @@ def test_data_mean_what_the_configuration_says():
 
 def test_count_bias_is_that_of_the_laws():
     config = replace(TINY, arms={"poisson": (0,), "exact": (0,)})
-    scenes = [downstream_data.crop(3000 + k, config) for k in range(2)]
-    (rows,) = count_bias(config, scenes, downstream_data.Simulators(config)).values()
+    data = downstream_data.Data(config)
+    scenes = data.test
+    (rows,) = count_bias(data).values()
     # flux of every pixel is known: expected counts and variances, pixel by pixel
     system, truth = downstream_data.SYSTEM, {"poisson": [], "exact": [], "variance": []}
     for scene in scenes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -51,3 +51,28 @@ def heat(ax: Axes, x: Sequence[float], y: Sequence[float], values: ArrayLike, no
         ends = [f"{10.0**d:g}" for d in decades]
         axis.set_ticks(10.0**decades, [ends[0], *inner, ends[-1]] if len(ends) > 1 else ends)
     return mesh
+
+
+def maps(
+    height: float,
+    x: Sequence[float],
+    rows: Mapping[str, tuple[Sequence[float], Sequence[ArrayLike]]],
+    titles: Sequence[str],
+    norm: LogNorm,
+    label: str,
+) -> tuple[Figure, Any, Any]:
+    """Square maps (y, x) over the signal `x` in rows and columns: `rows` by label, points of y and images.
+
+    Returns the figure, its axes (rows, columns) and the colour bar.
+    """
+    figure, grid = panels(height, len(rows), len(titles), sharex=True, sharey="row")
+    for row, (words, (y, images)) in zip(grid, rows.items(), strict=True):
+        for ax, image in zip(row, images, strict=True):
+            mesh = heat(ax, x, y, image, norm)
+        row[0].set_ylabel(words)
+    for ax, title in zip(grid[0], titles, strict=True):
+        ax.set_title(title)
+    grid[-1, len(titles) // 2].set_xlabel("S, photons per period")
+    bar = figure.colorbar(mesh, ax=grid, extend="both", aspect=50, pad=0.01)
+    bar.set_label(label)
+    return figure, grid, bar

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED
-from studies.common.draw import heat, legend_below, panels
+from studies.common.draw import legend_below, maps, panels
 from studies.count_law.law import LAWS, Cell, Settings
 
 _LOW, _HIGH = 3e-3, 1.0  # total variation on the colour scales
@@ -25,63 +23,50 @@ _LINES = {
 Value = Callable[[Cell], float]
 
 
-def _heat(ax: Axes, settings: Settings, cells: Sequence[Cell], kind: str, value: Value, norm: Any) -> Any:
-    """One map: S along x; B or cycles along y."""
+def _row(
+    settings: Settings, cells: Sequence[Cell], kind: str, value: Value
+) -> tuple[Sequence[float], list[list[list[float]]]]:
+    """Maps of a value for each dead time: S along x; B or cycles along y, whose points come first."""
     y = settings.background if kind == "flux" else settings.cycles
-    by = {(c.signal, c.background if kind == "flux" else c.cycles): value(c) for c in cells}
-    return heat(ax, settings.signal, y, [[by[s, b] for s in settings.signal] for b in y], norm)
+    by = {(c.dead, c.signal, c.background if kind == "flux" else c.cycles): value(c) for c in cells}
+    return y, [[[by[dead, s, b] for s in settings.signal] for b in y] for dead in settings.dead]
 
 
-def _at(cells: Sequence[Cell], dead: float) -> list[Cell]:
-    return [cell for cell in cells if cell.dead == dead]
+def _titles(settings: Settings) -> list[str]:
+    return [f"$t_d$ = {dead:g} $t_r$" for dead in settings.dead]
 
 
 def rows(settings: Settings, cells: Sequence[Cell], kind: str) -> Figure:
     """Total variation to simulation: rows for the sampling floor and each law, columns for dead times."""
     lines: list[tuple[str, Value]] = [("sampling floor", lambda cell: cell.floor)]
     lines += [(words, lambda cell, name=name: cell.to_simulation[name]) for name, words in LAWS.items()]  # type: ignore[misc]
-    figure, axes = panels(8.4, len(lines), len(settings.dead), sharex=True, sharey=True)
-    norm = LogNorm(_LOW, _HIGH)
-    for row, (words, value) in zip(axes, lines, strict=True):
-        for ax, dead in zip(row, settings.dead, strict=True):
-            mesh = _heat(ax, settings, _at(cells, dead), kind, value, norm)
-        row[0].set_ylabel(f"{words}\n{'B' if kind == 'flux' else 'cycles'}")
-    _frame(figure, axes, settings, mesh, "total variation to simulation")
-    return figure
-
-
-def _frame(figure: Any, axes: Any, settings: Settings, mesh: Any, label: str) -> None:
-    for ax, dead in zip(axes[0], settings.dead, strict=True):
-        ax.set_title(f"$t_d$ = {dead:g} $t_r$")
-    axes[-1, len(settings.dead) // 2].set_xlabel("S, photons per period")
-    figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01).set_label(label)
+    name = "B" if kind == "flux" else "cycles"
+    images = {f"{words}\n{name}": _row(settings, cells, kind, value) for words, value in lines}
+    label = "total variation to simulation"
+    return maps(8.4, settings.signal, images, _titles(settings), LogNorm(_LOW, _HIGH), label)[0]
 
 
 def gaussian(settings: Settings, flux: Sequence[Cell], exposure: Sequence[Cell]) -> Figure:
     """Where the Gaussian breaks: its distance to the exact law, without noise, and why."""
-    figure, axes = panels(3.3, 2, len(settings.dead), gridspec_kw={"hspace": 0.0})
-    norm = LogNorm(_LOW_EXACT, _HIGH)
-    for row, cells, kind in zip(axes, (flux, exposure), ("flux", "exposure"), strict=True):
-        for ax, dead in zip(row, settings.dead, strict=True):
-            here = _at(cells, dead)
-            mesh = _heat(ax, settings, here, kind, lambda cell: cell.to_exact["gaussian"], norm)
-            for cell in here:
-                y = cell.background if kind == "flux" else cell.cycles
-                mark = "." if cell.cumulants[0] < 10.0 else "_" if cell.cumulants[1] < 1.0 else ""
-                if mark:
-                    # dark on pale, pale on dark
-                    colour = COLOURS[0] if cell.to_exact["gaussian"] < 0.05 else COLOURS[5]
-                    ax.plot(cell.signal, y, mark, ms=2.4, color=colour, mew=0.8)
-            if ax is not row[0]:
-                ax.tick_params(labelleft=False)
-        row[0].set_ylabel("B" if kind == "flux" else "cycles")
-    for ax in axes[0]:
-        ax.tick_params(labelbottom=False)
-    marks = ((".", "E N < 10"), ("_", "E N at least 10, Var N < 1"))
-    for mark, words in marks:
+    kinds = {"B": ("flux", flux), "cycles": ("exposure", exposure)}
+    images = {
+        name: _row(settings, cells, kind, lambda cell: cell.to_exact["gaussian"])
+        for name, (kind, cells) in kinds.items()
+    }
+    norm, label = LogNorm(_LOW_EXACT, _HIGH), "total variation,\nbest Gaussian to exact law"
+    figure, axes, _ = maps(3.3, settings.signal, images, _titles(settings), norm, label)
+    for row, (kind, cells) in zip(axes, kinds.values(), strict=True):
+        for cell in cells:
+            y = cell.background if kind == "flux" else cell.cycles
+            mark = "." if cell.cumulants[0] < 10.0 else "_" if cell.cumulants[1] < 1.0 else ""
+            if mark:
+                # dark on pale, pale on dark
+                colour = COLOURS[0] if cell.to_exact["gaussian"] < 0.05 else COLOURS[5]
+                ax = row[settings.dead.index(cell.dead)]
+                ax.plot(cell.signal, y, mark, ms=2.4, color=colour, mew=0.8)
+    for mark, words in ((".", "E N < 10"), ("_", "E N at least 10, Var N < 1")):
         axes[0, 0].plot([], [], mark, ms=4, color=COLOURS[0], label=words)
     legend_below(figure, axes[0, :1], 2)
-    _frame(figure, axes, settings, mesh, "total variation,\nbest Gaussian to exact law")
     return figure
 
 

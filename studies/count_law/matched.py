@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -17,7 +17,7 @@ from mars_lidar.plot.style import COLOURS
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.matched import matched_pmf, trusted
 from studies import Facts, Request, Tell
-from studies.common.draw import heat, panels
+from studies.common.draw import maps
 from studies.common.report import Row
 from studies.common.sample import PERIOD_NS, log_points, system_of
 from studies.count_law.law import gaussian_of, pmf_of
@@ -88,10 +88,9 @@ class Part:
         return f"{flux}, t_d = {self.dead:.4g} t_r, {self.system.cycles} cycles"
 
 
-def maps(settings: Settings, tell: Tell) -> list[Part]:
+def grids(settings: Settings, tell: Tell) -> list[Part]:
     """The grids, armed first, then stationary."""
-    grids = np.meshgrid(settings.signal, settings.background, indexing="ij")
-    signal, background = grids[0].ravel(), grids[1].ravel()
+    signal, background = (g.ravel() for g in np.meshgrid(settings.signal, settings.background, indexing="ij"))
     parts = []
     for dead in settings.dead:
         for cycles in settings.cycles:
@@ -159,7 +158,7 @@ def worst(parts: Sequence[Part], number: int) -> list[tuple[Part, int]]:
 def run(request: Request) -> Facts:
     """The grids and the systems at random."""
     settings = QUICK if request.quick else FULL
-    parts, others = maps(settings, request.tell), drawn(settings, request.tell)
+    parts, others = grids(settings, request.tell), drawn(settings, request.tell)
     armed, stationary = ([part for part in parts if part.kind == kind] for kind in ("armed", "stationary"))
     everything = [*parts, *others]
     kinds = {"grid, armed": armed, "grid, stationary": stationary, "at random": others}
@@ -197,23 +196,18 @@ def _draw(settings: Settings, parts: Sequence[Part]) -> Figure:
     """Maps over S and B: columns for dead times; rows for cycles, and the Gaussian for comparison."""
     shape = len(settings.signal), len(settings.background)
     by = {(round(part.dead, 9), part.system.cycles): part for part in parts}
-    rows = [(n, "matched", f"{n} cycles") for n in settings.cycles]
-    rows.append((settings.cycles[0], "gaussian", f"Gaussian,\n{settings.cycles[0]} cycles"))
-    figure, axes = panels(0.5 + 0.95 * len(rows), len(rows), len(settings.dead), sharex=True, sharey=True)
-    norm = LogNorm(_LOW, _HIGH)
-    for row, (cycles, law, words) in zip(axes, rows, strict=True):
-        for ax, dead in zip(row, settings.dead, strict=True):
-            part = by[round(dead, 9), cycles]
-            image = getattr(part, law).reshape(shape).T
-            mesh = heat(ax, settings.signal, settings.background, image, norm)
-            if law == "matched":
-                at = ~part.trusted
-                ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
-        row[0].set_ylabel(f"{words}\nB")
-    for ax, dead in zip(axes[0], settings.dead, strict=True):
-        ax.set_title(f"{dead:g} $t_r$")
-    axes[-1, len(settings.dead) // 2].set_xlabel("S, photons per period")
-    bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=50, pad=0.01)
-    bar.set_label("total variation to the exact law")
+    shown = [[by[round(dead, 9), cycles] for dead in settings.dead] for cycles in settings.cycles]
+    rows = {
+        f"{cycles} cycles\nB": (settings.background, [part.matched.reshape(shape).T for part in here])
+        for cycles, here in zip(settings.cycles, shown, strict=True)
+    }
+    images = [part.gaussian.reshape(shape).T for part in shown[0]]
+    rows[f"Gaussian,\n{settings.cycles[0]} cycles\nB"] = settings.background, images
+    titles, label = [f"{dead:g} $t_r$" for dead in settings.dead], "total variation to the exact law"
+    height, norm = 0.5 + 0.95 * len(rows), LogNorm(_LOW, _HIGH)
+    figure, axes, bar = maps(height, settings.signal, rows, titles, norm, label)
+    for ax, part in zip(axes[:-1].flat, chain(*shown), strict=True):
+        at = ~part.trusted
+        ax.plot(part.signal[at], part.background[at], "x", ms=1.4, mew=0.4, color=COLOURS[0])
     bar.ax.axhline(AIM, color=COLOURS[0], lw=0.8)
     return figure

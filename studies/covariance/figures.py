@@ -10,7 +10,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from mars_lidar.plot.style import COLOURS, INK, MUTED
-from studies.common.draw import heat, legend_below, panels
+from studies.common.draw import legend_below, maps, panels
 from studies.covariance.run import (
     CUTOFFS,
     SPECTRAL_NAME,
@@ -99,21 +99,17 @@ def truncation(settings: Settings, cells: Sequence[Cell]) -> Figure:
 
 def error_map(settings: Settings, cells: Sequence[Cell]) -> Figure:
     """Relative error of sigma^2 over (S, B) for three rules, at each dead time of the last grid."""
-    rules = ("cut-off 0", "cut-off 20", SPECTRAL_NAME)
     grid = settings.grids[-1]
-    dead = grid.dead_ns
+    flux, dead = grid.flux, grid.dead_ns
     by = {(c.signal, c.background, c.dead_ns): c for c in cells if c.grid is grid}
-    figure, axes = panels(3.3, len(rules), len(dead), sharex=True, sharey=True)
-    norm = LogNorm(1e-6, 1.0)
-    for row, rule in zip(axes, rules, strict=True):
-        for ax, dead_ns in zip(row, dead, strict=True):
-            error = np.array([[by[s, b, dead_ns].relative_error(rule) for s in grid.flux] for b in grid.flux])
-            mesh = heat(ax, grid.flux, grid.flux, np.abs(error), norm)
-    for ax, dead_ns in zip(axes[0], dead, strict=True):
-        ax.set_title(f"$t_d$ = {dead_ns / grid.period_ns:g} $t_r$", fontsize=7)
-    for row, rule in zip(axes, rules, strict=True):
-        row[0].set_ylabel(f"{rule.replace('spectral ', '')}\nB")
-    figure.supxlabel("S, photons per period", fontsize=7.5)
-    bar = figure.colorbar(mesh, ax=axes, extend="both", aspect=40, pad=0.01)
-    bar.set_label(r"|relative error of $\sigma^2$|")
+
+    def error(rule: str, dead_ns: float) -> list[list[float]]:
+        return [[abs(by[s, b, dead_ns].relative_error(rule)) for s in flux] for b in flux]
+
+    rules = ("cut-off 0", "cut-off 20", SPECTRAL_NAME)
+    rows = {f"{rule.replace('spectral ', '')}\nB": (flux, [error(rule, d) for d in dead]) for rule in rules}
+    titles = [f"$t_d$ = {d / grid.period_ns:g} $t_r$" for d in dead]
+    figure, axes, _ = maps(3.3, flux, rows, titles, LogNorm(1e-6, 1.0), r"|relative error of $\sigma^2$|")
+    for ax in axes[0]:
+        ax.title.set_fontsize(7)
     return figure

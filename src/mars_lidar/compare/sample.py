@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -227,8 +226,3 @@ def _distance(value: float, null: FloatArray) -> Distance:
         return Distance(value, mean, 0.0 if value <= mean + 1e-9 else _LARGEST_SCORE)
     p = gammaincc(mean * mean / variance, value * mean / variance)
     return Distance(value, mean, float(np.clip(-ndtri(p), -_LARGEST_SCORE, _LARGEST_SCORE)))
-
-
-def worst(estimates: Sequence[Estimate | Distance]) -> float:
-    """The largest |z| of several; 0 where none was compared with anything."""
-    return max((abs(e.z) for e in estimates if not math.isnan(e.z)), default=0.0)

@@ -57,26 +57,13 @@ ExposureGrid grid_of(const double* told) {
 const int32_t kFirstShape = 0;
 const double kOne = 1.0, kNone = 0.0;
 
-// The light of one pixel: photons of each quarter of a bin.
-ExposureFlux flux_of(const ExposureGrid& grid, const double* photons) {
-    ExposureFlux flux;
-    flux.entries = 1;
-    flux.signal = &kOne;
-    flux.background = &kNone;
-    flux.shape = &kFirstShape;
-    flux.shapes = photons;
-    flux.bins = grid.bins;
-    return flux;
-}
-
-ExposureRate rate_of(const ExposureGrid& grid, const double* total, const double* rates) {
-    ExposureRate rate;
-    rate.entries = 1;
-    rate.photons = total;
-    rate.rates = rates;
-    rate.kinds = grid.stationary ? 1 : kRateKinds;
-    rate.bins = grid.bins;
-    return rate;
+// The light of one pixel: photons of each quarter of a bin, or of a paralyzable pixel their total and its `rates`.
+ExposureLight light_of(const ExposureGrid& grid, const double* photons, const double* rates) {
+    ExposureLight light{1, &kOne, &kNone, &kFirstShape, photons, grid.bins};
+    light.total = photons;
+    light.rates = rates;
+    light.kinds = grid.stationary ? 1 : kRateKinds;
+    return light;
 }
 
 // The same pixel as the joint law sees it, and its stationary registrations (n, 2); none where sweeps do not find them.
@@ -151,11 +138,11 @@ EMSCRIPTEN_KEEPALIVE void energy_before(double sigma, const double* t, int32_t n
 EMSCRIPTEN_KEEPALIVE double exposure_moments(const double* grid_told, const double* photons, const double* rates,
                                              double* cumulants, double* histogram, double* rate_out) {
     const ExposureGrid grid = grid_of(grid_told);
-    const ExposureFlux flux = flux_of(grid, photons);
-    const ExposureRate rate = rate_of(grid, photons, rates);
+    const ExposureLight light = light_of(grid, photons, rates);
     int64_t settled = 0;
-    MomentsBlock block{&grid, &flux, 0, 1, cumulants, rate_out, histogram, rate_out + kExposureOrders, &settled, &kRun};
-    if (rates) block.rate = &rate;
+    MomentsBlock block{&grid, &light, histogram, &settled, cumulants, rate_out, rate_out + kExposureOrders};
+    block.count = 1;
+    block.stop = &kRun;
     MARS_JOIN(exposure_moments_, MARS_BASE_LEVEL)(block);
     return static_cast<double>(settled);
 }
@@ -165,16 +152,13 @@ EMSCRIPTEN_KEEPALIVE double characteristic(const double* grid_told, const double
                                            int32_t count, const double* z_re, const double* z_im, double* re,
                                            double* im) {
     const ExposureGrid grid = grid_of(grid_told);
-    const ExposureFlux flux = flux_of(grid, photons);
-    const ExposureRate rate = rate_of(grid, photons, rates);
+    const ExposureLight light = light_of(grid, photons, rates);
     constexpr int kLanesAtOnce = MARS_JOIN(kDoubles_, MARS_BASE_LEVEL);
     int64_t settled[kLanesAtOnce], slowest = 0;
     for (int32_t first = 0; first < count; first += kLanesAtOnce) {
         const int64_t some = std::min<int64_t>(kLanesAtOnce, count - first);
-        CharacteristicBlock block{&grid,        &flux,      0,          some,    false, z_re + first,
-                                  z_im + first, re + first, im + first, settled, &kRun};
-        if (rates) block.rate = &rate;
-        MARS_JOIN(exposure_characteristic_, MARS_BASE_LEVEL)(block);
+        MARS_JOIN(exposure_characteristic_, MARS_BASE_LEVEL)
+        ({&grid, &light, 0, some, false, z_re + first, z_im + first, re + first, im + first, settled, &kRun});
         for (int64_t k = 0; k < some; ++k) {
             if (settled[k] < kRanToEnd) return static_cast<double>(settled[k]);
             slowest = std::max(slowest, settled[k] == kRanToEnd ? grid.cycles : settled[k]);

@@ -14,6 +14,7 @@ from mars_lidar.statistics import cells as cells_module
 from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import exposure_moments
+from mars_lidar.statistics.native_light import native_light
 from mars_lidar.statistics.stationary import stationary_histogram
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
@@ -47,15 +48,11 @@ def on_grid(signal, background, system, n, *, level="", settle=True, delay_ns=No
         stationary=system.start == "stationary",
         tolerance=1e-12 if settle else -1.0,
     )
-    energy, row = cells.energies(n)
     cumulants, rates = np.empty((1, 4)), np.empty((1, 4))
     settled = np.empty(1, np.int64)
     _core.exposure_moments(
         grid=grid,
-        signal=cells.signal,
-        background=cells.background,
-        shape=row,
-        shapes=energy,
+        light=native_light(cells, n),
         cumulants=cumulants,
         cumulant_rates=rates,
         histogram=np.empty((1, 1)),
@@ -63,7 +60,6 @@ def on_grid(signal, background, system, n, *, level="", settle=True, delay_ns=No
         settled=settled,
         threads=1,
         level=level,
-        progress=None,
     )
     return cumulants[0], int(settled[0])
 

@@ -329,7 +329,7 @@ def test_a_dead_time_of_many_periods_is_refused_before_the_work():
     """
     system = view(60_000.3, 60_000_000)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mars_lidar.statistics.exposure._moments", None)
+        patch.setattr("mars_lidar.statistics.exposure.native_light", None)
         with pytest.raises(ConvergenceError, match="joint_law"):
             ml.count_law(4.0, 0.13, system)
 

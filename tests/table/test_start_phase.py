@@ -10,6 +10,8 @@ import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.exposure_result import blank
+from mars_lidar.statistics.native_light import native_light
 from mars_lidar.table.start_phase import start_phases
 
 PHASES = np.array([0, 60, 200, 240, 256, 262, 300, 400, 512])
@@ -19,24 +21,21 @@ GRID = 512
 def corrections(signal, background, system, *, level="", cumulants=None):
     """(cells, phases, 4) of the adjoint recursion on 512 bins, and when it settled."""
     cells = Cells.of(signal, background, system)
-    energy, shape = cells.energies(GRID)
-    out, settled = np.zeros((cells.size, 4 * PHASES.size)), np.empty(cells.size, np.int64)
-    cumulants = np.empty((cells.size, 4)) if cumulants is None else cumulants
-    _core.exposure_phases(
+    out, law = np.zeros((cells.size, 4 * PHASES.size)), blank(cells, 1)
+    _core.exposure_moments(
         grid=cells.grid(GRID, 1),
-        signal=cells.signal,
-        background=cells.background,
-        shape=shape,
-        shapes=energy,
-        phase=PHASES.astype(np.int32),
-        cumulants=cumulants,
-        correction=out,
-        settled=settled,
+        light=native_light(cells, GRID),
+        cumulants=law.cumulants if cumulants is None else cumulants,
+        cumulant_rates=law.cumulant_rates,
+        histogram=law.histogram,
+        histogram_rate=law.histogram_rate,
+        settled=law.settled,
         threads=2,
         level=level,
-        progress=None,
+        phase=PHASES.astype(np.int32),
+        correction=out,
     )
-    return out.reshape(cells.size, PHASES.size, 4), settled
+    return out.reshape(cells.size, PHASES.size, 4), law.settled
 
 
 @pytest.mark.parametrize("start", ["armed", "stationary"])

@@ -12,7 +12,7 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.paralyzable_rate import registration_rates
+from mars_lidar.statistics.native_light import native_light
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.warm import NOT_WARM, warm_history
 
@@ -58,29 +58,20 @@ def characteristic(
         "re": re,
         "im": im,
         "settled": settled,
-        "threads": threads,
-        "level": "",
-        "progress": None,
     }
-    if cells.system.detector.mode == "paralyzable":
-        for part in cells.chunks(bins, 1):
-            some = cells.part(part)
-            mine: dict[str, Any] = {name: x[part] if isinstance(x, np.ndarray) else x for name, x in points.items()}
-            rates = registration_rates(some, bins)
-            _core.paralyzable_characteristic(grid=grid, photons=some.total, rates=rates, **mine)
-    else:
-        energy, row = cells.energies(bins)
-        photons, flat = cells.native_flux
-        arrays: dict[str, Any] = {"signal": photons, "background": flat, "shape": row}
-        _core.exposure_characteristic(grid=grid, shapes=energy, **arrays, **points)
-        cold = np.flatnonzero((settled == NOT_WARM).any(-1))
-        if cold.size:
-            every: dict[str, Any] = points | arrays
-            again = every | {name: np.ascontiguousarray(x[cold]) for name, x in every.items() if np.ndim(x)}
-            history = warm_history(cells, cold, bins)
-            _core.exposure_characteristic(grid=grid, shapes=energy, history=history, **again)
-            for name, array in (("re", re), ("im", im), ("settled", settled)):
-                array[cold] = again[name]
+    for part in cells.chunks(bins, 1):
+        mine: dict[str, Any] = points | {name: x[part] for name, x in points.items() if np.ndim(x)}
+        light = native_light(cells.part(part), bins)
+        _core.exposure_characteristic(grid=grid, light=light, **mine, threads=threads)
+    cold = np.flatnonzero((settled == NOT_WARM).any(-1))
+    if cold.size:
+        again: dict[str, Any] = points | {
+            name: np.ascontiguousarray(x[cold]) for name, x in points.items() if np.ndim(x)
+        }
+        light = native_light(cells.part(cold), bins, warm_history(cells, cold, bins))
+        _core.exposure_characteristic(grid=grid, light=light, **again, threads=threads)
+        for name, array in (("re", re), ("im", im), ("settled", settled)):
+            array[cold] = again[name]
     lost = (settled == _UNSETTLED).any(-1)
     if lost.any():
         raise TooLongError(

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
@@ -23,15 +23,12 @@ from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure_result import Exposure as Exposure
 from mars_lidar.statistics.exposure_result import blank, darkness, movement, put, shaped, take
 from mars_lidar.statistics.narrow_pulse import meets_itself
+from mars_lidar.statistics.native_light import native_light
 from mars_lidar.statistics.no_dead_time import without_dead_time
-from mars_lidar.statistics.paralyzable_rate import RATES_STEPS, registration_rates
+from mars_lidar.statistics.paralyzable_rate import RATES_STEPS
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
 from mars_lidar.statistics.warm import NOT_WARM, warm_history
-
-if TYPE_CHECKING:
-    from mars_lidar._base.native import _core
-
 
 _MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
 MOST_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
@@ -212,23 +209,16 @@ def _run(
     if steps is not None and periods * bins > steps:
         raise ConvergenceError(f"exposure statistics of {cells.name(0)}: {_too_long(cells, steps)}")
     result = blank(cells, out_bins)
-    paralyzable = cells.system.detector.mode == "paralyzable"
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
         grid = some.grid(bins, out_bins, steps)
-        into = {name: vars(result)[name][part] for name in _NATIVE}
-        if paralyzable:
-            rates = registration_rates(some, bins)
-            _core.paralyzable_moments(
-                grid=grid, photons=some.total, rates=rates, **into, threads=threads, level="", progress=progress
-            )
-            continue
-        _moments(some, grid, bins, into, threads, progress)
+        into: dict[str, Any] = {name: vars(result)[name][part] for name in _NATIVE}
+        _core.exposure_moments(grid=grid, light=native_light(some, bins), **into, threads=threads, progress=progress)
         cold = np.flatnonzero(into["settled"] == NOT_WARM)
         if cold.size:
-            again = {name: np.ascontiguousarray(array[cold]) for name, array in into.items()}
-            history = warm_history(some, cold, bins)
-            _moments(some.part(cold), grid, bins, again, threads, progress, history)
+            again: dict[str, Any] = {name: np.ascontiguousarray(array[cold]) for name, array in into.items()}
+            light = native_light(some.part(cold), bins, warm_history(some, cold, bins))
+            _core.exposure_moments(grid=grid, light=light, **again, threads=threads, progress=progress)
             for name, array in into.items():
                 array[cold] = again[name]
     lost = result.settled == UNSETTLED
@@ -237,31 +227,3 @@ def _run(
         raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, steps)}")
     result.bins[:] = bins
     return result
-
-
-def _moments(
-    cells: Cells,
-    grid: _core.ExposureGrid,
-    bins: int,
-    into: dict[str, NDArray[Any]],
-    threads: int,
-    progress: Progress | None,
-    history: FloatArray | None = None,
-) -> None:
-    """One pass of the native recursion; `history` (cells, 2 bins + 2) is the warm state where it is known."""
-    from mars_lidar._base.native import _core
-
-    energy, row = cells.energies(bins)
-    signal, background = cells.native_flux
-    _core.exposure_moments(
-        grid=grid,
-        signal=signal,
-        background=background,
-        shape=row,
-        shapes=energy,
-        **into,
-        threads=threads,
-        level="",
-        progress=progress,
-        history=history,
-    )

@@ -12,6 +12,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import MOST_BINS, UNSETTLED
 from mars_lidar.statistics.fine_bins import fine_histograms
+from mars_lidar.statistics.native_light import native_light
 from mars_lidar.statistics.no_dead_time import recorded_light
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.statistics.warm import warm_history
@@ -61,18 +62,12 @@ def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatAr
     settled = np.empty(cells.size, np.int64)
     for part in cells.chunks(bins, out_bins):
         some = cells.part(part)
-        energy, row = some.energies(bins)
         _core.exposure_stationary(
             grid=some.grid(bins, out_bins),
-            signal=some.native_flux[0],
-            background=some.native_flux[1],
-            shape=row,
-            shapes=energy,
+            light=native_light(some, bins),
             histogram=result[part],
             settled=settled[part],
             threads=threads,
-            level="",
-            progress=None,
         )
     cold = np.flatnonzero(settled == UNSETTLED)
     if cold.size:

@@ -17,6 +17,8 @@ from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import _run
+from mars_lidar.statistics.exposure_result import blank
+from mars_lidar.statistics.native_light import native_light
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.table.axes import thinned
 
@@ -139,23 +141,20 @@ def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tu
     from mars_lidar._base.native import _core
 
     cells.check_history(bins)
-    energy, shape = cells.energies(bins)
-    signal, background = cells.native_flux
     out = np.zeros((cells.size, phase.size * 4))
-    settled = np.empty(cells.size, np.int64)
-    _core.exposure_phases(
+    law = blank(cells, 1)
+    settled = law.settled
+    _core.exposure_moments(
         grid=cells.grid(bins, 1),
-        signal=signal,
-        background=background,
-        shape=shape,
-        shapes=energy,
-        phase=np.rint(np.interp(phase, cells.edges(bins), np.arange(bins + 1))).astype(np.int32),
-        cumulants=np.empty((cells.size, 4)),
-        correction=out,
+        light=native_light(cells, bins),
+        cumulants=law.cumulants,
+        cumulant_rates=law.cumulant_rates,
+        histogram=law.histogram,
+        histogram_rate=law.histogram_rate,
         settled=settled,
         threads=threads,
-        level="",
-        progress=None,
+        phase=np.rint(np.interp(phase, cells.edges(bins), np.arange(bins + 1))).astype(np.int32),
+        correction=out,
     )
     if (settled == _UNSETTLED).any():
         k = int(np.argmax(settled == _UNSETTLED))

@@ -68,11 +68,14 @@ inline StationaryState locked_state(const std::vector<double>& photons, double d
     grid.stationary = true;
     grid.tolerance = 1e-7;
     const int32_t row = 0;
-    const ExposureFlux flux{1, &one, &none, &row, photons.data(), n};
+    const ExposureLight light{1, &one, &none, &row, photons.data(), n};
     std::vector<double> registrations(n);
     int64_t settled = 0;
     const std::atomic<bool> stop{false};
-    MARS_JOIN(exposure_stationary_, MARS_BASE_LEVEL)({&grid, &flux, 0, 1, registrations.data(), &settled, &stop});
+    MomentsBlock block{&grid, &light, registrations.data(), &settled};
+    block.count = 1;
+    block.stop = &stop;
+    MARS_JOIN(exposure_stationary_, MARS_BASE_LEVEL)(block);
     if (settled != kUnsettled) return StationaryState(dead_time, registrations);
     std::vector<double> coarse(n);
     for (int32_t j = 0; j < n; ++j)

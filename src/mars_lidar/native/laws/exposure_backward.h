@@ -17,9 +17,9 @@ struct Values {
 // registrations still to come, in units of that of a pixel armed at the end of the period.
 class BackwardRun {
  public:
-    BackwardRun(const PhasesBlock& block, const std::vector<Response<Real>>& response, const Stationary* start)
+    BackwardRun(const MomentsBlock& block, const std::vector<Response<Real>>& response, const Stationary* start)
         : block_(block),
-          grid_(*block.moments.grid),
+          grid_(*block.grid),
           response_(response),
           start_(start),
           shift_(grid_.fraction),
@@ -31,17 +31,17 @@ class BackwardRun {
     }
 
     void run() {
-        const int64_t first = block_.moments.first, count = block_.moments.count;
+        const int64_t first = block_.first, count = block_.count;
         bool done[kReals]{};
         int64_t streak[kReals]{}, left = count;
         for (int64_t k = 0; k < count; ++k)
-            if (block_.moments.settled[first + k] <= kUnsettled) {
+            if (block_.settled[first + k] <= kUnsettled) {
                 done[k] = true;
                 --left;
             }
         std::vector<Moments> repeated, before;
         for (int64_t q = 0; q < grid_.cycles && left > 0; ++q) {
-            if (block_.moments.stop->load(std::memory_order_relaxed)) return;
+            if (block_.stop->load(std::memory_order_relaxed)) return;
             period(q, repeated);
             const Real moved = before.empty() ? splat(1.0) : change(repeated, before);
             std::swap(before, repeated);
@@ -53,7 +53,7 @@ class BackwardRun {
                 done[k] = true;
                 --left;
                 if (settled || over) put(k);
-                if (!settled) block_.moments.settled[first + k] = over ? kRanToEnd : kUnsettled;
+                if (!settled) block_.settled[first + k] = over ? kRanToEnd : kUnsettled;
             }
             // a pixel armed at the start of this period is the unit of the one before it
             const Moments step = log_series(armed_), unit = exp_series(-1.0 * step);
@@ -156,15 +156,15 @@ class BackwardRun {
     void put(int k) {
         constexpr double factorial[] = {1.0, 1.0, 2.0, 6.0, 24.0};
         const Moments origin = log_series(begun_[0]);
-        double* out = block_.correction + (block_.moments.first + k) * block_.phases * kExposureOrders;
+        double* out = block_.correction + (block_.first + k) * block_.phases * kExposureOrders;
         for (int64_t p = 0; p < block_.phases; ++p) {
-            const Moments start = log_series(begun_[block_.moments.phase[p]]);
+            const Moments start = log_series(begun_[block_.phase[p]]);
             for (int order = 1; order <= kExposureOrders; ++order)
                 *out++ += factorial[order] * (lane(start.c[order], k) - lane(origin.c[order], k));
         }
     }
 
-    const PhasesBlock& block_;
+    const MomentsBlock& block_;
     const ExposureGrid grid_;
     const std::vector<Response<Real>>& response_;
     const Stationary* start_;

@@ -66,9 +66,9 @@ class CharacteristicRun {
  private:
     static Responses responses_of(const CharacteristicBlock& block) {
         if constexpr (kParalyzable)
-            return responses(*block.rate, block.entry);
+            return rate_responses(*block.light, block.entry);
         else
-            return responses(*block.flux, block.entry);
+            return responses(*block.light, block.entry);
     }
 
     void start_units() {
@@ -82,8 +82,8 @@ class CharacteristicRun {
     void run_free() {
         Stationary start{};
         if (grid_.stationary) {
-            const auto lanes = responses(*block_.flux, block_.entry, 1);
-            start = warm_state(grid_, *block_.flux, block_.entry, 1, lanes, *block_.stop);
+            const auto lanes = responses(*block_.light, block_.entry, 1);
+            start = warm_state(grid_, *block_.light, block_.entry, 1, lanes, *block_.stop);
             for (Registrations<Real>& r : start.bins) r = {splat(lane(r.mass, 0)), splat(lane(r.moment, 0))};
             if (!start.settled[0]) {
                 for (int k = 0; k < block_.count; ++k) block_.settled[k] = kNotWarm;

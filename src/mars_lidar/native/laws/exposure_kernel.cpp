@@ -9,29 +9,20 @@
 namespace mars {
 
 void MARS_JOIN(exposure_moments_, MARS_LEVEL)(const MomentsBlock& block) {
-    block.rate ? MomentsRun<ParalyzableRecursion>(block).run() : MomentsRun<Recursion>(block).run();
-}
-
-void MARS_JOIN(exposure_phases_, MARS_LEVEL)(const PhasesBlock& block) {
-    const MomentsBlock& moments = block.moments;
-    MomentsRun<Recursion>(moments).run();
-    if (moments.stop->load(std::memory_order_relaxed)) return;
-    const auto response = responses(*moments.flux, moments.first, moments.count);
-    if (moments.grid->stationary) {
-        const Stationary start =
-            warm_state(*moments.grid, *moments.flux, moments.first, moments.count, response, *moments.stop);
+    if (block.light->rates) return MomentsRun<ParalyzableRecursion>(block).run();
+    MomentsRun<Recursion>(block).run();
+    if (!block.correction || block.stop->load(std::memory_order_relaxed)) return;
+    const auto response = responses(*block.light, block.first, block.count);
+    if (block.grid->stationary) {
+        const Stationary start = warm_state(*block.grid, *block.light, block.first, block.count, response, *block.stop);
         BackwardRun(block, response, &start).run();
     } else {
         BackwardRun(block, response, nullptr).run();
     }
 }
 
-void MARS_JOIN(exposure_characteristic_, MARS_LEVEL)(const CharacteristicBlock& block) {
-    block.rate ? CharacteristicRun<ParalyzableRecursion>(block).run() : CharacteristicRun<Recursion>(block).run();
-}
-
-void MARS_JOIN(exposure_stationary_, MARS_LEVEL)(const StationaryBlock& block) {
-    const auto response = responses(*block.flux, block.first, block.count);
+void MARS_JOIN(exposure_stationary_, MARS_LEVEL)(const MomentsBlock& block) {
+    const auto response = responses(*block.light, block.first, block.count);
     const Stationary state = stationary_state(*block.grid, response, block.count, *block.stop);
     std::vector<Real> mass(state.bins.size());
     for (size_t j = 0; j < mass.size(); ++j) mass[j] = state.bins[j].mass;
@@ -40,6 +31,11 @@ void MARS_JOIN(exposure_stationary_, MARS_LEVEL)(const StationaryBlock& block) {
         put_histogram(*block.grid, mass.data(), k, 1.0, block.histogram + entry * block.grid->out_bins);
         block.settled[entry] = state.settled[k] ? 0 : kUnsettled;
     }
+}
+
+void MARS_JOIN(exposure_characteristic_, MARS_LEVEL)(const CharacteristicBlock& block) {
+    block.light->rates ? CharacteristicRun<ParalyzableRecursion>(block).run()
+                       : CharacteristicRun<Recursion>(block).run();
 }
 
 }  // namespace mars

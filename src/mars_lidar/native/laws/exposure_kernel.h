@@ -30,9 +30,13 @@ struct ExposureGrid {
     int64_t window() const { return 3 * (whole + 1); }  // periods over which a state must repeat
 };
 
-// Photons per period and part of a bin: signal * shapes[shape] + background / parts.
-struct ExposureFlux {
+constexpr int kRateMoments = 4;
+constexpr int kRateKinds = 3;
+
+// What pixels see of the light, on the bins of a grid: photons, or of paralyzable pixels the rate of registrations.
+struct ExposureLight {
     int64_t entries = 0;
+    // Photons per period and part of a bin: signal * shapes[shape] + background / parts.
     const double* signal = nullptr;      // (entries)
     const double* background = nullptr;  // (entries)
     const int32_t* shape = nullptr;      // (entries) row of `shapes`
@@ -41,25 +45,17 @@ struct ExposureFlux {
     // (entries, 2 n + 2), or null: the warm state if it is known. Mass and moment of each bin, then the probability of
     // being armed at the start of the exposure, and the registrations in the d + f bins before it.
     const double* history = nullptr;
+    // Registrations of a paralyzable pixel per period and bin: integrals over the bin of r(t) x^m, m = 0..3, x in
+    // [-1, 1]. Null: other pixels.
+    const double* rates = nullptr;  // (entries, kinds, n, kRateMoments)
+    const double* total = nullptr;  // (entries) photons per period, of paralyzable pixels
+    int64_t kinds = 1;              // steady, and for an armed start the first period and period K: kRateKinds
 
     double photons(int64_t entry, int64_t part) const {
         const int64_t parts = static_cast<int64_t>(bins) * kExposureParts;
         return signal[entry] * shapes[shape[entry] * parts + part] + background[entry] / static_cast<double>(parts);
     }
-};
-
-constexpr int kRateMoments = 4;
-constexpr int kRateKinds = 3;
-
-// Registrations of a paralyzable pixel per period and bin: integrals over the bin of r(t) x^m, m = 0..3, x in [-1, 1].
-struct ExposureRate {
-    int64_t entries = 0;
-    const double* photons = nullptr;  // (entries) per period
-    const double* rates = nullptr;    // (entries, kinds, n, kRateMoments)
-    int64_t kinds = 1;                // steady, and for an armed start the first period and period K: kRateKinds
-    int32_t bins = 1;                 // n
-
-    const double* moments(int64_t entry, int64_t kind, int64_t bin) const {
+    const double* rate_moments(int64_t entry, int64_t kind, int64_t bin) const {
         return rates + ((entry * kinds + kind) * bins + bin) * kRateMoments;
     }
 };
@@ -69,37 +65,21 @@ constexpr int64_t kRanToEnd = -1;   // the exposure ended first: no extrapolatio
 constexpr int64_t kUnsettled = -2;  // max_periods was reached: no result
 constexpr int64_t kNotWarm = -3;    // the warm state that the exposure starts from was not found: no result
 
-// Cumulants and mean histogram of entries [first, first + count), count at most the level's lanes.
+// Cumulants and mean histogram of entries [first, first + count), count at most the level's lanes. Of the stationary
+// state no more than `histogram`, per period, and `settled`.
 struct MomentsBlock {
     const ExposureGrid* grid;
-    const ExposureFlux* flux;
-    int64_t first, count;
+    const ExposureLight* light;
+    double* histogram;       // (entries, out_bins)
+    int64_t* settled;        // (entries)
     double* cumulants;       // (entries, 4)
     double* cumulant_rates;  // (entries, 4) per period once settled, else NaN
-    double* histogram;       // (entries, out_bins)
     double* histogram_rate;  // (entries, out_bins) per period once settled, else NaN
-    int64_t* settled;        // (entries)
-    const std::atomic<bool>* stop;
-    const int32_t* phase = nullptr;  // (phases) edges of the grid, for PhasesBlock
-    int64_t phases = 0;
-    double* ends = nullptr;  // (entries, phases, 4) what ending at that phase adds to the cumulants, or null
-    const ExposureRate* rate = nullptr;  // instead of `flux`: a paralyzable pixel
-};
-
-// Change of the cumulants of entries where the exposure begins, and ends, at another phase (docs/table.md).
-struct PhasesBlock {
-    MomentsBlock moments;
+    // What the cumulants gain where the exposure begins, and ends, at another phase (docs/table.md), or null.
+    double* correction;    // (entries, phases, 4)
+    const int32_t* phase;  // (phases) ascending edges of the grid
     int64_t phases;
-    double* correction;  // (entries, phases, 4)
-};
-
-// Stationary registrations per period and bin of entries [first, first + count).
-struct StationaryBlock {
-    const ExposureGrid* grid;
-    const ExposureFlux* flux;
     int64_t first, count;
-    double* histogram;  // (entries, out_bins)
-    int64_t* settled;   // (entries)
     const std::atomic<bool>* stop;
 };
 
@@ -107,7 +87,7 @@ struct StationaryBlock {
 // give the value itself; real points (`tilted`) give its logarithm in `re`.
 struct CharacteristicBlock {
     const ExposureGrid* grid;
-    const ExposureFlux* flux;
+    const ExposureLight* light;
     int64_t entry, count;
     bool tilted;
     const double* z_re;
@@ -116,13 +96,11 @@ struct CharacteristicBlock {
     double* im;
     int64_t* settled;
     const std::atomic<bool>* stop;
-    const ExposureRate* rate = nullptr;  // instead of `flux`: a paralyzable pixel
 };
 
-// Cumulants and mean histogram; what start and end phases change; the stationary state; the generating function.
+// Cumulants and mean histogram, and what start and end phases change; the stationary state; the generating function.
 MARS_DECLARE_KERNEL(void, exposure_moments_, const MomentsBlock& block)
-MARS_DECLARE_KERNEL(void, exposure_phases_, const PhasesBlock& block)
-MARS_DECLARE_KERNEL(void, exposure_stationary_, const StationaryBlock& block)
+MARS_DECLARE_KERNEL(void, exposure_stationary_, const MomentsBlock& block)
 MARS_DECLARE_KERNEL(void, exposure_characteristic_, const CharacteristicBlock& block)
 
 }  // namespace mars

@@ -31,9 +31,9 @@ class MomentsRun {
         } else {
             Stationary start{};
             if (grid_.stationary)
-                start = warm_state(grid_, *block_.flux, block_.first, block_.count, response_, *block_.stop);
+                start = warm_state(grid_, *block_.light, block_.first, block_.count, response_, *block_.stop);
             Pixel<Moments, Real> recursion(grid_, response_, grid_.stationary ? start.bins.data() : nullptr,
-                                           block_.ends != nullptr);
+                                           block_.correction != nullptr);
             recursion.armed.c[0] = grid_.stationary ? start.armed : splat(1.0);
             if (grid_.stationary) recursion.set_last({one(start.bins.back().mass), one(start.bins.back().moment)});
             if (grid_.stationary) start_history(start);
@@ -44,9 +44,9 @@ class MomentsRun {
  private:
     static Responses responses_of(const MomentsBlock& block) {
         if constexpr (kParalyzable)
-            return responses(*block.rate, block.first, block.count);
+            return rate_responses(*block.light, block.first, block.count);
         else
-            return responses(*block.flux, block.first, block.count);
+            return responses(*block.light, block.first, block.count);
     }
 
     // Period after period until every entry has settled (its increments repeat for `window` periods), has come to the
@@ -99,7 +99,7 @@ class MomentsRun {
                 if (settled || over) {
                     put(k, step, periods, settled, histogram.data(), before.data());
                     if constexpr (!kParalyzable)
-                        if (block_.ends) put_ends(k, recursion, q);
+                        if (block_.correction) put_ends(k, recursion, q);
                 } else
                     block_.settled[block_.first + k] = kUnsettled;
             }
@@ -208,7 +208,7 @@ class MomentsRun {
     // What the count gains, in each cumulant, from the start of period q to the phases asked for (16).
     void put_ends(int k, const Recursion<Moments, Real>& recursion, int64_t q) const {
         constexpr double factorial[] = {1.0, 1.0, 2.0, 6.0, 24.0};
-        double* out = block_.ends + (block_.first + k) * block_.phases * kExposureOrders;
+        double* out = block_.correction + (block_.first + k) * block_.phases * kExposureOrders;
         Moments total{};
         int32_t j = 0;
         for (int64_t p = 0; p < block_.phases; ++p) {

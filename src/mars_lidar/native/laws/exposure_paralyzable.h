@@ -32,16 +32,16 @@ struct RateResponses {
 };
 
 // One entry per lane.
-inline RateResponses<Real> responses(const ExposureRate& rate, int64_t first, int64_t count) {
+inline RateResponses<Real> rate_responses(const ExposureLight& light, int64_t first, int64_t count) {
     RateResponses<Real> out{};
-    for (int64_t k = 0; k < count; ++k) set_lane(out.photons, static_cast<int>(k), rate.photons[first + k]);
-    for (int64_t kind = 0; kind < rate.kinds; ++kind) {
-        out.kind[kind].resize(rate.bins);
-        for (int32_t j = 0; j < rate.bins; ++j) {
+    for (int64_t k = 0; k < count; ++k) set_lane(out.photons, static_cast<int>(k), light.total[first + k]);
+    for (int64_t kind = 0; kind < light.kinds; ++kind) {
+        out.kind[kind].resize(light.bins);
+        for (int32_t j = 0; j < light.bins; ++j) {
             Real r[kRateMoments]{};
             for (int64_t k = 0; k < count; ++k)
                 for (int m = 0; m < kRateMoments; ++m)
-                    set_lane(r[m], static_cast<int>(k), rate.moments(first + k, kind, j)[m]);
+                    set_lane(r[m], static_cast<int>(k), light.rate_moments(first + k, kind, j)[m]);
             out.kind[kind][j] = rate_response(r[0], r[1], r[2], r[3]);
         }
     }
@@ -49,12 +49,12 @@ inline RateResponses<Real> responses(const ExposureRate& rate, int64_t first, in
 }
 
 // Lanes are points z of one entry.
-inline RateResponses<double> responses(const ExposureRate& rate, int64_t entry) {
+inline RateResponses<double> rate_responses(const ExposureLight& light, int64_t entry) {
     RateResponses<double> out{};
-    out.photons = rate.photons[entry];
-    for (int64_t kind = 0; kind < rate.kinds; ++kind)
-        for (int32_t j = 0; j < rate.bins; ++j) {
-            const double* r = rate.moments(entry, kind, j);
+    out.photons = light.total[entry];
+    for (int64_t kind = 0; kind < light.kinds; ++kind)
+        for (int32_t j = 0; j < light.bins; ++j) {
+            const double* r = light.rate_moments(entry, kind, j);
             out.kind[kind].push_back(rate_response(r[0], r[1], r[2], r[3]));
         }
     return out;

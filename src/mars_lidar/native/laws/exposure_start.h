@@ -10,27 +10,27 @@ inline namespace MARS_LEVEL {
 namespace {
 
 // Responses with one entry per lane.
-std::vector<Response<Real>> responses(const ExposureFlux& flux, int64_t first, int64_t count) {
-    std::vector<Response<Real>> out(flux.bins);
-    for (int32_t j = 0; j < flux.bins; ++j) {
+std::vector<Response<Real>> responses(const ExposureLight& light, int64_t first, int64_t count) {
+    std::vector<Response<Real>> out(light.bins);
+    for (int32_t j = 0; j < light.bins; ++j) {
         Real photons[kExposureParts]{};
         for (int i = 0; i < kExposureParts; ++i)
             for (int k = 0; k < count; ++k)
-                set_lane(photons[i], k, flux.photons(first + k, int64_t{j} * kExposureParts + i));
+                set_lane(photons[i], k, light.photons(first + k, int64_t{j} * kExposureParts + i));
         out[j] = respond(photons);
     }
     return out;
 }
 
 // Responses of one entry: lanes are bins on the way, then laid out bin after bin.
-std::vector<Response<double>> responses(const ExposureFlux& flux, int64_t entry) {
-    std::vector<Response<double>> out(flux.bins);
-    for (int32_t from = 0; from < flux.bins; from += kReals) {
-        const int count = std::min<int32_t>(kReals, flux.bins - from);
+std::vector<Response<double>> responses(const ExposureLight& light, int64_t entry) {
+    std::vector<Response<double>> out(light.bins);
+    for (int32_t from = 0; from < light.bins; from += kReals) {
+        const int count = std::min<int32_t>(kReals, light.bins - from);
         Real photons[kExposureParts]{};
         for (int i = 0; i < kExposureParts; ++i)
             for (int k = 0; k < count; ++k)
-                set_lane(photons[i], k, flux.photons(entry, int64_t{from + k} * kExposureParts + i));
+                set_lane(photons[i], k, light.photons(entry, int64_t{from + k} * kExposureParts + i));
         const Response<Real> r = respond(photons);
         for (int k = 0; k < count; ++k)
             out[from + k] = {lane(r.mass_armed, k),   lane(r.mass_in, k),   lane(r.mass_slope, k),
@@ -115,13 +115,13 @@ Stationary stationary_state(const ExposureGrid& grid, const std::vector<Response
 }
 
 // The same where the history of the entries may be known already.
-Stationary warm_state(const ExposureGrid& grid, const ExposureFlux& flux, int64_t first, int64_t count,
+Stationary warm_state(const ExposureGrid& grid, const ExposureLight& light, int64_t first, int64_t count,
                       const std::vector<Response<Real>>& response, const std::atomic<bool>& stop) {
-    if (!flux.history) return stationary_state(grid, response, count, stop);
+    if (!light.history) return stationary_state(grid, response, count, stop);
     Stationary out{};
     out.bins.resize(grid.bins);
     for (int k = 0; k < count; ++k) {
-        const double* known = flux.history + (first + k) * (2 * int64_t{grid.bins} + 2);
+        const double* known = light.history + (first + k) * (2 * int64_t{grid.bins} + 2);
         for (Registrations<Real>& r : out.bins) {
             set_lane(r.mass, k, *known++);
             set_lane(r.moment, k, *known++);

@@ -31,154 +31,106 @@ int64_t bytes_per_lane(const ExposureGrid& grid, int64_t numbers) {
     return grid.memory() * 2 * numbers * static_cast<int64_t>(sizeof(double));
 }
 
-ExposureFlux make_flux(const ExposureGrid& grid, const Vector<const double>& signal,
-                       const Vector<const double>& background, const Vector<const int32_t>& shape,
-                       const Matrix<const double>& shapes) {
-    ExposureFlux flux;
-    flux.entries = static_cast<int64_t>(signal.shape(0));
-    flux.signal = signal.data();
-    flux.background = background.data();
-    flux.shape = shape.data();
-    flux.shapes = shapes.data();
-    flux.bins = grid.bins;
-    if (background.shape(0) != signal.shape(0) || shape.shape(0) != signal.shape(0) ||
-        shapes.shape(1) != static_cast<size_t>(grid.bins) * kExposureParts)
-        throw nb::value_error("signal, background and shape must agree, shapes must be (rows, bins * parts)");
-    for (int64_t i = 0; i < flux.entries; ++i)
-        if (shape.data()[i] < 0 || static_cast<size_t>(shape.data()[i]) >= shapes.shape(0))
-            throw nb::value_error("shape must be rows of shapes");
-    return flux;
-}
+// Light together with the arrays that it points into.
+struct BoundLight : ExposureLight {
+    nb::object arrays;
+};
 
 using History = std::optional<Matrix<const double>>;
 
-void add_history(ExposureFlux& flux, const History& history) {
-    if (!history) return;
-    if (history->shape(0) != static_cast<size_t>(flux.entries) ||
-        history->shape(1) != 2 * static_cast<size_t>(flux.bins) + 2)
-        throw nb::value_error("history must be (entries, 2 bins + 2)");
-    flux.history = history->data();
+void make_light(BoundLight* self, Vector<const double> signal, Vector<const double> background,
+                Vector<const int32_t> shape, Matrix<const double> shapes, const History& history) {
+    const int64_t entries = size_of(signal), bins = static_cast<int64_t>(shapes.shape(1)) / kExposureParts;
+    if (size_of(background) != entries || size_of(shape) != entries || bins < 1)
+        throw nb::value_error("signal, background and shape must agree, shapes must be (rows, bins * parts)");
+    expect("shapes", shapes, static_cast<int64_t>(shapes.shape(0)), bins * kExposureParts);
+    for (int64_t i = 0; i < entries; ++i)
+        if (shape.data()[i] < 0 || static_cast<size_t>(shape.data()[i]) >= shapes.shape(0))
+            throw nb::value_error("shape must be rows of shapes");
+    if (history) expect("history", *history, entries, 2 * bins + 2);
+    new (self) BoundLight{{entries, signal.data(), background.data(), shape.data(), shapes.data(),
+                           static_cast<int32_t>(bins), history ? history->data() : nullptr},
+                          nb::make_tuple(signal, background, shape, shapes, history)};
 }
 
-ExposureRate make_rate(const ExposureGrid& grid, const Vector<const double>& photons,
-                       const Matrix<const double>& rates) {
-    ExposureRate rate;
-    rate.entries = static_cast<int64_t>(photons.shape(0));
-    rate.photons = photons.data();
-    rate.rates = rates.data();
-    rate.kinds = grid.stationary ? 1 : kRateKinds;
-    rate.bins = grid.bins;
-    expect("rates", rates, rate.entries, rate.kinds * grid.bins * kRateMoments);
-    return rate;
+// Of paralyzable pixels, on a grid.
+BoundLight paralyzable_light(const ExposureGrid& grid, Vector<const double> total, Matrix<const double> rates) {
+    BoundLight light;
+    light.entries = size_of(total);
+    light.bins = grid.bins;
+    light.total = total.data();
+    light.rates = rates.data();
+    light.kinds = grid.stationary ? 1 : kRateKinds;
+    expect("rates", rates, light.entries, light.kinds * grid.bins * kRateMoments);
+    light.arrays = nb::make_tuple(total, rates);
+    return light;
 }
 
-void run_moments(const ExposureGrid& grid, const ExposureFlux* flux, const ExposureRate* rate, int64_t entries,
-                 const Matrix<double>& cumulants, const Matrix<double>& cumulant_rates, const Matrix<double>& histogram,
-                 const Matrix<double>& histogram_rate, const Vector<int64_t>& settled, int threads,
+void check_bins(const ExposureGrid& grid, const ExposureLight& light) {
+    if (light.bins != grid.bins || (light.rates && light.kinds != (grid.stationary ? 1 : kRateKinds)))
+        throw nb::value_error("light must be on the bins of the grid");
+}
+
+// Runs a kernel on all entries, in batches of as many as its level has lanes.
+void run_entries(MomentsBlock block, const Vector<int64_t>& settled, int64_t numbers,
+                 std::initializer_list<LevelKernel<const MomentsBlock&>> kernels, int threads,
                  const std::string& level_name, const nb::object& progress) {
-    expect("cumulants", cumulants, entries, kExposureOrders);
-    expect("cumulant_rates", cumulant_rates, entries, kExposureOrders);
-    expect("histogram", histogram, entries, grid.out_bins);
-    expect("histogram_rate", histogram_rate, entries, grid.out_bins);
-    if (static_cast<int64_t>(settled.shape(0)) != entries) throw nb::value_error("settled has the wrong shape");
-    const auto level = level_for<MomentsBlock>(level_name, bytes_per_lane(grid, kExposureOrders + 1), entries,
-                                               MARS_KERNELS(exposure_moments_));
+    const int64_t entries = block.light->entries;
+    check_bins(*block.grid, *block.light);
+    if (size_of(settled) != entries) throw nb::value_error("settled has the wrong shape");
+    const auto level = level_for<MomentsBlock>(level_name, bytes_per_lane(*block.grid, numbers), entries, kernels);
     const int64_t batches = (entries + level.doubles - 1) / level.doubles;
     run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
-        const int64_t first = batch * level.doubles;
-        MomentsBlock block{&grid,
-                           flux,
-                           first,
-                           std::min<int64_t>(level.doubles, entries - first),
-                           cumulants.data(),
-                           cumulant_rates.data(),
-                           histogram.data(),
-                           histogram_rate.data(),
-                           settled.data(),
-                           &stop};
-        block.rate = rate;
-        level.call(block);
+        MomentsBlock some = block;
+        some.first = batch * level.doubles;
+        some.count = std::min<int64_t>(level.doubles, entries - some.first);
+        some.stop = &stop;
+        level.call(some);
     });
 }
 
-void moments(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
-             Vector<const int32_t> shape, Matrix<const double> shapes, Matrix<double> cumulants,
-             Matrix<double> cumulant_rates, Matrix<double> histogram, Matrix<double> histogram_rate,
-             Vector<int64_t> settled, int threads, const std::string& level_name, const nb::object& progress,
-             History history) {
-    ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
-    add_history(flux, history);
-    run_moments(grid, &flux, nullptr, flux.entries, cumulants, cumulant_rates, histogram, histogram_rate, settled,
-                threads, level_name, progress);
+// With `phase`, ascending edges of the grid, also the change of the cumulants where the exposure begins and ends there.
+void moments(const ExposureGrid& grid, const BoundLight& light, Matrix<double> cumulants, Matrix<double> cumulant_rates,
+             Matrix<double> histogram, Matrix<double> histogram_rate, Vector<int64_t> settled, int threads,
+             const std::string& level, const nb::object& progress, std::optional<Vector<const int32_t>> phase,
+             std::optional<Matrix<double>> correction) {
+    expect("cumulants", cumulants, light.entries, kExposureOrders);
+    expect("cumulant_rates", cumulant_rates, light.entries, kExposureOrders);
+    expect("histogram", histogram, light.entries, grid.out_bins);
+    expect("histogram_rate", histogram_rate, light.entries, grid.out_bins);
+    MomentsBlock block{&grid,
+                       &light,
+                       histogram.data(),
+                       settled.data(),
+                       cumulants.data(),
+                       cumulant_rates.data(),
+                       histogram_rate.data()};
+    if (phase && correction && !light.rates) {
+        block.correction = correction->data();
+        block.phase = phase->data();
+        block.phases = size_of(*phase);
+        expect("correction", *correction, light.entries, block.phases * kExposureOrders);
+        for (int64_t p = 0; p < block.phases; ++p)
+            if (block.phase[p] < (p ? block.phase[p - 1] : 0) || block.phase[p] > grid.bins)
+                throw nb::value_error("phase must be ascending edges of the grid");
+    }
+    run_entries(block, settled, (block.correction ? 2 : 1) * (kExposureOrders + 1), MARS_KERNELS(exposure_moments_),
+                threads, level, progress);
 }
 
-// The same of paralyzable pixels: photons per period (entries), registrations as ExposureRate has them.
-void paralyzable_moments(const ExposureGrid& grid, Vector<const double> photons, Matrix<const double> rates,
-                         Matrix<double> cumulants, Matrix<double> cumulant_rates, Matrix<double> histogram,
-                         Matrix<double> histogram_rate, Vector<int64_t> settled, int threads,
-                         const std::string& level_name, const nb::object& progress) {
-    const ExposureRate rate = make_rate(grid, photons, rates);
-    run_moments(grid, nullptr, &rate, rate.entries, cumulants, cumulant_rates, histogram, histogram_rate, settled,
-                threads, level_name, progress);
+void stationary(const ExposureGrid& grid, const BoundLight& light, Matrix<double> histogram, Vector<int64_t> settled,
+                int threads, const std::string& level, const nb::object& progress) {
+    expect("histogram", histogram, light.entries, grid.out_bins);
+    run_entries({&grid, &light, histogram.data(), settled.data()}, settled, 0, MARS_KERNELS(exposure_stationary_),
+                threads, level, progress);
 }
 
-// Cumulants as `moments` gives them, and their change at the edges `phase` (ascending) of the grid.
-void phases(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
-            Vector<const int32_t> shape, Matrix<const double> shapes, Vector<const int32_t> phase,
-            Matrix<double> cumulants, Matrix<double> correction, Vector<int64_t> settled, int threads,
-            const std::string& level_name, const nb::object& progress) {
-    const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
-    const int64_t edges = static_cast<int64_t>(phase.shape(0));
-    expect("cumulants", cumulants, flux.entries, kExposureOrders);
-    expect("correction", correction, flux.entries, edges * kExposureOrders);
-    if (static_cast<int64_t>(settled.shape(0)) != flux.entries) throw nb::value_error("settled has the wrong shape");
-    for (int64_t p = 0; p < edges; ++p)
-        if (phase.data()[p] < (p ? phase.data()[p - 1] : 0) || phase.data()[p] > grid.bins)
-            throw nb::value_error("phase must be ascending edges of the grid");
-    const std::vector<double>::size_type cells = static_cast<size_t>(flux.entries);
-    std::vector<double> rates(cells * kExposureOrders), histogram(cells * grid.out_bins), rate(cells * grid.out_bins);
-    const auto level = level_for<PhasesBlock>(level_name, 2 * bytes_per_lane(grid, kExposureOrders + 1), flux.entries,
-                                              MARS_KERNELS(exposure_phases_));
-    const int64_t batches = (flux.entries + level.doubles - 1) / level.doubles;
-    run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
-        const int64_t first = batch * level.doubles;
-        const MomentsBlock forward{&grid,
-                                   &flux,
-                                   first,
-                                   std::min<int64_t>(level.doubles, flux.entries - first),
-                                   cumulants.data(),
-                                   rates.data(),
-                                   histogram.data(),
-                                   rate.data(),
-                                   settled.data(),
-                                   &stop,
-                                   phase.data(),
-                                   edges,
-                                   correction.data()};
-        level.call({forward, edges, correction.data()});
-    });
-}
-
-void stationary(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
-                Vector<const int32_t> shape, Matrix<const double> shapes, Matrix<double> histogram,
-                Vector<int64_t> settled, int threads, const std::string& level_name, const nb::object& progress) {
-    const ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
-    expect("histogram", histogram, flux.entries, grid.out_bins);
-    if (static_cast<int64_t>(settled.shape(0)) != flux.entries) throw nb::value_error("settled has the wrong shape");
-    const auto level = level_for<StationaryBlock>(level_name, 0, flux.entries, MARS_KERNELS(exposure_stationary_));
-    const int64_t batches = (flux.entries + level.doubles - 1) / level.doubles;
-    run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
-        const int64_t first = batch * level.doubles;
-        level.call({&grid, &flux, first, std::min<int64_t>(level.doubles, flux.entries - first), histogram.data(),
-                    settled.data(), &stop});
-    });
-}
-
-void run_characteristic(const ExposureGrid& grid, const ExposureFlux* flux, const ExposureRate* rate, int64_t entries,
-                        bool tilted, const Matrix<const double>& z_re, const Matrix<const double>& z_im,
-                        const Matrix<double>& re, const Matrix<double>& im, const Matrix<int64_t>& settled, int threads,
-                        const std::string& level_name, const nb::object& progress) {
-    const int64_t points = static_cast<int64_t>(z_re.shape(1));
+// Row i of z holds the points of entry i; `re`, `im` and `settled` likewise.
+void characteristic(const ExposureGrid& grid, const BoundLight& light, bool tilted, Matrix<const double> z_re,
+                    Matrix<const double> z_im, Matrix<double> re, Matrix<double> im, Matrix<int64_t> settled,
+                    int threads, const std::string& level_name, const nb::object& progress) {
+    const int64_t entries = light.entries, points = static_cast<int64_t>(z_re.shape(1));
+    check_bins(grid, light);
     expect("z_re", z_re, entries, points);
     expect("z_im", z_im, entries, points);
     expect("re", re, entries, points);
@@ -189,30 +141,9 @@ void run_characteristic(const ExposureGrid& grid, const ExposureFlux* flux, cons
     const int64_t batches = (points + level.doubles - 1) / level.doubles;
     run_watched_chunks(entries * batches, threads, progress, [&](int64_t chunk, const std::atomic<bool>& stop) {
         const int64_t entry = chunk / batches, first = chunk % batches * level.doubles, at = entry * points + first;
-        level.call({&grid, flux, entry, std::min<int64_t>(level.doubles, points - first), tilted, z_re.data() + at,
-                    z_im.data() + at, re.data() + at, im.data() + at, settled.data() + at, &stop, rate});
+        level.call({&grid, &light, entry, std::min<int64_t>(level.doubles, points - first), tilted, z_re.data() + at,
+                    z_im.data() + at, re.data() + at, im.data() + at, settled.data() + at, &stop});
     });
-}
-
-// Row i of z holds the points of entry i; `re`, `im` and `settled` likewise.
-void characteristic(const ExposureGrid& grid, Vector<const double> signal, Vector<const double> background,
-                    Vector<const int32_t> shape, Matrix<const double> shapes, bool tilted, Matrix<const double> z_re,
-                    Matrix<const double> z_im, Matrix<double> re, Matrix<double> im, Matrix<int64_t> settled,
-                    int threads, const std::string& level_name, const nb::object& progress, History history) {
-    ExposureFlux flux = make_flux(grid, signal, background, shape, shapes);
-    add_history(flux, history);
-    run_characteristic(grid, &flux, nullptr, flux.entries, tilted, z_re, z_im, re, im, settled, threads, level_name,
-                       progress);
-}
-
-// The same of paralyzable pixels.
-void paralyzable_characteristic(const ExposureGrid& grid, Vector<const double> photons, Matrix<const double> rates,
-                                bool tilted, Matrix<const double> z_re, Matrix<const double> z_im, Matrix<double> re,
-                                Matrix<double> im, Matrix<int64_t> settled, int threads, const std::string& level_name,
-                                const nb::object& progress) {
-    const ExposureRate rate = make_rate(grid, photons, rates);
-    run_characteristic(grid, nullptr, &rate, rate.entries, tilted, z_re, z_im, re, im, settled, threads, level_name,
-                       progress);
 }
 
 }  // namespace
@@ -236,27 +167,20 @@ void bind_exposure(nb::module_& module) {
             nb::arg("warm_periods") = ExposureGrid{}.warm_periods)
         .def_prop_ro("bytes", [](const ExposureGrid& self) { return bytes_per_lane(self, kExposureOrders + 1); });
     module.attr("EXPOSURE_PARTS") = kExposureParts;
-    module.def("paralyzable_moments", &paralyzable_moments, nb::kw_only(), nb::arg("grid"), nb::arg("photons"),
-               nb::arg("rates"), nb::arg("cumulants"), nb::arg("cumulant_rates"), nb::arg("histogram"),
-               nb::arg("histogram_rate"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"),
-               nb::arg("progress").none());
-    module.def("paralyzable_characteristic", &paralyzable_characteristic, nb::kw_only(), nb::arg("grid"),
-               nb::arg("photons"), nb::arg("rates"), nb::arg("tilted"), nb::arg("z_re"), nb::arg("z_im"), nb::arg("re"),
-               nb::arg("im"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"), nb::arg("progress").none());
-    module.def("exposure_moments", &moments, nb::kw_only(), nb::arg("grid"), nb::arg("signal"), nb::arg("background"),
-               nb::arg("shape"), nb::arg("shapes"), nb::arg("cumulants"), nb::arg("cumulant_rates"),
-               nb::arg("histogram"), nb::arg("histogram_rate"), nb::arg("settled"), nb::arg("threads"),
-               nb::arg("level"), nb::arg("progress").none(), nb::arg("history") = nb::none());
-    module.def("exposure_phases", &phases, nb::kw_only(), nb::arg("grid"), nb::arg("signal"), nb::arg("background"),
-               nb::arg("shape"), nb::arg("shapes"), nb::arg("phase"), nb::arg("cumulants"), nb::arg("correction"),
-               nb::arg("settled"), nb::arg("threads"), nb::arg("level"), nb::arg("progress").none());
-    module.def("exposure_stationary", &stationary, nb::kw_only(), nb::arg("grid"), nb::arg("signal"),
-               nb::arg("background"), nb::arg("shape"), nb::arg("shapes"), nb::arg("histogram"), nb::arg("settled"),
-               nb::arg("threads"), nb::arg("level"), nb::arg("progress").none());
-    module.def("exposure_characteristic", &characteristic, nb::kw_only(), nb::arg("grid"), nb::arg("signal"),
-               nb::arg("background"), nb::arg("shape"), nb::arg("shapes"), nb::arg("tilted"), nb::arg("z_re"),
-               nb::arg("z_im"), nb::arg("re"), nb::arg("im"), nb::arg("settled"), nb::arg("threads"), nb::arg("level"),
-               nb::arg("progress").none(), nb::arg("history") = nb::none());
+    nb::class_<BoundLight>(module, "ExposureLight", "What pixels see of the light, on the bins of a grid.")
+        .def("__init__", &make_light, nb::kw_only(), nb::arg("signal"), nb::arg("background"), nb::arg("shape"),
+             nb::arg("shapes"), nb::arg("history").none() = nb::none())
+        .def_static("paralyzable", &paralyzable_light, nb::arg("grid"), nb::arg("total"), nb::arg("rates"));
+    module.def("exposure_moments", &moments, nb::kw_only(), nb::arg("grid"), nb::arg("light"), nb::arg("cumulants"),
+               nb::arg("cumulant_rates"), nb::arg("histogram"), nb::arg("histogram_rate"), nb::arg("settled"),
+               nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none(),
+               nb::arg("phase").none() = nb::none(), nb::arg("correction").none() = nb::none());
+    module.def("exposure_stationary", &stationary, nb::kw_only(), nb::arg("grid"), nb::arg("light"),
+               nb::arg("histogram"), nb::arg("settled"), nb::arg("threads"), nb::arg("level") = "",
+               nb::arg("progress").none() = nb::none());
+    module.def("exposure_characteristic", &characteristic, nb::kw_only(), nb::arg("grid"), nb::arg("light"),
+               nb::arg("tilted"), nb::arg("z_re"), nb::arg("z_im"), nb::arg("re"), nb::arg("im"), nb::arg("settled"),
+               nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none());
 }
 
 }  // namespace mars

@@ -228,8 +228,6 @@ EMSCRIPTEN_KEEPALIVE void maximum_likelihood(const double* told, int32_t knots, 
     if (open) {
         record.low.assign(open, open + record.bins);
         record.high.assign(open + record.bins, open + 2 * record.bins);
-        for (int64_t j = 0; j < record.bins; ++j)
-            record.open.push_back((open[record.bins + j] - open[j]) * static_cast<double>(record.bins));
     }
     const CountRows rows{counts, CountRows::Type::kUint32, record.bins};
     Maximizer maximizer(record, {starts, least_gain, true});

@@ -13,6 +13,7 @@
 namespace mars {
 
 namespace nb = nanobind;
+using namespace nb::literals;  // "name"_a: an argument
 
 template <class T>
 using Vector = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
@@ -25,18 +26,26 @@ int64_t size_of(const Vector<T>& vector) {
     return static_cast<int64_t>(vector.shape(0));
 }
 
-// Checks the histograms that an engine is to fill.
-template <class Count>
-void check_histogram(const Job& job, const Matrix<Count>& out) {
-    if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
-        throw nb::value_error("out must be (realizations * pixels, bins)");
-}
-
 // Checks an array's shape; `name` is in the message.
 template <class T>
 void expect(const char* name, const Matrix<T>& array, int64_t rows, int64_t columns) {
     if (static_cast<int64_t>(array.shape(0)) != rows || static_cast<int64_t>(array.shape(1)) != columns)
         throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
+}
+
+template <class T>
+void expect(const char* name, const Vector<T>& array, int64_t size) {
+    if (size_of(array) != size) throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
+}
+
+// Checks what an engine is to fill: histograms, or counts.
+template <class Count>
+void check_out(const Job& job, const Matrix<Count>& out) {
+    if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
+        throw nb::value_error("out must be (realizations * pixels, bins)");
+}
+inline void check_out(const Job& job, const Vector<int64_t>& out) {
+    if (size_of(out) != job.items()) throw nb::value_error("out must have one count per item");
 }
 
 // A job together with the arrays that it points into.

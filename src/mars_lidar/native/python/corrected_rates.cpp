@@ -75,36 +75,21 @@ void bind_corrected_rates(nb::module_& module) {
                     throw nb::value_error("open_low and open_high must be (bins) or empty");
                 if (bins < 1 || cycles < 1 || whole < 0 || shift < 0 || shift >= bins)
                     throw nb::value_error("bins, cycles, whole or shift out of range");
-                new (self) HistogramRecord();
-                self->bins = bins;
-                self->cycles = cycles;
-                self->whole = whole;
-                self->shift = shift;
-                self->fraction = fraction;
-                self->stationary = stationary;
-                self->synchronous = synchronous;
-                self->peak = peak;
-                self->width = width;
-                self->core_low = core_low;
-                self->core_high = core_high;
-                self->pulse = {pulse_low, pulse_cell, values_of(energy), values_of(slope)};
-                self->low = values_of(open_low);
-                self->high = values_of(open_high);
-                for (size_t j = 0; j < parts; ++j)
-                    self->open.push_back((self->high[j] - self->low[j]) * static_cast<double>(bins));
+                const PulseCurve curve{pulse_low, pulse_cell, values_of(energy), values_of(slope)};
+                const std::vector<double> low = values_of(open_low), high = values_of(open_high);
+                new (self) HistogramRecord{bins, cycles, whole,    shift,     fraction, stationary, synchronous,
+                                           peak, width,  core_low, core_high, curve,    low,        high};
             },
-            nb::kw_only(), nb::arg("bins"), nb::arg("cycles"), nb::arg("whole"), nb::arg("shift"), nb::arg("fraction"),
-            nb::arg("stationary"), nb::arg("synchronous"), nb::arg("pulse_low"), nb::arg("pulse_cell"),
-            nb::arg("energy"), nb::arg("slope"), nb::arg("peak"), nb::arg("width"), nb::arg("core_low"),
-            nb::arg("core_high"), nb::arg("open_low"), nb::arg("open_high"));
-    module.def("corrected_rates", &rates, nb::arg("recording"), nb::arg("histogram").noconvert(), nb::kw_only(),
-               nb::arg("correction"), nb::arg("steps"), nb::arg("tolerance"), nb::arg("total").none(),
-               nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"),
+            nb::kw_only(), "bins"_a, "cycles"_a, "whole"_a, "shift"_a, "fraction"_a, "stationary"_a, "synchronous"_a,
+            "pulse_low"_a, "pulse_cell"_a, "energy"_a, "slope"_a, "peak"_a, "width"_a, "core_low"_a, "core_high"_a,
+            "open_low"_a, "open_high"_a);
+    module.def("corrected_rates", &rates, "recording"_a, "histogram"_a.noconvert(), nb::kw_only(), "correction"_a,
+               "steps"_a, "tolerance"_a, "total"_a.none(), "out"_a.noconvert(), "flags"_a.noconvert(), "threads"_a,
                "Photons per period of each bin: out (pixels, bins).");
-    module.def("window_estimates", &windows, nb::arg("recording"), nb::arg("histogram").noconvert(), nb::kw_only(),
-               nb::arg("correction"), nb::arg("locator"), nb::arg("steps"), nb::arg("tolerance"),
-               nb::arg("total").none(), nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"),
-               nb::arg("progress").none(), "Signal, background, delay and errors of the first two: out (pixels, 5).");
+    module.def("window_estimates", &windows, "recording"_a, "histogram"_a.noconvert(), nb::kw_only(), "correction"_a,
+               "locator"_a, "steps"_a, "tolerance"_a, "total"_a.none(), "out"_a.noconvert(), "flags"_a.noconvert(),
+               "threads"_a, "progress"_a.none(),
+               "Signal, background, delay and errors of the first two: out (pixels, 5).");
 }
 
 }  // namespace mars

@@ -70,18 +70,16 @@ void tabulated(Vector<const int64_t> first, Vector<const int64_t> offsets, Vecto
 }  // namespace
 
 void bind_count_draws(nb::module_& module) {
-    module.def("gaussian_counts", &gaussian, nb::kw_only(), nb::arg("mean"), nb::arg("variance"),
-               nb::arg("pixel_index"), nb::arg("first_realization"), nb::arg("seed"), nb::arg("out").noconvert(),
-               nb::arg("threads"), "Rounded normal numbers, at least 0: out (realizations, pixels).");
-    module.def("matched_counts", &matched, nb::kw_only(), nb::arg("cumulants"), nb::arg("pixel_index"),
-               nb::arg("first_realization"), nb::arg("seed"), nb::arg("out").noconvert(), nb::arg("threads"),
+    module.def("gaussian_counts", &gaussian, nb::kw_only(), "mean"_a, "variance"_a, "pixel_index"_a,
+               "first_realization"_a, "seed"_a, "out"_a.noconvert(), "threads"_a,
+               "Rounded normal numbers, at least 0: out (realizations, pixels).");
+    module.def("matched_counts", &matched, nb::kw_only(), "cumulants"_a, "pixel_index"_a, "first_realization"_a,
+               "seed"_a, "out"_a.noconvert(), "threads"_a,
                "Numbers of the laws with four given cumulants (pixels, 4): out (realizations, pixels).");
-    module.def("poisson_counts", &poisson, nb::kw_only(), nb::arg("mean"), nb::arg("pixel_index"),
-               nb::arg("first_realization"), nb::arg("seed"), nb::arg("out").noconvert(), nb::arg("threads"),
-               "Poisson numbers: out (realizations, pixels).");
-    module.def("tabulated_counts", &tabulated, nb::kw_only(), nb::arg("first"), nb::arg("offsets"),
-               nb::arg("cumulative"), nb::arg("law"), nb::arg("pixel_index"), nb::arg("first_realization"),
-               nb::arg("seed"), nb::arg("out").noconvert(), nb::arg("threads"),
+    module.def("poisson_counts", &poisson, nb::kw_only(), "mean"_a, "pixel_index"_a, "first_realization"_a, "seed"_a,
+               "out"_a.noconvert(), "threads"_a, "Poisson numbers: out (realizations, pixels).");
+    module.def("tabulated_counts", &tabulated, nb::kw_only(), "first"_a, "offsets"_a, "cumulative"_a, "law"_a,
+               "pixel_index"_a, "first_realization"_a, "seed"_a, "out"_a.noconvert(), "threads"_a,
                "Numbers of tabulated laws: law k has P(N <= first[k] + i) = cumulative[offsets[k] + i].");
 }
 

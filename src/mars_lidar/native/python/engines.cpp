@@ -37,43 +37,35 @@ void poisson(const Job& job, const PulseTable& pulse, const Output& output, int 
     run_poisson(job, shape_of(pulse), output, threads, watch);
 }
 
-template <class Count, class... Level>
-void bind_histogram(nb::module_& module, const std::string& name, Run<Level...> run) {
-    module.def((name + "_histogram").c_str(),
-               [run](const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, int threads,
-                     const nb::object& progress, const Level&... level) {
-                   check_histogram(job, out);
-                   Output output{};
-                   output.sink = sizeof(Count) == 2 ? Sink::kHistogram16 : Sink::kHistogram32;
-                   output.out = out.data();
-                   watched(progress, [&](const Watch& watch) { run(job, pulse, output, threads, watch, level...); });
-               },
-               nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(), nb::arg("threads"),
-               nb::arg("progress").none(), nb::arg(sizeof(Level) ? "level" : "")...,
-               "Histograms out (realizations * pixels, bins).");
+// An engine that fills an array of this type.
+template <class Out, class... Level>
+void bind_output(nb::module_& module, const std::string& name, Run<Level...> run, Sink sink, const char* about) {
+    module.def(
+        name.c_str(),
+        [run, sink](const BoundJob& job, const PulseTable& pulse, Out out, int threads, const nb::object& progress,
+                    const Level&... level) {
+            check_out(job, out);
+            Output output{};
+            output.sink = sink;
+            output.out = out.data();
+            watched(progress, [&](const Watch& watch) { run(job, pulse, output, threads, watch, level...); });
+        },
+        "job"_a, "pulse"_a, "out"_a.noconvert(), "threads"_a, "progress"_a.none(),
+        nb::arg(sizeof(Level) ? "level" : "")..., about);
 }
 
 template <class... Level>
 void bind_histograms(nb::module_& module, const std::string& name, Run<Level...> run) {
-    bind_histogram<uint16_t>(module, name, run);
-    bind_histogram<uint32_t>(module, name, run);
+    const char* about = "Histograms out (realizations * pixels, bins).";
+    bind_output<Matrix<uint16_t>>(module, name + "_histogram", run, Sink::kHistogram16, about);
+    bind_output<Matrix<uint32_t>>(module, name + "_histogram", run, Sink::kHistogram32, about);
 }
 
 template <class... Level>
 void bind_registrations(nb::module_& module, const std::string& name, Run<Level...> run) {
     bind_histograms(module, name, run);
-    module.def((name + "_counts").c_str(),
-               [run](const BoundJob& job, const PulseTable& pulse, Vector<int64_t> out, int threads,
-                     const nb::object& progress, const Level&... level) {
-                   if (size_of(out) != job.items()) throw nb::value_error("out must have one count per item");
-                   Output output{};
-                   output.sink = Sink::kCounts;
-                   output.out = out.data();
-                   watched(progress, [&](const Watch& watch) { run(job, pulse, output, threads, watch, level...); });
-               },
-               nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(), nb::arg("threads"),
-               nb::arg("progress").none(), nb::arg(sizeof(Level) ? "level" : "")...,
-               "Registrations out (items): the draws of the histogram.");
+    bind_output<Vector<int64_t>>(module, name + "_counts", run, Sink::kCounts,
+                                 "Registrations out (items): the draws of the histogram.");
 }
 
 void bind_sequential_timestamps(nb::module_& module) {
@@ -92,8 +84,8 @@ void bind_sequential_timestamps(nb::module_& module) {
             output.bins = bin.data();
             watched(progress, [&](const Watch& watch) { sequential(job, pulse, output, threads, watch); });
         },
-        nb::arg("job"), nb::arg("pulse"), nb::arg("offsets").noconvert(), nb::arg("times").noconvert(),
-        nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("progress").none(),
+        "job"_a, "pulse"_a, "offsets"_a.noconvert(), "times"_a.noconvert(), "cycle"_a.noconvert(), "bin"_a.noconvert(),
+        "threads"_a, "progress"_a.none(),
         "Registrations item after item, item i in [offsets[i], offsets[i + 1]), times in periods: the draws of the "
         "histogram.");
 }
@@ -116,7 +108,7 @@ void bind_exact_records(nb::module_& module) {
                 const nb::gil_scoped_release release;
                 self.rest(to);
             },
-            nb::arg("times").noconvert(), nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(),
+            "times"_a.noconvert(), "cycle"_a.noconvert(), "bin"_a.noconvert(),
             "Fill in what there was no room for, in arrays that begin as those that were filled and hold all.");
     module.def(
         "exact_records",
@@ -132,9 +124,8 @@ void bind_exact_records(nb::module_& module) {
             watched(progress, [&](const Watch& watch) { exact(job, pulse, output, threads, watch, level); });
             return records;
         },
-        nb::arg("job"), nb::arg("pulse"), nb::arg("offsets").noconvert(), nb::arg("times").noconvert(),
-        nb::arg("cycle").noconvert(), nb::arg("bin").noconvert(), nb::arg("threads"), nb::arg("progress").none(),
-        nb::arg("level"),
+        "job"_a, "pulse"_a, "offsets"_a.noconvert(), "times"_a.noconvert(), "cycle"_a.noconvert(), "bin"_a.noconvert(),
+        "threads"_a, "progress"_a.none(), "level"_a,
         "Registrations item after item, item i in [offsets[i], offsets[i + 1]), times in periods: the draws of the "
         "histogram. Offsets are filled; what the other arrays have no room for is kept.");
 }
@@ -150,7 +141,7 @@ void bind_engines(nb::module_& module) {
     bind_sequential_timestamps(module);
     bind_histograms(module, "poisson", &poisson);
 #if defined(__GNUC__) || defined(__clang__)
-    module.def("addition_chain", &addition_chain, nb::arg("rounds"),
+    module.def("addition_chain", &addition_chain, "rounds"_a,
                "16 dependent additions a round, a cycle each: the processor's clock, for the benchmarks.");
 #endif
 }

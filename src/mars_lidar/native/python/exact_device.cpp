@@ -14,35 +14,21 @@ namespace {
 // Addresses of the task's arrays, by name; 0 where there is none.
 DeviceTask task_of(const BoundJob& job, const PulseTable& pulse, const nb::dict& addresses, int64_t first,
                    int64_t items) {
-    const nb::dict none;
-    const DeviceFields f(addresses, none);
     DeviceTask task{};
     task.system = view(job, pulse);
-    PulseView& tables = task.system.pulse;
-    tables.forward = f.at<const float>("forward");
-    tables.inverse = f.at<const float>("inverse");
-    tables.guide = f.at<const int32_t>("guide");
-    tables.upper = f.at<const float>("upper");
-    tables.end = f.at<const float>("end");
-    tables.periods_per_energy = f.at<const float>("periods_per_energy");
     task.centre = pulse.centre;
     task.seed = job.seed;
-    task.signal = f.at<const double>("signal");
-    task.delay = f.at<const double>("delay");
-    task.background = f.at<const double>("background");
-    task.pixel_index = f.at<const uint32_t>("pixel_index");
-    task.order = f.at<const int32_t>("order");
-    task.start_cycle = f.at<const int32_t>("start_cycle");
-    task.start_phase = f.at<const float>("start_phase");
-    task.out = f.at<void>("out");
-    task.offsets = f.at<const int64_t>("offsets");
-    task.times = f.at<double>("times");
-    task.cycles = f.at<int32_t>("cycles");
-    task.bins = f.at<int32_t>("bins");
     task.pixels = job.pixels;
     task.first = first;
     task.items = items;
     task.first_realization = job.first_realization;
+    PulseView& tables = task.system.pulse;
+    DeviceFields(addresses).set("forward", tables.forward, "inverse", tables.inverse, "guide", tables.guide, "upper",
+                                tables.upper, "end", tables.end, "periods_per_energy", tables.periods_per_energy,
+                                "signal", task.signal, "delay", task.delay, "background", task.background,
+                                "pixel_index", task.pixel_index, "order", task.order, "start_cycle", task.start_cycle,
+                                "start_phase", task.start_phase, "out", task.out, "offsets", task.offsets, "times",
+                                task.times, "cycles", task.cycles, "bins", task.bins);
     return task;
 }
 
@@ -59,23 +45,17 @@ void bind_exact_device(nb::module_& module) {
         [](const BoundJob& job, const PulseTable& pulse, const nb::dict& addresses, int64_t first, int64_t items) {
             return as_bytes(task_of(job, pulse, addresses, first, items));
         },
-        nb::arg("job"), nb::arg("pulse"), nb::arg("addresses"), nb::arg("first"), nb::arg("items"),
+        "job"_a, "pulse"_a, "addresses"_a, "first"_a, "items"_a,
         "The argument of the GPU's kernel: `addresses` of device arrays by name.");
-    module.def("device_whole", &is_whole, nb::arg("job"), nb::arg("pulse"),
+    module.def("device_whole", &is_whole, "job"_a, "pulse"_a,
                "Whether the kernel is that of dead times of whole periods.");
     module.def(
         "device_tables",
         [](const PulseTable& pulse) {
-            nb::dict tables;
-            tables["forward"] = copied(pulse.forward);
-            tables["inverse"] = copied(pulse.inverse);
-            tables["guide"] = copied(pulse.guide);
-            tables["upper"] = copied(pulse.upper);
-            tables["end"] = copied(pulse.end);
-            tables["periods_per_energy"] = copied(pulse.periods_per_energy);
-            return tables;
+            return arrays_of("forward", pulse.forward, "inverse", pulse.inverse, "guide", pulse.guide, "upper",
+                             pulse.upper, "end", pulse.end, "periods_per_energy", pulse.periods_per_energy);
         },
-        nb::arg("pulse"), "Tables of a pulse, to be copied to the device.");
+        "pulse"_a, "Tables of a pulse, to be copied to the device.");
     module.def(
         "device_starts",
         [](const BoundJob& job, const PulseTable& pulse, Vector<int32_t> cycle, Vector<float> phase, int threads,
@@ -85,8 +65,8 @@ void bind_exact_device(nb::module_& module) {
             watched(progress,
                     [&](const Watch& watch) { exact_starts(job, pulse, cycle.data(), phase.data(), threads, watch); });
         },
-        nb::arg("job"), nb::arg("pulse"), nb::arg("cycle").noconvert(), nb::arg("phase").noconvert(),
-        nb::arg("threads"), nb::arg("progress").none() = nb::none(), "Where the items of a stationary exposure begin.");
+        "job"_a, "pulse"_a, "cycle"_a.noconvert(), "phase"_a.noconvert(), "threads"_a, "progress"_a.none() = nb::none(),
+        "Where the items of a stationary exposure begin.");
 }
 
 }  // namespace mars

@@ -162,25 +162,21 @@ void bind_exposure(nb::module_& module) {
                 new (self) ExposureGrid{cycles,   max_periods,      whole,     bins,        out_bins, shift,
                                         fraction, stationary_start, tolerance, warm_periods};
             },
-            nb::kw_only(), nb::arg("cycles"), nb::arg("max_periods"), nb::arg("whole"), nb::arg("bins"),
-            nb::arg("out_bins"), nb::arg("shift"), nb::arg("fraction"), nb::arg("stationary"), nb::arg("tolerance"),
-            nb::arg("warm_periods") = ExposureGrid{}.warm_periods)
+            nb::kw_only(), "cycles"_a, "max_periods"_a, "whole"_a, "bins"_a, "out_bins"_a, "shift"_a, "fraction"_a,
+            "stationary"_a, "tolerance"_a, "warm_periods"_a = ExposureGrid{}.warm_periods)
         .def_prop_ro("bytes", [](const ExposureGrid& self) { return bytes_per_lane(self, kExposureOrders + 1); });
     module.attr("EXPOSURE_PARTS") = kExposureParts;
     nb::class_<BoundLight>(module, "ExposureLight", "What pixels see of the light, on the bins of a grid.")
-        .def("__init__", &make_light, nb::kw_only(), nb::arg("signal"), nb::arg("background"), nb::arg("shape"),
-             nb::arg("shapes"), nb::arg("history").none() = nb::none())
-        .def_static("paralyzable", &paralyzable_light, nb::arg("grid"), nb::arg("total"), nb::arg("rates"));
-    module.def("exposure_moments", &moments, nb::kw_only(), nb::arg("grid"), nb::arg("light"), nb::arg("cumulants"),
-               nb::arg("cumulant_rates"), nb::arg("histogram"), nb::arg("histogram_rate"), nb::arg("settled"),
-               nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none(),
-               nb::arg("phase").none() = nb::none(), nb::arg("correction").none() = nb::none());
-    module.def("exposure_stationary", &stationary, nb::kw_only(), nb::arg("grid"), nb::arg("light"),
-               nb::arg("histogram"), nb::arg("settled"), nb::arg("threads"), nb::arg("level") = "",
-               nb::arg("progress").none() = nb::none());
-    module.def("exposure_characteristic", &characteristic, nb::kw_only(), nb::arg("grid"), nb::arg("light"),
-               nb::arg("tilted"), nb::arg("z_re"), nb::arg("z_im"), nb::arg("re"), nb::arg("im"), nb::arg("settled"),
-               nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none());
+        .def("__init__", &make_light, nb::kw_only(), "signal"_a, "background"_a, "shape"_a, "shapes"_a,
+             "history"_a.none() = nb::none())
+        .def_static("paralyzable", &paralyzable_light, "grid"_a, "total"_a, "rates"_a);
+    module.def("exposure_moments", &moments, nb::kw_only(), "grid"_a, "light"_a, "cumulants"_a, "cumulant_rates"_a,
+               "histogram"_a, "histogram_rate"_a, "settled"_a, "threads"_a, "level"_a = "",
+               "progress"_a.none() = nb::none(), "phase"_a.none() = nb::none(), "correction"_a.none() = nb::none());
+    module.def("exposure_stationary", &stationary, nb::kw_only(), "grid"_a, "light"_a, "histogram"_a, "settled"_a,
+               "threads"_a, "level"_a = "", "progress"_a.none() = nb::none());
+    module.def("exposure_characteristic", &characteristic, nb::kw_only(), "grid"_a, "light"_a, "tilted"_a, "z_re"_a,
+               "z_im"_a, "re"_a, "im"_a, "settled"_a, "threads"_a, "level"_a = "", "progress"_a.none() = nb::none());
 }
 
 }  // namespace mars

@@ -14,7 +14,7 @@ template <class Count>
 void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, Vector<const int64_t> pixels,
                Matrix<uint8_t> status, int32_t merge, int32_t parts, Vector<const uint8_t> narrow, int32_t laps,
                int threads, const std::string& level, const nb::object& progress) {
-    check_histogram(job, out);
+    check_out(job, out);
     if (static_cast<int64_t>(status.shape(0)) != job.realizations || status.shape(1) != pixels.shape(0))
         throw nb::value_error("status must be (realizations, pixels)");
     if (merge < 1 || parts < 1 || static_cast<int64_t>(narrow.shape(0)) != int64_t{job.bins} * merge)
@@ -30,10 +30,9 @@ void histogram(const BoundJob& job, const PulseTable& pulse, Matrix<Count> out, 
 
 template <class Count>
 void define(nb::module_& module, const char* about) {
-    module.def("feedback_histogram", &histogram<Count>, nb::arg("job"), nb::arg("pulse"), nb::arg("out").noconvert(),
-               nb::arg("pixels"), nb::arg("status").noconvert(), nb::arg("merge"), nb::arg("parts"), nb::arg("narrow"),
-               nb::arg("laps"), nb::arg("threads"), nb::arg("level") = "", nb::arg("progress").none() = nb::none(),
-               about);
+    module.def("feedback_histogram", &histogram<Count>, "job"_a, "pulse"_a, "out"_a.noconvert(), "pixels"_a,
+               "status"_a.noconvert(), "merge"_a, "parts"_a, "narrow"_a, "laps"_a, "threads"_a, "level"_a = "",
+               "progress"_a.none() = nb::none(), about);
 }
 
 }  // namespace

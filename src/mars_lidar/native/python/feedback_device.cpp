@@ -17,80 +17,51 @@ nb::dict grid_arrays(const BoundJob& job, int32_t merge, int32_t parts, Vector<c
     if (merge < 1 || parts < 1 || static_cast<int64_t>(narrow.shape(0)) != int64_t{job.bins} * merge)
         throw nb::value_error("narrow must be (bins * merge)");
     const CellGrid cells(job, merge, parts, narrow.data(), laps);
-    auto bytes = [](const std::vector<FeedbackEdge>& edges) {
-        const uint8_t* const first = reinterpret_cast<const uint8_t*>(edges.data());
-        return copied(std::vector<uint8_t>(first, first + edges.size() * sizeof(FeedbackEdge)));
-    };
-    nb::dict told;
-    told["edge"] = bytes(cells.edge());
-    told["lap_edge"] = bytes(cells.lap_edge());
-    told["place"] = copied(cells.place());
-    told["bin_cell"] = copied(cells.bin_cell());
-    told["narrow"] = copied(cells.narrow());
-    return told;
+    return arrays_of("edge", cells.edge(), "lap_edge", cells.lap_edge(), "place", cells.place(), "bin_cell",
+                     cells.bin_cell(), "narrow", cells.narrow());
 }
 
 nb::dict pulse_arrays(const PulseTable& pulse) {
     const PulseEnergyTables tables(pulse.shape);
-    nb::dict told;
-    told["tail"] = copied(tables.tail);
-    told["density"] = copied(tables.density);
-    told["knots"] = copied(pulse.shape.knots);
-    return told;
+    return arrays_of("tail", tables.tail, "density", tables.density, "knots", pulse.shape.knots);
 }
 
 nb::bytes task_of(const BoundJob& job, const PulseTable& pulse, int32_t merge, int32_t parts,
                   Vector<const uint8_t> narrow, int32_t laps, const nb::dict& addresses, const nb::dict& numbers) {
-    const DeviceFields f(addresses, numbers);
+    const DeviceFields fields(addresses, numbers);
     FeedbackTask task{};
     task.job = job;
     task.job.recording = nullptr;
     task.job.traps.below = nullptr;
-    task.job.signal = f.at<const double>("signal");
-    task.job.delay = f.at<const double>("delay");
-    task.job.background = f.at<const double>("background");
-    task.job.waveform = f.at<const double>("waveform");
-    task.job.pixel_index = f.at<const uint32_t>("pixel_index");
+    fields.set("signal", task.job.signal, "delay", task.job.delay, "background", task.job.background, "waveform",
+               task.job.waveform, "pixel_index", task.job.pixel_index);
     const PulseEnergyTables tables(pulse.shape);
     task.energy = tables.energy;
-    task.energy.tail = f.at<const double>("tail");
-    task.energy.density = f.at<const double>("density");
-    task.energy.sampled.knots = f.at<const double>("knots");
+    fields.set("tail", task.energy.tail, "density", task.energy.density, "knots", task.energy.sampled.knots);
     const CellGrid cells(job, merge, parts, narrow.data(), laps);
     task.grid = cells.grid;
-    task.grid.edge = f.at<const FeedbackEdge>("edge");
-    task.grid.lap_edge = f.at<const FeedbackEdge>("lap_edge");
-    task.grid.place = f.at<const double>("place");
-    task.grid.bin_cell = f.at<const int32_t>("bin_cell");
-    task.grid.narrow = f.at<const uint8_t>("narrow");
-    task.pixels = f.at<const int64_t>("pixels");
-    task.streams = f.integer("streams");
-    task.splits = f.integer("splits");
-    task.number = f.integer("number");
-    task.status = f.at<uint8_t>("status");
-    task.out = f.at<void>("out");
-    task.queue = f.at<uint32_t>("queue");
-    task.full = f.at<uint32_t>("full");
-    task.work = f.at<uint8_t>("work");
-    task.work_bytes = f.integer("work_bytes");
+    fields.set("edge", task.grid.edge, "lap_edge", task.grid.lap_edge, "place", task.grid.place, "bin_cell",
+               task.grid.bin_cell, "narrow", task.grid.narrow);
+    fields.set("pixels", task.pixels, "streams", task.streams, "splits", task.splits, "number", task.number, "status",
+               task.status, "out", task.out, "queue", task.queue, "full", task.full, "work", task.work, "work_bytes",
+               task.work_bytes);
     return as_bytes(task);
 }
 
 }  // namespace
 
 void bind_feedback_device(nb::module_& module) {
-    module.def("feedback_grid", &grid_arrays, nb::arg("job"), nb::arg("merge"), nb::arg("parts"), nb::arg("narrow"),
-               nb::arg("laps"), "The internal grid, to be copied to the device.");
-    module.def("feedback_pulse", &pulse_arrays, nb::arg("pulse"), "Tables of a pulse's energy, likewise.");
-    module.def("feedback_task", &task_of, nb::arg("job"), nb::arg("pulse"), nb::arg("merge"), nb::arg("parts"),
-               nb::arg("narrow"), nb::arg("laps"), nb::arg("addresses"), nb::arg("numbers"),
-               "Argument of the kernel feedback_histograms: device arrays and numbers by name.");
+    module.def("feedback_grid", &grid_arrays, "job"_a, "merge"_a, "parts"_a, "narrow"_a, "laps"_a,
+               "The internal grid, to be copied to the device.");
+    module.def("feedback_pulse", &pulse_arrays, "pulse"_a, "Tables of a pulse's energy, likewise.");
+    module.def("feedback_task", &task_of, "job"_a, "pulse"_a, "merge"_a, "parts"_a, "narrow"_a, "laps"_a, "addresses"_a,
+               "numbers"_a, "Argument of the kernel feedback_histograms: device arrays and numbers by name.");
     module.def(
         "feedback_warp_bytes",
         [](int64_t cells, int64_t laps) {
             return (int64_t{8} * kRow * cells + feedback_bytes(cells, laps, cells) + 63) / 64 * 64;
         },
-        nb::arg("cells"), nb::arg("laps"), "Bytes that a warp of feedback_histograms works in.");
+        "cells"_a, "laps"_a, "Bytes that a warp of feedback_histograms works in.");
 }
 
 }  // namespace mars

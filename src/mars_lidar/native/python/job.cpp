@@ -14,13 +14,13 @@ namespace mars {
 
 void bind_pulse(nb::module_& module) {
     nb::class_<PulseTable>(module, "PulseTable", "Pulse shape and sampling tables; times in laser periods.")
-        .def_static("gaussian", &PulseTable::gaussian, nb::arg("sigma"))
+        .def_static("gaussian", &PulseTable::gaussian, "sigma"_a)
         .def_static(
             "sampled",
             [](Vector<const double> knots, double width, double start) {
                 return PulseTable::sampled({knots.data(), knots.data() + knots.shape(0)}, width, start);
             },
-            nb::arg("knots"), nb::arg("width"), nb::arg("start"))
+            "knots"_a, "width"_a, "start"_a)
         .def(
             "periodic", [](const PulseTable& self, double t) { return self.shape.periodic(t); },
             "Energy of the pulse train up to t.")
@@ -47,8 +47,8 @@ void bind_recording(nb::module_& module) {
                 if (code_edges) self->codes.set({code_edges->data(), code_edges->data() + code_edges->shape(0)});
                 self->tables = nb::cast(jitter);
             },
-            nb::kw_only(), nb::arg("electronics_dead_time"), nb::arg("most_per_period"), nb::arg("most_per_exposure"),
-            nb::arg("jitter").none(), nb::arg("tail"), nb::arg("tail_fraction"), nb::arg("code_edges").none());
+            nb::kw_only(), "electronics_dead_time"_a, "most_per_period"_a, "most_per_exposure"_a, "jitter"_a.none(),
+            "tail"_a, "tail_fraction"_a, "code_edges"_a.none());
 }
 
 void bind_job(nb::module_& module) {
@@ -84,12 +84,11 @@ void bind_job(nb::module_& module) {
                 self->stationary = stationary;
                 self->mode = static_cast<DetectorMode>(mode);
                 self->gate = {gate_start, gate_width, gate_step, gate_cycles};
-                self->traps.mean = traps;
-                self->traps.mean_delay = trap_delay;
-                self->traps.below = trap_delays ? trap_delays->data() : nullptr;
-                self->traps.samples = trap_delays ? static_cast<int64_t>(trap_delays->shape(0)) - 1 : 0;
-                self->traps.sample = trap_sample;
-                self->traps.generations = generations;
+                self->traps = {traps, trap_delay, nullptr, 0, trap_sample, generations};
+                if (trap_delays) {
+                    self->traps.below = trap_delays->data();
+                    self->traps.samples = size_of(*trap_delays) - 1;
+                }
                 self->twilight = twilight;
                 self->recovery = recovery;
                 if (crosstalk) {
@@ -100,21 +99,20 @@ void bind_job(nb::module_& module) {
                 self->signal = signal.data();
                 self->delay = delay.data();
                 self->background = background.data();
-                self->waveform = waveform ? waveform->data() : nullptr;
-                self->samples = waveform ? static_cast<int64_t>(waveform->shape(1)) : 0;
+                if (waveform) {
+                    self->waveform = waveform->data();
+                    self->samples = static_cast<int64_t>(waveform->shape(1));
+                }
                 self->pixel_index = pixel_index.data();
                 self->recording = recording;
                 self->arrays = nb::make_tuple(signal, delay, background, waveform, pixel_index, trap_delays, recording);
             },
-            nb::kw_only(), nb::arg("signal"), nb::arg("delay"), nb::arg("background"), nb::arg("waveform").none(),
-            nb::arg("pixel_index"), nb::arg("realizations"), nb::arg("first_realization"), nb::arg("seed"),
-            nb::arg("cycles"), nb::arg("bins"), nb::arg("dead_time"), nb::arg("stationary"), nb::arg("mode") = 0,
-            nb::arg("gate_start") = 0.0, nb::arg("gate_width") = 1.0, nb::arg("gate_step") = 0.0,
-            nb::arg("gate_cycles") = 1, nb::arg("traps") = 0.0, nb::arg("trap_delay") = 0.0,
-            nb::arg("trap_delays").none() = nb::none(), nb::arg("trap_sample") = 0.0,
-            nb::arg("generations") = INT32_MAX, nb::arg("twilight") = 0.0, nb::arg("recovery") = 0.0,
-            nb::arg("crosstalk").none() = nb::none(), nb::arg("height") = 0, nb::arg("width") = 0,
-            nb::arg("recording").none() = nb::none())
+            nb::kw_only(), "signal"_a, "delay"_a, "background"_a, "waveform"_a.none(), "pixel_index"_a,
+            "realizations"_a, "first_realization"_a, "seed"_a, "cycles"_a, "bins"_a, "dead_time"_a, "stationary"_a,
+            "mode"_a = 0, "gate_start"_a = 0.0, "gate_width"_a = 1.0, "gate_step"_a = 0.0, "gate_cycles"_a = 1,
+            "traps"_a = 0.0, "trap_delay"_a = 0.0, "trap_delays"_a.none() = nb::none(), "trap_sample"_a = 0.0,
+            "generations"_a = INT32_MAX, "twilight"_a = 0.0, "recovery"_a = 0.0, "crosstalk"_a.none() = nb::none(),
+            "height"_a = 0, "width"_a = 0, "recording"_a.none() = nb::none())
         .def_prop_ro("items", [](const BoundJob& self) { return self.items(); });
 }
 }  // namespace mars

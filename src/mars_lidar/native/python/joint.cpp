@@ -107,17 +107,15 @@ void exposure(Matrix<const double> response, int64_t whole, int32_t shift, doubl
 }  // namespace
 
 void bind_joint(nb::module_& module) {
-    module.def("joint_response", &respond_all, nb::arg("photons"), nb::arg("response"));
-    module.def("joint_adjoint", &adjoint, nb::kw_only(), nb::arg("response"), nb::arg("shift"), nb::arg("fraction"),
-               nb::arg("mass_in"), nb::arg("moment_in").none(), nb::arg("mass"), nb::arg("moment"), nb::arg("sweeps"),
-               nb::arg("tolerance"), nb::arg("done"), nb::arg("error"));
-    module.def("joint_forward", &forward, nb::kw_only(), nb::arg("response"), nb::arg("shift"), nb::arg("fraction"),
-               nb::arg("mass_in"), nb::arg("moment_in"), nb::arg("out"), nb::arg("sweeps"), nb::arg("tolerance"));
-    module.def("joint_settle", &settle, nb::kw_only(), nb::arg("response"), nb::arg("whole"), nb::arg("shift"),
-               nb::arg("fraction"), nb::arg("cycles"), nb::arg("state"), nb::arg("tolerance"), nb::arg("max_steps"),
-               nb::arg("total"));
-    module.def("joint_exposure", &exposure, nb::kw_only(), nb::arg("response"), nb::arg("whole"), nb::arg("shift"),
-               nb::arg("fraction"), nb::arg("cycles"), nb::arg("state").none(), nb::arg("weights"), nb::arg("columns"));
+    module.def("joint_response", &respond_all, "photons"_a, "response"_a);
+    module.def("joint_adjoint", &adjoint, nb::kw_only(), "response"_a, "shift"_a, "fraction"_a, "mass_in"_a,
+               "moment_in"_a.none(), "mass"_a, "moment"_a, "sweeps"_a, "tolerance"_a, "done"_a, "error"_a);
+    module.def("joint_forward", &forward, nb::kw_only(), "response"_a, "shift"_a, "fraction"_a, "mass_in"_a,
+               "moment_in"_a, "out"_a, "sweeps"_a, "tolerance"_a);
+    module.def("joint_settle", &settle, nb::kw_only(), "response"_a, "whole"_a, "shift"_a, "fraction"_a, "cycles"_a,
+               "state"_a, "tolerance"_a, "max_steps"_a, "total"_a);
+    module.def("joint_exposure", &exposure, nb::kw_only(), "response"_a, "whole"_a, "shift"_a, "fraction"_a, "cycles"_a,
+               "state"_a.none(), "weights"_a, "columns"_a);
 }
 
 }  // namespace mars

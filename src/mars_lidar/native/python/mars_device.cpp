@@ -11,91 +11,46 @@
 namespace mars {
 namespace {
 
-// An axis whose tables lie at addresses "<name>.value" and so on; `of` has the rest.
-Axis axis_at(const DeviceFields& fields, const std::string& name, const nb::handle& of) {
-    Axis axis{};
-    const Vector<const double> values = nb::cast<Vector<const double>>(of);
-    const AxisTables tables(values.data(), size_of(values));
-    axis = tables.axis();
-    axis.value = fields.at<const double>(name + ".value");
-    axis.log = fields.at<const double>(name + ".log");
-    axis.scale = fields.at<const double>(name + ".scale");
-    axis.start = fields.at<const int64_t>(name + ".start");
+// An axis whose tables lie at addresses "<name>.value" and so on; `axes` has the rest.
+Axis axis_at(const DeviceFields& fields, const std::string& name, const nb::dict& axes) {
+    const auto values = nb::cast<Vector<const double>>(axes[name.c_str()]);
+    Axis axis = AxisTables(values.data(), size_of(values)).axis();
+    fields.set(name + ".value", axis.value, name + ".log", axis.log, name + ".scale", axis.scale, name + ".start",
+               axis.start);
     return axis;
 }
 
 nb::bytes law_task(const nb::dict& addresses, const nb::dict& axes, const nb::dict& numbers) {
-    const DeviceFields f(addresses, numbers);
+    const DeviceFields fields(addresses, numbers);
     MarsLawTask task{};
     TableLookup& table = task.table;
-    table.signal = axis_at(f, "signal_axis", axes["signal_axis"]);
-    table.background = axis_at(f, "background_axis", axes["background_axis"]);
-    table.sub_signal = axis_at(f, "sub_signal", axes["sub_signal"]);
-    table.sub_background = axis_at(f, "sub_background", axes["sub_background"]);
-    table.cumulants = f.at<const double>("entries");
-    table.phase = f.at<const double>("phases");
-    table.phases = f.integer("phases");
-    table.correction = f.at<const float>("correction");
-    table.nearest = static_cast<int32_t>(f.integer("nearest"));
-    task.signal = f.at<const double>("signal");
-    task.background = f.at<const double>("background");
-    task.phase = f.at<const double>("phase");
-    task.rows = f.at<int64_t>("rows");
-    task.weights = f.at<double>("weights");
-    task.cumulants = f.at<double>("cumulants");
-    task.rate = f.at<double>("rate");
-    task.laws = f.at<MatchedLaw>("laws");
-    task.doubted = f.at<uint8_t>("doubted");
-    task.found = f.at<uint32_t>("found");
-    task.pixels = f.integer("pixels");
-    task.cycles = f.integer("cycles");
+    table.signal = axis_at(fields, "signal_axis", axes);
+    table.background = axis_at(fields, "background_axis", axes);
+    table.sub_signal = axis_at(fields, "sub_signal", axes);
+    table.sub_background = axis_at(fields, "sub_background", axes);
+    fields.set("entries", table.cumulants, "phases", table.phase, "phases", table.phases, "correction",
+               table.correction, "nearest", table.nearest);
+    fields.set("signal", task.signal, "background", task.background, "phase", task.phase, "rows", task.rows, "weights",
+               task.weights, "cumulants", task.cumulants, "rate", task.rate, "laws", task.laws, "doubted", task.doubted,
+               "found", task.found, "pixels", task.pixels, "cycles", task.cycles);
     return as_bytes(task);
 }
 
-ShapeJob shapes_of(const DeviceFields& f) {
-    ShapeJob job{};
-    job.pixels = f.integer("pixels");
-    job.realizations = f.integer("realizations");
-    job.first_realization = static_cast<uint32_t>(f.integer("first_realization"));
-    job.seed = f.word("seed");
-    job.bins = static_cast<int32_t>(f.integer("bins"));
-    job.dead_time = f.real("dead_time");
-    job.pixel_index = f.at<const uint32_t>("pixel_index");
-    job.place = f.at<const int64_t>("place");
-    job.image = f.integer("image");
-    job.shapes = f.at<const float>("shapes");
-    job.rows = f.at<const int64_t>("rows");
-    job.weights = f.at<const double>("weights");
-    job.shift = f.at<const double>("shift");
-    job.signal = f.at<const double>("signal");
-    job.background = f.at<const double>("background");
-    job.rate = f.at<const double>("rate");
-    job.frame = {static_cast<int32_t>(f.integer("frame_first")), static_cast<int32_t>(f.integer("frame_size")),
-                 static_cast<int32_t>(f.integer("frame_parts")), static_cast<int32_t>(f.integer("frame_cells")),
-                 f.at<const float>("energy")};
-    job.guides = f.at<const RowGuide>("guides");
-    job.counts = f.at<const int64_t>("counts");
-    return job;
-}
-
 nb::bytes task(const nb::dict& addresses, const nb::dict& numbers) {
-    const DeviceFields f(addresses, numbers);
+    const DeviceFields fields(addresses, numbers);
     MarsTask task{};
-    task.shapes = shapes_of(f);
-    task.laws = f.at<const MatchedLaw>("laws");
-    task.cumulants = f.at<const double>("cumulants");
-    task.exact = f.at<const int32_t>("exact");
-    task.law_first = f.at<const int64_t>("law_first");
-    task.law_offsets = f.at<const int64_t>("law_offsets");
-    task.law_cumulative = f.at<const double>("law_cumulative");
-    task.out = f.at<void>("out");
-    task.runs = f.integer("runs");
-    task.parts = f.integer("parts");
-    task.deep = f.integer("deep");
-    task.queue = f.at<uint32_t>("queue");
-    task.full = f.at<uint32_t>("full");
-    task.work = f.at<uint8_t>("work");
-    task.work_bytes = f.integer("work_bytes");
+    ShapeJob& job = task.shapes;
+    fields.set("pixels", job.pixels, "realizations", job.realizations, "first_realization", job.first_realization,
+               "seed", job.seed, "bins", job.bins, "dead_time", job.dead_time, "pixel_index", job.pixel_index, "place",
+               job.place, "image", job.image, "shapes", job.shapes, "rows", job.rows, "weights", job.weights, "shift",
+               job.shift, "signal", job.signal, "background", job.background, "rate", job.rate, "guides", job.guides,
+               "counts", job.counts);
+    fields.set("frame_first", job.frame.first, "frame_size", job.frame.size, "frame_parts", job.frame.parts,
+               "frame_cells", job.frame.cells, "energy", job.frame.energy);
+    fields.set("laws", task.laws, "cumulants", task.cumulants, "exact", task.exact, "law_first", task.law_first,
+               "law_offsets", task.law_offsets, "law_cumulative", task.law_cumulative, "out", task.out, "runs",
+               task.runs, "parts", task.parts, "deep", task.deep, "queue", task.queue, "full", task.full, "work",
+               task.work, "work_bytes", task.work_bytes);
     return as_bytes(task);
 }
 
@@ -114,25 +69,21 @@ int64_t block_bytes(int32_t bins, int32_t frame_size, int32_t frame_cells, doubl
 }  // namespace
 
 void bind_mars_device(nb::module_& module) {
-    module.def("mars_law_task", &law_task, nb::arg("addresses"), nb::arg("axes"), nb::arg("numbers"),
+    module.def("mars_law_task", &law_task, "addresses"_a, "axes"_a, "numbers"_a,
                "Argument of the kernel mars_laws: device arrays and numbers by name, the table's axes.");
-    module.def("mars_task", &task, nb::arg("addresses"), nb::arg("numbers"),
+    module.def("mars_task", &task, "addresses"_a, "numbers"_a,
                "Argument of the kernel mars_histograms: device arrays and numbers by name.");
-    module.def("mars_block_bytes", &block_bytes, nb::arg("bins"), nb::arg("frame_size"), nb::arg("frame_cells"),
-               nb::arg("dead_time"), "Bytes that a block of mars_histograms works in.");
+    module.def("mars_block_bytes", &block_bytes, "bins"_a, "frame_size"_a, "frame_cells"_a, "dead_time"_a,
+               "Bytes that a block of mars_histograms works in.");
     module.def("mars_law_bytes", [] { return sizeof(MatchedLaw); }, "Bytes of one pixel's law.");
     module.def(
         "table_axis",
         [](const Vector<const double>& values) {
             const AxisTables tables(values.data(), size_of(values));
-            nb::dict told;
-            told["value"] = copied(std::vector<double>(values.data(), values.data() + values.shape(0)));
-            told["log"] = copied(tables.log());
-            told["scale"] = copied(tables.scale());
-            told["start"] = copied(tables.start());
-            return told;
+            return arrays_of("value", std::vector<double>(values.data(), values.data() + values.shape(0)), "log",
+                             tables.log(), "scale", tables.scale(), "start", tables.start());
         },
-        nb::arg("values"), "What the lookup needs of an axis of a table, to be copied to the device.");
+        "values"_a, "What the lookup needs of an axis of a table, to be copied to the device.");
 }
 
 }  // namespace mars

@@ -76,14 +76,13 @@ void draw(Matrix<const double> cumulants, Matrix<const double> uniform, Matrix<i
 }  // namespace
 
 void bind_matched(nb::module_& module) {
-    module.def("matched_support", &support, nb::arg("cumulants"), nb::arg("first").noconvert(),
-               nb::arg("last").noconvert(), nb::arg("trusted").noconvert(), nb::arg("threads"),
+    module.def("matched_support", &support, "cumulants"_a, "first"_a.noconvert(), "last"_a.noconvert(),
+               "trusted"_a.noconvert(), "threads"_a,
                "First and last count (cells) of the laws with these cumulants (cells, 4); whether they are close.");
-    module.def("matched_pmf", &probabilities, nb::arg("cumulants"), nb::arg("first"), nb::arg("start"),
-               nb::arg("out").noconvert(), nb::arg("threads"),
+    module.def("matched_pmf", &probabilities, "cumulants"_a, "first"_a, "start"_a, "out"_a.noconvert(), "threads"_a,
                "Probabilities of the counts first, first + 1, ... of each cell, out[start[cell]:start[cell + 1]].");
-    module.def("matched_draw", &draw, nb::arg("cumulants"), nb::arg("uniform"), nb::arg("out").noconvert(),
-               nb::arg("threads"), "Counts out (cells, draws) at the uniform numbers (cells, draws).");
+    module.def("matched_draw", &draw, "cumulants"_a, "uniform"_a, "out"_a.noconvert(), "threads"_a,
+               "Counts out (cells, draws) at the uniform numbers (cells, draws).");
 }
 
 }  // namespace mars

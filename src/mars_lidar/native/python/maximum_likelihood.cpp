@@ -95,22 +95,19 @@ void log_likelihood(const HistogramRecord& recording, Vector<const double> histo
 }  // namespace
 
 void bind_maximum_likelihood(nb::module_& module) {
-    module.def("maximum_likelihood", &maximum_likelihood, nb::arg("recording"), nb::arg("histogram").noconvert(),
-               nb::kw_only(), nb::arg("starts"), nb::arg("least_gain"), nb::arg("less_bias"),
-               nb::arg("out").noconvert(), nb::arg("flags").noconvert(), nb::arg("threads"), nb::arg("progress").none(),
-               "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).");
-    module.def("several_returns", &several_returns, nb::arg("recording"), nb::arg("histogram").noconvert(),
-               nb::kw_only(), nb::arg("most"), nb::arg("starts"), nb::arg("false_alarm"), nb::arg("out").noconvert(),
-               nb::arg("flags").noconvert(), nb::arg("returns").noconvert(), nb::arg("threads"),
-               nb::arg("progress").none(),
+    module.def("maximum_likelihood", &maximum_likelihood, "recording"_a, "histogram"_a.noconvert(), nb::kw_only(),
+               "starts"_a, "least_gain"_a, "less_bias"_a, "out"_a.noconvert(), "flags"_a.noconvert(), "threads"_a,
+               "progress"_a.none(), "ML of (S, B, delay) of each pixel: out (pixels, 8), flags (pixels).");
+    module.def("several_returns", &several_returns, "recording"_a, "histogram"_a.noconvert(), nb::kw_only(), "most"_a,
+               "starts"_a, "false_alarm"_a, "out"_a.noconvert(), "flags"_a.noconvert(), "returns"_a.noconvert(),
+               "threads"_a, "progress"_a.none(),
                "Further returns of each pixel: returns (pixels, most x (delay, S, errors, chance)).");
-    module.def("surface_fits", &surface_fits, nb::arg("recording"), nb::arg("first"), nb::arg("bins"),
-               nb::arg("exposure"), nb::kw_only(), nb::arg("width"), nb::arg("radius"), nb::arg("tilted"),
-               nb::arg("before"), nb::arg("planes").noconvert(), nb::arg("out").noconvert(), nb::arg("threads"),
-               nb::arg("progress").none(),
+    module.def("surface_fits", &surface_fits, "recording"_a, "first"_a, "bins"_a, "exposure"_a, nb::kw_only(),
+               "width"_a, "radius"_a, "tilted"_a, "before"_a, "planes"_a.noconvert(), "out"_a.noconvert(), "threads"_a,
+               "progress"_a.none(),
                "Planes (share, delay, right, down) of windows of an image: planes (pixels, 4), out (pixels, 7).");
-    module.def("histogram_log_likelihood", &log_likelihood, nb::arg("recording"), nb::arg("histogram"), nb::arg("at"),
-               nb::arg("out").noconvert(), nb::arg("whole") = true,
+    module.def("histogram_log_likelihood", &log_likelihood, "recording"_a, "histogram"_a, "at"_a, "out"_a.noconvert(),
+               "whole"_a = true,
                "Value, gradient and information at points (S, B, delay); `whole`: bin by bin round the period.");
 }
 

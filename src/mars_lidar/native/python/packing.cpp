@@ -45,14 +45,14 @@ void unpack_events(Vector<const uint8_t> packed, Vector<int64_t> position, Vecto
 }  // namespace
 
 void bind_packing(nb::module_& module) {
-    module.def("pack_counts", &pack<uint16_t>, nb::arg("counts").noconvert(), "Packed counts (n,).");
-    module.def("pack_counts", &pack<uint32_t>, nb::arg("counts").noconvert());
-    module.def("unpack_counts", &unpack<uint16_t>, nb::arg("packed"), nb::arg("out").noconvert(),
+    module.def("pack_counts", &pack<uint16_t>, "counts"_a.noconvert(), "Packed counts (n,).");
+    module.def("pack_counts", &pack<uint32_t>, "counts"_a.noconvert());
+    module.def("unpack_counts", &unpack<uint16_t>, "packed"_a, "out"_a.noconvert(),
                "Fill `out` (n,) with what `pack_counts` packed.");
-    module.def("unpack_counts", &unpack<uint32_t>, nb::arg("packed"), nb::arg("out").noconvert());
-    module.def("packed_events", &events_of, nb::arg("packed"), "Elements that are not zero.");
-    module.def("unpack_events", &unpack_events, nb::arg("packed"), nb::arg("position").noconvert(),
-               nb::arg("count").noconvert(), "Fill position and count (events,) of the elements that are not zero.");
+    module.def("unpack_counts", &unpack<uint32_t>, "packed"_a, "out"_a.noconvert());
+    module.def("packed_events", &events_of, "packed"_a, "Elements that are not zero.");
+    module.def("unpack_events", &unpack_events, "packed"_a, "position"_a.noconvert(), "count"_a.noconvert(),
+               "Fill position and count (events,) of the elements that are not zero.");
 }
 
 }  // namespace mars

@@ -32,10 +32,9 @@ nb::tuple sweeps_until(Vector<const double> fire, Vector<const double> refire, V
 }  // namespace
 
 void bind_chain(nb::module_& module) {
-    module.def("cyclic_recursion", &recursion, nb::arg("keep"), nb::arg("in_"), nb::arg("loss"), nb::arg("backward"),
-               nb::arg("out"));
-    module.def("feedback_sweeps", &sweeps_until, nb::arg("fire"), nb::arg("refire"), nb::arg("rhs"), nb::arg("shift"),
-               nb::arg("adjoint"), nb::arg("sweeps"), nb::arg("tolerance"), nb::arg("x"));
+    module.def("cyclic_recursion", &recursion, "keep"_a, "in_"_a, "loss"_a, "backward"_a, "out"_a);
+    module.def("feedback_sweeps", &sweeps_until, "fire"_a, "refire"_a, "rhs"_a, "shift"_a, "adjoint"_a, "sweeps"_a,
+               "tolerance"_a, "x"_a);
 }
 
 }  // namespace mars

@@ -100,8 +100,8 @@ void bind_shape_sampler(nb::module_& module) {
                 check(*self, shapes.shape(0));
                 self->arrays = nb::make_tuple(shapes, rows, weights, pixel_index, place);
             },
-            nb::kw_only(), nb::arg("shapes"), nb::arg("rows"), nb::arg("weights"), nb::arg("pixel_index"),
-            nb::arg("place"), nb::arg("image"), nb::arg("realizations"), nb::arg("first_realization"), nb::arg("seed"))
+            nb::kw_only(), "shapes"_a, "rows"_a, "weights"_a, "pixel_index"_a, "place"_a, "image"_a, "realizations"_a,
+            "first_realization"_a, "seed"_a)
         .def(
             "align",
             [](BoundShapeJob& self, Vector<const double> shift, Vector<const double> signal,
@@ -123,26 +123,25 @@ void bind_shape_sampler(nb::module_& module) {
                 self.frame = {first, size, parts, cells, energy.data()};
                 self.arrays = nb::make_tuple(self.arrays, shift, signal, background, rate, energy);
             },
-            nb::kw_only(), nb::arg("shift"), nb::arg("signal"), nb::arg("background"), nb::arg("rate"),
-            nb::arg("dead_time"), nb::arg("first"), nb::arg("cells"), nb::arg("energy"),
-            "Move the rows by `shift`, in [0, 1), to the pixels' own delays.")
+            nb::kw_only(), "shift"_a, "signal"_a, "background"_a, "rate"_a, "dead_time"_a, "first"_a, "cells"_a,
+            "energy"_a, "Move the rows by `shift`, in [0, 1), to the pixels' own delays.")
         .def(
             "guide",
             [](BoundShapeJob& self, Matrix<float> guides, int threads) {
                 guide(self, guides, self.row_count, threads);
             },
-            nb::kw_only(), nb::arg("guides").noconvert(), nb::arg("threads"),
+            nb::kw_only(), "guides"_a.noconvert(), "threads"_a,
             "Let moderate counts be drawn photon by photon: `guides` (rows, 64), zeros at first, are filled as "
             "needed.");
-    module.def("shape_guides", &all_guides, nb::arg("shapes"), nb::kw_only(), nb::arg("dead_time"), nb::arg("first"),
-               nb::arg("size"), "Guides (rows, 64) to all rows of canonical delay, as `ShapeJob.guide` fills them.");
-    module.def("shape_aligned", &aligned, nb::arg("job"), nb::arg("out").noconvert(), nb::arg("level"),
+    module.def("shape_guides", &all_guides, "shapes"_a, nb::kw_only(), "dead_time"_a, "first"_a, "size"_a,
+               "Guides (rows, 64) to all rows of canonical delay, as `ShapeJob.guide` fills them.");
+    module.def("shape_aligned", &aligned, "job"_a, "out"_a.noconvert(), "level"_a,
                "Shapes out (pixels, bins) from which a job's histograms are drawn: for its tests.");
     const char* about = "Histograms out (realizations * image, bins) of counts (realizations, pixels).";
-    module.def("shape_histogram", &sample<uint16_t>, nb::arg("job"), nb::arg("counts"), nb::arg("out").noconvert(),
-               nb::arg("threads"), nb::arg("level"), nb::arg("progress").none(), about);
-    module.def("shape_histogram", &sample<uint32_t>, nb::arg("job"), nb::arg("counts"), nb::arg("out").noconvert(),
-               nb::arg("threads"), nb::arg("level"), nb::arg("progress").none(), about);
+    module.def("shape_histogram", &sample<uint16_t>, "job"_a, "counts"_a, "out"_a.noconvert(), "threads"_a, "level"_a,
+               "progress"_a.none(), about);
+    module.def("shape_histogram", &sample<uint32_t>, "job"_a, "counts"_a, "out"_a.noconvert(), "threads"_a, "level"_a,
+               "progress"_a.none(), about);
 }
 
 }  // namespace mars

@@ -54,10 +54,9 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
 }  // namespace
 
 void bind_table(nb::module_& module) {
-    module.def("table_lookup", &lookup, nb::kw_only(), nb::arg("signal_axis"), nb::arg("background_axis"),
-               nb::arg("entries"), nb::arg("sub_signal"), nb::arg("sub_background"), nb::arg("phase"),
-               nb::arg("correction"), nb::arg("signal"), nb::arg("background"), nb::arg("at"), nb::arg("nearest"),
-               nb::arg("rows"), nb::arg("weights"), nb::arg("cumulants"), nb::arg("threads"));
+    module.def("table_lookup", &lookup, nb::kw_only(), "signal_axis"_a, "background_axis"_a, "entries"_a,
+               "sub_signal"_a, "sub_background"_a, "phase"_a, "correction"_a, "signal"_a, "background"_a, "at"_a,
+               "nearest"_a, "rows"_a, "weights"_a, "cumulants"_a, "threads"_a);
 }
 
 }  // namespace mars

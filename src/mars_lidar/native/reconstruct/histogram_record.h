@@ -42,12 +42,12 @@ struct HistogramRecord {
     double core_low = 0.0, core_high = 0.0;  // the part of the pulse that is counted as its window
     PulseCurve pulse;
     std::vector<double> low, high;  // (bins) the open part of each bin, in periods; empty without a gate
-    std::vector<double> open;       // (bins) its share of the bin
 
     // Dead times below one bin: several registrations a period fit into a bin.
     bool below_bin() const { return !synchronous && whole == 0 && shift == 0; }
-    bool gated() const { return !open.empty(); }
-    double share(int64_t j) const { return open.empty() ? 1.0 : open[j]; }
+    bool gated() const { return !low.empty(); }
+    // The open part of bin j.
+    double share(int64_t j) const { return gated() ? (high[j] - low[j]) * static_cast<double>(bins) : 1.0; }
 };
 
 // Calls each(k, j, s, ds) for the bins that a pulse at `delay` reaches: k = 0, 1, .. along the pulse, j the bin of the

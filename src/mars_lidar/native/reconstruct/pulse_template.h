@@ -15,7 +15,7 @@ namespace mars {
 struct PulseTemplate {
     explicit PulseTemplate(const HistogramRecord& recording) {
         HistogramRecord plain = recording;
-        plain.open.clear();
+        plain.low.clear();
         const double n = static_cast<double>(recording.bins), at = 0.5 / n;
         first = static_cast<int64_t>(std::floor((at + recording.pulse.low) * n));
         for_pulse_bins(plain, at, recording.pulse.low, recording.pulse.low + recording.pulse.span(),

@@ -1,91 +1,66 @@
-// Where an item of the exact engine begins when its pixel is warmed up at the start of the exposure: the period and
-// the phase at which it re-arms next. Drawn photon by photon (exact/backward.h) where few arrive in a dead time, and
-// from the stationary law (laws/stationary.h, exact/mode_start.h) where many do.
+// The light of a pixel that sees pulses, and where an item of the exact engine begins when it is warmed up at the start of
+// the exposure (exact/warmed_up.h).
 #pragma once
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <vector>
 
-#include "exact/backward.h"
 #include "exact/kernel.h"
-#include "exact/mode_start.h"
 #include "exact/pulse_view.h"
-#include "laws/stationary.h"
+#include "exact/warmed_up.h"
 
 namespace mars {
 
-// Signal photons per period of a pixel.
-inline double bright(const Job& job, int64_t pixel) {
-    double photons = 0.0;
-    for (int64_t k = 0; k < job.returns; ++k) photons += std::max(0.0, job.signal[k * job.pixels + pixel]);
-    return photons;
-}
-
-// Photons in the parts of a grid fine enough for the pulse and the gate, each cut into `split`.
-inline std::vector<double> photons_on_grid(const Job& job, const PulseShape& shape, int64_t pixel, int64_t split = 1) {
-    int64_t n = 1024;
-    const bool gated = job.mode == DetectorMode::kGated;
-    const double parts = gated ? 28.0 : 7.0, narrowest = gated ? job.gate.width / 64.0 : 1.0;
-    while (n < 16384 && static_cast<double>(n) * std::min(shape.equivalent_width() / parts, narrowest) < 1.0) n *= 2;
-    n *= split;
-    const double cells = static_cast<double>(n);
-    std::vector<double> photons(n, job.background[pixel] / cells);
-    for (int64_t k = 0; k < job.returns; ++k) {
-        const double s = job.signal[k * job.pixels + pixel], tau = job.delay[k * job.pixels + pixel];
-        if (!(s > 0.0)) continue;
-        // only where the pulse is: at most once round the period
-        const int64_t first = static_cast<int64_t>(std::floor((tau + shape.low()) * cells));
-        const int64_t last = std::min(first + n, static_cast<int64_t>(std::ceil((tau + shape.high()) * cells)));
-        double before = shape.periodic(static_cast<double>(first) / cells - tau);
-        for (int64_t j = first; j < last; ++j) {
-            const double after = shape.periodic(static_cast<double>(j + 1) / cells - tau);
-            photons[((j % n) + n) % n] += s * std::max(0.0, after - before);
-            before = after;
-        }
-    }
-    return photons;
-}
-
-// Photons of a pixel in [from, to), 0 <= from <= to <= 1.
-inline double photons_between(const Job& job, const PulseShape& shape, int64_t pixel, double from, double to) {
-    double photons = job.background[pixel] * (to - from);
-    for (int64_t k = 0; k < job.returns; ++k) {
-        const double s = job.signal[k * job.pixels + pixel], tau = job.delay[k * job.pixels + pixel];
-        if (s > 0.0) photons += s * std::max(0.0, shape.periodic(to - tau) - shape.periodic(from - tau));
-    }
-    return photons;
-}
-
-// The photons of one pixel, drawn one by one.
-class Photons {
+// Background and returns of one pixel: how many photons they are, and when each of them arrives.
+class PulseLight {
  public:
-    Photons(const Job& job, const PulseTable& pulse, int64_t pixel)
-        : view_(pulse_view(pulse)), background_(job.background[pixel]) {
+    PulseLight(const Job& job, const PulseTable& pulse, int64_t pixel)
+        : job_(job), shape_(pulse.shape), view_(pulse_view(pulse)), background_(job.background[pixel]) {
         total_ = background_;
         for (int64_t k = 0; k < job.returns; ++k) {
-            total_ += job.signal[k * job.pixels + pixel];
+            signal_[k] = job.signal[k * job.pixels + pixel];
+            delay_[k] = job.delay[k * job.pixels + pixel];
+            total_ += signal_[k];
             until_[k] = total_;
-            centre_[k] = job.delay[k * job.pixels + pixel] + pulse.centre;
+            centre_[k] = delay_[k] + pulse.centre;
         }
-        returns_ = job.returns;
     }
 
     double total() const { return total_; }
 
-    // The least that arrive in a dead time, wherever it begins; an upper bound of it.
-    double least(double dead_time, const PulseShape& shape) const {
+    double between(double from, double to) const {
+        double photons = background_ * (to - from);
+        for (int64_t k = 0; k < job_.returns; ++k) {
+            const double tau = delay_[k];
+            if (signal_[k] > 0.0)
+                photons += signal_[k] * std::max(0.0, shape_.periodic(to - tau) - shape_.periodic(from - tau));
+        }
+        return photons;
+    }
+
+    double least(double dead_time) const {
         const double whole = std::floor(dead_time), rest = dead_time - whole;
-        const bool fits = rest == 0.0 || (returns_ == 1 && rest + shape.high() - shape.low() < 1.0);
+        const bool fits = rest == 0.0 || (job_.returns == 1 && rest + shape_.high() - shape_.low() < 1.0);
         return background_ * dead_time + (total_ - background_) * (fits ? whole : whole + 1.0);
+    }
+
+    StationaryState state() const {
+        double bright = 0.0;  // signal photons
+        for (int64_t k = 0; k < job_.returns; ++k) bright += std::max(0.0, signal_[k]);
+        const bool locked = nearly_locked(job_.dead_time, shape_.equivalent_width(), bright);
+        std::vector<double> photons = on_grid(locked ? kExposureParts : 1);
+        if (job_.mode == DetectorMode::kGated)
+            apply_gate(job_.gate, photons, [&](double a, double b) { return between(a, b); });
+        return locked ? locked_state(photons, job_.dead_time) : StationaryState(photons, job_.dead_time);
     }
 
     // Phase of a photon in [0, 1).
     double operator()(uint32_t choice, const Pair<uint32_t>& words) const {
         const double photon = (choice + 0.5) * 0x1p-32 * total_, u = unit(words);
-        if (photon < background_ || returns_ == 0) return u;
+        if (photon < background_ || job_.returns == 0) return u;
         int64_t k = 0;
-        while (k + 1 < returns_ && photon >= until_[k]) ++k;
+        while (k + 1 < job_.returns && photon >= until_[k]) ++k;
         const float energy = static_cast<float>(u < view_.split ? u : u - 1.0);
         const float size = magnitude(energy);
         const double time = centre_[k] + quantile<PulseKind::kAny>(view_, energy, size);
@@ -94,61 +69,38 @@ class Photons {
     }
 
  private:
+    // Photons in the parts of a grid fine enough for the pulse and the gate, each cut into `split`.
+    std::vector<double> on_grid(int64_t split) const {
+        int64_t n = 1024;
+        const bool gated = job_.mode == DetectorMode::kGated;
+        const double parts = gated ? 28.0 : 7.0, narrowest = gated ? job_.gate.width / 64.0 : 1.0;
+        while (n < 16384 && static_cast<double>(n) * std::min(shape_.equivalent_width() / parts, narrowest) < 1.0)
+            n *= 2;
+        n *= split;
+        const double cells = static_cast<double>(n);
+        std::vector<double> photons(n, background_ / cells);
+        for (int64_t k = 0; k < job_.returns; ++k) {
+            const double s = signal_[k], tau = delay_[k];
+            if (!(s > 0.0)) continue;
+            // only where the pulse is: at most once round the period
+            const int64_t first = static_cast<int64_t>(std::floor((tau + shape_.low()) * cells));
+            const int64_t last = std::min(first + n, static_cast<int64_t>(std::ceil((tau + shape_.high()) * cells)));
+            double before = shape_.periodic(static_cast<double>(first) / cells - tau);
+            for (int64_t j = first; j < last; ++j) {
+                const double after = shape_.periodic(static_cast<double>(j + 1) / cells - tau);
+                photons[((j % n) + n) % n] += s * std::max(0.0, after - before);
+                before = after;
+            }
+        }
+        return photons;
+    }
+
+    const Job& job_;
+    const PulseShape& shape_;
     PulseView view_;
     double background_, total_;
-    int64_t returns_;
+    double signal_[16], delay_[16];
     double until_[16], centre_[16];  // photons of the background and the returns up to this one; its centre
-};
-
-// What a pixel that has been running for long is doing at the start of a period.
-class WarmedUp {
- public:
-    WarmedUp(const Job& job, const PulseTable& pulse, int64_t pixel) : job_(job), photons_(job, pulse, pixel) {
-        const PulseShape& shape = pulse.shape;
-        const double dead = job.dead_time;
-        if (job.mode == DetectorMode::kParalyzable) {
-            start_ = -paralyzable_warm_up(dead, photons_.total());
-        } else if (job.mode == DetectorMode::kSynchronous) {
-            const double early = photons_between(job, shape, pixel, 0.0, 1.0 - (dead - std::floor(dead)));
-            synchronous_.emplace_back(dead, photons_.total(), early);
-        } else if (job.mode == DetectorMode::kNonparalyzable &&
-                   gaps_are_near(photons_.total(), photons_.least(dead, shape), dead)) {
-            gaps_ = true;
-        } else {
-            const bool locked = nearly_locked(dead, shape.equivalent_width(), bright(job, pixel));
-            std::vector<double> photons = photons_on_grid(job, shape, pixel, locked ? kExposureParts : 1);
-            if (job.mode == DetectorMode::kGated)
-                apply_gate(job.gate, photons,
-                           [&](double a, double b) { return photons_between(job, shape, pixel, a, b); });
-            // drawn at the start of a period K + 2 periods before the exposure, which the kernel then runs through:
-            // what the grid blurs, the physics mends
-            start_ = -(static_cast<int64_t>(dead) + 2);
-            blind_.push_back(locked ? locked_state(photons, dead) : StationaryState(photons, dead));
-            blind_.front().check(job.pixel_index[pixel]);
-        }
-    }
-
-    // Cycle and phase from which on the arrivals of an item matter.
-    void draw(int64_t item, GapSearch& search, int32_t& cycle, float& phase) const {
-        const Pair<uint32_t> key = stream_key(job_.seed, job_.realization(item), job_.pixel_index[job_.pixel(item)]);
-        const double u = start_uniform(key);
-        const double residual = gaps_             ? search.residual(photons_.total(), job_.dead_time, key, photons_)
-                                : !blind_.empty() ? blind_.front().residual(u)
-                                : !synchronous_.empty() ? static_cast<double>(synchronous_.front().periods(u))
-                                                        : 0.0;
-        const double whole = std::floor(residual);
-        const float fraction = static_cast<float>(residual - whole);
-        cycle = static_cast<int32_t>(static_cast<int64_t>(whole) + start_ + (fraction >= 1.0f ? 1 : 0));
-        phase = fraction >= 1.0f ? 0.0f : fraction;
-    }
-
- private:
-    const Job& job_;
-    Photons photons_;
-    bool gaps_ = false;
-    int64_t start_ = 0;
-    std::vector<StationaryState> blind_;  // one at most; likewise
-    std::vector<SynchronousStart> synchronous_;
 };
 
 // Where the items of a block that starts warmed up begin.
@@ -159,9 +111,10 @@ inline void draw_starts(const Job& job, const PulseTable& pulse, const ExactBloc
     phase.resize(block.items);
     for (int64_t i = 0; i < std::min(block.items, job.pixels); ++i) {
         if (block.stop->load(std::memory_order_relaxed)) return;
-        const WarmedUp state(job, pulse, job.pixel(block.first_item + i));
+        const int64_t pixel = job.pixel(block.first_item + i);
+        const WarmedUp state(job, pixel, PulseLight(job, pulse, pixel));
         for (int64_t k = i; k < block.items; k += job.pixels)  // realizations of this pixel
-            state.draw(block.first_item + k, search, cycle[k], phase[k]);
+            state.draw(job.realization(block.first_item + k), search, cycle[k], phase[k]);
     }
 }
 

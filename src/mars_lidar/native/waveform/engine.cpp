@@ -31,7 +31,8 @@ void draw_starts(const Job& job, const WaveformBlock& block, std::vector<int32_t
     phase.resize(block.pixels * block.realizations);
     for (int64_t p = 0, k = 0; p < block.pixels; ++p) {
         if (block.stop->load(std::memory_order_relaxed)) return;
-        const WaveformWarmedUp state(job, block.first_pixel + p);
+        const int64_t pixel = block.first_pixel + p;
+        const WarmedUp state(job, pixel, WaveformLight(job, pixel));
         const uint32_t first = job.first_realization + static_cast<uint32_t>(block.first_realization);
         for (int64_t r = 0; r < block.realizations; ++r, ++k)
             state.draw(first + static_cast<uint32_t>(r), search, cycle[k], phase[k]);

@@ -1,15 +1,12 @@
-// The state at the start of the exposure of a pixel with a waveform that has been running for long: when it re-arms,
-// drawn from its own stationary law, or photon by photon where few arrive in a dead time.
+// The light of a pixel with a waveform, from which it is known where its exposure begins when it is warmed up
+// (exact/warmed_up.h).
 #pragma once
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <memory>
 #include <vector>
 
-#include "exact/backward.h"
-#include "exact/mode_start.h"
-#include "laws/stationary.h"
+#include "exact/warmed_up.h"
 
 namespace mars {
 
@@ -53,9 +50,9 @@ inline double integrate(const double* photons, int64_t parts, double* edge) {
 }
 
 // C of one pixel and its inverse, by phase in [0, 1), in double precision.
-class PixelWaveform {
+class WaveformLight {
  public:
-    PixelWaveform(const Job& job, int64_t pixel) : parts_(job.samples), edges_(job.samples + 1) {
+    WaveformLight(const Job& job, int64_t pixel) : job_(job), parts_(job.samples), edges_(job.samples + 1) {
         total_ = integrate(job.waveform + pixel * parts_, parts_, edges_.data()) + job.background[pixel];
         const double each = job.background[pixel] / static_cast<double>(parts_);
         for (int64_t j = 1; j < parts_; ++j) edges_[j] += static_cast<double>(j) * each;
@@ -64,6 +61,21 @@ class PixelWaveform {
 
     double total() const { return total_; }
 
+    double between(double from, double to) const { return energy(to) - energy(from); }
+
+    double least(double dead_time) const { return total_ * dead_time; }
+
+    StationaryState state() const {
+        const bool gated = job_.mode == DetectorMode::kGated;
+        std::vector<double> photons = on_grid(gated ? 64.0 / job_.gate.width : 0.0);
+        if (gated) apply_gate(job_.gate, photons, [&](double a, double b) { return between(a, b); });
+        return StationaryState(photons, job_.dead_time);
+    }
+
+    // Phase of a photon in [0, 1).
+    double operator()(uint32_t, const Pair<uint32_t>& words) const { return phase(unit(words) * total_); }
+
+ private:
     double energy(double phase) const {
         const double x = phase * static_cast<double>(parts_);
         const int64_t j = std::min(static_cast<int64_t>(x), parts_ - 1);
@@ -78,8 +90,8 @@ class PixelWaveform {
         return std::min((static_cast<double>(j) + inside) / static_cast<double>(parts_), 1.0 - 0x1p-53);
     }
 
-    // In at least 1024 parts, or `least` up to 16384; a whole number of them in each sample.
-    std::vector<double> photons(double least) const {
+    // Photons in at least 1024 parts, or `least` up to 16384; a whole number of them in each sample.
+    std::vector<double> on_grid(double least) const {
         const int64_t wanted = static_cast<int64_t>(std::min(std::max(least, 1024.0), 16384.0));
         const int64_t split = std::max<int64_t>(1, wanted / parts_);
         std::vector<double> photons;
@@ -89,56 +101,10 @@ class PixelWaveform {
         return photons;
     }
 
- private:
+    const Job& job_;
     int64_t parts_;
     double total_;
     std::vector<double> edges_;
-};
-
-class WaveformWarmedUp {
- public:
-    WaveformWarmedUp(const Job& job, int64_t pixel) : job_(job), pixel_(job.pixel_index[pixel]), wave_(job, pixel) {
-        const double dead = job.dead_time, total = wave_.total();
-        if (job.mode == DetectorMode::kParalyzable) {
-            cycle_ = -paralyzable_warm_up(dead, total);
-        } else if (job.mode == DetectorMode::kSynchronous) {
-            const double early = wave_.energy(1.0 - (dead - std::floor(dead)));
-            synchronous_ = std::make_unique<SynchronousStart>(dead, total, early);
-        } else if (job.mode == DetectorMode::kNonparalyzable && gaps_are_near(total, total * dead, dead)) {
-            gaps_ = true;
-        } else {
-            const bool gated = job.mode == DetectorMode::kGated;
-            std::vector<double> photons = wave_.photons(gated ? 64.0 / job.gate.width : 0.0);
-            if (gated)
-                apply_gate(job.gate, photons, [&](double a, double b) { return wave_.energy(b) - wave_.energy(a); });
-            cycle_ = -static_cast<int64_t>(dead) - 2;
-            blind_ = std::make_unique<StationaryState>(photons, dead);
-            blind_->check(pixel_);
-        }
-    }
-
-    // Cycle and phase from which on the arrivals of one realization matter.
-    void draw(uint32_t realization, GapSearch& search, int32_t& cycle, double& phase) const {
-        const Pair<uint32_t> key = stream_key(job_.seed, realization, pixel_);
-        const double total = wave_.total(), u = start_uniform(key);
-        const auto place = [&](uint32_t, const Pair<uint32_t>& words) { return wave_.phase(unit(words) * total); };
-        const double residual = gaps_          ? search.residual(total, job_.dead_time, key, place)
-                                : blind_       ? blind_->residual(u)
-                                : synchronous_ ? static_cast<double>(synchronous_->periods(u))
-                                               : 0.0;
-        const double periods = std::floor(residual);
-        cycle = static_cast<int32_t>(cycle_ + static_cast<int64_t>(periods));
-        phase = residual - periods;
-    }
-
- private:
-    const Job& job_;
-    uint32_t pixel_;
-    PixelWaveform wave_;
-    std::unique_ptr<StationaryState> blind_;
-    std::unique_ptr<SynchronousStart> synchronous_;
-    int64_t cycle_ = 0;  // at which that is
-    bool gaps_ = false;  // drawn from the arrivals before the exposure
 };
 
 }  // namespace mars

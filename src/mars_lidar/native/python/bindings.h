@@ -1,7 +1,7 @@
 // What the bindings share: nanobind's arrays by short names, and objects of Python together with the arrays into which they
 // point. Bindings check shapes and convert; algorithms are in the other folders and know no Python.
 #pragma once
-#include <string>
+#include <initializer_list>
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -26,26 +26,25 @@ int64_t size_of(const Vector<T>& vector) {
     return static_cast<int64_t>(vector.shape(0));
 }
 
-// Checks an array's shape; `name` is in the message.
-template <class T>
-void expect(const char* name, const Matrix<T>& array, int64_t rows, int64_t columns) {
-    if (static_cast<int64_t>(array.shape(0)) != rows || static_cast<int64_t>(array.shape(1)) != columns)
-        throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
-}
-
-template <class T>
-void expect(const char* name, const Vector<T>& array, int64_t size) {
-    if (size_of(array) != size) throw nb::value_error((std::string(name) + " has the wrong shape").c_str());
+// Checks that arrays have a shape; the message says what they must be.
+template <class... Arrays>
+void expect(const char* message, std::initializer_list<int64_t> shape, const Arrays&... arrays) {
+    const auto fits = [&](const auto& array) {
+        size_t axis = 0;
+        for (const int64_t extent : shape)
+            if (static_cast<int64_t>(array.shape(axis++)) != extent) return false;
+        return true;
+    };
+    if (!(fits(arrays) && ...)) throw nb::value_error(message);
 }
 
 // Checks what an engine is to fill: histograms, or counts.
 template <class Count>
 void check_out(const Job& job, const Matrix<Count>& out) {
-    if (static_cast<int64_t>(out.shape(0)) != job.items() || static_cast<int64_t>(out.shape(1)) != job.bins)
-        throw nb::value_error("out must be (realizations * pixels, bins)");
+    expect("out must be (realizations * pixels, bins)", {job.items(), job.bins}, out);
 }
 inline void check_out(const Job& job, const Vector<int64_t>& out) {
-    if (size_of(out) != job.items()) throw nb::value_error("out must have one count per item");
+    expect("out must have one count per item", {job.items()}, out);
 }
 
 // A job together with the arrays that it points into.

@@ -16,19 +16,19 @@ namespace {
 constexpr int64_t kChunk = 64;  // pixels
 
 CorrectionSettings settings_of(int correction, int steps, double tolerance,
-                               const std::optional<Vector<const double>>& total, size_t pixels) {
-    if (total && total->shape(0) != pixels) throw nb::value_error("total must be (pixels)");
+                               const std::optional<Vector<const double>>& total, int64_t pixels) {
+    if (total) expect("total must be (pixels)", {pixels}, *total);
     return {static_cast<Correction>(correction), steps, tolerance, total ? total->data() : nullptr};
 }
 
 void rates(const HistogramRecord& recording, Histograms histogram, int correction, int steps, double tolerance,
            std::optional<Vector<const double>> total, Matrix<double> out, Vector<uint8_t> flags, int threads) {
-    const size_t pixels = histogram.shape(0), bins = static_cast<size_t>(recording.bins);
-    if (histogram.shape(1) != bins || out.shape(0) != pixels || out.shape(1) != bins || flags.shape(0) != pixels)
-        throw nb::value_error("histogram and out must be (pixels, bins), flags (pixels)");
+    const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
+    expect("histogram and out must be (pixels, bins)", {pixels, recording.bins}, histogram, out);
+    expect("flags must be (pixels)", {pixels}, flags);
     const CorrectionSettings settings = settings_of(correction, steps, tolerance, total, pixels);
     const CountRows counts = rows_of(histogram);
-    run_watched_items(static_cast<int64_t>(pixels), kChunk, threads, nb::none(), [&] {
+    run_watched_items(pixels, kChunk, threads, nb::none(), [&] {
         return [&, correct = Corrector(recording, settings)](int64_t p) mutable {
             flags.data()[p] = correct(counts, p, false);
             std::copy(correct.rate.begin(), correct.rate.end(), out.data() + p * recording.bins);
@@ -39,13 +39,13 @@ void rates(const HistogramRecord& recording, Histograms histogram, int correctio
 void windows(const HistogramRecord& recording, Histograms histogram, int correction, int locator, int steps,
              double tolerance, std::optional<Vector<const double>> total, Matrix<double> out, Vector<uint8_t> flags,
              int threads, nb::object progress) {
-    const size_t pixels = histogram.shape(0);
-    if (histogram.shape(1) != static_cast<size_t>(recording.bins) || out.shape(0) != pixels ||
-        out.shape(1) != kWindowColumns || flags.shape(0) != pixels)
-        throw nb::value_error("histogram must be (pixels, bins), out (pixels, 5), flags (pixels)");
+    const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
+    expect("histogram must be (pixels, bins)", {pixels, recording.bins}, histogram);
+    expect("out must be (pixels, 5)", {pixels, kWindowColumns}, out);
+    expect("flags must be (pixels)", {pixels}, flags);
     const CorrectionSettings settings = settings_of(correction, steps, tolerance, total, pixels);
     const CountRows counts = rows_of(histogram);
-    run_watched_items(static_cast<int64_t>(pixels), kChunk, threads, progress, [&] {
+    run_watched_items(pixels, kChunk, threads, progress, [&] {
         return [&, correct = Corrector(recording, settings),
                 estimate = WindowEstimate(recording, static_cast<Locator>(locator))](int64_t p) mutable {
             flags.data()[p] = estimate_window(correct, estimate, settings.correction == Correction::kPasses, counts, p,

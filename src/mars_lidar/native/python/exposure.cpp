@@ -41,13 +41,12 @@ using History = std::optional<Matrix<const double>>;
 void make_light(BoundLight* self, Vector<const double> signal, Vector<const double> background,
                 Vector<const int32_t> shape, Matrix<const double> shapes, const History& history) {
     const int64_t entries = size_of(signal), bins = static_cast<int64_t>(shapes.shape(1)) / kExposureParts;
-    if (size_of(background) != entries || size_of(shape) != entries || bins < 1)
-        throw nb::value_error("signal, background and shape must agree, shapes must be (rows, bins * parts)");
-    expect("shapes", shapes, static_cast<int64_t>(shapes.shape(0)), bins * kExposureParts);
+    expect("signal, background and shape must agree", {entries}, background, shape);
+    if (bins < 1 || shapes.shape(1) % kExposureParts != 0) throw nb::value_error("shapes must be (rows, bins * parts)");
     for (int64_t i = 0; i < entries; ++i)
         if (shape.data()[i] < 0 || static_cast<size_t>(shape.data()[i]) >= shapes.shape(0))
             throw nb::value_error("shape must be rows of shapes");
-    if (history) expect("history", *history, entries, 2 * bins + 2);
+    if (history) expect("history must be (entries, 2 bins + 2)", {entries, 2 * bins + 2}, *history);
     new (self) BoundLight{{entries, signal.data(), background.data(), shape.data(), shapes.data(),
                            static_cast<int32_t>(bins), history ? history->data() : nullptr},
                           nb::make_tuple(signal, background, shape, shapes, history)};
@@ -61,7 +60,7 @@ BoundLight paralyzable_light(const ExposureGrid& grid, Vector<const double> tota
     light.total = total.data();
     light.rates = rates.data();
     light.kinds = grid.stationary ? 1 : kRateKinds;
-    expect("rates", rates, light.entries, light.kinds * grid.bins * kRateMoments);
+    expect("rates must be (entries, kinds * bins * 4)", {light.entries, light.kinds * grid.bins * kRateMoments}, rates);
     light.arrays = nb::make_tuple(total, rates);
     return light;
 }
@@ -77,7 +76,7 @@ void run_entries(MomentsBlock block, const Vector<int64_t>& settled, int64_t num
                  const std::string& level_name, const nb::object& progress) {
     const int64_t entries = block.light->entries;
     check_bins(*block.grid, *block.light);
-    if (size_of(settled) != entries) throw nb::value_error("settled has the wrong shape");
+    expect("settled must be (entries)", {entries}, settled);
     const auto level = level_for<MomentsBlock>(level_name, bytes_per_lane(*block.grid, numbers), entries, kernels);
     const int64_t batches = (entries + level.doubles - 1) / level.doubles;
     run_watched_chunks(batches, threads, progress, [&](int64_t batch, const std::atomic<bool>& stop) {
@@ -94,10 +93,10 @@ void moments(const ExposureGrid& grid, const BoundLight& light, Matrix<double> c
              Matrix<double> histogram, Matrix<double> histogram_rate, Vector<int64_t> settled, int threads,
              const std::string& level, const nb::object& progress, std::optional<Vector<const int32_t>> phase,
              std::optional<Matrix<double>> correction) {
-    expect("cumulants", cumulants, light.entries, kExposureOrders);
-    expect("cumulant_rates", cumulant_rates, light.entries, kExposureOrders);
-    expect("histogram", histogram, light.entries, grid.out_bins);
-    expect("histogram_rate", histogram_rate, light.entries, grid.out_bins);
+    expect("cumulants and their rates must be (entries, 4)", {light.entries, kExposureOrders}, cumulants,
+           cumulant_rates);
+    expect("histogram and its rate must be (entries, out_bins)", {light.entries, grid.out_bins}, histogram,
+           histogram_rate);
     MomentsBlock block{&grid,
                        &light,
                        histogram.data(),
@@ -109,7 +108,8 @@ void moments(const ExposureGrid& grid, const BoundLight& light, Matrix<double> c
         block.correction = correction->data();
         block.phase = phase->data();
         block.phases = size_of(*phase);
-        expect("correction", *correction, light.entries, block.phases * kExposureOrders);
+        expect("correction must be (entries, phases * 4)", {light.entries, block.phases * kExposureOrders},
+               *correction);
         for (int64_t p = 0; p < block.phases; ++p)
             if (block.phase[p] < (p ? block.phase[p - 1] : 0) || block.phase[p] > grid.bins)
                 throw nb::value_error("phase must be ascending edges of the grid");
@@ -120,7 +120,7 @@ void moments(const ExposureGrid& grid, const BoundLight& light, Matrix<double> c
 
 void stationary(const ExposureGrid& grid, const BoundLight& light, Matrix<double> histogram, Vector<int64_t> settled,
                 int threads, const std::string& level, const nb::object& progress) {
-    expect("histogram", histogram, light.entries, grid.out_bins);
+    expect("histogram must be (entries, out_bins)", {light.entries, grid.out_bins}, histogram);
     run_entries({&grid, &light, histogram.data(), settled.data()}, settled, 0, MARS_KERNELS(exposure_stationary_),
                 threads, level, progress);
 }
@@ -131,11 +131,7 @@ void characteristic(const ExposureGrid& grid, const BoundLight& light, bool tilt
                     int threads, const std::string& level_name, const nb::object& progress) {
     const int64_t entries = light.entries, points = static_cast<int64_t>(z_re.shape(1));
     check_bins(grid, light);
-    expect("z_re", z_re, entries, points);
-    expect("z_im", z_im, entries, points);
-    expect("re", re, entries, points);
-    expect("im", im, entries, points);
-    expect("settled", settled, entries, points);
+    expect("z, re, im and settled must be (entries, points)", {entries, points}, z_re, z_im, re, im, settled);
     const auto level = level_for<CharacteristicBlock>(level_name, bytes_per_lane(grid, 2), points,
                                                       MARS_KERNELS(exposure_characteristic_));
     const int64_t batches = (points + level.doubles - 1) / level.doubles;

@@ -29,8 +29,8 @@ FeedbackGrid make_grid(const Matrix<const double>& response, int64_t whole, int3
 // `photons` (4 n): per quarter of a bin; `response` (6, n).
 void respond_all(Vector<const double> photons, Matrix<double> response) {
     const int64_t n = static_cast<int64_t>(response.shape(1));
-    if (response.shape(0) != 6 || photons.shape(0) != static_cast<size_t>(n * kExposureParts))
-        throw nb::value_error("photons must be (4 n), response (6, n)");
+    expect("response must be (6, n)", {6}, response);
+    expect("photons must be (4 n)", {n * kExposureParts}, photons);
     const nb::gil_scoped_release release;
     bin_responses(photons.data(), n, response.data());
 }
@@ -40,11 +40,9 @@ void adjoint(Matrix<const double> response, int32_t shift, double fraction, Matr
              double tolerance, Vector<int64_t> done, Vector<double> error) {
     const FeedbackGrid grid = make_grid(response, 0, shift, fraction);
     const int64_t windows = static_cast<int64_t>(mass_in.shape(0)), n = grid.bins;
-    expect("mass_in", mass_in, windows, n);
-    if (moment_in) expect("moment_in", *moment_in, windows, n);
-    expect("mass", mass, windows, n);
-    expect("moment", moment, windows, n);
-    if (size_of(done) != windows || size_of(error) != windows) throw nb::value_error("done and error: one per window");
+    expect("mass_in, mass and moment must be (windows, n)", {windows, n}, mass_in, mass, moment);
+    if (moment_in) expect("moment_in must be (windows, n)", {windows, n}, *moment_in);
+    expect("done and error: one per window", {windows}, done, error);
     const auto kernel =  // of which the windows fill more than half
         fitting_kernel<const AdjointBlock&, void>("", MARS_KERNELS(joint_adjoint_),
                                                   [&](const auto& level) { return windows > level.doubles / 2; });
@@ -69,9 +67,8 @@ std::pair<int64_t, double> forward(Matrix<const double> response, int32_t shift,
                                    Vector<const double> mass_in, Vector<const double> moment_in, Matrix<double> out,
                                    int64_t sweeps, double tolerance) {
     const FeedbackGrid grid = make_grid(response, 0, shift, fraction);
-    const size_t n = response.shape(1);
-    if (mass_in.shape(0) != n || moment_in.shape(0) != n || out.shape(0) != n || out.shape(1) != 2)
-        throw nb::value_error("sources must be (n), out (n, 2)");
+    expect("sources must be (n)", {grid.bins}, mass_in, moment_in);
+    expect("out must be (n, 2)", {grid.bins, 2}, out);
     static_assert(sizeof(Pair) == 2 * sizeof(double), "pairs lie in memory as rows of two");
     const nb::gil_scoped_release release;
     const FoldedSweeps done = folded_registrations(grid, mass_in.data(), moment_in.data(),
@@ -82,8 +79,8 @@ std::pair<int64_t, double> forward(Matrix<const double> response, int32_t shift,
 int64_t settle(Matrix<const double> response, int64_t whole, int32_t shift, double fraction, int64_t cycles,
                Matrix<const double> state, double tolerance, int64_t max_steps, Vector<double> total) {
     const FeedbackGrid grid = make_grid(response, whole, shift, fraction);
-    expect("state", state, grid.bins, 2);
-    if (size_of(total) != grid.bins) throw nb::value_error("total must be (n)");
+    expect("state must be (n, 2)", {grid.bins, 2}, state);
+    expect("total must be (n)", {grid.bins}, total);
     int64_t result = -1;
     run_watched_chunks(1, 1, nb::none(), [&](int64_t, const std::atomic<bool>& stop) {
         result = settling_time(grid, cycles, state.data(), tolerance, max_steps, total.data(), stop);
@@ -94,7 +91,7 @@ int64_t settle(Matrix<const double> response, int64_t whole, int32_t shift, doub
 void exposure(Matrix<const double> response, int64_t whole, int32_t shift, double fraction, int64_t cycles,
               std::optional<Matrix<const double>> state, Matrix<const double> weights, Matrix<double> columns) {
     const FeedbackGrid grid = make_grid(response, whole, shift, fraction);
-    if (state) expect("state", *state, grid.bins, 2);
+    if (state) expect("state must be (n, 2)", {grid.bins, 2}, *state);
     const size_t windows = weights.shape(0), out_bins = weights.shape(1);
     if (columns.shape(0) != windows || columns.shape(1) != out_bins || out_bins == 0 || grid.bins % out_bins != 0)
         throw nb::value_error("columns must have the shape of weights, n must be a multiple of the bins");

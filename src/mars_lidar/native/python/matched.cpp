@@ -28,9 +28,7 @@ void for_cells(int64_t cells, int threads, const Work& work) {
 void support(Matrix<const double> cumulants, Vector<int64_t> first, Vector<int64_t> last, Vector<bool> trusted,
              int threads) {
     const int64_t cells = check_cells(cumulants);
-    if (static_cast<int64_t>(first.shape(0)) != cells || first.shape(0) != last.shape(0) ||
-        first.shape(0) != trusted.shape(0))
-        throw nb::value_error("first, last and trusted must be of shape (cells)");
+    expect("first, last and trusted must be of shape (cells)", {cells}, first, last, trusted);
     for_cells(cells, threads, [&](int64_t cell) {
         const Cumulants given = cumulants_of(cumulants, cell);
         const MatchedLaw law(given);
@@ -64,9 +62,7 @@ void probabilities(Matrix<const double> cumulants, Vector<const int64_t> first, 
 
 void draw(Matrix<const double> cumulants, Matrix<const double> uniform, Matrix<int64_t> out, int threads) {
     const int64_t cells = check_cells(cumulants), number = static_cast<int64_t>(uniform.shape(1));
-    if (static_cast<int64_t>(uniform.shape(0)) != cells || out.shape(0) != uniform.shape(0) ||
-        out.shape(1) != uniform.shape(1))
-        throw nb::value_error("uniform and out must be of shape (cells, draws)");
+    expect("uniform and out must be of shape (cells, draws)", {cells, number}, uniform, out);
     for_cells(cells, threads, [&](int64_t cell) {
         const MatchedLaw law(cumulants_of(cumulants, cell));
         for (int64_t i = cell * number; i < (cell + 1) * number; ++i) out.data()[i] = law.draw(uniform.data()[i]);

@@ -15,10 +15,9 @@ constexpr int64_t kChunk = 64;  // pixels
 void maximum_likelihood(const HistogramRecord& recording, Histograms histogram, int starts, double least_gain,
                         bool less_bias, Matrix<double> out, Vector<uint8_t> flags, int threads, nb::object progress) {
     const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
-    if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
-        throw nb::value_error("histogram must be (pixels, bins)");
-    if (out.shape(0) != histogram.shape(0) || out.shape(1) != kMaximumColumns || flags.shape(0) != histogram.shape(0))
-        throw nb::value_error("out must be (pixels, 8), flags (pixels)");
+    expect("histogram must be (pixels, bins)", {pixels, recording.bins}, histogram);
+    expect("out must be (pixels, 8)", {pixels, kMaximumColumns}, out);
+    expect("flags must be (pixels)", {pixels}, flags);
     const ReconstructionJob job{starts, least_gain, less_bias};
     const CountRows counts = rows_of(histogram);
     run_watched_items(pixels, kChunk, threads, progress, [&] {
@@ -33,12 +32,11 @@ void several_returns(const HistogramRecord& recording, Histograms histogram, int
                      Matrix<double> out, Vector<uint8_t> flags, Matrix<double> returns, int threads,
                      nb::object progress) {
     const int64_t pixels = static_cast<int64_t>(histogram.shape(0));
-    if (static_cast<int64_t>(histogram.shape(1)) != recording.bins)
-        throw nb::value_error("histogram must be (pixels, bins)");
+    expect("histogram must be (pixels, bins)", {pixels, recording.bins}, histogram);
     if (most < 1 || most > kMostReturns) throw nb::value_error("most must lie in [1, 8]");
-    if (out.shape(0) != histogram.shape(0) || out.shape(1) != kMaximumColumns || flags.shape(0) != histogram.shape(0) ||
-        returns.shape(0) != histogram.shape(0) || static_cast<int>(returns.shape(1)) != most * kReturnColumns)
-        throw nb::value_error("out must be (pixels, 8), returns (pixels, 5 most), flags (pixels)");
+    expect("out must be (pixels, 8)", {pixels, kMaximumColumns}, out);
+    expect("returns must be (pixels, 5 most)", {pixels, most * kReturnColumns}, returns);
+    expect("flags must be (pixels)", {pixels}, flags);
     const ReturnsJob job{most, starts, false_alarm};
     const CountRows counts = rows_of(histogram);
     run_watched_items(pixels, kChunk, threads, progress, [&] {
@@ -55,9 +53,8 @@ void surface_fits(const HistogramRecord& recording, Vector<const int64_t> first,
     const int64_t pixels = size_of(exposure);
     if (size_of(first) != pixels + 1 || width < 1 || pixels % width != 0)
         throw nb::value_error("first must be (pixels + 1), pixels a multiple of width");
-    expect("before", before, pixels, 4);
-    expect("planes", planes, pixels, 4);
-    expect("out", out, pixels, kSurfaceColumns);
+    expect("before and planes must be (pixels, 4)", {pixels, 4}, before, planes);
+    expect("out must be (pixels, 7)", {pixels, kSurfaceColumns}, out);
     static_assert(sizeof(Plane) == 4 * sizeof(double));
     const PhotonImage image{pixels / width, width, first.data(), bins.data(), exposure.data()};
     const Plane* from = reinterpret_cast<const Plane*>(before.data());

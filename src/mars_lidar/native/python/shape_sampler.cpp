@@ -26,12 +26,8 @@ void check(const BoundShapeJob& job, size_t rows) {
 template <class Count>
 void sample(const BoundShapeJob& job, Matrix<const int64_t> counts, Matrix<Count> out, int threads,
             const std::string& level, const nb::object& progress) {
-    if (static_cast<int64_t>(counts.shape(0)) != job.realizations ||
-        static_cast<int64_t>(counts.shape(1)) != job.pixels)
-        throw nb::value_error("counts must be (realizations, pixels)");
-    if (static_cast<int64_t>(out.shape(0)) != job.realizations * job.image ||
-        static_cast<int64_t>(out.shape(1)) != job.bins)
-        throw nb::value_error("out must be (realizations * image, bins)");
+    expect("counts must be (realizations, pixels)", {job.realizations, job.pixels}, counts);
+    expect("out must be (realizations * image, bins)", {job.realizations * job.image, job.bins}, out);
     watched(progress,
             [&](const Watch& watch) { shape_histogram(job, counts.data(), out.data(), threads, level, watch); });
 }
@@ -66,8 +62,7 @@ nb::object all_guides(Matrix<const float> shapes, double dead_time, int32_t firs
 }
 
 void aligned(const BoundShapeJob& job, Matrix<double> out, const std::string& level) {
-    if (static_cast<int64_t>(out.shape(0)) != job.pixels || static_cast<int64_t>(out.shape(1)) != job.bins)
-        throw nb::value_error("out must be (pixels, bins)");
+    expect("out must be (pixels, bins)", {job.pixels, job.bins}, out);
     shape_aligned(job, out.data(), level);
 }
 
@@ -86,10 +81,8 @@ void bind_shape_sampler(nb::module_& module) {
                 self->first_realization = first_realization;
                 self->seed = seed;
                 self->bins = static_cast<int32_t>(shapes.shape(1));
-                const size_t pixels = pixel_index.shape(0);
-                if (rows.shape(0) != pixels || place.shape(0) != pixels || weights.shape(0) != pixels ||
-                    rows.shape(1) != 4 || weights.shape(1) != 4)
-                    throw nb::value_error("rows and weights must be (pixels, 4), place (pixels)");
+                expect("rows and weights must be (pixels, 4)", {self->pixels, 4}, rows, weights);
+                expect("place must be (pixels)", {self->pixels}, place);
                 self->pixel_index = pixel_index.data();
                 self->place = place.data();
                 self->image = image;
@@ -107,10 +100,8 @@ void bind_shape_sampler(nb::module_& module) {
             [](BoundShapeJob& self, Vector<const double> shift, Vector<const double> signal,
                Vector<const double> background, Vector<const double> rate, double dead_time, int32_t first,
                int32_t cells, Matrix<const float> energy) {
-                const size_t pixels = static_cast<size_t>(self.pixels);
-                if (shift.shape(0) != pixels || signal.shape(0) != pixels || background.shape(0) != pixels ||
-                    rate.shape(0) != pixels)
-                    throw nb::value_error("shift, signal, background and rate must be (pixels)");
+                expect("shift, signal, background and rate must be (pixels)", {self.pixels}, shift, signal, background,
+                       rate);
                 const int32_t parts = static_cast<int32_t>(energy.shape(0)) - 1;
                 const int32_t size = static_cast<int32_t>(energy.shape(1));
                 if (parts < 1 || cells < 1 || parts % cells != 0 || size > self.bins || first < 0 || first >= self.bins)

@@ -37,12 +37,8 @@ void lookup(Vector<const double> signal_axis, Vector<const double> background_ax
     if (table.phases == 1 || (table.phases > 1 && (sub == 0 || correction.shape(0) != sub ||
                                                    correction.shape(1) != phase.shape(0) * kCumulants)))
         throw nb::value_error("correction must be (sub_signal * sub_background, phases * 4)");
-    if (background.shape(0) != signal.shape(0) || at.shape(0) != signal.shape(0))
-        throw nb::value_error("signal, background and at must agree");
-    if (rows.shape(0) != signal.shape(0) || weights.shape(0) != signal.shape(0) ||
-        cumulants.shape(0) != signal.shape(0) || rows.shape(1) != 4 || weights.shape(1) != 4 ||
-        cumulants.shape(1) != kCumulants)
-        throw nb::value_error("rows, weights and cumulants must be (pixels, 4)");
+    expect("signal, background and at must agree", {pixels}, background, at);
+    expect("rows, weights and cumulants must be (pixels, 4)", {pixels, kCumulants}, rows, weights, cumulants);
     run_watched_items(pixels, kBlock, threads, nb::none(), [&] {
         return [&](int64_t p) {
             table.pixel(signal.data()[p], background.data()[p], at.data()[p], rows.data() + 4 * p,

@@ -10,43 +10,21 @@
 
 namespace mars {
 
-// C at the edges in photons, without the background: in eight runs of parts side by side, because each addition waits
-// for the one before it.
-struct Runs {
-    static constexpr int64_t kRuns = 8;
-    int64_t length;
-    double before[kRuns];  // photons before each run
-    double total;          // and in all parts
-};
-
-// Fills `edge` with C at the edges of each run from its beginning on, one run `stride` after the other, then with C at
-// the edges of the parts after the last run.
-inline Runs integrate_runs(const double* photons, int64_t parts, int64_t stride, double* edge) {
-    Runs runs;
-    const int64_t length = runs.length = parts / Runs::kRuns;
-    double sum[Runs::kRuns] = {};
-    const double* from = photons;
-    double* to = edge;
-    for (int64_t j = 0; j < length; ++j, ++from, ++to) {
-        for (int64_t run = 0; run < Runs::kRuns; ++run) to[run * stride] = sum[run] += from[run * length];
-    }
-    runs.total = 0.0;
-    for (int64_t run = 0; run < Runs::kRuns; ++run) {
-        runs.before[run] = runs.total;
-        runs.total += sum[run];
-    }
-    for (int64_t j = Runs::kRuns * length; j < parts; ++j)
-        edge[Runs::kRuns * (stride - length) + j] = runs.total += photons[j];
-    return runs;
-}
-
-// C at the edges (parts + 1) in photons, without the background.
+// C at the edges (parts + 1) in photons, without the background: in eight runs of parts side by side, because each addition
+// waits for the one before it. Returns the photons in all parts.
 inline double integrate(const double* photons, int64_t parts, double* edge) {
+    constexpr int64_t kRuns = 8;
+    const int64_t length = parts / kRuns;
+    double sum[kRuns] = {}, total = 0.0;
     edge[0] = 0.0;
-    const Runs runs = integrate_runs(photons, parts, parts / Runs::kRuns, edge + 1);
-    for (int64_t run = 0; run < Runs::kRuns; ++run)
-        for (int64_t j = 1; j <= runs.length; ++j) edge[run * runs.length + j] += runs.before[run];
-    return runs.total;
+    for (int64_t j = 0; j < length; ++j)
+        for (int64_t run = 0; run < kRuns; ++run) edge[run * length + j + 1] = sum[run] += photons[run * length + j];
+    for (int64_t run = 0; run < kRuns; ++run) {
+        for (int64_t j = 1; j <= length; ++j) edge[run * length + j] += total;
+        total += sum[run];
+    }
+    for (int64_t j = kRuns * length; j < parts; ++j) edge[j + 1] = total += photons[j];
+    return total;
 }
 
 // C of one pixel and its inverse, by phase in [0, 1), in double precision.

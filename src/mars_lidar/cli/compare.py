@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import TemporarySibling
+from mars_lidar._base.files import beside
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import check_new, check_picture, progress_bar, reported, save_picture, table, two_integers
 from mars_lidar.cli.effect_options import Effects
@@ -91,7 +91,7 @@ def compare(
             )
         save_picture(comparison(found), out)
         if numbers is not None:
-            with TemporarySibling(numbers).writing() as unfinished:
+            with beside(numbers) as unfinished:
                 told = {"scene": view.source, **as_data(found)}
                 unfinished.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n")
         show(found)

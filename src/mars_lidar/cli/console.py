@@ -115,10 +115,10 @@ def two_integers(option: str, text: str, form: str = "Y,X (row, column)") -> tup
 
 def save_picture(figure: Figure, out: Path) -> None:
     """Write a figure beside its name and rename it when it is whole."""
-    from mars_lidar._base.files import TemporarySibling
+    from mars_lidar._base.files import beside
 
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 4}} if out.suffix == ".png" else {}
-    with TemporarySibling(out).writing() as unfinished:
+    with beside(out) as unfinished:
         figure.savefig(unfinished, format=out.suffix[1:], **options)
 
 

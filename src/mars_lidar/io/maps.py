@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_target, reading
-from mars_lidar._base.hdf5 import new_file, seal
+from mars_lidar._base.files import beside, check_target, reading
+from mars_lidar._base.hdf5 import ForgivingFile, seal
 from mars_lidar.instrument.system import System
 from mars_lidar.io import hdf5, npz, zarr_store
 from mars_lidar.io.cube import format_of
@@ -68,7 +68,7 @@ def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "",
     target = Path(path)
     check_maps_output(target, overwrite=overwrite)
     variables, attrs = _contents(results, source)
-    with TemporarySibling(target).writing() as unfinished:
+    with beside(target) as unfinished:
         if target.suffix == ".zarr":
             shutil.rmtree(unfinished, ignore_errors=True)
             with warnings.catch_warnings():
@@ -82,7 +82,7 @@ def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "",
             with npz.archive(unfinished) as archive:
                 npz.add_attributes(archive, {**attrs, "variables": npz.add(archive, variables)})
         else:
-            with new_file(unfinished) as file:
+            with ForgivingFile(unfinished).hdf5() as file:
                 file.attrs.update(attrs)
                 hdf5.add(file, variables, compression="gzip", shuffle=True)
                 hdf5.name_axes(file, {v.name: v.dims for v in variables})

@@ -1,15 +1,14 @@
 """What the formats have in common: a writer, and an opened file.
 
-A format is one module with a `Writer`, called `open_writer` there, and a function `open_store`. The rule for all of
-them: what is half written never looks complete, whatever stops the process.
+A format is one module with two functions, `open_writer`, a context that gives a `Writer`, and `open_store`. The rule
+for all of them: what is half written never looks complete, whatever stops the process.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,9 +17,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import Interrupted, TemporarySibling, WriteError, reading, reason
+from mars_lidar._base.files import reading
 from mars_lidar._base.memory import check_memory
-from mars_lidar.io.recipe import Recipe, Recording
 
 
 class CountArray(Protocol):
@@ -128,75 +126,19 @@ class OpenedStore:
         return bool(self.attrs.get("complete", True))
 
 
-class Writer(ABC):
-    """Writes one cube, block by block, in the order of `Recipe.blocks`.
+@dataclass
+class Writer:
+    """Takes the counts of one cube, block by block, in the order of `Recipe.blocks`.
 
-    The file exists from the constructor on and is complete only after `finish`.
+    A format's ``open_writer(path, recipe)`` is a context that gives one: the file is complete where it ends well.
     """
 
     chunks: tuple[int, int, int, int]
+    put: Callable[[slice, slice, NDArray[Any]], None]
+    begun: int = 0  # blocks that are there already, of a store that is continued
+    registrations: int = 0
 
-    @abstractmethod
     def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
         """Store the counts (realizations, rows, W, bins) of one block."""
-
-    @abstractmethod
-    def finish(self, registrations: int) -> None:
-        """Close the file and mark it complete."""
-
-    @abstractmethod
-    def abandon(self) -> str:
-        """Stop early; returns a sentence that says what is left on disk."""
-
-
-class FileWriter(Writer):
-    """Writes a sibling of the target and renames it at the end; given up, it leaves nothing."""
-
-    def __init__(self, path: Path, recipe: Recipe | Recording) -> None:
-        self._path, self._sibling = path, TemporarySibling(path)
-        self._parts: list[Any] = []  # what is open, closed from the last one on
-        try:
-            self._begin(recipe)
-        except BaseException:
-            self.abandon()
-            raise
-
-    @abstractmethod
-    def _begin(self, recipe: Any) -> None:
-        """Open the sibling and write all but the counts."""
-
-    @abstractmethod
-    def _end(self, registrations: int) -> None:
-        """Write what is left."""
-
-    def finish(self, registrations: int) -> None:
-        """Write what is left, close the file, and put it in its place."""
-        self._end(registrations)
-        for part in reversed(self._parts):
-            part.close()
-        self._sibling.publish()
-
-    def abandon(self) -> str:
-        """Remove the unfinished sibling."""
-        for part in reversed(self._parts):
-            with contextlib.suppress(Exception):  # closing flushes, which fails again on a full disk
-                part.close()
-        return self._sibling.discard()
-
-
-@contextlib.contextmanager
-def writing(path: str | Path, begin: Callable[[], Writer]) -> Iterator[Writer]:
-    """The writer that `begin` makes, abandoned where it is not finished; errors tell what is left on disk."""
-    try:
-        writer = begin()
-    except OSError as error:
-        raise WriteError(error.errno, f"{reason(error)}; nothing was left at {path}") from error
-    try:
-        yield writer
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {writer.abandon()}") from None
-    except OSError as error:
-        raise WriteError(error.errno, f"{reason(error)}; {writer.abandon()}") from error
-    except BaseException:
-        writer.abandon()
-        raise
+        self.put(realizations, rows, block)
+        self.registrations += int(block.sum(dtype=np.uint64))

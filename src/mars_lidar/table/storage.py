@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_target, reading, whole
-from mars_lidar._base.hdf5 import new_file, open_hdf5, seal
+from mars_lidar._base.files import beside, check_target, reading, whole
+from mars_lidar._base.hdf5 import ForgivingFile, open_hdf5, seal
 from mars_lidar._base.types import FloatArray
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
@@ -63,7 +63,7 @@ def save(table: Nodes, path: str | Path, *, overwrite: bool = False) -> None:
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
     check_target(path, folder=False, overwrite=overwrite)
-    with TemporarySibling(path).writing() as unfinished, new_file(unfinished) as file:
+    with beside(path) as unfinished, ForgivingFile(unfinished).hdf5() as file:
         for name, value in _header(table).items():
             file.attrs[name] = value
         for name, array in _arrays(table).items():

@@ -108,30 +108,6 @@ def _loaded(make: type[N], path: Path, system: System | None) -> N:
     return table
 
 
-def read_header(path: Path) -> dict[str, Any]:
-    """What a file says about its table: system, axes, method, provenance; no shapes are read."""
-    with reading(path, "a table of mars-lidar"):
-        return _shown(path, *_read(path))
-
-
-def _shown(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    return {
-        "system": System.from_json(header["system"]),
-        "method": header["method"],
-        "rearm": header["rearm"],
-        "tolerance": float(header["tolerance"]),
-        "provenance": json.loads(header["provenance"]),
-        "signal": arrays["signal"],
-        "background": arrays["background"],
-        "phases": arrays["phase_phase"].size,
-        "enough": arrays["enough"],
-        "nbytes": path.stat().st_size,
-        "shape_bytes": arrays["shape"].nbytes,
-        "laws": arrays["law_row"].size,
-        "law_bytes": arrays["law_pmf"].nbytes,
-    }
-
-
 def _header(table: Nodes) -> dict[str, Any]:
     made_for = table.system.replace(cycles=table.entries.cycles)
     return {

@@ -65,13 +65,13 @@ class Variable:
     name: str
     dims: tuple[str, ...]
     data: Any  # an array, or `Waveforms`, which are read by `bands`
-    units: str
+    units: str  # empty of texts
     long_name: str
 
     @property
     def labels(self) -> dict[str, str]:
         """Attributes of the variable."""
-        return {"long_name": self.long_name, "units": self.units}
+        return {"long_name": self.long_name} | ({"units": self.units} if self.units else {})
 
     def bands(self) -> Iterator[slice]:
         """Parts along the first axis that fit in memory."""

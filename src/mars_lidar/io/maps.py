@@ -70,10 +70,14 @@ def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "",
     variables, attrs = _contents(results, source)
     with beside(target) as unfinished:
         if target.suffix == ".zarr":
+            import zarr
+
             shutil.rmtree(unfinished, ignore_errors=True)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "The data type")  # of the methods' names: fixed-length text
-                zarr_store.consolidated(zarr_store.new_store(unfinished, {}, variables))
+                group = zarr.create_group(unfinished, zarr_format=3)
+                zarr_store.add(group, variables)
+                zarr_store.consolidated(group)
                 manifest.seal(unfinished, attrs)
             if target.exists():
                 (target / "zarr.json").unlink(missing_ok=True)

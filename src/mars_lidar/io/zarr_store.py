@@ -45,12 +45,15 @@ def open_writer(path: Path, recipe: Recipe | Recording, group: Any = None) -> It
 
 
 def _create(path: Path, recipe: Recipe | Recording) -> Any:
+    import zarr
+
     if path.exists():
         # without its root document the old store is no store: a removal cut short cannot pass for a cube
         (path / "zarr.json").unlink(missing_ok=True)
         shutil.rmtree(path)
     attrs = {"complete": False, **layout.attributes(recipe)}
-    group = new_store(path, attrs, layout.variables(recipe))
+    group = zarr.create_group(path, zarr_format=3, attributes=attrs)
+    add(group, layout.variables(recipe))
     group.create_array(
         "histogram",
         shape=recipe.shape,
@@ -121,24 +124,23 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     return OpenedStore(attrs, names, lambda name: whole(group[name]), histogram, progress, rows_of=group.__getitem__)
 
 
-def new_store(path: Path, attrs: dict[str, Any], variables: Iterable[layout.Variable]) -> Any:
-    """A new group with these attributes and variables."""
-    import zarr
+def add(group: Any, variables: Iterable[layout.Variable]) -> None:
+    """Create and write variables: numbers, or objects that are texts."""
+    from zarr.codecs import Crc32cCodec, ZstdCodec
 
-    group = zarr.create_group(path, zarr_format=3, attributes=attrs)
     for v in variables:
+        text = v.data.dtype == object
         array = group.create_array(
             v.name,
             shape=v.data.shape,
-            dtype=v.data.dtype,
+            dtype=str if text else v.data.dtype,
             chunks=_map_chunks(v.data),
-            compressors=blosc(v.data.dtype, "zstd", 1, "shuffle"),
+            compressors=(ZstdCodec(level=1), Crc32cCodec()) if text else blosc(v.data.dtype, "zstd", 1, "shuffle"),
             dimension_names=v.dims,
             attributes={**v.labels},
         )
         for rows in v.bands():
             array[rows] = v.data[rows]
-    return group
 
 
 def consolidated(group: Any) -> Any:

@@ -31,9 +31,10 @@ from mars_lidar.dataset.arrays import create_maps
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
 from mars_lidar.instrument.system import System
 from mars_lidar.io.layout import Variable
-from mars_lidar.io.store import OnDisk, Rows
+from mars_lidar.io.store import OnDisk
 from mars_lidar.io.zarr_store import add, blosc
 from mars_lidar.light.fog import Fog
+from mars_lidar.light.rate_parts import Rows
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import MOST, LayeredScene
 from mars_lidar.scene.scene import Scene

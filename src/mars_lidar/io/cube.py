@@ -28,8 +28,8 @@ from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.remote import Elsewhere, open_url, url_of
-from mars_lidar.io.store import CountArray, OnDisk, OpenedStore, Writer
+from mars_lidar.io.remote import open_url, url_of
+from mars_lidar.io.store import CountArray, OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 
 _MODULES = {
@@ -241,20 +241,18 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
 
 
 def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str = "") -> Cube:
-    lazy: type[OnDisk] = Elsewhere if url else OnDisk
     try:
         complete = store.complete and not source.name.endswith(INCOMPLETE_SUFFIX)
         if not (complete or allow_incomplete):
             told = f" ({store.progress})" if store.progress else ""
             raise IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{told}")
-        if store.histogram is None:
+        histogram = store.arrays.get("histogram")
+        if histogram is None:
             raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped at the very start")
-        rows_of = store.rows_of
-        rows = None if rows_of is None else lambda name: lazy(rows_of(name), source)
-        recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]), rows)
+        recipe = layout.recipe_from(store.attrs, store.arrays, int(histogram.shape[0]))
         total = store.attrs.get("registrations")
         return Cube(
-            histogram=lazy(store.histogram, source),
+            histogram=histogram,
             recipe=recipe,
             complete=complete,
             registrations=None if total is None else int(total),

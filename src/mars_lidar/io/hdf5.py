@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import beside, whole
+from mars_lidar._base.files import beside
 from mars_lidar._base.hdf5 import ForgivingFile, check_heaps, require, seal, with_checksums
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.store import OpenedStore, Writer
+from mars_lidar.io.store import OnDisk, OpenedStore, Writer
 
 # 1 MiB is HDF5's default chunk cache. gzip at level 1 with byte shuffle, on the room of zarr_store.py (write,
 # read, size): 0.32 s, 0.15 s, 5.2 MB; level 4 0.72 s, 0.21 s, 4.5 MB; lzf 0.26 s, 0.16 s, 8.7 MB, and MATLAB
@@ -96,11 +96,4 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     except BaseException:
         file.close()
         raise
-    return OpenedStore(
-        attrs,
-        frozenset(file),
-        lambda name: whole(file[name]),
-        file.get("histogram"),
-        close=file.close,
-        rows_of=file.__getitem__,
-    )
+    return OpenedStore(attrs, {name: OnDisk(array, path) for name, array in file.items()}, close=file.close)

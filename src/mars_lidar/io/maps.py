@@ -28,6 +28,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.io import hdf5, npz, zarr_store
 from mars_lidar.io.cube import format_of
 from mars_lidar.io.layout import Variable
+from mars_lidar.io.store import values
 
 FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")
@@ -103,7 +104,7 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
     with reading(source, "maps of mars-lidar"):
         _check_suffix("path", source)
         with contextlib.closing(format_of(source, "path").open_store(source, _check_format)) as store:
-            found = {name: store.read(name) for name in store.names}
+            found = {name: values(array) for name, array in store.arrays.items()}
         if found.get("method", np.empty(0)).dtype.kind == "S":
             found["method"] = found["method"].astype(str)
         _check(found, store.attrs)

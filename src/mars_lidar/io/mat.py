@@ -36,7 +36,7 @@ from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
-from mars_lidar.io.store import LazyCounts, OpenedStore, Writer
+from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 
 UPSAMPLING = 8  # bin_hr over bin: 512 x 512 and 64 x 64 in the files that the networks were trained on
@@ -188,10 +188,9 @@ def open_store(path: Path) -> OpenedStore:
     layout.check_format(path, attrs)
     shapes: Mapping[str, list[int]] = attrs.pop("shapes")
 
-    def read(name: str) -> NDArray[Any]:
-        return np.ascontiguousarray(np.asarray(ours[name]).reshape(shapes[name]))  # sums keep their bits
-
-    recipe = layout.recipe_from(attrs, frozenset(shapes), read, 1)
+    # contiguous, so that sums keep their bits
+    arrays = {name: np.ascontiguousarray(np.asarray(ours[name]).reshape(shape)) for name, shape in shapes.items()}
+    recipe = layout.recipe_from(attrs, arrays, 1)
     _, height, width, bins = recipe.shape
     spad = found["spad"]
     if spad.shape != (height * width, bins):
@@ -202,7 +201,7 @@ def open_store(path: Path) -> OpenedStore:
         dense = spad.astype(recipe.dtype).toarray(order="C")
         return np.ascontiguousarray(dense.reshape(width, height, bins).transpose(1, 0, 2))[None]
 
-    return OpenedStore(attrs, frozenset(shapes), read, LazyCounts(recipe.shape, recipe.dtype, counts))
+    return OpenedStore(attrs, arrays | {"histogram": OnDisk(LazyCounts(recipe.shape, recipe.dtype, counts), path)})
 
 
 def read_variables(path: Path) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from mars_lidar._base.files import beside, npy_header, open_npz
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe, Recording
-from mars_lidar.io.store import LazyCounts, OpenedStore, Writer
+from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
 
 _LEVEL = 1  # zlib; on the room of zarr_store.py 0.6 s and 6.6 MB, level 6 takes 3.9 s for 5.0 MB
 
@@ -71,18 +71,14 @@ def add_attributes(to: zipfile.ZipFile, attrs: Mapping[str, Any]) -> None:
 
 
 def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedStore:
-    """Open an archive for reading."""
+    """Open an archive for reading; all but the counts are read at once."""
     with open_npz(path, beside="histogram") as found:
-        names = frozenset(found.files)
-        attrs = json.loads(found["attributes"].item()) if "attributes" in names else {}
-    check(path, attrs)
-
-    def read(name: str) -> NDArray[Any]:
-        with open_npz(path, beside="histogram") as found:
-            return np.asarray(found[name])
-
-    counts = _counts(path) if "histogram" in names else None
-    return OpenedStore(attrs, names - {"attributes"}, read, counts)
+        attrs = json.loads(found["attributes"].item()) if "attributes" in found.files else {}
+        check(path, attrs)
+        arrays: dict[str, Any] = {name: found[name] for name in found.files if name not in ("attributes", "histogram")}
+        if "histogram" in found.files:
+            arrays["histogram"] = OnDisk(_counts(path), path)
+    return OpenedStore(attrs, arrays)
 
 
 def _counts(path: Path) -> LazyCounts:

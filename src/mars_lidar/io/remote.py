@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.files import FileError
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.optional import MissingLibraryError, needed
 from mars_lidar.io import layout
 from mars_lidar.io.store import OnDisk, OpenedStore
@@ -39,6 +37,10 @@ class Elsewhere(OnDisk):
     def _naming(self) -> contextlib.AbstractContextManager[Any]:
         return _naming(str(self._path))
 
+    def whole(self) -> NDArray[Any]:
+        """All values, if there is memory for them."""
+        return np.asarray(self)
+
 
 def open_url(url: str) -> OpenedStore:
     """Open a store for reading; its documents and coordinates are compared with its manifest, and its names if listed.
@@ -58,15 +60,7 @@ def open_url(url: str) -> OpenedStore:
         if attrs.get("complete") is True:
             _require(url, system, root)
         group: Any = zarr.open_group(FsspecStore.from_url(url, read_only=True), mode="r")
-        names = frozenset(group.array_keys())
-        histogram = group["histogram"] if "histogram" in names else None
-
-    def read(name: str) -> NDArray[Any]:
-        array = group[name]
-        check_memory(math.prod(array.shape) * array.dtype.itemsize, f"{name} of {url}", "read it on a larger machine")
-        return np.asarray(Elsewhere(array, Path(url))[...])
-
-    return OpenedStore(attrs, names, read, histogram, rows_of=group.__getitem__)
+        return OpenedStore(attrs, {name: Elsewhere(array, Path(url)) for name, array in group.arrays()})
 
 
 def _require(url: str, system: Any, root: str) -> None:

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import reading
+from mars_lidar._base.files import reading, whole
 from mars_lidar._base.memory import check_memory
 
 
@@ -59,16 +59,6 @@ class LazyCounts:
         return self.shape[0]
 
 
-class Rows:
-    """An array of a file whose rows are read when it is sliced."""
-
-    def __init__(self, shape: tuple[int, ...], read: Callable[[slice], NDArray[Any]]) -> None:
-        self.shape, self._read = shape, read
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        return self._read(rows)
-
-
 class OnDisk:
     """An array of a file, of h5py, Zarr or our own: what goes wrong when it is read names the file."""
 
@@ -95,6 +85,11 @@ class OnDisk:
     def __len__(self) -> int:
         return int(self._array.shape[0])
 
+    def whole(self) -> NDArray[Any]:
+        """All values, if they are no more than a file of this size can hold."""
+        found: NDArray[Any] = self._read(lambda: whole(self._array))
+        return found
+
     def _read(self, read: Callable[[], Any]) -> Any:
         try:
             return read()
@@ -108,17 +103,19 @@ class OnDisk:
         return reading(self._path, "an array")
 
 
+def values(array: Any) -> NDArray[Any]:
+    """A variable of an `OpenedStore`, in memory."""
+    return array.whole() if isinstance(array, OnDisk) else np.asarray(array)
+
+
 @dataclass(frozen=True, eq=False)
 class OpenedStore:
     """A file as its format module reads it."""
 
     attrs: Mapping[str, Any]
-    names: frozenset[str]
-    read: Callable[[str], NDArray[Any]]
-    histogram: CountArray | None = None  # None where its writing stopped before, or of a file of maps
+    arrays: Mapping[str, Any]  # variables by name; on disk until they are indexed, where the format allows it
     progress: str = ""  # how far an incomplete file got, for people; empty where that is not known
     close: Callable[[], None] = lambda: None
-    rows_of: Callable[[str], Any] | None = None  # a variable that is read when it is sliced
 
     @property
     def complete(self) -> bool:

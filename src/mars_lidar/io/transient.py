@@ -12,7 +12,7 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_data, open_npz, read_mat5, read_npy, reading, whole
 from mars_lidar._base.hdf5 import open_hdf5
 from mars_lidar.io.capture import capture_in
-from mars_lidar.io.store import Rows
+from mars_lidar.light.rate_parts import Rows
 from mars_lidar.light.transient import Transient
 
 SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")

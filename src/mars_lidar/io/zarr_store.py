@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from mars_lidar._base import manifest
-from mars_lidar._base.files import telling, whole
+from mars_lidar._base.files import telling
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.store import OpenedStore, Writer
+from mars_lidar.io.store import OnDisk, OpenedStore, Writer
 
 _CHUNK_BYTES = 4 * 2**20
 
@@ -116,12 +116,11 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     if attrs.get("complete", True) is True:
         manifest.require(path)
     group: Any = zarr.open_group(path, mode="r")
-    names = frozenset(group.array_keys())
-    histogram: Any = group["histogram"] if "histogram" in names else None
+    arrays = {name: OnDisk(array, path) for name, array in group.arrays()}
     progress = ""
-    if attrs.get("complete") is False and histogram is not None:
+    if attrs.get("complete") is False and (histogram := arrays.get("histogram")) is not None:
         progress = f"at least {histogram.nchunks_initialized} of {histogram.nchunks} chunks are written"
-    return OpenedStore(attrs, names, lambda name: whole(group[name]), histogram, progress, rows_of=group.__getitem__)
+    return OpenedStore(attrs, arrays, progress)
 
 
 def add(group: Any, variables: Iterable[layout.Variable]) -> None:

@@ -21,7 +21,7 @@ from mars_lidar._base.memory import check_memory
 from mars_lidar._base.optional import needed
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import LazyCounts, OpenedStore, Writer
+from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
 from mars_lidar.io.streams import ptu_header
 
 KIND = "cube"
@@ -86,7 +86,7 @@ def open_store(path: Path) -> OpenedStore:
             f"ptufile.imread any image"
         )
     layout.check_format(path, attrs)
-    recipe = layout.recipe_from(attrs, frozenset(arrays), arrays.__getitem__, told)
+    recipe = layout.recipe_from(attrs, arrays, told)
     shape = recipe.shape
 
     def counts() -> NDArray[Any]:
@@ -99,7 +99,7 @@ def open_store(path: Path) -> OpenedStore:
             raise ValueError(f"{path} is damaged: its records make an image of {made}")
         return np.ascontiguousarray(image[:, :, :, 0])
 
-    return OpenedStore(attrs, frozenset(arrays), arrays.__getitem__, LazyCounts(shape, recipe.dtype, counts))
+    return OpenedStore(attrs, arrays | {"histogram": OnDisk(LazyCounts(shape, recipe.dtype, counts), path)})
 
 
 def _pixel_periods(recipe: Recipe) -> int:

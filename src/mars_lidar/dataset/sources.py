@@ -253,5 +253,4 @@ def _at_level(unit: Flux, signal: float, ambient: float, dark: float) -> Flux:
     background = ambient * unit.background + dark
     if unit.waveform is not None:
         return Flux(waveform=signal * unit.waveform, background=background)
-    returns = zip(unit.returns_signal, unit.returns_delay_ns, strict=True)
-    return Flux.multi(*(Flux(signal * one, background if k == 0 else 0.0, tau) for k, (one, tau) in enumerate(returns)))
+    return Flux(signal * unit.returns_signal, background, unit.returns_delay_ns)

@@ -177,9 +177,7 @@ def recipe_from(attrs: Mapping[str, Any], arrays: Mapping[str, Any], realization
         else:
             flux = Flux(waveform=read("waveform"), background=background, info=info)
     elif "returns_signal" in arrays:
-        returns = zip(read("returns_signal"), read("returns_delay"), strict=True)
-        zero = np.zeros_like(background)
-        flux = Flux.multi(*[Flux(s, zero if k else background, tau) for k, (s, tau) in enumerate(returns)], info=info)
+        flux = Flux(read("returns_signal"), background, read("returns_delay"), info=info)
     else:
         flux = Flux(read("signal"), background, read("delay"), info=info)
     recipe = Recipe(

@@ -185,7 +185,8 @@ class Scene:
             An argument of the wrong kind or out of range; no valid pixel; a level or ratio that cannot be
             reached because reflectivity or ambient light is zero at every valid pixel.
         """
-        return scene_flux((self,), system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+        maps = self.depth_m[None], self.reflectivity[None], self.background
+        return scene_flux(*maps, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
 
     @staticmethod
     def example_names() -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import of_part, shown
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
 from mars_lidar.engines.options import given
@@ -282,13 +282,7 @@ def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["c
 
 def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
     """A callback for one block that tells `progress` how far the whole cube is, in pixel exposures."""
-    if progress is None:
-        return None
     count, height, width, _ = recipe.shape
     before = images.start * height * width + rows.start * width
     size = (images.stop - images.start) * (rows.stop - rows.start) * width
-
-    def shifted(done: int, total: int) -> None:
-        progress(before + size * done // max(total, 1), count * height * width)
-
-    return shifted
+    return of_part(progress, before, before + size, count * height * width)

@@ -9,7 +9,7 @@ import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import of_part, shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
@@ -17,7 +17,7 @@ from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.gate import require_mode
 from mars_lidar.table.axes import MAX_POINTS, Grid, axis_values, describe, inserted, midpoints, thinned
-from mars_lidar.table.entries import Entries, progress_of_part
+from mars_lidar.table.entries import Entries
 from mars_lidar.table.error import (
     QuantisationError,
     deviations,
@@ -107,7 +107,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
         np.repeat(signal, background.size),
         np.tile(background, signal.size),
         system,
-        progress_of_part(progress, 0, cells, total),
+        of_part(progress, 0, cells, total),
     )
     phases, laws = StartPhases.none(), NodeLaws.none()
     if recipe.method == "exposure":
@@ -118,7 +118,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
             entries.cumulants,
             entries.bins,
             threads=recipe.threads,
-            progress=progress_of_part(progress, cells, settled, total),
+            progress=of_part(progress, cells, settled, total),
         )
         laws = node_laws(
             system,
@@ -126,7 +126,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
             background,
             entries,
             threads=recipe.threads,
-            progress=progress_of_part(progress, settled, total, total),
+            progress=of_part(progress, settled, total, total),
         )
     if progress is not None:
         progress(total, total)

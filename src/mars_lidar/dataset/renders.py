@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from mars_lidar.dataset.sample_content import Rendered
-from mars_lidar.io.transient import SUFFIXES, read_transient
-from mars_lidar.io.transient_truth import read_truth
+from mars_lidar.io.transient import SUFFIXES, read_transient, read_truth
 
 _OPTIONS = ("bin_ns", "start_ns", "name", "channel")
 

@@ -12,13 +12,11 @@ import itertools
 import threading
 import uuid
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mars_lidar._base.optional import needed
-
-if TYPE_CHECKING:
-    from mars_lidar.dataset.store import Dataset, Item
-    from mars_lidar.dataset.write import Made, Maker
+from mars_lidar.dataset.store import Dataset, Item, open_dataset
+from mars_lidar.dataset.write import Made, Maker
 
 _LIBRARY = "distributed", "making parts by workers", "cluster"
 _AHEAD = 3  # parts given out per worker thread: none waits for the scheduler, and a million are not queued at once
@@ -61,9 +59,6 @@ def make_part(path: str, run: str, item: Item, threads: int) -> Made:
     """Make one part; runs on a worker."""
     maker: Maker | None = getattr(_local, "maker", None)
     if maker is None or _local.run != run:
-        from mars_lidar.dataset.store import open_dataset
-        from mars_lidar.dataset.write import Maker
-
         maker = Maker(open_dataset(path, allow_incomplete=True), threads)
         _local.maker, _local.run = maker, run
     return maker.make(item)

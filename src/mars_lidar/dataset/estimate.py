@@ -23,6 +23,7 @@ from mars_lidar.dataset.shard import packer
 from mars_lidar.dataset.sources import Candidate, candidates, scenes
 from mars_lidar.io.advice import Advice, advice
 from mars_lidar.io.scan import Problem
+from mars_lidar.simulate import simulate
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -168,8 +169,6 @@ def _probe(
 
     `shard` exposures of a sample are made one after the other.
     """
-    from mars_lidar.simulate import simulate
-
     random = np.random.default_rng(0)
     every = samples.count_samples(plan, len(looked))
     rows, columns = chunk[2], chunk[3]

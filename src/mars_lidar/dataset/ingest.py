@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar._version import __version__
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import (
     FORMAT,
@@ -58,8 +59,6 @@ def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
 def begin(path: Path, recipe: DatasetRecipe) -> Any:
     """A new store without arrays, marked incomplete; what was there is removed."""
     import zarr
-
-    from mars_lidar._version import __version__
 
     if path.exists():
         (path / "zarr.json").unlink(missing_ok=True)  # from now on it is no store

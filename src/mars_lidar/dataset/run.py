@@ -13,19 +13,21 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.files import Interrupted, WriteError, check_target
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
-
-if TYPE_CHECKING:
-    from mars_lidar.dataset.recipe import DatasetRecipe
-    from mars_lidar.dataset.store import Dataset, Item
-    from mars_lidar.dataset.write import Made
-    from mars_lidar.io.scan import Problem
+from mars_lidar._version import __version__
+from mars_lidar.dataset import cluster
+from mars_lidar.dataset.ingest import create
+from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.store import Dataset, Item, open_dataset
+from mars_lidar.dataset.write import Made, Maker
+from mars_lidar.io.scan import Problem
 
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
 
@@ -107,11 +109,6 @@ def generate(
     mars_lidar.io.WriteError, mars_lidar.io.Interrupted
         Stopped half way (a full disk, Ctrl-C); the text says how to go on.
     """
-    from mars_lidar._base.files import check_target
-    from mars_lidar.dataset.ingest import create
-    from mars_lidar.dataset.store import open_dataset
-    from mars_lidar.io import Interrupted, WriteError
-
     began = time.perf_counter()
     progress = shown(progress, "generating")
     target = Path(out)
@@ -128,8 +125,6 @@ def generate(
     wanted, folder = read_recipe(recipe)
     check_target(target, folder=True, overwrite=overwrite or resume)
     if workers is not None or scheduler is not None:
-        from mars_lidar.dataset import cluster
-
         cluster.reach(scheduler)  # before the scenes are read
     with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
         there = target.exists() and resume
@@ -173,8 +168,6 @@ def generate(
 
 def read_recipe(recipe: DatasetRecipe | dict[str, Any] | str | Path | None) -> tuple[DatasetRecipe | None, Path]:
     """The recipe in any of its forms, and the folder that its paths are relative to."""
-    from mars_lidar.dataset.recipe import DatasetRecipe
-
     if recipe is None or isinstance(recipe, DatasetRecipe):
         return recipe, Path()
     if isinstance(recipe, dict):
@@ -203,8 +196,6 @@ def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None
     Simulator and compressors run without Python's lock. Where so many chunks would not fit in `BUFFER_BYTES`, fewer
     parts are made at a time, each on several threads.
     """
-    from mars_lidar.dataset.write import Maker
-
     team = thread_count(threads or None)
     array = dataset.histogram
     parts = dataset.scenes.waveform_parts(dataset.recipe.systems)
@@ -236,8 +227,6 @@ def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> in
 
 
 def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) -> None:
-    from mars_lidar._version import __version__
-
     if dataset.attrs.get("version") != __version__:
         raise ValueError(
             f"{target} was begun by mars-lidar {dataset.attrs.get('version')} and this is {__version__}: "
@@ -256,8 +245,6 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
 
 def _left(target: Path) -> str:
     """What is on the disk, for the text of an error."""
-    from mars_lidar.dataset.store import Dataset
-
     free = shutil.disk_usage(target.parent).free
     try:
         dataset = Dataset(target)

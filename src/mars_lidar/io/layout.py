@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import OnDisk, values
@@ -126,8 +127,6 @@ def variables(recipe: Recipe | Recording) -> list[Variable]:
 
 def attributes(recipe: Recipe | Recording) -> dict[str, str | int]:
     """Attributes of the file as plain strings and integers; ``complete`` is the writer's own."""
-    from mars_lidar._version import __version__
-
     both: dict[str, str | int] = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,

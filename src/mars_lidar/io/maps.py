@@ -24,6 +24,7 @@ from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import beside, check_target, reading
 from mars_lidar._base.hdf5 import ForgivingFile, seal
+from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.io import hdf5, npz, zarr_store
 from mars_lidar.io.cube import format_of
@@ -142,8 +143,6 @@ def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
 
 
 def _contents(results: Mapping[str, Any], source: str) -> tuple[list[Variable], dict[str, Any]]:
-    from mars_lidar._version import __version__
-
     first = next(iter(results.values()))
     shape: tuple[int, ...] = first.depth_m.shape
     if len(shape) != 3:

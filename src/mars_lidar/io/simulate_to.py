@@ -7,7 +7,7 @@ import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Unpack
+from typing import Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,14 +18,14 @@ from mars_lidar._base.progress import of_part, shown
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
 from mars_lidar.engines.options import given
+from mars_lidar.engines.table_reader import table_record
 from mars_lidar.instrument.system import System
 from mars_lidar.io import zarr_store
 from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
 from mars_lidar.light.flux import Flux
-
-if TYPE_CHECKING:
-    from mars_lidar.table import Table
+from mars_lidar.simulate import simulate
+from mars_lidar.table import Table, cache
 
 
 @dataclass(frozen=True)
@@ -220,8 +220,6 @@ def verify(
 
 def _simulate(recipe: Recipe, images: slice, rows: slice, **how: Any) -> NDArray[Any]:
     """A part of a cube; `how` are further arguments of `mars_lidar.simulate`."""
-    from mars_lidar import simulate
-
     counts: Any = simulate(**recipe.part(images, rows), **how)
     here: NDArray[Any] = counts.get() if how.get("device") == "cuda" else counts
     return here
@@ -250,9 +248,6 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
 
 def _from_cache(system: System, record: dict[str, Any]) -> Table | None:
     """The table of that record, where the user's cache has it."""
-    from mars_lidar.engines.table_reader import table_record
-    from mars_lidar.table import Table, cache
-
     for path in cache.files():
         with contextlib.suppress(OSError, ValueError):
             table = Table.load(path, system)

@@ -17,6 +17,7 @@ from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions
 from mars_lidar.cli.scene_view import seen
 from mars_lidar.cli.system_options import SystemOptions
+from mars_lidar.engines import ENGINES
 
 COMPARE_EPILOG = examples(
     "mars-lidar compare --scene room --size 64 -o compare.png",
@@ -60,8 +61,6 @@ def compare(
     signal window and the covariance of neighbouring bins: what count x shape models get wrong.
     """
     with reported():
-        from mars_lidar.engines import ENGINES
-
         began = time.perf_counter()
         check_picture(out, overwrite)
         check_new(numbers, overwrite)

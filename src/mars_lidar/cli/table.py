@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
@@ -15,9 +15,8 @@ from mars_lidar.cli.groups import argument, grouped, option, panel
 from mars_lidar.cli.options import THREADS, of_output
 from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.system_options import SystemOptions
-
-if TYPE_CHECKING:
-    from mars_lidar.table import Table
+from mars_lidar.table import Table, cache
+from mars_lidar.table.error import QuantisationError
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Lookup tables over (S, B).")
 
@@ -56,8 +55,6 @@ def build(
         refuse_existing(out, overwrite)
         system = instrument.build(effects)
         axes = _grid("--signal", signal), _grid("--background", background)
-        from mars_lidar.table import Table, cache
-
         chosen: dict[str, Any] = {
             "method": method,
             "rearm": rearm,
@@ -84,8 +81,6 @@ def info(
         if file is not None:
             table(_rows(file))
             return
-        from mars_lidar.table import cache
-
         found = cache.files()
         total = sum(path.stat().st_size for path in found)
         rows = [("cache", f"{cache.directory()}: {len(found)} files, {total / 1e6:,.4g} MB")]
@@ -99,8 +94,6 @@ def clear(
 ) -> None:
     """Remove the tables in the cache."""
     with reported():
-        from mars_lidar.table import cache
-
         found = cache.files()
         if not found:
             print(f"{cache.directory()} holds no tables")
@@ -123,8 +116,6 @@ def _grid(name: str, text: str) -> tuple[float, float, int]:
 
 
 def _rows(path: Path) -> dict[str, str]:
-    from mars_lidar.table import Table
-
     found = Table.load(path)
     system, told, made = found.system, found.provenance, found.provenance["error"]
     size, shapes, enough = path.stat().st_size, found.entries.shape.nbytes, found.entries.enough
@@ -176,8 +167,6 @@ def _any_error(longest: dict[str, Any] | None, unsettled: int) -> str:
     grows = "that of the mean grows as the root of the number of cycles (in standard deviations)"
     if longest is None:
         return f"{grows}; at long exposures it was not measured when this table was built"
-    from mars_lidar.table.error import QuantisationError
-
     error = QuantisationError(**longest)
     within = error.cycles_within(_ALLOWED)
     mean, variance = max(error.mean_max, error.delayed_mean_max), max(error.variance_max, error.delayed_variance_max)
@@ -198,8 +187,6 @@ def _laws(found: Table) -> str:
 
 
 def _line(path: Path) -> str:
-    from mars_lidar.table import Table
-
     try:
         found = Table.load(path)
     except (OSError, ValueError, KeyError) as error:

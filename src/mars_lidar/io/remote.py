@@ -69,14 +69,16 @@ def _require(url: str, system: Any, root: str) -> None:
         lines = system.cat_file(f"{root}/{manifest.NAME}").decode()
     except FileNotFoundError:
         return  # of an earlier version
-    told = manifest.lines_of(lines)
-    wrong = list(manifest.changed(told, lambda n: hashlib.sha256(system.cat_file(f"{root}/{n}")).hexdigest()))
     try:
         there = {str(name).rpartition(f"{root}/")[2] for name in system.find(root)}
     except Exception:  # what cannot be listed (most web servers)
         there = set()
-    if manifest.NAME in there:
-        wrong += [f"{name} is missing" for name in sorted(set(told) - there)]
+    listed = there if manifest.NAME in there else None
+
+    def digest(name: str) -> str:
+        return hashlib.sha256(system.cat_file(f"{root}/{name}")).hexdigest()
+
+    wrong = list(manifest.compared(manifest.lines_of(lines), listed, digest))
     if wrong:
         raise ValueError(f"is damaged: {', '.join(wrong[:3])}")
 

@@ -19,21 +19,15 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import reading, whole
 from mars_lidar._base.memory import check_memory
+from mars_lidar.light.rate_parts import RateArray
 
 
-class CountArray(Protocol):
-    """Counts in memory or on disk: `shape`, `dtype`, and indexing that reads only what is asked for."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(realizations, H, W, bins)."""
+class CountArray(RateArray, Protocol):
+    """Counts (realizations, H, W, bins) in memory or on disk; indexing reads only what is asked for."""
 
     @property
     def dtype(self) -> Any:
         """uint16 or uint32."""
-
-    def __getitem__(self, key: Any) -> Any:
-        """The selected counts, in memory."""
 
 
 class LazyCounts:

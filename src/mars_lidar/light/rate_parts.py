@@ -13,11 +13,11 @@ from mars_lidar._base.resample import area_mean
 
 
 class RateArray(Protocol):
-    """Rates (H, W, T) in memory or on disk: `shape`, and rows by ``values[first:last]``."""
+    """An array in memory or on disk, such as rates (H, W, T): `shape`, and rows by ``values[first:last]``."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(H, W, T)."""
+        """Length of each axis."""
 
     def __getitem__(self, key: Any) -> Any:
         """The selected rows, in memory."""

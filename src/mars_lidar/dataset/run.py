@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -10,7 +11,8 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import __version__
 from mars_lidar.dataset import cluster
+from mars_lidar.dataset.cluster import Team
 from mars_lidar.dataset.ingest import create
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
@@ -147,10 +150,11 @@ def generate(
                     damaged.unlink(missing_ok=True)
             before = sum(1 for _ in dataset.items()) - len(todo)
             totals = _Totals(before, before + len(todo), progress)
-            if workers is not None or scheduler is not None:
-                cluster.make_all(dataset, todo, totals.add, workers, threads or 1, scheduler)
-            else:
-                _make_all(dataset, todo, totals.add, threads)
+            if todo:
+                team = _here(dataset, len(todo), threads)
+                if workers is not None or scheduler is not None:
+                    team = cluster.team(dataset, workers, threads or 1, scheduler)
+                _make_all(team, todo, totals.add)
             if not dataset.complete:
                 dataset.tidy()  # of workers that were killed while others went on
                 dataset.finish()
@@ -190,35 +194,44 @@ class _Totals:
             self._progress(self._done, self._total)
 
 
-def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None], threads: int | None) -> None:
-    """Make parts on threads, each of which simulates, packs and writes parts of its own.
+@contextlib.contextmanager
+def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
+    """Threads, each of which simulates, packs and writes parts of its own.
 
     Simulator and compressors run without Python's lock. Where so many chunks would not fit in `BUFFER_BYTES`, fewer
     parts are made at a time, each on several threads.
     """
     team = thread_count(threads or None)
     array = dataset.histogram
-    parts = dataset.scenes.waveform_parts(dataset.recipe.systems)
-    chunk = making_bytes(array.chunks, array.dtype.itemsize, parts)
-    teams = max(1, min(team, len(todo), BUFFER_BYTES // chunk))
-    stop = threading.Event()
-    idle = [Maker(dataset, max(1, team // teams), stop) for _ in range(teams)]
-    waiting: Iterator[Item] = iter(todo)
+    waveforms = dataset.scenes.waveform_parts(dataset.recipe.systems)
+    chunk = making_bytes(array.chunks, array.dtype.itemsize, waveforms)
+    teams = max(1, min(team, parts, BUFFER_BYTES // chunk))
+    stop, local = threading.Event(), threading.local()
+
+    def make(item: Item) -> Made:
+        if not hasattr(local, "maker"):
+            local.maker = Maker(dataset, max(1, team // teams), stop)
+        made: Made = local.maker.make(item)
+        return made
+
     with ThreadPoolExecutor(teams) as pool:
-        running: dict[Future[Made], Maker] = {}
         try:
-            while True:
-                while idle and (item := next(waiting, None)) is not None:
-                    maker = idle.pop()
-                    running[pool.submit(maker.make, item)] = maker
-                if not running:
-                    return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    idle.append(running.pop(future))
-                    add(future.result())
+            yield pool, make, teams
         except BaseException:
             stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
+
+
+def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:
+    """Make parts, a few of them at a time."""
+    waiting = iter(todo)
+    with team as (executor, make, ahead):
+        running = {executor.submit(make, item) for item in itertools.islice(waiting, ahead)}
+        while running:
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                add(future.result())
+                running |= {executor.submit(make, item) for item in itertools.islice(waiting, 1)}
 
 
 def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> int:

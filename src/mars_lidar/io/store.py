@@ -10,7 +10,7 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -37,20 +37,10 @@ class LazyCounts:
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: Any, read: Callable[[], NDArray[Any]]) -> None:
-        self.shape, self.dtype, self._read = shape, dtype, read
-
-    @cached_property
-    def _counts(self) -> NDArray[Any]:
-        return self._read()
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return np.array(self._counts, dtype) if copy else np.asarray(self._counts, dtype)
+        self.shape, self.dtype, self._read = shape, dtype, cache(read)
 
     def __getitem__(self, key: Any) -> Any:
-        return self._counts[key]
-
-    def __len__(self) -> int:
-        return self.shape[0]
+        return self._read()[key]
 
 
 class OnDisk:
@@ -73,7 +63,7 @@ class OnDisk:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         size = math.prod(self._array.shape) * self._array.dtype.itemsize
         check_memory(size, f"all values of {self._path}", "index it to read a part")
-        found: NDArray[Any] = self._read(lambda: np.asarray(self._array, dtype=dtype))
+        found: NDArray[Any] = self._read(lambda: np.asarray(self._array[...], dtype=dtype))
         return found.copy() if copy else found
 
     def __len__(self) -> int:

@@ -8,9 +8,10 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.threads import thread_count
@@ -24,9 +25,6 @@ from mars_lidar.dataset.sources import Candidate, candidates, scenes
 from mars_lidar.io.advice import Advice, advice
 from mars_lidar.io.scan import Problem
 from mars_lidar.simulate import simulate
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _SCENES, _PROBES = 4, 8
 _BASE_BYTES = 220 * 2**20  # of the interpreter with NumPy, SciPy and Zarr

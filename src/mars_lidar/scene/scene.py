@@ -78,8 +78,7 @@ class Scene:
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W)."""
-        h, w = self.depth_m.shape
-        return h, w
+        return self.depth_m.shape[0], self.depth_m.shape[1]
 
     @property
     def valid(self) -> NDArray[np.bool_]:

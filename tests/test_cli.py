@@ -324,12 +324,12 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
 
 
 def test_a_full_disk_is_exit_code_1(tmp_path, monkeypatch):
-    from mars_lidar.io.zarr_store import ZarrWriter
+    from mars_lidar.io.store import Writer
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(ZarrWriter, "write", full)
+    monkeypatch.setattr(Writer, "write", full)
     done = run("simulate", "--scene", "room", *SMALL, "-o", tmp_path / "a.zarr")
     assert done.exit_code == 1
     left = f"{tmp_path / 'a.zarr'} is left behind, marked incomplete: --resume (resume=True) continues it"

@@ -30,12 +30,13 @@ def test_the_command_prints_draws_and_writes_numbers(tmp_path):
     assert not any("!" in line for line in rows["exact"])
     data = json.loads(numbers.read_text())
     assert list(data["scenes"]) == ["exact", "poisson"]
-    assert data["pixels"]["bright"]["engines"]["poisson"]["mean"]["z"] > 5
-    bright = data["pixels"]["bright"]
-    assert bright["engines"]["exact"]["window_ratio"]["value"] == 1.0
-    for name in ("window_mean", "window_variance"):
-        drawn = bright["engines"]["exact"][name]
-        assert drawn["z"] == pytest.approx((drawn["value"] - bright["predicted"][name]) / drawn["error"], rel=0.2)
+    bright, law = data["statistics"]["bright"], data["laws"]["bright"]
+    assert bright["poisson"]["counts"]["mean"]["z"] > 5
+    assert bright["exact"]["window_ratio"]["value"] == 1.0
+    assert "mean_histogram" not in bright["exact"]
+    for name, predicted in zip(("mean", "variance"), law["window"], strict=True):
+        drawn = bright["exact"]["window"][name]
+        assert drawn["z"] == pytest.approx((drawn["value"] - predicted) / drawn["error"], rel=0.2)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c.json", "c.png"]
     again = CliRunner().invoke(app, arguments)
     assert (again.exit_code, "exists already" in again.stderr) == (2, True)

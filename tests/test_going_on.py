@@ -14,6 +14,7 @@ from mars_lidar.cli import app
 from mars_lidar.dataset import open_dataset
 from mars_lidar.io import recipe as recipes
 from mars_lidar.io import zarr_store
+from mars_lidar.io.store import Writer
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=40, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
@@ -38,7 +39,7 @@ def flux_of(size: int = 12, **light: float) -> ml.Flux:
 @pytest.mark.parametrize("stop_after", [0, 1, 4, 11])
 def test_an_interrupted_cube_goes_on_to_the_same_bits(tmp_path, monkeypatch, in_small_blocks, stop_after):
     flux, made = flux_of(), []
-    write = zarr_store.ZarrWriter.write
+    write = Writer.write
 
     def stopping(self, images, rows, block):
         if len(made) == stop_after:
@@ -46,14 +47,14 @@ def test_an_interrupted_cube_goes_on_to_the_same_bits(tmp_path, monkeypatch, in_
         made.append((images, rows))
         write(self, images, rows, block)
 
-    monkeypatch.setattr(zarr_store.ZarrWriter, "write", stopping)
+    monkeypatch.setattr(Writer, "write", stopping)
     with pytest.raises(io.Interrupted, match=r"--resume \(resume=True\) continues it"):
         io.simulate_to(tmp_path / "a.zarr", flux, SYSTEM, realizations=2, seed=5)
     if stop_after > 1:  # what was written last may be cut short: it is made again
         some = next((tmp_path / "a.zarr" / "histogram" / "c" / str(made[-1][0].start)).rglob("0"))
         some.write_bytes(b"half") if some.is_file() else None
     made.clear()
-    monkeypatch.setattr(zarr_store.ZarrWriter, "write", lambda *a: (made.append(a[1:3]), write(*a))[1])
+    monkeypatch.setattr(Writer, "write", lambda *a: (made.append(a[1:3]), write(*a))[1])
     done = io.simulate_to(tmp_path / "a.zarr", flux, SYSTEM, realizations=2, seed=5, resume=True)
     assert len(made) == 12 - max(0, stop_after - 1)
     expected = ml.simulate(flux, SYSTEM, realizations=2, seed=5)

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 from mars_lidar._version import __version__
 from mars_lidar.calibrate import Calibration, Validation, calibrate, validate
-from mars_lidar.dataset.run import Generated, generate
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.dark_counts import dark_count_map
 from mars_lidar.instrument.effects import Jitter, SampledJitter
@@ -69,20 +68,21 @@ if TYPE_CHECKING:
     from mars_lidar import io as io
     from mars_lidar import learn as learn
     from mars_lidar import plot as plot
+    from mars_lidar.dataset import Generated as Generated
+    from mars_lidar.dataset import generate as generate
     from mars_lidar.io import to_xarray as to_xarray
 else:
+    from importlib import import_module
+
     _LATER = ("io", "learn", "plot")  # with what they import, only where they are used: `ml.io.load`
+    _HOMES = {"Generated": "dataset", "generate": "dataset", "to_xarray": "io"}
 
     def __getattr__(name: str) -> object:
         if name in _LATER:
-            from importlib import import_module
-
             return import_module(f"mars_lidar.{name}")
-        if name == "to_xarray":
-            from mars_lidar.io import to_xarray
-
-            return to_xarray
+        if name in _HOMES:
+            return getattr(import_module(f"mars_lidar.{_HOMES[name]}"), name)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *_LATER})
+        return sorted({*globals(), *_LATER, *_HOMES})

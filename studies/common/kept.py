@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mars_lidar._base.files import TemporarySibling
+from mars_lidar._base.files import beside
 from studies import OtherRunsError, Request, Tell
 
 C = TypeVar("C")
@@ -41,7 +41,7 @@ def kept(path: Path, make: Callable[[], Any], tell: Tell) -> Any:
 
 def _save_whole(path: Path, text: str) -> None:
     """Write a text that is whole or not there, whatever stops the process."""
-    with TemporarySibling(path).writing() as unfinished:
+    with beside(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar import Scene, cramer_rao, reconstruct
-from mars_lidar._base.files import TemporarySibling
+from mars_lidar._base.files import beside
 from mars_lidar._base.optional import needed
 from mars_lidar._base.types import FloatArray
 from studies import Facts, Request
@@ -137,7 +137,7 @@ def train_and_test(one: Run, data: Data, folder: Path) -> dict[str, Any]:
                 optimizers[name].step(told.loss(delay[some].flatten(), light[some].flatten()))
         if (step + 1) % KEPT_EVERY == 0:
             spent = before + time.process_time() - began
-            with TemporarySibling(halfway).writing() as unfinished:
+            with beside(halfway) as unfinished:
                 torch.save((step + 1, spent, networks, optimizers, polynomial, stream.state_dict()), unfinished)
     result: dict[str, Any] = {"run": asdict(one), "device": device.type}
     result["seconds"] = before + time.process_time() - began

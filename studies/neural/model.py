@@ -127,7 +127,7 @@ class NeuralMap:
             "record": self.record,
         }
         weights = {name: value.cpu().numpy() for name, value in self.network.state_dict().items()}
-        with files.TemporarySibling(target).writing() as unfinished, unfinished.open("wb") as file:
+        with files.beside(target) as unfinished, unfinished.open("wb") as file:
             np.savez_compressed(file, header=np.array(json.dumps(header)), **weights)
 
     @classmethod

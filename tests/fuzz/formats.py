@@ -18,7 +18,7 @@ from mars_lidar.io.foreign import foreign_cube
 from mars_lidar.io.maps import load_maps, save_maps
 from mars_lidar.io.recorder import recorded
 from mars_lidar.io.rgbd.layered import read_layers
-from mars_lidar.io.transient_truth import read_truth
+from mars_lidar.io.transient import read_truth
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=50, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)

@@ -140,7 +140,7 @@ def test_matlab_files(transient, tmp_path):
         found = io.read_transient(tmp_path / name)
         assert (found.shape, found.bin_ns, found.start_ns) == ((5, 3), 0.5, 3.0)
         assert np.array_equal(np.asarray(found.values[1:3]), values[1:3])
-        with pytest.raises(ValueError, match=rf"{name}: .*no variable 'light'.*transient"):
+        with pytest.raises(ValueError, match=rf"{name}: .*no array 'light'.*transient"):
             io.read_transient(tmp_path / name, name="light")
 
 

@@ -13,7 +13,7 @@ import os
 import shutil
 import stat
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,38 +48,35 @@ class Interrupted(KeyboardInterrupt):
     """Ctrl-C while a file was written; its text says what is left on disk."""
 
 
-class TemporarySibling:
-    """The file beside the target that is renamed to it when all is written: the rename is atomic."""
+@contextlib.contextmanager
+def telling(left: Callable[[], str]) -> Iterator[None]:
+    """What stops the writing inside tells what is `left` on the disk, which tidies up: `WriteError`, `Interrupted`."""
+    try:
+        yield
+    except OSError as error:
+        raise WriteError(error.errno, f"{reason(error)}; {left()}") from error
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {left()}") from None
+    except BaseException:
+        left()
+        raise
 
-    def __init__(self, target: Path) -> None:
-        self.target = target
-        self.path = target.with_name(target.name + INCOMPLETE_SUFFIX)
 
-    def publish(self) -> None:
-        """Put the finished file in its place."""
-        os.replace(self.path, self.target)
+@contextlib.contextmanager
+def beside(target: Path) -> Iterator[Path]:
+    """The path beside `target` to write a file or folder to: renamed to it at the end, at once, or else removed."""
+    path = target.with_name(target.name + INCOMPLETE_SUFFIX)
 
-    @contextlib.contextmanager
-    def writing(self) -> Iterator[Path]:
-        """The path to write to: published at the end, or removed, and an OSError then tells what is left."""
-        try:
-            yield self.path
-            self.publish()
-        except OSError as error:
-            raise WriteError(error.errno, f"{reason(error)}; {self.discard()}") from error
-        except BaseException:
-            self.discard()
-            raise
-
-    def discard(self) -> str:
-        """Remove the unfinished file, or folder; says so."""
-        if self.path.is_dir():
-            shutil.rmtree(self.path, ignore_errors=True)
+    def removed() -> str:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
         else:
-            self.path.unlink(missing_ok=True)
-        if self.target.exists():
-            return f"{self.target} is what it was before"
-        return f"nothing was left at {self.target}"
+            path.unlink(missing_ok=True)
+        return f"{target} is what it was before" if target.exists() else f"nothing was left at {target}"
+
+    with telling(removed):
+        yield path
+        os.replace(path, target)
 
 
 def reason(error: OSError) -> str:

@@ -44,6 +44,18 @@ class ForgivingFile(io.FileIO):
         self._error: OSError | None = None
         super().__init__(path, "w+")
 
+    @contextlib.contextmanager
+    def hdf5(self) -> Iterator[h5py.File]:
+        """A new HDF5 file in it, closed and checked at the end."""
+        import h5py
+
+        try:
+            with h5py.File(self, "w", libver=LIBVER) as file:
+                yield file
+        finally:
+            self.close()
+        self.check()
+
     def check(self) -> None:
         """Raise the first error there was."""
         if self._error is not None:
@@ -74,20 +86,6 @@ class ForgivingFile(io.FileIO):
             super().close()
         except OSError as error:
             self._error = self._error or error
-
-
-@contextlib.contextmanager
-def new_file(path: Path) -> Iterator[h5py.File]:
-    """A new file, closed and checked at the end: HDF5's own, when a disk is full, ends the process as it is closed."""
-    import h5py
-
-    disk = ForgivingFile(path)
-    try:
-        with h5py.File(disk, "w", libver=LIBVER) as file:
-            yield file
-    finally:
-        disk.close()
-    disk.check()
 
 
 @contextlib.contextmanager

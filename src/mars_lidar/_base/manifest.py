@@ -88,11 +88,7 @@ def damage(store: Path, *, every: bool = True) -> Iterator[str]:
     with reading(path, "lines of sha256sum"):
         check_claim(path, 4 * path.stat().st_size)
         told = lines_of(path.read_text("utf-8"))
-    there = _files(store)
-    yield from (f"{name} is missing" for name in told if name not in there)
-    yield from changed({name: told[name] for name in told if name in there}, lambda name: _hash(store / name), every)
-    documents = {name for name in there if name.rpartition("/")[2] == _ROOT}
-    yield from (f"{name} is not in its {NAME}" for name in sorted(documents - set(told)))
+    yield from compared(told, _files(store), lambda name: _hash(store / name), every)
 
 
 def lines_of(text: str) -> dict[str, str]:
@@ -100,9 +96,16 @@ def lines_of(text: str) -> dict[str, str]:
     return {name: digest for digest, _, name in (line.partition("  ") for line in text.splitlines())}
 
 
-def changed(told: Mapping[str, str], digest: Callable[[str], str], every: bool = False) -> Iterator[str]:
-    """A sentence for each file that is not as `told`; without `every`, only documents and coordinates are read."""
-    names = sorted(name for name in told if every or _SMALL.search(name))
+def compared(
+    told: Mapping[str, str], there: set[str] | None, digest: Callable[[str], str], every: bool = False
+) -> Iterator[str]:
+    """A sentence for each file that is not as `told`, of those that are `there`, None where they cannot be listed."""
+    if there is not None:
+        yield from (f"{name} is missing" for name in told if name not in there)
+        documents = {name for name in there if name.rpartition("/")[2] == _ROOT}
+        yield from (f"{name} is not in its {NAME}" for name in sorted(documents - set(told)))
+    known = set(told) if there is None else there
+    names = sorted(name for name in told if name in known and (every or _SMALL.search(name)))
     with ThreadPoolExecutor(_THREADS) as pool:
         found = list(pool.map(digest, names))
     yield from (f"{name} is not as it was written" for name, now in zip(names, found, strict=True) if told[name] != now)

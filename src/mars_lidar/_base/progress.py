@@ -26,6 +26,20 @@ def shown(progress: Any, label: str) -> Progress | None:
     return told
 
 
+def of_part(progress: Progress | None, first: int, last: int, total: int) -> Progress | None:
+    """The callback for one part of the work, from `first` to `last` of `total`; never backward."""
+    if progress is None:
+        return None
+    reached = first
+
+    def update(done: int, of: int) -> object:
+        nonlocal reached
+        reached = max(reached, first + (last - first) * done // max(of, 1))
+        return progress(reached, total)
+
+    return update
+
+
 class Bar:
     """A callback (done, total) that says on standard error how far a run is, and how long it will still take."""
 

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from mars_lidar._base import checks
-from mars_lidar._base.files import TemporarySibling
+from mars_lidar._base.files import beside
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import check_new, check_picture, progress_bar, reported, save_picture, table, two_integers
 from mars_lidar.cli.effect_options import Effects
@@ -17,6 +17,7 @@ from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions
 from mars_lidar.cli.scene_view import seen
 from mars_lidar.cli.system_options import SystemOptions
+from mars_lidar.engines import ENGINES
 
 COMPARE_EPILOG = examples(
     "mars-lidar compare --scene room --size 64 -o compare.png",
@@ -60,8 +61,6 @@ def compare(
     signal window and the covariance of neighbouring bins: what count x shape models get wrong.
     """
     with reported():
-        from mars_lidar.engines import ENGINES
-
         began = time.perf_counter()
         check_picture(out, overwrite)
         check_new(numbers, overwrite)
@@ -91,7 +90,7 @@ def compare(
             )
         save_picture(comparison(found), out)
         if numbers is not None:
-            with TemporarySibling(numbers).writing() as unfinished:
+            with beside(numbers) as unfinished:
                 told = {"scene": view.source, **as_data(found)}
                 unfinished.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n")
         show(found)

@@ -6,8 +6,11 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mars_lidar.cli.console import grid, screen
 from mars_lidar.compare.sample import SIGNIFICANT, Distance, Estimate, Moments
+from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
     from mars_lidar.compare.comparison import Comparison
 
 _MARK = "!"
+_SMALL = 4  # numbers in an array that is written as such
 
 
 def show(found: Comparison) -> None:
@@ -36,72 +40,23 @@ def show(found: Comparison) -> None:
         console.print(line, style="dim")
 
 
-def as_data(found: Comparison) -> dict[str, Any]:
-    """All numbers as JSON can hold them: NaN is None, infinity 1e308; maps and histograms are left out."""
-    expected = found.expected
-    return {
-        "system": found.system.to_dict(),
-        "shape": list(found.flux.shape),
-        "against": found.against,
-        "seed": found.seed,
-        "threads": found.threads,
-        "significant": SIGNIFICANT,
-        "skipped": found.skipped,
-        "unpredicted": found.unpredicted,
-        "expected": {"step": expected.step, "pixels": int(expected.known.sum()), "seconds": expected.seconds},
-        "scenes": {
-            name: _plain(
-                {
-                    **{f.name: getattr(s, f.name) for f in dataclasses.fields(s) if f.name != "mean_counts"},
-                    "median_s": s.median_s,
-                    "ns_per_registration": s.ns_per_registration,
-                }
-            )
-            for name, s in found.scenes.items()
-        },
-        "pixels": {
-            pixel: {
-                "y": y,
-                "x": x,
-                "signal": float(found.flux.signal[y, x]),
-                "background": float(found.flux.background[y, x]),
-                "predicted": _predicted(found, pixel),
-                "engines": {
-                    name: {"realizations": s.realizations, "lag1": _plain(s.lag1)}
-                    | {key: _plain(value) for key, value in s.scored.items()}
-                    for name, s in found.statistics[pixel].items()
-                },
-            }
-            for pixel, (y, x) in found.pixels.items()
-        },
-    }
+def as_data(found: Any) -> Any:
+    """A comparison as JSON can hold it, its attributes by their names.
 
-
-def _predicted(found: Comparison, pixel: str) -> dict[str, Any] | None:
-    law = found.laws[pixel]
-    if law is None:
-        return None
-    mean, variance = (None, None) if law.window is None else (float(v) for v in law.window)
-    return {
-        "mean": law.counts.mean.value,
-        "variance": law.counts.variance.value,
-        "fano": _plain(law.counts.fano.value),
-        "window_mean": mean,
-        "window_variance": variance,
-        "lag1": _plain(law.lag1),
-    }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None if math.isnan(value) else math.copysign(1e308, value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
-    return value
+    NaN is None, infinity 1e308; maps, laws and histograms are left out.
+    """
+    if isinstance(found, System):
+        return found.to_dict()
+    if isinstance(found, float):
+        return found if math.isfinite(found) else None if math.isnan(found) else math.copysign(1e308, found)
+    if isinstance(found, np.ndarray | np.generic):
+        return as_data(found.tolist())
+    if dataclasses.is_dataclass(found):
+        found = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+    if isinstance(found, dict):
+        small = {name: one for name, one in found.items() if not (isinstance(one, np.ndarray) and one.size > _SMALL)}
+        return {name: as_data(one) for name, one in small.items()}
+    return [as_data(one) for one in found] if isinstance(found, tuple | list) else found
 
 
 def _scene_table(console: Console, found: Comparison) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from mars_lidar._base.files import beside
 from mars_lidar._base.progress import Bar
 from mars_lidar.cli.groups import OPTIONS
 
@@ -115,10 +116,8 @@ def two_integers(option: str, text: str, form: str = "Y,X (row, column)") -> tup
 
 def save_picture(figure: Figure, out: Path) -> None:
     """Write a figure beside its name and rename it when it is whole."""
-    from mars_lidar._base.files import TemporarySibling
-
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 4}} if out.suffix == ".png" else {}
-    with TemporarySibling(out).writing() as unfinished:
+    with beside(out) as unfinished:
         figure.savefig(unfinished, format=out.suffix[1:], **options)
 
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mars_lidar._base import checks
+from mars_lidar._base.files import read_npy
 from mars_lidar.cli.groups import group, panel
 from mars_lidar.instrument.effects import FIELDS
 
@@ -108,10 +111,6 @@ class Effects(StreamEffects, LightEffects):
 
 def read_array(option: str, file: Path) -> Any:
     """The array of a .npy file that `option` names."""
-    import numpy as np
-
-    from mars_lidar._base.files import read_npy
-
     if file.suffix != ".npy":
         raise ValueError(f"{option} must be a 1-D .npy array, got {str(file)!r}")
     values = read_npy(file)

@@ -8,6 +8,7 @@ from pathlib import Path
 from mars_lidar.cli.console import reported, say, table
 from mars_lidar.cli.foreign import ForeignOptions
 from mars_lidar.cli.groups import argument, examples, option
+from mars_lidar.cli.info import opened
 
 EXPLORE_EPILOG = examples(
     "mars-lidar explore",
@@ -34,7 +35,6 @@ def explore(
 
     The page is served on 127.0.0.1 alone, until Ctrl-C; parts of the cube are read as they are looked at.
     """
-    from mars_lidar.cli.info import opened
     from mars_lidar.explore import CubeServer
 
     with reported(), contextlib.ExitStack() as stack:

@@ -6,13 +6,15 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mars_lidar.cli.console import two_integers
 from mars_lidar.cli.groups import group, panel
 from mars_lidar.cli.options import DETECTOR, SYSTEM
 from mars_lidar.cli.pulse_options import PulseOptions
+from mars_lidar.instrument.system import Detector, System
 
 if TYPE_CHECKING:
-    from mars_lidar.instrument.system import System
     from mars_lidar.io import Cube
     from mars_lidar.io.recorder import Recorded
 
@@ -95,8 +97,6 @@ class ForeignOptions:
     def _file(self) -> System | None:
         if self.system is None:
             return None
-        from mars_lidar.instrument.system import System
-
         single = ("bin_ns", "bin_ps", "period_ns", "cycles", "detector", "dead_time_ns")
         given = [name for name in single if getattr(self, name) is not None]
         if given or self.pulse != PulseOptions():
@@ -105,8 +105,6 @@ class ForeignOptions:
         return System.load(self.system)
 
     def _system(self, path: Path, length: int | None) -> System:
-        from mars_lidar.instrument.system import Detector, System
-
         pulse = self.pulse.build()
         missing = [
             told
@@ -173,8 +171,6 @@ def foreign_rows(path: Path) -> list[tuple[str, str]]:
 
 def _recorder_rows(path: Path) -> list[tuple[str, str]]:
     """What a photon counter recorded: its clocks, the photons of each channel, and the images of a scan."""
-    import numpy as np
-
     from mars_lidar.io.recorder import recorded
     from mars_lidar.io.streams.files import recorded as photons_of
 

@@ -15,6 +15,7 @@ from mars_lidar.cli.options import THREADS, of_output, of_run, of_system
 from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.scene_options import AMBIENT, ATTENUATION, of_light
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM, SystemChanges
+from mars_lidar.scene.scene import Scene
 
 if TYPE_CHECKING:
     from mars_lidar.dataset import DatasetRecipe
@@ -153,7 +154,6 @@ def _recipe(
     source: Path | None, replaced: dict[str, Any], scene_seeds: int | None, rgbd: dict[str, Any], resume: bool
 ) -> DatasetRecipe | None:
     from mars_lidar.dataset.recipe import DatasetRecipe
-    from mars_lidar.scene.scene import Scene
 
     if source is None:
         if not resume:

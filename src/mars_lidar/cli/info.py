@@ -10,15 +10,16 @@ import typer
 from mars_lidar._base import manifest
 from mars_lidar._base.files import size_on_disk
 from mars_lidar._version import other_version
-from mars_lidar.cli.console import check_picture, reported, save_picture, table, two_integers
+from mars_lidar.cli.console import FAILED, check_picture, progress_bar, reported, save_picture, table, two_integers
+from mars_lidar.cli.dataset_tables import dataset_rows
 from mars_lidar.cli.foreign import ForeignOptions, foreign_rows, is_foreign
 from mars_lidar.cli.groups import argument, option
 from mars_lidar.cli.options import out as out_option
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.light.flux import Flux
 
 if TYPE_CHECKING:
-    from mars_lidar.instrument.detector import Detector
     from mars_lidar.io import Cube
-    from mars_lidar.light.flux import Flux
 
 
 def info(
@@ -30,8 +31,6 @@ def info(
     from mars_lidar.io import verify as same_again
 
     with reported():
-        from mars_lidar.cli.dataset_tables import dataset_rows
-
         rows = dataset_rows(file)
         if rows is not None:
             if verify:
@@ -52,8 +51,6 @@ def info(
             table(_rows(cube))
             if not verify:
                 return
-            from mars_lidar.cli.console import FAILED, progress_bar
-
             if not cube.complete:
                 raise ValueError(f"{file} is incomplete: there is nothing to verify")
             with progress_bar("verifying") as progress:

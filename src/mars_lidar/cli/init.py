@@ -8,6 +8,7 @@ from pathlib import Path
 from mars_lidar.cli.console import refuse_existing, reported, table
 from mars_lidar.cli.groups import argument, option
 from mars_lidar.cli.options import out as out_option
+from mars_lidar.cli.system_options import DEFAULT_SYSTEM
 from mars_lidar.instrument.effects import FIELDS
 from mars_lidar.instrument.instruments import INSTRUMENTS, sourced
 
@@ -68,8 +69,6 @@ def commented(file: Path) -> str:
 
 def of_instrument(name: str) -> str:
     """A system file of an instrument, each value with its source; a detector alone gets the default's laser."""
-    from mars_lidar.cli.system_options import DEFAULT_SYSTEM
-
     told = sourced(name)
     of_default = "not of the detector: the default of mars-lidar"
     default = {key: (getattr(DEFAULT_SYSTEM, key), of_default) for key in ("period_ns", "cycles", "bins")}

@@ -8,6 +8,9 @@ from pathlib import Path
 import typer
 
 from mars_lidar._base import checks
+from mars_lidar.calibrate import inspect as look
+from mars_lidar.calibrate import validate as compared
+from mars_lidar.calibrate.prediction import system_of
 from mars_lidar.cli.console import FAILED, check_picture, refuse_existing, reported, save_picture, table
 from mars_lidar.cli.effect_options import StreamEffects
 from mars_lidar.cli.groups import argument, examples
@@ -57,7 +60,6 @@ def inspect(
     """
     with reported():
         check_picture(out, overwrite)
-        from mars_lidar.calibrate import inspect as look
         from mars_lidar.io.streams.photons import NoLaserError
 
         try:
@@ -117,8 +119,6 @@ def calibrate(
         found, detector = light.calibrate(times, effects)
         table(rows + clock_rows(found) + light_rows(found, detector))
         if out is not None:
-            from mars_lidar.calibrate.prediction import system_of
-
             bins = times.bins if times.bins <= 2**20 else 1024
             exposure = min(max(times.cycles, 1), MAX_CYCLES) if cycles is None else cycles
             system_of(found, detector, exposure, bins).replace(start="armed").save(out)
@@ -142,8 +142,6 @@ def validate(
     """
     with reported():
         check_picture(out, overwrite)
-        from mars_lidar.calibrate import validate as compared
-
         times, rows = source.load(stream)
         calibrated, detector = light.calibrate(times, effects)
         found = compared(times, calibrated, cycles=cycles, detector=detector, simulated=simulated)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from mars_lidar.calibrate import ArrivalInspection, Calibration
-    from mars_lidar.instrument.detector import Detector
-
+from mars_lidar.calibrate import ArrivalInspection, Calibration
+from mars_lidar.calibrate.detector_model import moves_records
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 
 _APART = 5.0  # standard errors
 
@@ -51,9 +49,6 @@ def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
 
 def light_rows(found: Calibration, detector: Detector | None = None) -> list[tuple[str, str]]:
     """What was calibrated; `detector` is told, with its effects."""
-    from mars_lidar.calibrate.detector_model import moves_records
-    from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
-
     rows = interval_rows(found, found.dead_time_error_ns != 0)
     if found.hold_off_ns > found.dead_time_ns + found.dead_time_error_ns:
         rows.append(("hold-off", f"{found.hold_off_ns:.5g} ns: {found.armed.left_out:,} photons not used"))

@@ -25,11 +25,11 @@ from mars_lidar.cli.console import (
 from mars_lidar.cli.foreign import ForeignOptions
 from mars_lidar.cli.groups import argument, examples, option
 from mars_lidar.cli.options import out as out_option
-from mars_lidar.reconstruct import METHODS
+from mars_lidar.reconstruct import METHODS, Flags, Reconstruction
+from mars_lidar.reconstruct.reconstruction import ATTENUATIONS
 
 if TYPE_CHECKING:
     from mars_lidar.io import Cube
-    from mars_lidar.reconstruct import Reconstruction
     from mars_lidar.reconstruct.stored import Timed
 
 RECONSTRUCT_EPILOG = examples(
@@ -88,7 +88,6 @@ def reconstruct(
     with reported():
         began = time.perf_counter()
         from mars_lidar.io.maps import check_maps_output, save_maps
-        from mars_lidar.reconstruct.reconstruction import ATTENUATIONS
         from mars_lidar.reconstruct.stored import reconstruct_stored
 
         png = out.with_suffix(".png")
@@ -152,7 +151,6 @@ def _methods(text: str, cube: Cube) -> list[str]:
 def _show(cube: Cube, found: dict[str, Timed]) -> None:
     """One line a method on standard output."""
     from mars_lidar._base.optional import MissingLibraryError
-    from mars_lidar.reconstruct import Flags
     from mars_lidar.reconstruct.quality import errors_against
 
     realizations, height, width, _ = cube.shape

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions
+from mars_lidar.cli.system_options import SystemOptions
+from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
-    from mars_lidar.cli.system_options import SystemOptions
     from mars_lidar.dataset.view import View
-    from mars_lidar.instrument.system import System
     from mars_lidar.io.capture import Capture
 
 # options by the kind of scene; the keys of a description that they give (`mars_lidar.dataset.scene_entries`) are theirs

@@ -18,13 +18,14 @@ from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions, of_scene
 from mars_lidar.cli.scene_view import alike, seen
 from mars_lidar.cli.system_options import SystemOptions
+from mars_lidar.engines import ENGINES, EngineOptions
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.table import Table
 
 if TYPE_CHECKING:
-    from mars_lidar.engines import EngineOptions
-    from mars_lidar.instrument.system import System
     from mars_lidar.io import Written
-    from mars_lidar.light.flux import Flux
-    from mars_lidar.table import Table
 
 EPILOG = examples(
     "mars-lidar simulate --scene room -o room.zarr",
@@ -158,10 +159,7 @@ def _table(
     file: Path | None, system: System, engine: str, flux: Flux, outside: str | None, threads: int | None
 ) -> tuple[Table | None, str | None]:
     """The table that is given; or for an engine that would evaluate each pixel, one of the image's range."""
-    from mars_lidar.engines import ENGINES
     from mars_lidar.engines.image_table import image_table
-    from mars_lidar.light.stored_flux import StoredFlux
-    from mars_lidar.table import Table
 
     if file is not None and str(file) != "none":
         return Table.load(file, system), outside

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+import numpy as np
+
+from mars_lidar.calibrate import Calibration, inspect_arrivals
+from mars_lidar.calibrate import calibrate as fitted
+from mars_lidar.calibrate.detector_model import is_plain, jitter_sigma, stream_detector
 from mars_lidar.cli.console import say, two_integers
 from mars_lidar.cli.effect_options import StreamEffects
 from mars_lidar.cli.groups import group, panel
+from mars_lidar.cli.measured_tables import arrival_rows
 from mars_lidar.cli.options import DETECTOR, of_system
 from mars_lidar.cli.pulse_options import FittedPulseOptions
-
-if TYPE_CHECKING:
-    from mars_lidar.calibrate import Calibration
-    from mars_lidar.instrument.detector import Detector
-    from mars_lidar.instrument.pulse import Pulse
-    from mars_lidar.instrument.system import System as SystemObject
-    from mars_lidar.light.timestamps import Timestamps
+from mars_lidar.cli.system_options import with_given
+from mars_lidar.instrument.detector import Detector
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+from mars_lidar.instrument.system import MAX_CYCLES, System
+from mars_lidar.light.timestamps import Timestamps
 
 of_stream = panel("Stream")
 DEAD_TIME_NS = of_system(
@@ -36,10 +40,6 @@ class StreamOptions:
 
     def arrivals(self, stream: Path, dead_time_ns: float | None) -> list[tuple[str, str]]:
         """The rows of a recording without a laser."""
-        import numpy as np
-
-        from mars_lidar.calibrate import inspect_arrivals
-        from mars_lidar.cli.measured_tables import arrival_rows
         from mars_lidar.io.streams.files import recorded
 
         found = recorded(stream, unit_ns=self.unit_ns, variable=self.variable)
@@ -55,12 +55,8 @@ class StreamOptions:
 
     def load(self, stream: Path) -> tuple[Timestamps, list[tuple[str, str]]]:
         """The pixel, and the rows that say what was read."""
-        import numpy as np
-
-        from mars_lidar.light.timestamps import Timestamps as Times
-
         asked = None if self.pixel is None else two_integers("--pixel", self.pixel)
-        times = Times.load(
+        times = Timestamps.load(
             stream, period_ns=self.period_ns, bins=self.bins, unit_ns=self.unit_ns, variable=self.variable
         )
         height, width = times.shape
@@ -98,19 +94,12 @@ class FitOptions:
     free: bool = of_system("Any shape of light, bin by bin: fluorescence, haze, many surfaces.", default=False)
     returns: int = of_system("Returns (surfaces) in the pixel.", default=1)
 
-    def _told(self, times: Timestamps, given: dict[str, Any], pulse: Pulse | None) -> SystemObject | None:
+    def _told(self, times: Timestamps, given: dict[str, Any], pulse: Pulse | None) -> System | None:
         """The system that file, stream and options tell, of the light's own pulse; None where they tell no detector.
 
         `given`: fields of the detector, of the options. A jitter alone tells none: the dead time is found beside it.
         """
-        from mars_lidar.calibrate.detector_model import stream_detector
-        from mars_lidar.cli.system_options import with_given
-        from mars_lidar.instrument.detector import Detector
-        from mars_lidar.instrument.pulse import GaussianPulse
-        from mars_lidar.instrument.system import MAX_CYCLES
-        from mars_lidar.instrument.system import System as SystemOf
-
-        known = times.system if self.system is None else SystemOf.load(self.system)
+        known = times.system if self.system is None else System.load(self.system)
         dead = self.dead_time_ns
         if known is None and self.detector is None and (not given or (dead is None and set(given) == {"jitter"})):
             return None
@@ -126,7 +115,7 @@ class FitOptions:
         pulse = pulse or (GaussianPulse(sigma_ns=0.01 * times.period_ns) if known is None else known.pulse)
         if known is not None:
             return known.replace(detector=detector, pulse=pulse)
-        return SystemOf(
+        return System(
             period_ns=times.period_ns,
             cycles=min(max(times.cycles, 1), MAX_CYCLES),
             bins=times.bins,
@@ -137,11 +126,6 @@ class FitOptions:
 
     def calibrate(self, times: Timestamps, effects: StreamEffects) -> tuple[Calibration, Detector | None]:
         """The light of the stream by maximum likelihood, and the detector where it is more than a dead time."""
-        from mars_lidar.calibrate import calibrate as fitted
-        from mars_lidar.calibrate.detector_model import is_plain, jitter_sigma
-        from mars_lidar.cli.system_options import with_given
-        from mars_lidar.instrument.detector import Detector
-
         if self.mode not in (None, "nonparalyzable", "paralyzable"):
             raise ValueError(f"--mode must be nonparalyzable or paralyzable for a running stream, got {self.mode!r}")
         given = effects.given() | ({} if self.mode is None else {"mode": self.mode})

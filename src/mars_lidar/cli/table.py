@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
@@ -15,9 +15,8 @@ from mars_lidar.cli.groups import argument, grouped, option, panel
 from mars_lidar.cli.options import THREADS, of_output
 from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.system_options import SystemOptions
-
-if TYPE_CHECKING:
-    from mars_lidar.instrument.system import System
+from mars_lidar.table import Table, cache
+from mars_lidar.table.error import QuantisationError
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", help="Lookup tables over (S, B).")
 
@@ -56,8 +55,6 @@ def build(
         refuse_existing(out, overwrite)
         system = instrument.build(effects)
         axes = _grid("--signal", signal), _grid("--background", background)
-        from mars_lidar.table import Table, cache
-
         chosen: dict[str, Any] = {
             "method": method,
             "rearm": rearm,
@@ -84,8 +81,6 @@ def info(
         if file is not None:
             table(_rows(file))
             return
-        from mars_lidar.table import cache
-
         found = cache.files()
         total = sum(path.stat().st_size for path in found)
         rows = [("cache", f"{cache.directory()}: {len(found)} files, {total / 1e6:,.4g} MB")]
@@ -99,8 +94,6 @@ def clear(
 ) -> None:
     """Remove the tables in the cache."""
     with reported():
-        from mars_lidar.table import cache
-
         found = cache.files()
         if not found:
             print(f"{cache.directory()} holds no tables")
@@ -123,18 +116,15 @@ def _grid(name: str, text: str) -> tuple[float, float, int]:
 
 
 def _rows(path: Path) -> dict[str, str]:
-    from mars_lidar.table.storage import read_header
-
-    header = read_header(path)
-    system: System = header["system"]
-    told, made = header["provenance"], header["provenance"]["error"]
-    size, shapes = header["nbytes"], header["shape_bytes"]
-    never, later = int((header["enough"] < 0).sum()), int(header["enough"].max())
+    found = Table.load(path)
+    system, told, made = found.system, found.provenance, found.provenance["error"]
+    size, shapes, enough = path.stat().st_size, found.entries.shape.nbytes, found.entries.enough
+    never, later = int((enough < 0).sum()), int(enough.max())
     if never:
         serves = f"{system.cycles:,}; {never} entries have not settled by then and serve no other number"
     else:
         serves = f"any number from {later:,} on (made for {system.cycles:,})"
-    method = header["method"] + (f", re-arming at the {header['rearm']}" if header["method"] == "mars" else "")
+    method = found.method + (f", re-arming at the {found.rearm}" if found.method == "mars" else "")
     rows = {
         "table": f"{path} (mars-lidar {told['version']}, built in {told['build_s']:.3g} s)",
         "method": method,
@@ -143,10 +133,12 @@ def _rows(path: Path) -> dict[str, str]:
         "size": f"{size / 1e6:,.4g} MB, shapes {shapes / 1e6:,.4g} MB of them; with a delay axis of {_DEPTHS} values "
         f"{shapes * _DEPTHS / 1e9:,.4g} GB (the paper: {_PAPER_BYTES})",
         "cycles": serves,
-        "exact laws": _laws(header),
+        "exact laws": _laws(found),
         "system": f"period {system.period_ns:.6g} ns, {system.bins} bins, {system.pulse!r}, dead time "
         f"{system.detector.dead_time_ns:.6g} ns, start {system.start}",
-        "start phases": f"{header['phases']}" if header["phases"] else "none: nothing depends on the delay",
+        "start phases": f"{phases}"
+        if (phases := found.start_phases.phase.size)
+        else "none: nothing depends on the delay",
         f"error at {made['cycles']:,} cycles": _error(made),
         "error at any": _any_error(told.get("error_longest"), never),
     }
@@ -175,8 +167,6 @@ def _any_error(longest: dict[str, Any] | None, unsettled: int) -> str:
     grows = "that of the mean grows as the root of the number of cycles (in standard deviations)"
     if longest is None:
         return f"{grows}; at long exposures it was not measured when this table was built"
-    from mars_lidar.table.error import QuantisationError
-
     error = QuantisationError(**longest)
     within = error.cycles_within(_ALLOWED)
     mean, variance = max(error.mean_max, error.delayed_mean_max), max(error.variance_max, error.delayed_variance_max)
@@ -187,24 +177,22 @@ def _any_error(longest: dict[str, Any] | None, unsettled: int) -> str:
     )
 
 
-def _laws(header: dict[str, Any]) -> str:
-    number, entries = header["laws"], header["enough"].size
-    if header["method"] == "mars":
+def _laws(found: Table) -> str:
+    number, entries = found.laws.row.size, found.entries.enough.size
+    if found.method == "mars":
         return "none: the paper's count is a Gaussian"
     if not number:
         return "none kept: four cumulants fix the law of every entry, or the file is of an older format"
-    return f"{number:,} of {entries:,} entries keep the law of their count, {header['law_bytes'] / 1e6:,.3g} MB"
+    return f"{number:,} of {entries:,} entries keep the law of their count, {found.laws.pmf.nbytes / 1e6:,.3g} MB"
 
 
 def _line(path: Path) -> str:
-    from mars_lidar.table.storage import read_header
-
     try:
-        header = read_header(path)
+        found = Table.load(path)
     except (OSError, ValueError, KeyError) as error:
         return f"{path.name}: cannot be read ({error})"
-    system, told = header["system"], header["provenance"]
+    system, told = found.system, found.provenance
     return (
-        f"{path.name}: {header['method']}, S {told['signal']}, B {told['background']}, {system.bins} bins, "
+        f"{path.name}: {found.method}, S {told['signal']}, B {told['background']}, {system.bins} bins, "
         f"{system.cycles:,} cycles, dead time {system.detector.dead_time_ns:.6g} ns of {system.period_ns:.6g} ns"
     )

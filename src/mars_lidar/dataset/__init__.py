@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from mars_lidar._base.late import names_of
-from mars_lidar.dataset.run import Generated as Generated
-from mars_lidar.dataset.run import generate as generate
 
 if TYPE_CHECKING:
     from mars_lidar.dataset.estimate import Estimate as Estimate
@@ -17,6 +15,8 @@ if TYPE_CHECKING:
     from mars_lidar.dataset.network_files import export as export
     from mars_lidar.dataset.read import read_sparse as read_sparse
     from mars_lidar.dataset.recipe import DatasetRecipe as DatasetRecipe
+    from mars_lidar.dataset.run import Generated as Generated
+    from mars_lidar.dataset.run import generate as generate
     from mars_lidar.dataset.schema import json_schema as json_schema
     from mars_lidar.dataset.store import Dataset as Dataset
     from mars_lidar.dataset.store import open_dataset as open_dataset
@@ -29,6 +29,7 @@ _HOMES = {
     **dict.fromkeys(("Dataset", "open_dataset"), "store"),
     **dict.fromkeys(("Estimate", "estimate", "quick_advice"), "estimate"),
     **dict.fromkeys(("Exported", "export"), "network_files"),
+    **dict.fromkeys(("Generated", "generate"), "run"),
     **dict.fromkeys(("Verified", "verify"), "verify"),
     **dict.fromkeys(("View", "read_view"), "view"),
     "DatasetRecipe": "recipe",
@@ -37,4 +38,4 @@ _HOMES = {
     "read_sparse": "read",
 }
 __getattr__ = names_of(__name__, _HOMES)  # `import mars_lidar` loads no Zarr
-__all__ = ["Generated", "generate", *(name for name in _HOMES if name != "quick_advice")]
+__all__ = [name for name in _HOMES if name != "quick_advice"]

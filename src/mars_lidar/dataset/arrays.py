@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.recipe import DatasetRecipe
@@ -61,23 +59,6 @@ def create_histogram(group: Any, recipe: DatasetRecipe, number: int, shape: tupl
     )
 
 
-def histogram_array(
-    recipe: DatasetRecipe, shape: tuple[int, ...], dtype: np.dtype[Any]
-) -> tuple[Any, Callable[[], int]]:
-    """An array (1, realizations, H, W, bins) in memory, one chunk packed as on disk; and a function for its bytes."""
-    import zarr
-
-    kept: dict[str, Any] = {}
-    array = zarr.create_array(
-        zarr.storage.MemoryStore(kept),
-        shape=(1, *shape),
-        dtype=dtype,
-        chunks=(1, *shape),
-        **packing(recipe.layout, dtype),
-    )
-    return with_zeros(array), lambda: sum(len(value) for name, value in kept.items() if not name.endswith(".json"))
-
-
 def packing(layout: str, dtype: np.dtype[Any]) -> dict[str, Any]:
     """Codecs of the histogram; `mars_lidar.dataset.shard` writes what they would."""
     from zarr.codecs import Crc32cCodec
@@ -105,36 +86,6 @@ def create_maps(
         dimension_names=dims,
         attributes={"long_name": told, "units": unit},
     )
-
-
-def create_list(group: Any, name: str, values: NDArray[Any], dims: tuple[str, ...], told: str, unit: str) -> None:
-    """Create and write a small array."""
-    array = group.create_array(
-        name,
-        shape=values.shape,
-        dtype=values.dtype,
-        chunks=values.shape,
-        compressors=blosc(values.dtype, "zstd", 1, "shuffle"),
-        dimension_names=dims,
-        attributes={"long_name": told, "units": unit},
-    )
-    array[...] = values
-
-
-def create_texts(group: Any, name: str, texts: Sequence[str], dim: str, told: str) -> None:
-    """Create and write an array of texts, which xarray shows as such."""
-    from zarr.codecs import Crc32cCodec, ZstdCodec
-
-    array = group.create_array(
-        name,
-        shape=(len(texts),),
-        dtype=str,
-        chunks=(len(texts),),
-        compressors=(ZstdCodec(level=1), Crc32cCodec()),
-        dimension_names=(dim,),
-        attributes={"long_name": told},
-    )
-    array[...] = np.array(texts, dtype=object)
 
 
 def with_zeros(array: Any) -> Any:

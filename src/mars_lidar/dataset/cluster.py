@@ -8,22 +8,22 @@ rename, so half a part does not exist.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import threading
 import uuid
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor
+from functools import partial
+from typing import Any
 
 from mars_lidar._base.optional import needed
-
-if TYPE_CHECKING:
-    from mars_lidar.dataset.store import Dataset, Item
-    from mars_lidar.dataset.write import Made, Maker
+from mars_lidar.dataset.store import Dataset, Item, open_dataset
+from mars_lidar.dataset.write import Made, Maker
 
 _LIBRARY = "distributed", "making parts by workers", "cluster"
 _AHEAD = 3  # parts given out per worker thread: none waits for the scheduler, and a million are not queued at once
 TIMEOUT_S = 20.0  # for a scheduler to answer
 _local = threading.local()
+Team = tuple[Executor, Callable[[Item], Made], int]  # what makes a part, and how many are given out at a time
 
 
 def reach(scheduler: str | None) -> None:
@@ -33,18 +33,10 @@ def reach(scheduler: str | None) -> None:
         _client(distributed, scheduler).close()
 
 
-def make_all(
-    dataset: Dataset,
-    todo: Sequence[Item],
-    add: Callable[[Made], None],
-    workers: int | None,
-    threads: int,
-    scheduler: str | None,
-) -> None:
-    """Make parts on `workers` processes of this machine, or on the workers of the `scheduler` at that address."""
+@contextlib.contextmanager
+def team(dataset: Dataset, workers: int | None, threads: int, scheduler: str | None) -> Iterator[Team]:
+    """`workers` processes of this machine, or the workers of the `scheduler` at that address."""
     distributed = needed(*_LIBRARY)
-    if not todo:
-        return
     with contextlib.ExitStack() as after:
         if scheduler is not None:
             client = after.enter_context(_client(distributed, scheduler))
@@ -54,16 +46,28 @@ def make_all(
             )
             client = distributed.Client(after.enter_context(cluster), set_as_default=False)
             after.enter_context(client)
-        _share_out(distributed, client, dataset, todo, add, threads)
+        executor = client.get_executor(pure=False)
+        make = partial(make_part, str(dataset.path.resolve()), uuid.uuid4().hex, threads)
+        try:
+            yield executor, make, _AHEAD * max(1, sum(client.nthreads().values()))
+        except (
+            CancelledError,
+            distributed.client.FutureCancelledError,
+            distributed.scheduler.KilledWorker,
+            distributed.comm.CommClosedError,
+        ) as error:
+            told = " ".join(str(error).split()) or type(error).__name__
+            raise ConnectionError(f"the scheduler or its workers were lost ({told})") from error
+        except BaseException:
+            with contextlib.suppress(Exception):  # a scheduler that is gone has nothing to cancel
+                executor.shutdown(wait=False)
+            raise
 
 
-def make_part(path: str, run: str, item: Item, threads: int) -> Made:
+def make_part(path: str, run: str, threads: int, item: Item) -> Made:
     """Make one part; runs on a worker."""
     maker: Maker | None = getattr(_local, "maker", None)
     if maker is None or _local.run != run:
-        from mars_lidar.dataset.store import open_dataset
-        from mars_lidar.dataset.write import Maker
-
         maker = Maker(open_dataset(path, allow_incomplete=True), threads)
         _local.maker, _local.run = maker, run
     return maker.make(item)
@@ -77,34 +81,3 @@ def _client(distributed: Any, address: str) -> Any:
         return distributed.Client(address, timeout=TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise ValueError(f"scheduler must be the address of a dask scheduler, got {address!r}: {error}") from error
-
-
-def _share_out(
-    distributed: Any, client: Any, dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None], threads: int
-) -> None:
-    path, run = str(dataset.path.resolve()), uuid.uuid4().hex
-    team = max(1, sum(client.nthreads().values()))
-    waiting = iter(todo)
-
-    def given(item: Item) -> Any:
-        return client.submit(make_part, path, run, item, threads, pure=False)
-
-    first = [given(item) for item in itertools.islice(waiting, _AHEAD * team)]
-    running = distributed.as_completed(first, loop=client.loop)  # the client is nobody's default
-    try:
-        for future in running:
-            made = future.result()
-            future.release()
-            add(made)
-            for item in itertools.islice(waiting, 1):
-                running.add(given(item))
-    except (
-        distributed.client.FutureCancelledError,
-        distributed.scheduler.KilledWorker,
-        distributed.comm.CommClosedError,
-    ) as error:
-        raise ConnectionError(f"the scheduler or its workers were lost ({' '.join(str(error).split())})") from error
-    except BaseException:
-        with contextlib.suppress(Exception):  # a scheduler that is gone has nothing to cancel
-            client.cancel(list(running.futures), force=True)
-        raise

@@ -8,23 +8,23 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.threads import thread_count
 from mars_lidar.dataset import samples
-from mars_lidar.dataset.arrays import MAPS, histogram_array, histogram_blocks
+from mars_lidar.dataset.arrays import MAPS, histogram_blocks
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.run import BUFFER_BYTES, making_bytes, read_recipe
 from mars_lidar.dataset.sample_content import Rendered, Shown
+from mars_lidar.dataset.shard import packer
 from mars_lidar.dataset.sources import Candidate, candidates, scenes
 from mars_lidar.io.advice import Advice, advice
 from mars_lidar.io.scan import Problem
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from mars_lidar.simulate import simulate
 
 _SCENES, _PROBES = 4, 8
 _BASE_BYTES = 220 * 2**20  # of the interpreter with NumPy, SciPy and Zarr
@@ -167,12 +167,11 @@ def _probe(
 
     `shard` exposures of a sample are made one after the other.
     """
-    from mars_lidar.simulate import simulate
-
     random = np.random.default_rng(0)
     every = samples.count_samples(plan, len(looked))
     rows, columns = chunk[2], chunk[3]
     seconds, packed, dense, exposures = 0.0, 0, 0, 0
+    pack = packer(plan.layout, dtype)
     together = min(shard, plan.realizations)  # exposures that share a flux
     for k, sample in enumerate(random.choice(every, min(every, _PROBES), replace=False)):
         scene, system, signal, sbr = samples.sample_parts(plan, int(sample))
@@ -185,9 +184,8 @@ def _probe(
         def once(part: Any = part, system: int = system, seed: int = k) -> tuple[float, NDArray[Any], int]:
             began = time.perf_counter()
             counts = simulate(part, plan.systems[system], engine=plan.engine, seed=seed, threads=1).astype(dtype)
-            array, size = histogram_array(plan, counts.shape, dtype)
-            array[...] = counts[None]
-            return time.perf_counter() - began, counts, size()
+            size = len(pack(counts))
+            return time.perf_counter() - began, counts, size
 
         spent, counts, size = min((once() for _ in range(2)), key=lambda told: told[0])
         seconds, packed, dense = seconds + spent, packed + size, dense + counts.nbytes

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mars_lidar._version import __version__
 from mars_lidar.dataset import samples
 from mars_lidar.dataset.arrays import (
     FORMAT,
@@ -18,16 +18,16 @@ from mars_lidar.dataset.arrays import (
     MORE_VERSION,
     PHOTONS,
     create_histogram,
-    create_list,
     create_maps,
-    create_texts,
     histogram_blocks,
     mark,
 )
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.scenes import SceneWriter
 from mars_lidar.dataset.sources import candidates, scenes, seed_of
+from mars_lidar.io.layout import Variable
 from mars_lidar.io.scan import Problem
+from mars_lidar.io.zarr_store import add
 
 
 def create(path: Path, recipe: DatasetRecipe, folder: Path) -> None:
@@ -60,8 +60,6 @@ def begin(path: Path, recipe: DatasetRecipe) -> Any:
     """A new store without arrays, marked incomplete; what was there is removed."""
     import zarr
 
-    from mars_lidar._version import __version__
-
     if path.exists():
         (path / "zarr.json").unlink(missing_ok=True)  # from now on it is no store
         shutil.rmtree(path)
@@ -80,10 +78,7 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
     """Create all arrays of the samples, write the small ones, and mark the store as planned."""
     names, shape = writer.names, writer.shape
     assert shape is not None
-    lists = coordinates(recipe, names, shape)
-    for name, values, dims, told, unit in lists:
-        create_list(group, name, values, dims, told, unit)
-    create_texts(group, "scene_name", scene_names(recipe, names), "sample", "name of the scene")
+    add(group, coordinates(recipe, names, shape))
     number = samples.count_samples(recipe, len(names))
     for name, (told, unit) in MAPS.items():
         create_maps(group, name, (number, *shape), np.dtype(np.float32), ("sample", "y", "x"), told, unit)
@@ -96,34 +91,30 @@ def lay_out(group: Any, recipe: DatasetRecipe, writer: SceneWriter, problems: li
     mark(group, attrs)
 
 
-def scene_names(recipe: DatasetRecipe, names: list[str]) -> list[str]:
-    """Name of the scene of every sample."""
-    number = samples.count_samples(recipe, len(names))
-    return [names[samples.sample_parts(recipe, k)[0]] for k in range(number)]
-
-
-def coordinates(
-    recipe: DatasetRecipe, names: list[str], shape: tuple[int, int]
-) -> list[tuple[str, NDArray[Any], tuple[str, ...], str, str]]:
-    """Name, values, dimensions, meaning and unit of every small array, of scenes of these names and shape (H, W)."""
+def coordinates(recipe: DatasetRecipe, names: list[str], shape: tuple[int, int]) -> list[Variable]:
+    """Every small array, of scenes of these names and shape (H, W)."""
     number = samples.count_samples(recipe, len(names))
     parts = [samples.sample_parts(recipe, k) for k in range(number)]
     texts = [one.to_json() for one in recipe.systems]
     seeds = [seed_of(recipe, names[scene], texts[system], s, b) for scene, system, s, b in parts]
     scene, system, signal, sbr = (np.array(column) for column in zip(*parts, strict=True))
     periods = np.array([one.period_ns for one in recipe.systems])
-    lists: list[tuple[str, NDArray[Any], tuple[str, ...], str, str]] = [
-        ("sample", np.arange(number), ("sample",), "sample", "1"),
-        ("realization", np.arange(recipe.realizations), ("realization",), "realization number", "1"),
-        ("y", np.arange(shape[0]), ("y",), "image row", "pixel"),
-        ("x", np.arange(shape[1]), ("x",), "image column", "pixel"),
-        ("scene", scene.astype(np.int32), ("sample",), "number of the scene in the group scenes", "1"),
-        ("system", system.astype(np.int32), ("sample",), "number of the system in the attribute systems", "1"),
-        ("signal_level", signal, ("sample",), "mean signal over the pixels with a return", PHOTONS),
-        ("sbr", sbr, ("sample",), "mean signal / mean ambient photons", "1"),
-        ("period_ns", periods[system], ("sample",), "laser period", "ns"),
-        ("seed", np.array(seeds, np.uint64), ("sample",), "seed of the sample", "1"),
+    scene_name = np.array([names[k] for k in scene], object)
+    of_sample = ("sample",)
+    variables = [
+        Variable("sample", of_sample, np.arange(number), "1", "sample"),
+        Variable("realization", ("realization",), np.arange(recipe.realizations), "1", "realization number"),
+        Variable("y", ("y",), np.arange(shape[0]), "pixel", "image row"),
+        Variable("x", ("x",), np.arange(shape[1]), "pixel", "image column"),
+        Variable("scene", of_sample, scene.astype(np.int32), "1", "number of the scene in the group scenes"),
+        Variable("scene_name", of_sample, scene_name, "", "name of the scene"),
+        Variable("system", of_sample, system.astype(np.int32), "1", "number of the system in the attribute systems"),
+        Variable("signal_level", of_sample, signal, PHOTONS, "mean signal over the pixels with a return"),
+        Variable("sbr", of_sample, sbr, "1", "mean signal / mean ambient photons"),
+        Variable("period_ns", of_sample, periods[system], "ns", "laser period"),
+        Variable("seed", of_sample, np.array(seeds, np.uint64), "1", "seed of the sample"),
     ]
     if np.ptp(periods) == 0.0:
-        lists.append(("time", recipe.systems[0].time_ns, ("time",), "time in the period, bin centre", "ns"))
-    return lists
+        time = recipe.systems[0].time_ns
+        variables.append(Variable("time", ("time",), time, "ns", "time in the period, bin centre"))
+    return variables

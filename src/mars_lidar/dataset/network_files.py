@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling
+from mars_lidar._base.files import beside
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import shown
 from mars_lidar._base.types import Progress
@@ -189,7 +189,7 @@ def _plain(name: str) -> str:
 
 def _save(path: Path, variables: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporarySibling(path).writing() as unfinished, open(unfinished, "wb") as file:
+    with beside(path) as unfinished, open(unfinished, "wb") as file:
         write_variables(file, variables)
 
 
@@ -198,5 +198,5 @@ def _save_depth(path: Path, depth_m: NDArray[np.float64]) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     grey = np.clip(np.round(255.0 / _MONOCULAR_M * depth_m), 0, 255).astype(np.uint8)
-    with TemporarySibling(path).writing() as unfinished:
+    with beside(path) as unfinished:
         iio.imwrite(unfinished, grey, extension=".png", plugin="pillow")

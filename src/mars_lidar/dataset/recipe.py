@@ -13,6 +13,7 @@ from mars_lidar.dataset import values
 from mars_lidar.dataset.light import Light, plain_levels, read_light, refuse_for_transients
 from mars_lidar.dataset.scene_entries import read_scenes
 from mars_lidar.dataset.values import Fields
+from mars_lidar.engines import check_detector, find_engine
 from mars_lidar.instrument.system import System
 
 LAYOUTS = ("sparse", "dense")
@@ -188,8 +189,6 @@ def _systems(data: Any, folder: Path) -> tuple[System, ...]:
 
 
 def _engine(engine: Any, systems: tuple[System, ...]) -> str:
-    from mars_lidar.engines import check_detector, find_engine
-
     if not isinstance(engine, str):
         raise TypeError(f"engine must be the name of an engine, got {engine!r}")
     found = find_engine(engine)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -10,22 +11,26 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
+from mars_lidar._base.files import Interrupted, WriteError, check_target
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
-
-if TYPE_CHECKING:
-    from mars_lidar.dataset.recipe import DatasetRecipe
-    from mars_lidar.dataset.store import Dataset, Item
-    from mars_lidar.dataset.write import Made
-    from mars_lidar.io.scan import Problem
+from mars_lidar._version import __version__
+from mars_lidar.dataset import cluster
+from mars_lidar.dataset.cluster import Team
+from mars_lidar.dataset.ingest import create
+from mars_lidar.dataset.recipe import DatasetRecipe
+from mars_lidar.dataset.store import Dataset, Item, open_dataset
+from mars_lidar.dataset.write import Made, Maker
+from mars_lidar.io.scan import Problem
 
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
 
@@ -107,11 +112,6 @@ def generate(
     mars_lidar.io.WriteError, mars_lidar.io.Interrupted
         Stopped half way (a full disk, Ctrl-C); the text says how to go on.
     """
-    from mars_lidar._base.files import check_target
-    from mars_lidar.dataset.ingest import create
-    from mars_lidar.dataset.store import open_dataset
-    from mars_lidar.io import Interrupted, WriteError
-
     began = time.perf_counter()
     progress = shown(progress, "generating")
     target = Path(out)
@@ -128,8 +128,6 @@ def generate(
     wanted, folder = read_recipe(recipe)
     check_target(target, folder=True, overwrite=overwrite or resume)
     if workers is not None or scheduler is not None:
-        from mars_lidar.dataset import cluster
-
         cluster.reach(scheduler)  # before the scenes are read
     with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
         there = target.exists() and resume
@@ -152,10 +150,11 @@ def generate(
                     damaged.unlink(missing_ok=True)
             before = sum(1 for _ in dataset.items()) - len(todo)
             totals = _Totals(before, before + len(todo), progress)
-            if workers is not None or scheduler is not None:
-                cluster.make_all(dataset, todo, totals.add, workers, threads or 1, scheduler)
-            else:
-                _make_all(dataset, todo, totals.add, threads)
+            if todo:
+                team = _here(dataset, len(todo), threads)
+                if workers is not None or scheduler is not None:
+                    team = cluster.team(dataset, workers, threads or 1, scheduler)
+                _make_all(team, todo, totals.add)
             if not dataset.complete:
                 dataset.tidy()  # of workers that were killed while others went on
                 dataset.finish()
@@ -173,8 +172,6 @@ def generate(
 
 def read_recipe(recipe: DatasetRecipe | dict[str, Any] | str | Path | None) -> tuple[DatasetRecipe | None, Path]:
     """The recipe in any of its forms, and the folder that its paths are relative to."""
-    from mars_lidar.dataset.recipe import DatasetRecipe
-
     if recipe is None or isinstance(recipe, DatasetRecipe):
         return recipe, Path()
     if isinstance(recipe, dict):
@@ -197,37 +194,44 @@ class _Totals:
             self._progress(self._done, self._total)
 
 
-def _make_all(dataset: Dataset, todo: Sequence[Item], add: Callable[[Made], None], threads: int | None) -> None:
-    """Make parts on threads, each of which simulates, packs and writes parts of its own.
+@contextlib.contextmanager
+def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
+    """Threads, each of which simulates, packs and writes parts of its own.
 
     Simulator and compressors run without Python's lock. Where so many chunks would not fit in `BUFFER_BYTES`, fewer
     parts are made at a time, each on several threads.
     """
-    from mars_lidar.dataset.write import Maker
-
     team = thread_count(threads or None)
     array = dataset.histogram
-    parts = dataset.scenes.waveform_parts(dataset.recipe.systems)
-    chunk = making_bytes(array.chunks, array.dtype.itemsize, parts)
-    teams = max(1, min(team, len(todo), BUFFER_BYTES // chunk))
-    stop = threading.Event()
-    idle = [Maker(dataset, max(1, team // teams), stop) for _ in range(teams)]
-    waiting: Iterator[Item] = iter(todo)
+    waveforms = dataset.scenes.waveform_parts(dataset.recipe.systems)
+    chunk = making_bytes(array.chunks, array.dtype.itemsize, waveforms)
+    teams = max(1, min(team, parts, BUFFER_BYTES // chunk))
+    stop, local = threading.Event(), threading.local()
+
+    def make(item: Item) -> Made:
+        if not hasattr(local, "maker"):
+            local.maker = Maker(dataset, max(1, team // teams), stop)
+        made: Made = local.maker.make(item)
+        return made
+
     with ThreadPoolExecutor(teams) as pool:
-        running: dict[Future[Made], Maker] = {}
         try:
-            while True:
-                while idle and (item := next(waiting, None)) is not None:
-                    maker = idle.pop()
-                    running[pool.submit(maker.make, item)] = maker
-                if not running:
-                    return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    idle.append(running.pop(future))
-                    add(future.result())
+            yield pool, make, teams
         except BaseException:
             stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
+
+
+def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:
+    """Make parts, a few of them at a time."""
+    waiting = iter(todo)
+    with team as (executor, make, ahead):
+        running = {executor.submit(make, item) for item in itertools.islice(waiting, ahead)}
+        while running:
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                add(future.result())
+                running |= {executor.submit(make, item) for item in itertools.islice(waiting, 1)}
 
 
 def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> int:
@@ -236,8 +240,6 @@ def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> in
 
 
 def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) -> None:
-    from mars_lidar._version import __version__
-
     if dataset.attrs.get("version") != __version__:
         raise ValueError(
             f"{target} was begun by mars-lidar {dataset.attrs.get('version')} and this is {__version__}: "
@@ -256,8 +258,6 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
 
 def _left(target: Path) -> str:
     """What is on the disk, for the text of an error."""
-    from mars_lidar.dataset.store import Dataset
-
     free = shutil.disk_usage(target.parent).free
     try:
         dataset = Dataset(target)

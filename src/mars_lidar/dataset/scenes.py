@@ -27,12 +27,14 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import reading
 from mars_lidar.dataset import samples
-from mars_lidar.dataset.arrays import create_list, create_maps, create_texts
+from mars_lidar.dataset.arrays import create_maps
 from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
 from mars_lidar.instrument.system import System
-from mars_lidar.io.store import OnDisk, Rows
-from mars_lidar.io.zarr_store import blosc
+from mars_lidar.io.layout import Variable
+from mars_lidar.io.store import OnDisk
+from mars_lidar.io.zarr_store import add, blosc
 from mars_lidar.light.fog import Fog
+from mars_lidar.light.rate_parts import Rows
 from mars_lidar.light.transient import Transient
 from mars_lidar.scene.layers import MOST, LayeredScene
 from mars_lidar.scene.scene import Scene
@@ -86,10 +88,9 @@ class SceneWriter:
         self._flush()
         for array in self._arrays.values():
             array.resize((self._written, *array.shape[1:]))
-        dims = ("scene", "letter")
-        create_texts(self._group, "name", self.names, "scene", "name of the scene")
+        add(self._group, [Variable("name", ("scene",), np.array(self.names, object), "", "name of the scene")])
         if not self.plain:
-            create_list(self._group, "kind", _rows(self._kinds), dims, "what it is, JSON", "1")
+            add(self._group, [Variable("kind", ("scene", "letter"), _rows(self._kinds), "1", "what it is, JSON")])
         return self._written
 
     def _flush(self) -> None:

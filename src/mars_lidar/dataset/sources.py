@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from mars_lidar.dataset.recipe import DatasetRecipe
-from mars_lidar.dataset.renders import transient_files
-from mars_lidar.dataset.sample_content import Shown, Surfaces
+from mars_lidar.dataset.sample_content import Rendered, Shown, Surfaces
 from mars_lidar.dataset.values import listed_numbers
 from mars_lidar.engines import find_engine
 from mars_lidar.io.rgbd import middlebury, nyu
 from mars_lidar.io.rgbd.layered import is_layered, read_layers
 from mars_lidar.io.scan import BAD_FILE, Problem, SceneFile, scan
+from mars_lidar.io.transient import SUFFIXES, read_transient, read_truth
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.fog import Fog
 from mars_lidar.scene.layers import LayeredScene
@@ -28,6 +28,7 @@ from mars_lidar.scene.scene import Scene
 from mars_lidar.simulate import _check_registrations
 
 _TRIES = 20  # places tried for a crop with a return in it
+_LIGHT = ("bin_ns", "start_ns", "name", "channel")  # keys that tell how a file of rendered light is read
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def candidates(entries: Sequence[dict[str, Any]], folder: Path) -> tuple[list[Ca
             found += [one for clear in _examples(entry) for one in _behind_all(clear, entry)]
             continue
         if "transient" in entry:
-            for path, load in transient_files(entry, folder):
+            for path, load in _transients(entry, folder):
                 name = _named(entry["transient"], folder, path)
                 found.append(_sized(Candidate(name, path, load, name), entry))
             continue
@@ -140,6 +141,31 @@ def _files(entry: dict[str, Any], folder: Path, problems: list[Problem]) -> Iter
     frames = range(nyu.frames(path))
     options.pop("depth_unit_m", None)
     yield from _chosen([SceneFile(depth=path, image=own.image, index=k, **options) for k in frames], entry)
+
+
+def _transients(entry: dict[str, Any], folder: Path) -> Iterator[tuple[Path, Callable[[], Rendered]]]:
+    """The files of an entry in the order of their paths, and what opens each; ValueError where there is none."""
+    root = folder / entry["transient"]
+    options = {name: entry[name] for name in _LIGHT if name in entry}
+    files = [root]
+    if root.is_dir():
+        every = sorted(root.glob(entry.get("pattern", "**/*")))
+        files = [one for one in every if one.is_file() and ("pattern" in entry or one.suffix.lower() in SUFFIXES)]
+        if not files:
+            raise ValueError(f"{root}: no transient found, a file {', '.join(SUFFIXES)}")
+    elif "pattern" in entry:
+        raise ValueError(f"pattern belongs to a folder, and {root} is none")
+    elif not root.is_file():
+        raise ValueError(f"{root}: no such file or folder")
+    for file in files:
+
+        def load(file: Path = file) -> Rendered:
+            transient = read_transient(file, **options)
+            nothing = np.full(transient.shape, np.nan)
+            told = {"depth": nothing, "reflectivity": nothing} | read_truth(file, transient.shape)
+            return Rendered(transient, told["depth"], told["reflectivity"], entry.get("pulse", True))
+
+        yield file, load
 
 
 def _chosen(files: list[SceneFile], entry: dict[str, Any]) -> list[SceneFile]:
@@ -253,5 +279,4 @@ def _at_level(unit: Flux, signal: float, ambient: float, dark: float) -> Flux:
     background = ambient * unit.background + dark
     if unit.waveform is not None:
         return Flux(waveform=signal * unit.waveform, background=background)
-    returns = zip(unit.returns_signal, unit.returns_delay_ns, strict=True)
-    return Flux.multi(*(Flux(signal * one, background if k == 0 else 0.0, tau) for k, (one, tau) in enumerate(returns)))
+    return Flux(signal * unit.returns_signal, background, unit.returns_delay_ns)

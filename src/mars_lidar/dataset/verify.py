@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
 from mars_lidar._version import other_version
 from mars_lidar.dataset.arrays import MAPS
-from mars_lidar.dataset.ingest import coordinates, scene_names
+from mars_lidar.dataset.ingest import coordinates
 from mars_lidar.dataset.samples import block, grid
 from mars_lidar.dataset.store import Dataset, open_dataset
 from mars_lidar.dataset.write import Maker
@@ -96,22 +95,17 @@ def verify(
 
 def _labels(dataset: Dataset) -> Iterator[str]:
     """What is wrong with the coordinates and labels of a dataset: all of them follow from its recipe and scenes."""
-    names = dataset.scene_names()
-    lists = coordinates(dataset.recipe, names, dataset.histogram.shape[2:4])
-    wanted: dict[str, Any] = {name: values for name, values, *_ in lists}
-    if "scene_name" in dataset.group:  # not in stores of version 0.1
-        wanted["scene_name"] = np.array(scene_names(dataset.recipe, names), object)
-    for name, values in wanted.items():
+    for v in coordinates(dataset.recipe, dataset.scene_names(), dataset.histogram.shape[2:4]):
+        if v.name == "scene_name" and v.name not in dataset.group:  # of version 0.1
+            continue
+        array = dataset.group[v.name]
         try:
-            if not np.array_equal(dataset.group[name][...], values):
-                yield f"{name} is not that of the recipe"
+            if not np.array_equal(array[...], v.data):
+                yield f"{v.name} is not that of the recipe"
         except Exception as error:  # whatever the codecs make of a damaged chunk
-            yield f"{name} cannot be read ({error})"
-    for name, _, dims, told, unit in lists:
-        array = dataset.group[name]
-        labels = array.attrs.get("long_name"), array.attrs.get("units"), array.metadata.dimension_names
-        if labels != (told, unit, dims):
-            yield f"the labels of {name} are not its own"
+            yield f"{v.name} cannot be read ({error})"
+        if ({name: array.attrs.get(name) for name in v.labels}, array.metadata.dimension_names) != (v.labels, v.dims):
+            yield f"the labels of {v.name} are not its own"
 
 
 def _compare(maker: Maker, region: tuple[slice, ...]) -> str:

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.yaml import Key, Lines, RecipeError, located, read_yaml
 from mars_lidar.dataset.light import read_light, refuse_for_transients
 from mars_lidar.dataset.scene_entries import read_scene
 from mars_lidar.dataset.sources import candidates
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from mars_lidar.instrument.system import System
-    from mars_lidar.light.flux import Flux
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
 
 _PATHS = ("depth", "path", "image", "manifest", "transient")
 

@@ -19,6 +19,7 @@ from mars_lidar.dataset.shard import chunks_of, packer, write_shard
 from mars_lidar.dataset.store import Dataset, Item
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.simulate import simulate
 
 _KEPT = 4  # scenes and fluxes that a maker remembers: neighbours in the order of parts share them
 
@@ -108,8 +109,6 @@ class Maker:
 
     def counts(self, region: tuple[slice, ...]) -> NDArray[Any]:
         """Counts of a region (samples, realizations, rows, columns, all bins); good until the next call."""
-        from mars_lidar.simulate import simulate
-
         samples, realizations, rows, columns, _ = region
         recipe = self.dataset.recipe
         dtype, width = self.dataset.histogram.dtype, self.dataset.histogram.shape[3]

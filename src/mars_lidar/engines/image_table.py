@@ -32,7 +32,7 @@ def image_table(
     ``outside="exact"``.
     """
     from mars_lidar.statistics.gate import require_mode
-    from mars_lidar.table import Table, cache
+    from mars_lidar.table import Table
 
     try:
         require_mode("a table", system)
@@ -46,7 +46,7 @@ def image_table(
     if len(np.unique(np.stack([*single, background], 1), axis=0)) < FEWEST:
         return None
     told: dict[str, Any] = {"threads": threads, "progress": progress}
-    return cache.cached(Table, system, _axis("signal", signal), _axis("background", background), **told)
+    return Table.cached(system, _axis("signal", signal), _axis("background", background), **told)
 
 
 def _axis(name: str, photons: FloatArray) -> Any:

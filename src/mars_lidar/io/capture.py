@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_data, check_target, whole
-from mars_lidar._base.hdf5 import new_file, open_hdf5, with_checksums
+from mars_lidar._base.files import beside, check_data, check_target, whole
+from mars_lidar._base.hdf5 import ForgivingFile, open_hdf5, with_checksums
 from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
 from mars_lidar.io.cube import Cube
 
@@ -174,9 +174,9 @@ def save_capture(path: str | Path, cube: Cube, like: str | Path, *, overwrite: b
         raise ValueError(f"cube must have bins of {source.bin_ns:g} ns as {like} has, got {cube.system.bin_ns:g}")
     check_target(target, folder=False, overwrite=overwrite)
     with (
-        TemporarySibling(target).writing() as unfinished,
+        beside(target) as unfinished,
         open_hdf5(source.path) as old,
-        new_file(unfinished) as new,
+        ForgivingFile(unfinished).hdf5() as new,
     ):
         for name in old:
             if name != source.name:

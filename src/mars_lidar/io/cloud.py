@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_target
+from mars_lidar._base.files import beside, check_target
 from mars_lidar._base.types import FloatArray
 
 
@@ -90,7 +90,7 @@ def save_cloud(
     rows = np.stack([values[seen] for values in columns.values()], axis=-1).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [*(f"property float {name}" for name in columns), "end_header", ""]
-    with TemporarySibling(target).writing() as unfinished, open(unfinished, "wb") as file:
+    with beside(target) as unfinished, open(unfinished, "wb") as file:
         file.write("\n".join(header).encode())
         file.write(rows.tobytes())
     return len(rows)

@@ -10,9 +10,12 @@ import numpy as np
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import Progress
+from mars_lidar._version import __version__
 from mars_lidar.io.cube import SUFFIXES, Cube, load, one_exposure, save
+from mars_lidar.io.streams import photon_hdf5, ptu_stream
 from mars_lidar.io.streams.files import STREAM_SUFFIXES, is_stream
 from mars_lidar.light.timestamps import Timestamps
+from mars_lidar.simulate import simulate_timestamps
 
 
 @dataclass(frozen=True)
@@ -119,9 +122,6 @@ def photons(
         The photons do not have the stored counts (another version made the cube), or the engine draws
         histograms only.
     """
-    from mars_lidar._version import __version__
-    from mars_lidar.simulate import simulate_timestamps
-
     k = checks.integer("realization", realization, low=0, high=cube.shape[0] - 1)
     arguments = cube.simulation("the time of each photon").part(slice(k, k + 1), slice(0, cube.shape[1]))
     del arguments["realizations"]
@@ -143,8 +143,6 @@ def photons(
 
 
 def _cube(cube: Cube, old: Path, new: Path, realization: int | None, overwrite: bool) -> Converted:
-    from mars_lidar._version import __version__
-
     if new.suffix not in SUFFIXES:
         raise ValueError(f"{old} is a cube, which goes into one of {', '.join(SUFFIXES)}, not {str(new)!r}")
     lost = []
@@ -179,8 +177,6 @@ def resolution_ns(path: Path, times: Timestamps, clock_ps: float | None = None) 
     """Unit of the times that the format of `path` stores, ns; 0 for .npz, which holds them as they are."""
     if path.suffix == ".npz":
         return 0.0
-    from mars_lidar.io.streams import photon_hdf5, ptu_stream
-
     if path.suffix == ".ptu":
         units = ptu_stream.units_per_bin(times.bins, times.period_ns, clock_ps)
     else:

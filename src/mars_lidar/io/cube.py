@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -27,8 +28,8 @@ from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.remote import Elsewhere, open_url, url_of
-from mars_lidar.io.store import CountArray, OnDisk, OpenedStore, Writer, writing
+from mars_lidar.io.remote import open_url, url_of
+from mars_lidar.io.store import CountArray, OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 
 _MODULES = {
@@ -177,20 +178,17 @@ def save(path: str | Path, cube: Cube, *, overwrite: bool = False) -> None:
         `path` exists and `overwrite` is false, or cannot be written.
     """
     check_output(path, cube.recipe, overwrite=overwrite)
-    with writing(path, lambda: create(path, cube.recipe, overwrite=overwrite)) as writer:
+    with open_writer(path, cube.recipe) as writer:
         copy_counts(cube, writer)
 
 
 def copy_counts(cube: Cube, writer: Writer) -> None:
     """Write the counts of a cube, block by block."""
-    registrations = 0
     for realizations, rows in cube.recipe.blocks(writer.chunks):
         block = np.asarray(cube.histogram[realizations, rows])
         if block.dtype != cube.recipe.dtype:
             raise TypeError(f"histogram must be {cube.recipe.dtype} for this system, got {block.dtype}")
         writer.write(realizations, rows, block)
-        registrations += int(block.sum(dtype=np.uint64))
-    writer.finish(registrations)
 
 
 def one_exposure(cube: Cube, realization: int) -> Cube:
@@ -243,20 +241,18 @@ def load(path: str | Path, *, allow_incomplete: bool = False) -> Cube:
 
 
 def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str = "") -> Cube:
-    lazy: type[OnDisk] = Elsewhere if url else OnDisk
     try:
         complete = store.complete and not source.name.endswith(INCOMPLETE_SUFFIX)
         if not (complete or allow_incomplete):
             told = f" ({store.progress})" if store.progress else ""
             raise IncompleteFileError(f"{url or source} is incomplete: its simulation did not finish{told}")
-        if store.histogram is None:
+        histogram = store.arrays.get("histogram")
+        if histogram is None:
             raise ValueError(f"{url or source} has no variable 'histogram': its writing stopped at the very start")
-        rows_of = store.rows_of
-        rows = None if rows_of is None else lambda name: lazy(rows_of(name), source)
-        recipe = layout.recipe_from(store.attrs, store.names, store.read, int(store.histogram.shape[0]), rows)
+        recipe = layout.recipe_from(store.attrs, store.arrays, int(histogram.shape[0]))
         total = store.attrs.get("registrations")
         return Cube(
-            histogram=lazy(store.histogram, source),
+            histogram=histogram,
             recipe=recipe,
             complete=complete,
             registrations=None if total is None else int(total),
@@ -272,7 +268,7 @@ def _opened(store: OpenedStore, source: Path, allow_incomplete: bool, url: str =
 
 
 def check_output(path: str | Path, recipe: Recipe | Recording, *, overwrite: bool = False) -> None:
-    """Raise what `create` would raise, without touching anything."""
+    """Raise what writing the cube there would raise, without touching anything."""
     target = Path(path)
     form = format_of(target, "out")
     check_target(target, folder=target.suffix == ".zarr", overwrite=overwrite)
@@ -285,11 +281,10 @@ def check_output(path: str | Path, recipe: Recipe | Recording, *, overwrite: boo
         form.check(recipe)
 
 
-def create(path: str | Path, recipe: Recipe | Recording, *, overwrite: bool = False) -> Writer:
-    """A writer for the format that the suffix names."""
-    check_output(path, recipe, overwrite=overwrite)
-    writer: Writer = format_of(Path(path), "out").open_writer(Path(path), recipe)
-    return writer
+def open_writer(path: str | Path, recipe: Recipe | Recording) -> AbstractContextManager[Writer]:
+    """A writer for the format that the suffix names, where `check_output` finds nothing wrong."""
+    opened: AbstractContextManager[Writer] = format_of(Path(path), "out").open_writer(Path(path), recipe)
+    return opened
 
 
 def format_of(path: Path, argument: str) -> Any:

@@ -15,8 +15,8 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_claim, open_npz, read_npy, reading
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
-from mars_lidar.io.mat_arrays import hdf5_arrays, mat_arrays
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
+from mars_lidar.io.named_arrays import hdf5_arrays, mat_arrays
 from mars_lidar.io.recorder import RECORDER_SUFFIXES, Recorded, recorded
 from mars_lidar.io.streams.bare_stream import cells_of
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import whole
-from mars_lidar._base.hdf5 import LIBVER, ForgivingFile, check_heaps, require, seal, with_checksums
+from mars_lidar._base.files import beside
+from mars_lidar._base.hdf5 import ForgivingFile, check_heaps, require, seal, with_checksums
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
-from mars_lidar.io.store import FileWriter, OpenedStore
+from mars_lidar.io.store import OnDisk, OpenedStore, Writer
 
 # 1 MiB is HDF5's default chunk cache. gzip at level 1 with byte shuffle, on the room of zarr_store.py (write,
 # read, size): 0.32 s, 0.15 s, 5.2 MB; level 4 0.72 s, 0.21 s, 4.5 MB; lzf 0.26 s, 0.16 s, 8.7 MB, and MATLAB
@@ -21,49 +22,37 @@ from mars_lidar.io.store import FileWriter, OpenedStore
 _CHUNK_BYTES = 2**20
 
 
-class Hdf5Writer(FileWriter):
-    """Writes a cube."""
-
-    def _begin(self, recipe: Recipe | Recording) -> None:
-        import h5py
-
-        self._disk = ForgivingFile(self._sibling.path)
-        self._parts.append(self._disk)
-        self._file = h5py.File(self._disk, "w", libver=LIBVER)
-        self._parts.append(self._file)
-        self._file.attrs.update({**layout.attributes(recipe), "complete": 0})
+@contextlib.contextmanager
+def open_writer(path: Path, recipe: Recipe | Recording) -> Iterator[Writer]:
+    """Writes a cube; its attribute ``complete`` is set at the end."""
+    with beside(path) as unfinished, ForgivingFile(unfinished) as disk, disk.hdf5() as file:
+        file.attrs.update({**layout.attributes(recipe), "complete": 0})
         variables = layout.variables(recipe)
-        add(self._file, variables, check=self._disk.check)
-        self.chunks = recipe.chunks(_CHUNK_BYTES)
-        self._histogram = self._file.create_dataset(
+        add(file, variables, check=disk.check)
+        chunks = recipe.chunks(_CHUNK_BYTES)
+        histogram = file.create_dataset(
             "histogram",
             shape=recipe.shape,
             dtype=recipe.dtype,
-            chunks=self.chunks,
+            chunks=chunks,
             compression="gzip",
             compression_opts=1,
             shuffle=True,
             fletcher32=True,
         )
-        self._histogram.attrs.update(layout.HISTOGRAM_LABELS)
-        name_axes(self._file, {"histogram": layout.DIMS} | {v.name: v.dims for v in variables})
-        self._file.flush()
-        self._disk.check()
+        histogram.attrs.update(layout.HISTOGRAM_LABELS)
+        name_axes(file, {"histogram": layout.DIMS} | {v.name: v.dims for v in variables})
+        file.flush()
+        disk.check()
 
-    def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
-        """Store whole chunks."""
-        self._histogram[realizations, rows] = block
-        self._disk.check()
+        def put(realizations: slice, rows: slice, block: NDArray[Any]) -> None:
+            histogram[realizations, rows] = block
+            disk.check()
 
-    def _end(self, registrations: int) -> None:
-        self._file.attrs.update({"registrations": registrations, "complete": 1})
-        seal(self._file)
-        self._file.close()
-        self._disk.close()
-        self._disk.check()
-
-
-open_writer = Hdf5Writer
+        writer = Writer(chunks, put)
+        yield writer
+        file.attrs.update({"registrations": writer.registrations, "complete": 1})
+        seal(file)
 
 
 def add(
@@ -107,11 +96,4 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     except BaseException:
         file.close()
         raise
-    return OpenedStore(
-        attrs,
-        frozenset(file),
-        lambda name: whole(file[name]),
-        file.get("histogram"),
-        close=file.close,
-        rows_of=file.__getitem__,
-    )
+    return OpenedStore(attrs, {name: OnDisk(array, path) for name, array in file.items()}, close=file.close)

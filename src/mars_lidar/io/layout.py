@@ -36,8 +36,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.io.recipe import Recipe, Recording
+from mars_lidar.io.store import OnDisk, values
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import BAND_BYTES, StoredFlux, Waveforms
 
@@ -65,13 +67,13 @@ class Variable:
     name: str
     dims: tuple[str, ...]
     data: Any  # an array, or `Waveforms`, which are read by `bands`
-    units: str
+    units: str  # empty of texts
     long_name: str
 
     @property
     def labels(self) -> dict[str, str]:
         """Attributes of the variable."""
-        return {"long_name": self.long_name, "units": self.units}
+        return {"long_name": self.long_name} | ({"units": self.units} if self.units else {})
 
     def bands(self) -> Iterator[slice]:
         """Parts along the first axis that fit in memory."""
@@ -125,8 +127,6 @@ def variables(recipe: Recipe | Recording) -> list[Variable]:
 
 def attributes(recipe: Recipe | Recording) -> dict[str, str | int]:
     """Attributes of the file as plain strings and integers; ``complete`` is the writer's own."""
-    from mars_lidar._version import __version__
-
     both: dict[str, str | int] = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -146,18 +146,15 @@ def attributes(recipe: Recipe | Recording) -> dict[str, str | int]:
     }
 
 
-def recipe_from(
-    attrs: Mapping[str, Any],
-    names: frozenset[str],
-    read: Callable[[str], NDArray[Any]],
-    realizations: int,
-    rows_of: Callable[[str], Any] | None = None,
-) -> Recipe | Recording:
-    """The recipe or the recording that `variables` and `attributes` wrote.
+def recipe_from(attrs: Mapping[str, Any], arrays: Mapping[str, Any], realizations: int) -> Recipe | Recording:
+    """The recipe or the recording that `variables` and `attributes` wrote, of the variables of a file by name.
 
-    `read` returns a variable by name; `rows_of` one that is read from disk when it is sliced, for waveforms larger
-    than `BAND_BYTES`.
+    Waveforms larger than `BAND_BYTES` stay on disk, where they are there.
     """
+
+    def read(name: str) -> NDArray[Any]:
+        return values(arrays[name])
+
     if attrs["engine"] == MEASURED:
         return Recording(
             system=System.from_json(attrs["system"]),
@@ -168,9 +165,9 @@ def recipe_from(
     flux: Flux
     system = System.from_json(attrs["system"])
     background, info = read("background"), json.loads(attrs["flux"])
-    if "waveform" in names:
-        stored = None if rows_of is None else rows_of("waveform")
-        if stored is not None and 8 * math.prod(stored.shape) > BAND_BYTES:
+    if "waveform" in arrays:
+        stored = arrays["waveform"]
+        if isinstance(stored, OnDisk) and 8 * math.prod(stored.shape) > BAND_BYTES:
 
             def make(rows: slice) -> Flux:
                 return Flux(waveform=np.asarray(stored[rows]), background=background[rows], info=info)
@@ -178,10 +175,8 @@ def recipe_from(
             flux = StoredFlux(read("signal"), background, int(stored.shape[-1]), make, info)
         else:
             flux = Flux(waveform=read("waveform"), background=background, info=info)
-    elif "returns_signal" in names:
-        returns = zip(read("returns_signal"), read("returns_delay"), strict=True)
-        zero = np.zeros_like(background)
-        flux = Flux.multi(*[Flux(s, zero if k else background, tau) for k, (s, tau) in enumerate(returns)], info=info)
+    elif "returns_signal" in arrays:
+        flux = Flux(read("returns_signal"), background, read("returns_delay"), info=info)
     else:
         flux = Flux(read("signal"), background, read("delay"), info=info)
     recipe = Recipe(
@@ -191,14 +186,14 @@ def recipe_from(
         seed=int(attrs["seed"]),
         realizations=realizations,
         first_realization=int(attrs["first_realization"]),
-        pixel_index=read("pixel_index").ravel() if "pixel_index" in names else None,
+        pixel_index=read("pixel_index").ravel() if "pixel_index" in arrays else None,
         depth_m=read("depth"),
-        reflectivity=read("reflectivity") if "reflectivity" in names else None,
+        reflectivity=read("reflectivity") if "reflectivity" in arrays else None,
         source=str(attrs["source"]),
         settings=json.loads(attrs.get("engine_settings", "{}")),
     )
     for told in variables(recipe):
-        if told.dims == (told.name,) and told.name in names and not np.array_equal(read(told.name), told.data):
+        if told.dims == (told.name,) and told.name in arrays and not np.array_equal(read(told.name), told.data):
             raise ValueError(f"the coordinate {told.name} is not that of its system and flux: it is damaged")
     return recipe
 

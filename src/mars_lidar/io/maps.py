@@ -22,12 +22,14 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_target, reading
-from mars_lidar._base.hdf5 import new_file, seal
+from mars_lidar._base.files import beside, check_target, reading
+from mars_lidar._base.hdf5 import ForgivingFile, seal
+from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.io import hdf5, npz, zarr_store
 from mars_lidar.io.cube import format_of
 from mars_lidar.io.layout import Variable
+from mars_lidar.io.store import values
 
 FORMAT, FORMAT_VERSION = "mars-lidar maps", 1
 SUFFIXES = (".zarr", ".h5", ".hdf5", ".npz")
@@ -68,12 +70,16 @@ def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "",
     target = Path(path)
     check_maps_output(target, overwrite=overwrite)
     variables, attrs = _contents(results, source)
-    with TemporarySibling(target).writing() as unfinished:
+    with beside(target) as unfinished:
         if target.suffix == ".zarr":
+            import zarr
+
             shutil.rmtree(unfinished, ignore_errors=True)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "The data type")  # of the methods' names: fixed-length text
-                zarr_store.consolidated(zarr_store.new_store(unfinished, {}, variables))
+                group = zarr.create_group(unfinished, zarr_format=3)
+                zarr_store.add(group, variables)
+                zarr_store.consolidated(group)
                 manifest.seal(unfinished, attrs)
             if target.exists():
                 (target / "zarr.json").unlink(missing_ok=True)
@@ -82,7 +88,7 @@ def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "",
             with npz.archive(unfinished) as archive:
                 npz.add_attributes(archive, {**attrs, "variables": npz.add(archive, variables)})
         else:
-            with new_file(unfinished) as file:
+            with ForgivingFile(unfinished).hdf5() as file:
                 file.attrs.update(attrs)
                 hdf5.add(file, variables, compression="gzip", shuffle=True)
                 hdf5.name_axes(file, {v.name: v.dims for v in variables})
@@ -99,7 +105,7 @@ def load_maps(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]
     with reading(source, "maps of mars-lidar"):
         _check_suffix("path", source)
         with contextlib.closing(format_of(source, "path").open_store(source, _check_format)) as store:
-            found = {name: store.read(name) for name in store.names}
+            found = {name: values(array) for name, array in store.arrays.items()}
         if found.get("method", np.empty(0)).dtype.kind == "S":
             found["method"] = found["method"].astype(str)
         _check(found, store.attrs)
@@ -137,8 +143,6 @@ def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:
 
 
 def _contents(results: Mapping[str, Any], source: str) -> tuple[list[Variable], dict[str, Any]]:
-    from mars_lidar._version import __version__
-
     first = next(iter(results.values()))
     shape: tuple[int, ...] = first.depth_m.shape
     if len(shape) != 3:

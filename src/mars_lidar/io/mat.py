@@ -19,6 +19,7 @@ so `scipy.io.loadmat` returns it as uint16. ``rates`` is zero where there is no 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import struct
 import zlib
@@ -30,12 +31,12 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base.files import FileError, read_mat5
+from mars_lidar._base.files import FileError, beside, read_mat5
 from mars_lidar._base.memory import check_memory
 from mars_lidar.instrument.system import System
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe
-from mars_lidar.io.store import FileWriter, LazyCounts, OpenedStore
+from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
 from mars_lidar.light.flux import Flux
 
 UPSAMPLING = 8  # bin_hr over bin: 512 x 512 and 64 x 64 in the files that the networks were trained on
@@ -59,54 +60,41 @@ def check(recipe: Recipe) -> None:
         )
 
 
-class MatWriter(FileWriter):
-    """Keeps the counts sparse until the end."""
+@contextlib.contextmanager
+def open_writer(path: Path, recipe: Recipe, bin_hr: NDArray[np.float64] | None = None) -> Iterator[Writer]:
+    """Writes a cube, whose counts it keeps sparse until the end."""
+    from scipy import sparse
 
-    def __init__(self, path: Path, recipe: Recipe, bin_hr: NDArray[np.float64] | None = None) -> None:
-        check(recipe)
-        size = 3 * 8 * int(np.prod(recipe.shape))
-        check_memory(size, f"the rates of {path}", "a .zarr or .h5 is written in parts")
-        self._recipe, self._bin_hr = recipe, bin_hr
-        self.chunks = recipe.chunks(BLOCK_BYTES)
-        self._counts: list[Any] = []
-        super().__init__(path, recipe)
+    check(recipe)
+    check_memory(3 * 8 * int(np.prod(recipe.shape)), f"the rates of {path}", "a .zarr or .h5 is written in parts")
+    kept: list[Any] = []
 
-    def _begin(self, recipe: Recipe) -> None:
-        self._file = open(self._sibling.path, "wb")  # noqa: SIM115  # closed by `finish` and `abandon`
-        self._parts.append(self._file)
-
-    def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
-        """Keep the non-zero counts of the rows."""
+    def put(realizations: slice, rows: slice, block: NDArray[Any]) -> None:
         y, x, k = np.nonzero(block[0])
-        self._counts.append((y + rows.start, x, k, block[0][y, x, k]))
+        kept.append((y + rows.start, x, k, block[0][y, x, k]))
 
-    def _end(self, registrations: int) -> None:
-        """Write the variables, one after the other."""
-        from scipy import sparse
-
-        recipe = self._recipe
+    with beside(path) as unfinished, open(unfinished, "wb") as file:
+        writer = Writer(recipe.chunks(BLOCK_BYTES), put)
+        yield writer
         _, height, width, bins = recipe.shape
-        y, x, k, counts = (np.concatenate(part) for part in zip(*self._counts, strict=True))
+        y, x, k, counts = (np.concatenate(part) for part in zip(*kept, strict=True))
         spad = sparse.csc_matrix((counts.astype(np.float64), (y + height * x, k)), shape=(height * width, bins))
         first, fine = return_bins(recipe.flux, recipe.system)
         flux = recipe.flux.detected(recipe.system)
         background = float(flux.background.mean())
-        attrs: dict[str, Any] = {**layout.attributes(recipe), "complete": True, "registrations": registrations}
+        attrs: dict[str, Any] = {"complete": True, "registrations": writer.registrations}
         ours: dict[str, Any] = {v.name: v.data for v in layout.variables(recipe)}
         attrs["shapes"] = {name: list(array.shape) for name, array in ours.items()}
         variables = {
             "spad": spad,
             "SBR": float(flux.signal.mean()) / background if background > 0 else np.inf,
             "bin": first,
-            "bin_hr": larger(fine) if self._bin_hr is None else self._bin_hr,
+            "bin_hr": larger(fine) if bin_hr is None else bin_hr,
             "photons": float(flux.signal.mean()) * recipe.system.cycles,
             "rates": rates(flux, recipe.system),
-            "mars_lidar": {"attributes": json.dumps(attrs), **ours},
+            "mars_lidar": {"attributes": json.dumps(layout.attributes(recipe) | attrs), **ours},
         }
-        write_variables(self._file, variables)
-
-
-open_writer = MatWriter
+        write_variables(file, variables)
 
 
 def larger(image: NDArray[Any]) -> NDArray[Any]:
@@ -200,10 +188,9 @@ def open_store(path: Path) -> OpenedStore:
     layout.check_format(path, attrs)
     shapes: Mapping[str, list[int]] = attrs.pop("shapes")
 
-    def read(name: str) -> NDArray[Any]:
-        return np.ascontiguousarray(np.asarray(ours[name]).reshape(shapes[name]))  # sums keep their bits
-
-    recipe = layout.recipe_from(attrs, frozenset(shapes), read, 1)
+    # contiguous, so that sums keep their bits
+    arrays = {name: np.ascontiguousarray(np.asarray(ours[name]).reshape(shape)) for name, shape in shapes.items()}
+    recipe = layout.recipe_from(attrs, arrays, 1)
     _, height, width, bins = recipe.shape
     spad = found["spad"]
     if spad.shape != (height * width, bins):
@@ -214,7 +201,7 @@ def open_store(path: Path) -> OpenedStore:
         dense = spad.astype(recipe.dtype).toarray(order="C")
         return np.ascontiguousarray(dense.reshape(width, height, bins).transpose(1, 0, 2))[None]
 
-    return OpenedStore(attrs, frozenset(shapes), read, LazyCounts(recipe.shape, recipe.dtype, counts))
+    return OpenedStore(attrs, arrays | {"histogram": OnDisk(LazyCounts(recipe.shape, recipe.dtype, counts), path)})
 
 
 def read_variables(path: Path) -> dict[str, Any]:

@@ -6,51 +6,43 @@ units. The counts are streamed into the archive, so writing needs no memory for 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import npy_header, open_npz
+from mars_lidar._base.files import beside, npy_header, open_npz
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import BLOCK_BYTES, Recipe, Recording
-from mars_lidar.io.store import FileWriter, LazyCounts, OpenedStore
+from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
 
 _LEVEL = 1  # zlib; on the room of zarr_store.py 0.6 s and 6.6 MB, level 6 takes 3.9 s for 5.0 MB
 
 
-class NpzWriter(FileWriter):
+@contextlib.contextmanager
+def open_writer(path: Path, recipe: Recipe | Recording) -> Iterator[Writer]:
     """Writes a cube; an unfinished archive has no directory."""
+    header = {"descr": np.lib.format.dtype_to_descr(recipe.dtype), "fortran_order": False, "shape": recipe.shape}
+    with beside(path) as unfinished, archive(unfinished) as to:
+        labels = {"histogram": {"dims": layout.DIMS, **layout.HISTOGRAM_LABELS}} | add(to, layout.variables(recipe))
+        with to.open("histogram.npy", "w", force_zip64=True) as member:
+            np.lib.format.write_array_header_1_0(member, header)
 
-    def _begin(self, recipe: Recipe | Recording) -> None:
-        self._zip = archive(self._sibling.path)
-        self._parts.append(self._zip)
-        labels = {"histogram": {"dims": layout.DIMS, **layout.HISTOGRAM_LABELS}}
-        labels |= add(self._zip, layout.variables(recipe))
-        self._attrs = {**layout.attributes(recipe), "variables": labels}
-        # a realization is the least that may come in bands of rows, in C order
-        self.chunks = recipe.chunks(BLOCK_BYTES)
-        self._member = self._zip.open("histogram.npy", "w", force_zip64=True)
-        self._parts.append(self._member)
-        header = {"descr": np.lib.format.dtype_to_descr(recipe.dtype), "fortran_order": False, "shape": recipe.shape}
-        np.lib.format.write_array_header_1_0(self._member, header)
+            def put(realizations: slice, rows: slice, block: NDArray[Any]) -> None:
+                member.write(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
 
-    def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
-        """Append a block; blocks come in C order."""
-        self._member.write(np.ascontiguousarray(block).reshape(-1).view(np.uint8).data)
-
-    def _end(self, registrations: int) -> None:
-        self._member.close()
-        add_attributes(self._zip, {**self._attrs, "registrations": registrations, "complete": True})
-
-
-open_writer = NpzWriter
+            # a realization is the least that may come in bands of rows, in C order
+            writer = Writer(recipe.chunks(BLOCK_BYTES), put)
+            yield writer
+        attrs = {**layout.attributes(recipe), "variables": labels}
+        add_attributes(to, {**attrs, "registrations": writer.registrations, "complete": True})
 
 
 def archive(path: Path) -> zipfile.ZipFile:
@@ -79,18 +71,14 @@ def add_attributes(to: zipfile.ZipFile, attrs: Mapping[str, Any]) -> None:
 
 
 def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedStore:
-    """Open an archive for reading."""
+    """Open an archive for reading; all but the counts are read at once."""
     with open_npz(path, beside="histogram") as found:
-        names = frozenset(found.files)
-        attrs = json.loads(found["attributes"].item()) if "attributes" in names else {}
-    check(path, attrs)
-
-    def read(name: str) -> NDArray[Any]:
-        with open_npz(path, beside="histogram") as found:
-            return np.asarray(found[name])
-
-    counts = _counts(path) if "histogram" in names else None
-    return OpenedStore(attrs, names - {"attributes"}, read, counts)
+        attrs = json.loads(found["attributes"].item()) if "attributes" in found.files else {}
+        check(path, attrs)
+        arrays: dict[str, Any] = {name: found[name] for name in found.files if name not in ("attributes", "histogram")}
+        if "histogram" in found.files:
+            arrays["histogram"] = OnDisk(_counts(path), path)
+    return OpenedStore(attrs, arrays)
 
 
 def _counts(path: Path) -> LazyCounts:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.files import FileError
-from mars_lidar._base.memory import check_memory
 from mars_lidar._base.optional import MissingLibraryError, needed
 from mars_lidar.io import layout
 from mars_lidar.io.store import OnDisk, OpenedStore
@@ -39,6 +37,10 @@ class Elsewhere(OnDisk):
     def _naming(self) -> contextlib.AbstractContextManager[Any]:
         return _naming(str(self._path))
 
+    def whole(self) -> NDArray[Any]:
+        """All values, if there is memory for them."""
+        return np.asarray(self)
+
 
 def open_url(url: str) -> OpenedStore:
     """Open a store for reading; its documents and coordinates are compared with its manifest, and its names if listed.
@@ -58,15 +60,7 @@ def open_url(url: str) -> OpenedStore:
         if attrs.get("complete") is True:
             _require(url, system, root)
         group: Any = zarr.open_group(FsspecStore.from_url(url, read_only=True), mode="r")
-        names = frozenset(group.array_keys())
-        histogram = group["histogram"] if "histogram" in names else None
-
-    def read(name: str) -> NDArray[Any]:
-        array = group[name]
-        check_memory(math.prod(array.shape) * array.dtype.itemsize, f"{name} of {url}", "read it on a larger machine")
-        return np.asarray(Elsewhere(array, Path(url))[...])
-
-    return OpenedStore(attrs, names, read, histogram, rows_of=group.__getitem__)
+        return OpenedStore(attrs, {name: Elsewhere(array, Path(url)) for name, array in group.arrays()})
 
 
 def _require(url: str, system: Any, root: str) -> None:
@@ -75,14 +69,16 @@ def _require(url: str, system: Any, root: str) -> None:
         lines = system.cat_file(f"{root}/{manifest.NAME}").decode()
     except FileNotFoundError:
         return  # of an earlier version
-    told = manifest.lines_of(lines)
-    wrong = list(manifest.changed(told, lambda n: hashlib.sha256(system.cat_file(f"{root}/{n}")).hexdigest()))
     try:
         there = {str(name).rpartition(f"{root}/")[2] for name in system.find(root)}
     except Exception:  # what cannot be listed (most web servers)
         there = set()
-    if manifest.NAME in there:
-        wrong += [f"{name} is missing" for name in sorted(set(told) - there)]
+    listed = there if manifest.NAME in there else None
+
+    def digest(name: str) -> str:
+        return hashlib.sha256(system.cat_file(f"{root}/{name}")).hexdigest()
+
+    wrong = list(manifest.compared(manifest.lines_of(lines), listed, digest))
     if wrong:
         raise ValueError(f"is damaged: {', '.join(wrong[:3])}")
 

@@ -7,26 +7,25 @@ import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Unpack
+from typing import Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import manifest
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import of_part, shown
 from mars_lidar._base.types import Progress
 from mars_lidar.engines import EngineOptions, find_engine
 from mars_lidar.engines.options import given
+from mars_lidar.engines.table_reader import table_record
 from mars_lidar.instrument.system import System
-from mars_lidar.io.cube import Cube, check_output, create, load
+from mars_lidar.io import zarr_store
+from mars_lidar.io.cube import Cube, check_output, load, open_writer
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import writing
-from mars_lidar.io.zarr_store import continue_writer
 from mars_lidar.light.flux import Flux
-
-if TYPE_CHECKING:
-    from mars_lidar.table import Table
+from mars_lidar.simulate import simulate
+from mars_lidar.table import Table, cache
 
 
 @dataclass(frozen=True)
@@ -140,28 +139,24 @@ def simulate_to(
         raise ValueError(f"resume is for a .zarr, the only format that an interruption leaves, got {str(target)!r}")
     drawn_by.check(flux, system)  # every pixel, before the blocks one by one
     _try_brightest_pixel(recipe, threads, device)
-    continued = continue_writer(target, recipe) if going_on else None
-    if going_on and continued is None:
+    begun = zarr_store.unfinished(target, recipe) if going_on else None
+    if going_on and begun is None:
         return Written(target, int(load(target).registrations or 0), 0.0, 0.0, {})
     simulate_s = write_s = 0.0
     report: dict[str, float] = {}
-    with writing(target, lambda: continued or create(target, recipe, overwrite=overwrite)) as writer:
-        blocks = list(recipe.blocks(writer.chunks))
-        begun, registrations = continued.begun(blocks) if continued else (0, 0)
-        for images, rows in blocks[begun:]:
+    with zarr_store.open_writer(target, recipe, begun) if going_on else open_writer(target, recipe) as writer:
+        for images, rows in list(recipe.blocks(writer.chunks))[writer.begun :]:
             began = time.perf_counter()
             told: dict[str, float] = {}
             tell = _of_the_whole(progress, recipe, images, rows)
             block = _simulate(recipe, images, rows, threads=threads, progress=tell, report=told, device=device)
             ended = time.perf_counter()
             writer.write(images, rows, block)
-            registrations += int(block.sum(dtype=np.uint64))
             simulate_s += ended - began
             write_s += time.perf_counter() - ended
             for name, value in told.items():
                 report[name] = report.get(name, 0.0) + value
-        writer.finish(registrations)
-    return Written(target, registrations, simulate_s, write_s, report)
+    return Written(target, writer.registrations, simulate_s, write_s, report)
 
 
 @checked
@@ -225,8 +220,6 @@ def verify(
 
 def _simulate(recipe: Recipe, images: slice, rows: slice, **how: Any) -> NDArray[Any]:
     """A part of a cube; `how` are further arguments of `mars_lidar.simulate`."""
-    from mars_lidar import simulate
-
     counts: Any = simulate(**recipe.part(images, rows), **how)
     here: NDArray[Any] = counts.get() if how.get("device") == "cuda" else counts
     return here
@@ -255,9 +248,6 @@ def _repeatable(recipe: Recipe, table: Table | None) -> Recipe:
 
 def _from_cache(system: System, record: dict[str, Any]) -> Table | None:
     """The table of that record, where the user's cache has it."""
-    from mars_lidar.engines.table_reader import table_record
-    from mars_lidar.table import Table, cache
-
     for path in cache.files():
         with contextlib.suppress(OSError, ValueError):
             table = Table.load(path, system)
@@ -287,13 +277,7 @@ def _try_brightest_pixel(recipe: Recipe, threads: int | None, device: Literal["c
 
 def _of_the_whole(progress: Progress | None, recipe: Recipe, images: slice, rows: slice) -> Progress | None:
     """A callback for one block that tells `progress` how far the whole cube is, in pixel exposures."""
-    if progress is None:
-        return None
     count, height, width, _ = recipe.shape
     before = images.start * height * width + rows.start * width
     size = (images.stop - images.start) * (rows.stop - rows.start) * width
-
-    def shifted(done: int, total: int) -> None:
-        progress(before + size * done // max(total, 1), count * height * width)
-
-    return shifted
+    return of_part(progress, before, before + size, count * height * width)

@@ -14,7 +14,6 @@ from mars_lidar._base.files import check_target, reading
 from mars_lidar._base.memory import check_memory
 from mars_lidar.io import mat
 from mars_lidar.io.cube import Cube, copy_counts, one_exposure
-from mars_lidar.io.store import writing
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,5 +134,5 @@ def save_mat(
         fine = mat.bins_of_delay(recipe.system.delay_ns(depth), recipe.system)
     mat.check(recipe)
     check_target(target, folder=False, overwrite=overwrite)
-    with writing(target, lambda: mat.MatWriter(target, recipe, fine)) as writer:
+    with mat.open_writer(target, recipe, fine) as writer:
         copy_counts(one, writer)

@@ -1,4 +1,4 @@
-"""Transients on disk: .npy and .npz, HDF5, and the HDF5 captures of tal and mitransient."""
+"""Transients on disk, with depth and reflectivity beside them: NumPy, HDF5, MATLAB, captures of tal and mitransient."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import check_data, open_npz, read_mat5, read_npy, reading, whole
+from mars_lidar._base.files import check_data, read_npy, reading
 from mars_lidar._base.hdf5 import open_hdf5
-from mars_lidar.io.capture import capture_in
-from mars_lidar.io.store import Rows
+from mars_lidar._base.types import FloatArray
+from mars_lidar.io.capture import CAPTURE_SUFFIXES, Capture, capture_in
+from mars_lidar.io.named_arrays import open_arrays
+from mars_lidar.io.store import OnDisk, values
+from mars_lidar.light.rate_parts import Rows
 from mars_lidar.light.transient import Transient
 
 SUFFIXES = (".npy", ".npz", ".h5", ".hdf5", ".mat")
 _NAME = "transient"
 _TIMES: tuple[str, ...] = ("bin_ns", "start_ns")
+_TRUTH = ("depth", "reflectivity")
 _CONFOCAL = ("rect_data", "meas")  # of a .mat, in place of "transient": O'Toole 2018; Lindell 2019
 
 
@@ -77,88 +81,81 @@ def _read(
     if suffix == ".npy":
         if name is not None:
             raise ValueError(f"{source}: a .npy has one array without a name, got name {name!r}")
-        values: Any = read_npy(source)
-    elif suffix == ".npz":
-        values, told = _from_npz(source, name or _NAME)
-    elif suffix in (".h5", ".hdf5"):
-        values, told = _from_hdf5(source, name)
-    elif suffix == ".mat":
-        values, told = _from_mat(source, name)
+        light: Any = read_npy(source)
+    elif suffix in CAPTURE_SUFFIXES and name is None and (capture := _capture(source)) is not None:
+        light = Rows(capture.image, capture.read)
+        times = {"bin_ns": capture.bin_ns, "start_ns": capture.start_ns}
+        told = {key: value for key, value in times.items() if value is not None}
+    elif suffix in SUFFIXES:
+        light, told = _named(source, name)
     else:
         raise ValueError(f"{source}: a transient must be one of {', '.join(SUFFIXES)}")
     width = told.get("bin_ns") if bin_ns is None else bin_ns
     if width is None:
         raise ValueError(f"{source}: does not tell the width of a time bin: give bin_ns")
     start = told.get("start_ns", 0.0) if start_ns is None else start_ns
-    if len(values.shape) == 4:
-        if channel is None or not 0 <= channel < values.shape[3]:
-            raise ValueError(f"{source}: has {values.shape[3]} channels: give channel from 0, got {channel!r}")
-        every, place = values, channel
-        values = Rows(tuple(every.shape[:3]), lambda rows: np.asarray(every[rows])[..., place])
+    if len(light.shape) == 4:
+        if channel is None or not 0 <= channel < light.shape[3]:
+            raise ValueError(f"{source}: has {light.shape[3]} channels: give channel from 0, got {channel!r}")
+        every, place = light, channel
+        light = Rows(tuple(every.shape[:3]), lambda rows: np.asarray(every[rows])[..., place])
     elif channel is not None:
-        raise ValueError(f"{source}: channel is for (H, W, T, C) arrays, got shape {tuple(values.shape)}")
-    return Transient(values, width, start_ns=start, source=str(source))
+        raise ValueError(f"{source}: channel is for (H, W, T, C) arrays, got shape {tuple(light.shape)}")
+    return Transient(light, width, start_ns=start, source=str(source))
 
 
-def _from_npz(path: Path, name: str) -> tuple[NDArray[Any], dict[str, float]]:
-    with open_npz(path) as archive:
-        if name not in archive.files:
-            raise ValueError(f"{path}: cannot be read (no array {name!r}, got {', '.join(archive.files) or 'none'})")
-        told = {key: float(archive[key]) for key in _TIMES if key in archive.files}
-        return archive[name], told
+def _named(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
+    """An array of a file, of HDF5 with its rows on disk, and the times that stand beside it."""
+    with open_arrays(path) as file:
+        name = name or next((one for one in (_NAME, *_CONFOCAL) if one in file.names), _NAME)
+        if name not in file.names:
+            raise ValueError(f"{path}: cannot be read (no array {name!r}, got {', '.join(file.names) or 'nothing'})")
+        found = file.read((name, *_TIMES))
+        stored = found.pop(name)
+        told = {key: float(np.ravel(values(one))[0]) for key, one in found.items()}
+        if not isinstance(stored, OnDisk):
+            return stored, told
+        check_data(path, stored, name, in_parts=True)
+        told |= {key: float(stored.attrs[key]) for key in _TIMES if key in stored.attrs}
+
+    def read(rows: slice) -> NDArray[Any]:  # the file is open only here
+        with open_hdf5(path) as again:
+            data = again[name]
+            return np.asarray(data[..., rows]).T if file.turned else np.asarray(data[rows])
+
+    return Rows(tuple(stored.shape[::-1] if file.turned else stored.shape), read), told
 
 
-def _from_hdf5(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
-    import h5py
-
+def _capture(path: Path) -> Capture | None:
     with open_hdf5(path) as file:
-        capture = capture_in(path, file) if name is None else None
-        if capture is not None:
-            times = {"bin_ns": capture.bin_ns, "start_ns": capture.start_ns}
-            return Rows(capture.image, capture.read), {key: value for key, value in times.items() if value is not None}
-        wanted = name or _NAME
-        if not isinstance(file.get(wanted), h5py.Dataset):
-            names = ", ".join(file) or "nothing"
-            raise ValueError(
-                f"{path}: no data set {wanted!r} and no capture ('H' and 'H_format', 'data' and 'deltaT'), got {names}"
-            )
-        data = file[wanted]
-        check_data(path, data, wanted, in_parts=True)
-        told = {key: float(data.attrs[key]) for key in _TIMES if key in data.attrs}
-        return _rows(path, wanted, tuple(data.shape), turned=False), told
+        return capture_in(path, file)
 
 
-def _from_mat(path: Path, name: str | None) -> tuple[Any, dict[str, float]]:
-    import h5py
-    from scipy.io import whosmat
+def read_truth(path: str | Path, shape: tuple[int, int]) -> dict[str, FloatArray]:
+    """Depth and reflectivity beside a transient of `shape` (H, W), float64, those that are there.
 
-    turned = h5py.is_hdf5(path)  # version 7.3; MATLAB's first axis comes last
-    if turned:
-        with open_hdf5(path) as file:
-            there = list(file)
-    else:
-        there = [each for each, _, _ in whosmat(path)]
-    name = name or next((one for one in (_NAME, *_CONFOCAL) if one in there), _NAME)
-    if name not in there:
-        raise ValueError(f"{path}: cannot be read (no variable {name!r}, got {', '.join(there) or 'nothing'})")
-    if not turned:
-        found = read_mat5(path, (name, *_TIMES))
-        return found[name], {key: float(np.ravel(found[key])[0]) for key in _TIMES if key in found}
-    with open_hdf5(path) as file:
-        data = file[name]
-        if not isinstance(data, h5py.Dataset) or data.ndim != 3:
-            raise ValueError(f"{path}: no variable {name!r} of three axes, got {', '.join(there)}")
-        check_data(path, data, name, in_parts=True)
-        told = {key: float(np.ravel(whole(file[key]))[0]) for key in _TIMES if key in file}
-        return _rows(path, name, data.shape[::-1], turned=True), told
+    Arrays ``depth`` (m; 0, NaN and inf mean "no return", which becomes NaN) and ``reflectivity`` ([0, 1]), (H, W), of
+    ``.npz``, ``.h5``, ``.hdf5`` and ``.mat`` (turned, as the transient is). A ValueError begins with the file.
+    """
+    with reading(path, "a transient with depth and reflectivity") as source:
+        told: dict[str, FloatArray] = {}
+        for name, stored in _truth(source).items():
+            if stored.shape != shape or stored.dtype.kind not in "fiu":
+                raise ValueError(f"{source}: {name} must be real numbers {shape}, got {stored.dtype} {stored.shape}")
+            told[name] = stored.astype(np.float64)
+        if "depth" in told:
+            depth = told["depth"]
+            if (depth < 0.0).any():
+                raise ValueError(f"{source}: depth must not be negative, got {np.nanmin(depth):g} m")
+            told["depth"] = np.where((depth > 0.0) & (depth < np.inf), depth, np.nan)
+        if "reflectivity" in told and not ((told["reflectivity"] >= 0.0) & (told["reflectivity"] <= 1.0)).all():
+            raise ValueError(f"{source}: reflectivity must lie in [0, 1]")
+        return told
 
 
-def _rows(path: Path, name: str, shape: tuple[int, ...], *, turned: bool) -> Rows:
-    """A data set (H, W, T), or one (T, W, H) where it is turned; the file is open only while rows are read."""
-
-    def read(rows: slice) -> NDArray[Any]:
-        with open_hdf5(path) as file:
-            data = file[name]
-            return np.asarray(data[:, :, rows]).transpose(2, 1, 0) if turned else np.asarray(data[rows])
-
-    return Rows(shape, read)
+def _truth(path: Path) -> dict[str, NDArray[Any]]:
+    if path.suffix.lower() == ".npy":
+        return {}
+    with open_arrays(path) as file:
+        found = {name: values(array) for name, array in file.read(_TRUTH).items()}
+        return {name: array.T if file.turned else array for name, array in found.items()}

@@ -5,93 +5,89 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base import manifest
-from mars_lidar._base.files import whole
+from mars_lidar._base.files import telling
 from mars_lidar.io import layout
-from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import OpenedStore, Writer
+from mars_lidar.io.recipe import Recipe, Recording
+from mars_lidar.io.store import OnDisk, OpenedStore, Writer
 
 _CHUNK_BYTES = 4 * 2**20
 
 
-class ZarrWriter(Writer):
-    """A store whose attribute ``complete`` is false from its first byte on and true after its last."""
+@contextlib.contextmanager
+def open_writer(path: Path, recipe: Recipe | Recording, group: Any = None) -> Iterator[Writer]:
+    """Writes a new store, or goes on with what `unfinished` found.
 
-    def __init__(self, path: Path, recipe: Recipe, group: Any = None) -> None:
-        self._path = path
-        self._group: Any = self._new(recipe) if group is None else group
-        self._histogram: Any = self._group["histogram"]
-        self.chunks = self._histogram.chunks
-
-    def _new(self, recipe: Recipe) -> Any:
-        path = self._path
-        if path.exists():
-            # without its root document the old store is no store: a removal cut short cannot pass for a cube
-            (path / "zarr.json").unlink(missing_ok=True)
-            shutil.rmtree(path)
-        try:
-            return self._create(recipe)
-        except BaseException:
-            shutil.rmtree(path, ignore_errors=True)  # no counts are lost
-            raise
-
-    def _create(self, recipe: Recipe) -> Any:
-        attrs = {"complete": False, **layout.attributes(recipe)}
-        group = new_store(self._path, attrs, layout.variables(recipe))
-        group.create_array(
-            "histogram",
-            shape=recipe.shape,
-            dtype=recipe.dtype,
-            chunks=recipe.chunks(_CHUNK_BYTES),
-            compressors=blosc(recipe.dtype, "zstd", 1, "bitshuffle"),
-            dimension_names=layout.DIMS,
-            attributes={**layout.HISTOGRAM_LABELS},
-        )
-        return consolidated(group)
-
-    def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
-        """Store whole chunks."""
-        self._histogram[realizations, rows] = block
-
-    def finish(self, registrations: int) -> None:
-        """Mark the store complete: one atomic replacement of its root document, after its manifest."""
-        manifest.seal(self._path, {"registrations": registrations, "complete": True})
-
-    def abandon(self) -> str:
-        """Leave what is there, marked incomplete."""
-        return f"{self._path} is left behind, marked incomplete: --resume (resume=True) continues it"
-
-    def begun(self, blocks: Sequence[tuple[slice, slice]]) -> tuple[int, int]:
-        """How many of `blocks` are written, in their order, and the registrations in them.
-
-        The last one with anything in it may be half there, and does not count; chunks without counts are no files.
-        """
-        folder = self._path / "histogram" / "c"
-        last = 0
-        for number, (images, rows) in enumerate(blocks):
-            first, row = images.start // self.chunks[0], rows.start // self.chunks[1]
-            ends = -(-images.stop // self.chunks[0]), -(-rows.stop // self.chunks[1])
-            if any((folder / str(k) / str(y)).exists() for k in range(first, ends[0]) for y in range(row, ends[1])):
-                last = number
-        counts = (int(self._histogram[images, rows].sum(dtype=np.uint64)) for images, rows in blocks[:last])
-        return last, sum(counts)
+    Its attribute ``complete`` is false from the first byte on and true after the last: an atomic replacement of its
+    root document, after its manifest.
+    """
+    new = group is None
+    if new:
+        with telling(lambda: _removed(path)):  # no counts are lost
+            group = _create(path, recipe)
+    histogram = group["histogram"]
+    writer = Writer(histogram.chunks, lambda images, rows, block: histogram.__setitem__((images, rows), block))
+    with telling(lambda: f"{path} is left behind, marked incomplete: --resume (resume=True) continues it"):
+        if not new:
+            writer.begun, writer.registrations = _begun(path, histogram, list(recipe.blocks(histogram.chunks)))
+        yield writer
+        manifest.seal(path, {"registrations": writer.registrations, "complete": True})
 
 
-open_writer = ZarrWriter
+def _create(path: Path, recipe: Recipe | Recording) -> Any:
+    import zarr
+
+    if path.exists():
+        # without its root document the old store is no store: a removal cut short cannot pass for a cube
+        (path / "zarr.json").unlink(missing_ok=True)
+        shutil.rmtree(path)
+    attrs = {"complete": False, **layout.attributes(recipe)}
+    group = zarr.create_group(path, zarr_format=3, attributes=attrs)
+    add(group, layout.variables(recipe))
+    group.create_array(
+        "histogram",
+        shape=recipe.shape,
+        dtype=recipe.dtype,
+        chunks=recipe.chunks(_CHUNK_BYTES),
+        compressors=blosc(recipe.dtype, "zstd", 1, "bitshuffle"),
+        dimension_names=layout.DIMS,
+        attributes={**layout.HISTOGRAM_LABELS},
+    )
+    return consolidated(group)
 
 
-def continue_writer(path: Path, recipe: Recipe) -> ZarrWriter | None:
-    """The writer of a store that was left incomplete, by this recipe and version; None for a complete one."""
+def _removed(path: Path) -> str:
+    shutil.rmtree(path, ignore_errors=True)
+    return f"nothing was left at {path}"
+
+
+def _begun(path: Path, histogram: Any, blocks: Sequence[tuple[slice, slice]]) -> tuple[int, int]:
+    """How many of `blocks` are written, in their order, and the registrations in them.
+
+    The last one with anything in it may be half there, and does not count; chunks without counts are no files.
+    """
+    folder, chunks = path / "histogram" / "c", histogram.chunks
+    last = 0
+    for number, (images, rows) in enumerate(blocks):
+        first, row = images.start // chunks[0], rows.start // chunks[1]
+        ends = -(-images.stop // chunks[0]), -(-rows.stop // chunks[1])
+        if any((folder / str(k) / str(y)).exists() for k in range(first, ends[0]) for y in range(row, ends[1])):
+            last = number
+    return last, sum(int(histogram[images, rows].sum(dtype=np.uint64)) for images, rows in blocks[:last])
+
+
+def unfinished(path: Path, recipe: Recipe) -> Any:
+    """The group of a store that was left incomplete, by this recipe and version; None for a complete one."""
     import zarr
 
     if not (path / "zarr.json").is_file():
@@ -108,7 +104,7 @@ def continue_writer(path: Path, recipe: Recipe) -> ZarrWriter | None:
             raise ValueError(f"{path} was begun with another {v.name}; start again with --overwrite (overwrite=True)")
     if "histogram" not in group:
         raise ValueError(f"{path} was stopped before its first count; start again with --overwrite (overwrite=True)")
-    return None if stored.get("complete") is True else ZarrWriter(path, recipe, group)
+    return None if stored.get("complete") is True else group
 
 
 def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedStore:
@@ -120,32 +116,30 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     if attrs.get("complete", True) is True:
         manifest.require(path)
     group: Any = zarr.open_group(path, mode="r")
-    names = frozenset(group.array_keys())
-    histogram: Any = group["histogram"] if "histogram" in names else None
+    arrays = {name: OnDisk(array, path) for name, array in group.arrays()}
     progress = ""
-    if attrs.get("complete") is False and histogram is not None:
+    if attrs.get("complete") is False and (histogram := arrays.get("histogram")) is not None:
         progress = f"at least {histogram.nchunks_initialized} of {histogram.nchunks} chunks are written"
-    return OpenedStore(attrs, names, lambda name: whole(group[name]), histogram, progress, rows_of=group.__getitem__)
+    return OpenedStore(attrs, arrays, progress)
 
 
-def new_store(path: Path, attrs: dict[str, Any], variables: Iterable[layout.Variable]) -> Any:
-    """A new group with these attributes and variables."""
-    import zarr
+def add(group: Any, variables: Iterable[layout.Variable]) -> None:
+    """Create and write variables: numbers, or objects that are texts."""
+    from zarr.codecs import Crc32cCodec, ZstdCodec
 
-    group = zarr.create_group(path, zarr_format=3, attributes=attrs)
     for v in variables:
+        text = v.data.dtype == object
         array = group.create_array(
             v.name,
             shape=v.data.shape,
-            dtype=v.data.dtype,
+            dtype=str if text else v.data.dtype,
             chunks=_map_chunks(v.data),
-            compressors=blosc(v.data.dtype, "zstd", 1, "shuffle"),
+            compressors=(ZstdCodec(level=1), Crc32cCodec()) if text else blosc(v.data.dtype, "zstd", 1, "shuffle"),
             dimension_names=v.dims,
             attributes={**v.labels},
         )
         for rows in v.bands():
             array[rows] = v.data[rows]
-    return group
 
 
 def consolidated(group: Any) -> Any:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar.dataset.arrays import MAPS
+from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.store import Dataset, open_dataset
 from mars_lidar.learn.distributed import rank_of, worker_of
 from mars_lidar.learn.needed import torch
@@ -166,8 +167,6 @@ class StoredDataset(torch.utils.data.IterableDataset[dict[str, Any]]):
     def _example(
         self, sample: int, realization: int, counts: NDArray[Any], maps: dict[str, NDArray[np.float32]]
     ) -> Any:
-        from mars_lidar.dataset.samples import sample_parts
-
         scene, system, signal, sbr = sample_parts(self._dataset.recipe, sample)
         # torch computes little with unsigned integers: signed ones of the same bits, or wider where bits are used
         wide = counts.astype(np.int64) if counts.dtype == np.uint32 else _signed(counts)

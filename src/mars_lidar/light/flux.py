@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,13 +13,11 @@ from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray
+from mars_lidar.instrument.system import System
 from mars_lidar.light.photon_maps import MAX_PHOTONS as MAX_PHOTONS
 from mars_lidar.light.photon_maps import broadcast, check_photons, common_shape, frozen, light_map, waveform_maps
 
 MAX_RETURNS = 16
-
-if TYPE_CHECKING:
-    from mars_lidar.instrument.system import System
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +12,10 @@ from numpy.typing import NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.types import FloatArray
-
-if TYPE_CHECKING:
-    from mars_lidar.instrument.system import System
-    from mars_lidar.light.flux import Flux
-    from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS, System
+from mars_lidar.light.flux import Flux
+from mars_lidar.light.stored_flux import StoredFlux
+from mars_lidar.light.transient import through_pulse
 
 PARTS_PER_BIN = 4  # of the waveform, by default
 _BAND_BYTES = 8 * 2**20  # of waveforms that are made together, some six times over
@@ -50,9 +48,6 @@ class Fog:
 
     def before(self, flux: Flux, system: System, signal: float) -> StoredFlux:
         """Returns of the mean `signal` seen through this fog: `Flux.in_fog`, made row by row as it is used."""
-        from mars_lidar.light.flux import Flux
-        from mars_lidar.light.stored_flux import StoredFlux
-
         parts = PARTS_PER_BIN * system.bins
         photons = self.backscatter * signal
         step = max(1, _BAND_BYTES // (8 * flux.shape[1] * parts))
@@ -85,10 +80,6 @@ def in_fog(
     parts: int | None,
 ) -> Flux:
     """The body of `Flux.in_fog`, which documents arguments and formulas."""
-    from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
-    from mars_lidar.light.flux import Flux
-    from mars_lidar.light.transient import through_pulse
-
     if flux.waveform is not None:
         raise ValueError("in_fog needs the delays of returns, got a flux of waveforms")
     alpha = checks.real("extinction_per_m", extinction_per_m, low=0.0, strict_low=True)
@@ -111,8 +102,6 @@ def in_fog(
 
 def _depths(flux: Flux) -> tuple[NDArray[np.bool_], FloatArray]:
     """Which returns there are, and their depths, m (K, H, W); 0 where there is none."""
-    from mars_lidar.instrument.system import SPEED_OF_LIGHT_M_PER_NS
-
     lit = flux.returns_signal > 0
     depth = np.where(lit, 0.5 * SPEED_OF_LIGHT_M_PER_NS * flux.returns_delay_ns, 0.0)
     if (depth < 0.0).any():

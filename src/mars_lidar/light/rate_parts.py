@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,50 +13,51 @@ from mars_lidar._base.resample import area_mean
 
 
 class RateArray(Protocol):
-    """Rates (H, W, T) in memory or on disk: `shape`, and rows by ``values[first:last]``."""
+    """An array in memory or on disk, such as rates (H, W, T): `shape`, and rows by ``values[first:last]``."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(H, W, T)."""
+        """Length of each axis."""
 
     def __getitem__(self, key: Any) -> Any:
         """The selected rows, in memory."""
 
 
-class CroppedRates:
+class Rows:
+    """Rates (H, W, T) whose rows are read when they are sliced."""
+
+    def __init__(self, shape: tuple[int, ...], read: Callable[[slice], NDArray[Any]]) -> None:
+        self.shape, self._read = shape, read
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        return self._read(rows)
+
+
+def cropped(values: RateArray, rows: slice, columns: slice) -> Rows:
     """Some rows and columns."""
+    height, width, bins = values.shape
+    inside = range(height)[rows]
 
-    def __init__(self, values: RateArray, rows: slice, columns: slice) -> None:
-        height, width, bins = values.shape
-        self._values = values
-        self._rows, self._columns = range(height)[rows], columns
-        self.shape = (len(self._rows), len(range(width)[columns]), bins)
+    def read(key: slice) -> NDArray[Any]:
+        wanted = inside[key]
+        return np.asarray(values[min(wanted) : max(wanted) + 1])[:: wanted.step, columns]
 
-    def __getitem__(self, key: slice) -> NDArray[Any]:
-        wanted = self._rows[key]
-        first, last = min(wanted), max(wanted) + 1
-        rows = np.asarray(self._values[first:last])
-        turned = rows[:: wanted.step] if wanted.step > 0 else rows[::-1][:: -wanted.step]
-        return turned[:, self._columns]
+    return Rows((len(inside), len(range(width)[columns]), bins), read)
 
 
-class ResizedRates:
+def resized(values: RateArray, size: tuple[int, int]) -> Rows:
     """Mean light over the area of larger or smaller pixels."""
+    old, (new, width) = values.shape[0], size
 
-    def __init__(self, values: RateArray, size: tuple[int, int]) -> None:
-        self._values = values
-        self.shape = (*size, values.shape[2])
+    def read(key: slice) -> NDArray[Any]:
+        return area_mean(np.stack([row(k) for k in range(new)[key]]), width, axis=1)
 
-    def __getitem__(self, key: slice) -> NDArray[np.float64]:
-        old, new = self._values.shape[0], self.shape[0]
-        wanted = range(new)[key]
-        light = [self._row(row, old, new) for row in wanted]
-        return area_mean(np.stack(light), self.shape[1], axis=1)
-
-    def _row(self, row: int, old: int, new: int) -> NDArray[np.float64]:
+    def row(k: int) -> NDArray[np.float64]:
         """Mean of the old rows that a new one covers, each by its share."""
-        first, last = row * old // new, math.ceil((row + 1) * old / new)
-        edges = np.clip(np.arange(first, last + 1) * new, row * old, (row + 1) * old)
+        first, last = k * old // new, math.ceil((k + 1) * old / new)
+        edges = np.clip(np.arange(first, last + 1) * new, k * old, (k + 1) * old)
         share = np.diff(edges) / old
-        rows = np.asarray(self._values[first:last], dtype=np.float64)
+        rows = np.asarray(values[first:last], dtype=np.float64)
         return np.asarray((share[:, None, None] * rows).sum(axis=0))
+
+    return Rows((*size, values.shape[2]), read)

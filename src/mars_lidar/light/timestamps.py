@@ -6,7 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
-
-if TYPE_CHECKING:
-    from mars_lidar.instrument.system import System
+from mars_lidar.instrument.system import System
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +89,6 @@ class Timestamps:
     @property
     def system(self) -> System | None:
         """Laser, detector and histogram, or None where they are not known (a measured stream)."""
-        from mars_lidar.instrument.system import System
-
         told = self.info.get("system")
         return None if told is None else System.from_dict(told)
 

@@ -22,7 +22,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.light.rate_parts import CroppedRates, RateArray, ResizedRates
+from mars_lidar.light.rate_parts import RateArray, cropped, resized
 from mars_lidar.light.stored_flux import StoredFlux
 
 _BAND_BYTES = 64 * 2**20
@@ -86,12 +86,12 @@ class Transient:
     def __getitem__(self, key: Any) -> Transient:
         """A crop: ``transient[rows, columns]`` with slices; nothing is read."""
         rows, columns = window("transient", key, self.shape)
-        return self._with(CroppedRates(self.values, rows, columns))
+        return self._with(cropped(self.values, rows, columns))
 
     @checked
     def resize(self, size: int | tuple[int, int]) -> Transient:
         """At another size, (H, W) or the longer side: mean light over the area of the new pixels; nothing is read."""
-        return self._with(ResizedRates(self.values, new_size(size, self.shape)))
+        return self._with(resized(self.values, new_size(size, self.shape)))
 
     def _with(self, values: RateArray) -> Transient:
         return Transient(values, self.bin_ns, start_ns=self.start_ns, source=self.source)
@@ -206,25 +206,12 @@ class Transient:
         return Flux(waveform=waveform, background=background, info=info)
 
     @checked
-    def stored_flux(
-        self,
-        system: System,
-        *,
-        signal: float | None = None,
-        photons_per_unit: float | None = None,
-        sbr: float = math.inf,
-        dark_counts_per_s: float = 0.0,
-        pulse: bool = True,
-        parts: int | None = None,
-    ) -> StoredFlux:
+    def stored_flux(self, system: System, **level: Any) -> StoredFlux:
         """The flux as `flux` gives it, for a transient larger than memory: rows are read when they are used.
 
-        `mars_lidar.io.simulate_to` takes it band by band. Parameters and errors are those of `flux`; the transient
-        is read once at this call, for its `totals`.
+        `mars_lidar.io.simulate_to` takes it band by band. `level` takes the other arguments of `flux` but `rows`, and
+        errors are the same; the transient is read once at this call, for its `totals`.
         """
-
-        level: dict[str, Any] = {"signal": signal, "photons_per_unit": photons_per_unit, "sbr": sbr}
-        level |= {"dark_counts_per_s": dark_counts_per_s, "pulse": pulse, "parts": parts}
 
         def make(rows: slice) -> Flux:
             return self.flux(system, **level, rows=rows)

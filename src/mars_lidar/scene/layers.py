@@ -109,4 +109,5 @@ class LayeredScene:
         reflectivities of the surfaces that a pixel sees, and where it sees none the largest reflectivity of all
         layers, in whatever order they come.
         """
-        return scene_flux(self.layers, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+        depth, share = (np.stack([getattr(one, name) for one in self.layers]) for name in ("depth_m", "reflectivity"))
+        return scene_flux(depth, share, self.background, system, signal, sbr, attenuation, ambient, dark_counts_per_s)

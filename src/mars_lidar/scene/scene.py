@@ -78,8 +78,7 @@ class Scene:
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W)."""
-        h, w = self.depth_m.shape
-        return h, w
+        return self.depth_m.shape[0], self.depth_m.shape[1]
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -185,7 +184,8 @@ class Scene:
             An argument of the wrong kind or out of range; no valid pixel; a level or ratio that cannot be
             reached because reflectivity or ambient light is zero at every valid pixel.
         """
-        return scene_flux((self,), system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+        maps = self.depth_m[None], self.reflectivity[None], self.background
+        return scene_flux(*maps, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
 
     @staticmethod
     def example_names() -> tuple[str, ...]:

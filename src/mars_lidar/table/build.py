@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Self
 
 import numpy as np
 
 from mars_lidar._base import checks
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.progress import shown
+from mars_lidar._base.progress import of_part, shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.chain import Rearm
 from mars_lidar.statistics.gate import require_mode
-from mars_lidar.table.axes import MAX_POINTS, Grid, axis_values, describe, inserted, midpoints, thinned
-from mars_lidar.table.entries import Entries, progress_of_part
+from mars_lidar.table.axes import MAX_POINTS, PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
+from mars_lidar.table.entries import Entries
 from mars_lidar.table.error import (
     QuantisationError,
     deviations,
@@ -28,7 +29,7 @@ from mars_lidar.table.error import (
 )
 from mars_lidar.table.lookup import evaluate
 from mars_lidar.table.node_laws import NodeLaws, node_laws
-from mars_lidar.table.nodes import Method, N
+from mars_lidar.table.nodes import Method, N, Nodes
 from mars_lidar.table.recipe import Recipe
 from mars_lidar.table.start_phase import StartPhases, start_phases
 from mars_lidar.table.storage import request_key
@@ -44,53 +45,90 @@ Axes = tuple[FloatArray, FloatArray]
 Evaluate = Callable[[FloatArray, FloatArray], Entries]
 
 
-def build(
-    make: type[N],
-    system: System,
-    signal: Grid,
-    background: Grid,
-    *,
-    method: Method = "exposure",
-    rearm: Rearm = "centre",
-    refine: float | None = None,
-    tolerance: float = 1e-4,
-    check_law: bool = False,
-    threads: int | None = None,
-    progress: Progress | bool | None = None,
-) -> N:
-    """A table of the class `make`; arguments and errors as `Table.build`."""
-    if not isinstance(system, System):
-        raise TypeError(f"system must be a System, got {type(system).__name__}")
-    require_mode("a table", system)
-    system = system.detected()  # its axes are detected photons
-    axes = axis_values("signal", signal), axis_values("background", background)
-    checks.choice("method", method, _METHODS)
-    checks.choice("rearm", rearm, _REARMS)
-    if rearm != "centre" and method != "mars":
-        raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
-    goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
-    tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
-    if not isinstance(check_law, bool):
-        raise TypeError(f"check_law must be True or False, got {check_law!r}")
-    progress = shown(progress, "building a table")
-    recipe = Recipe(method, rearm, tolerance, thread_count(threads))
-    began = time.perf_counter()
-    if goal is None:
-        table = _evaluated(make, system, axes, recipe, progress)
-        error = quantisation_error(table, samples=_ERROR_SAMPLES, threads=recipe.threads)
-    else:
-        table, error = _refined(make, system, axes, recipe, goal, progress)
-    longest = long_error(table, _ERROR_SAMPLES, recipe.threads)
-    law = law_error(table, threads=recipe.threads).to_dict() if check_law else None
-    table.provenance.update(
-        key=request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
-        refine=goal,
-        error=error.to_dict(),
-        error_longest=None if longest is None else longest.to_dict(),
-        law=law,
-        build_s=time.perf_counter() - began,
-    )
-    return table
+class Built(Nodes):
+    """Nodes that are evaluated."""
+
+    @classmethod
+    def build(
+        cls,
+        system: System,
+        signal: Grid = PAPER_GRID["signal"],
+        background: Grid = PAPER_GRID["background"],
+        *,
+        method: Method = "exposure",
+        rearm: Rearm = "centre",
+        refine: float | None = None,
+        tolerance: float = 1e-4,
+        check_law: bool = False,
+        threads: int | None = None,
+        progress: Progress | bool | None = None,
+    ) -> Self:
+        """Evaluate every entry.
+
+        Parameters
+        ----------
+        system
+            Laser, detector and histogram. Its detection efficiency and dark counts are left out (`System.detected`).
+        signal, background
+            Axes, detected photons per period (`Flux.detected`): ``(low, high, points)`` for 0 and `points` log-spaced
+            values, or an array of values taken as it is. Between 0 and the next value everything is interpolated
+            linearly.
+        method
+            ``"exposure"``: exact statistics of the finite exposure. ``"mars"``: the paper's, Markov chain and
+            Gaussian of the Markov-renewal law, asymptotic in the exposure.
+        rearm
+            ``"centre"`` or ``"edge"`` of the bin, for ``"mars"``.
+        refine
+            Error in total variation, in [1e-5, 0.1]: points are inserted until the table meets it between its
+            nodes (`QuantisationError.largest`). None: the axes as they are.
+        tolerance
+            Of each entry, for ``"exposure"``: see `exposure_moments`.
+        check_law
+            Compare the counts drawn from the table with exact laws as well (`law_error`), and keep the result.
+        threads
+            Threads to run on; default: all processors that this process may use.
+        progress
+            Called as ``progress(done, total)``; an exception from it stops the build.
+
+        Raises
+        ------
+        ValueError, TypeError
+            Naming the argument, before any work; or where `refine` cannot be met.
+        ConvergenceError
+            Naming the cell that could not be evaluated.
+        """
+        if not isinstance(system, System):
+            raise TypeError(f"system must be a System, got {type(system).__name__}")
+        require_mode("a table", system)
+        system = system.detected()  # its axes are detected photons
+        axes = axis_values("signal", signal), axis_values("background", background)
+        checks.choice("method", method, _METHODS)
+        checks.choice("rearm", rearm, _REARMS)
+        if rearm != "centre" and method != "mars":
+            raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
+        goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
+        tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
+        if not isinstance(check_law, bool):
+            raise TypeError(f"check_law must be True or False, got {check_law!r}")
+        progress = shown(progress, "building a table")
+        recipe = Recipe(method, rearm, tolerance, thread_count(threads))
+        began = time.perf_counter()
+        if goal is None:
+            table = _evaluated(cls, system, axes, recipe, progress)
+            error = quantisation_error(table, samples=_ERROR_SAMPLES, threads=recipe.threads)
+        else:
+            table, error = _refined(cls, system, axes, recipe, goal, progress)
+        longest = long_error(table, _ERROR_SAMPLES, recipe.threads)
+        law = law_error(table, threads=recipe.threads).to_dict() if check_law else None
+        table.provenance.update(
+            key=request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
+            refine=goal,
+            error=error.to_dict(),
+            error_longest=None if longest is None else longest.to_dict(),
+            law=law,
+            build_s=time.perf_counter() - began,
+        )
+        return table
 
 
 def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> N:
@@ -107,7 +145,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
         np.repeat(signal, background.size),
         np.tile(background, signal.size),
         system,
-        progress_of_part(progress, 0, cells, total),
+        of_part(progress, 0, cells, total),
     )
     phases, laws = StartPhases.none(), NodeLaws.none()
     if recipe.method == "exposure":
@@ -118,7 +156,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
             entries.cumulants,
             entries.bins,
             threads=recipe.threads,
-            progress=progress_of_part(progress, cells, settled, total),
+            progress=of_part(progress, cells, settled, total),
         )
         laws = node_laws(
             system,
@@ -126,7 +164,7 @@ def _evaluated(make: type[N], system: System, axes: Axes, recipe: Recipe, progre
             background,
             entries,
             threads=recipe.threads,
-            progress=progress_of_part(progress, settled, total, total),
+            progress=of_part(progress, settled, total, total),
         )
     if progress is not None:
         progress(total, total)

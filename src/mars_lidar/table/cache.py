@@ -9,14 +9,13 @@ import contextlib
 import os
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from mars_lidar._base.files import reason
 from mars_lidar.instrument.system import System
-from mars_lidar.table.axes import Grid, axis_values
-from mars_lidar.table.build import build
-from mars_lidar.table.nodes import N, Nodes
-from mars_lidar.table.storage import KEY_LENGTH, load, request_key, save
+from mars_lidar.table.axes import PAPER_GRID, Grid, axis_values
+from mars_lidar.table.build import Built
+from mars_lidar.table.storage import KEY_LENGTH, Stored, request_key
 
 SUFFIX = ".h5"
 
@@ -31,37 +30,50 @@ def directory() -> Path:
     return root / "mars-lidar"
 
 
-def cached(make: type[N], system: System, signal: Grid, background: Grid, **options: Any) -> N:
-    """The table from the cache, or built and put there; where nothing can be written, built, with a warning."""
-    own, found = _search(make, system, signal, background, options)
-    if found is None:
-        table = build(make, system.detected(), signal, background, **options)
-        try:
-            _keep(table, own)
-        except OSError as error:
-            warnings.warn(
-                f"the table cannot be kept in {own.parent} ({reason(error)}) and will be built again the next time; "
-                "MARS_LIDAR_CACHE names another folder",
-                UserWarning,
-                stacklevel=3,
-            )
-            return table
-    return load(make, found or own, system)
+class Cached(Built, Stored):
+    """Nodes that are kept."""
+
+    @classmethod
+    def cached(
+        cls,
+        system: System,
+        signal: Grid = PAPER_GRID["signal"],
+        background: Grid = PAPER_GRID["background"],
+        **options: Any,
+    ) -> Self:
+        """`build`, or the same table from the user's cache (docs/table.md, 7), which keeps what is built.
+
+        Where nothing can be written there, the table is built, with a warning.
+        """
+        own, found = _search(cls, system, signal, background, options)
+        if found is None:
+            table = cls.build(system.detected(), signal, background, **options)
+            try:
+                _keep(table, own)
+            except OSError as error:
+                warnings.warn(
+                    f"the table cannot be kept in {own.parent} ({reason(error)}) and will be built again the next "
+                    "time; MARS_LIDAR_CACHE names another folder",
+                    UserWarning,
+                    stacklevel=2,
+                )
+                return table
+        return cls.load(found or own, system)
 
 
-def cached_path(make: type[Nodes], system: System, signal: Grid, background: Grid, **options: Any) -> Path:
+def cached_path(make: type[Cached], system: System, signal: Grid, background: Grid, **options: Any) -> Path:
     """File of the table in the cache; built and put there where it is not.
 
     A table made for another number of cycles is taken where every entry of it holds for those of `system`.
     """
     own, found = _search(make, system, signal, background, options)
     if found is None:
-        _keep(build(make, system.detected(), signal, background, **options), own)
+        _keep(make.build(system.detected(), signal, background, **options), own)
     return found or own
 
 
 def _search(
-    make: type[Nodes], system: System, signal: Grid, background: Grid, options: dict[str, Any]
+    make: type[Cached], system: System, signal: Grid, background: Grid, options: dict[str, Any]
 ) -> tuple[Path, Path | None]:
     """Where the table belongs, and the file that serves, if there is one."""
     if not isinstance(system, System):
@@ -78,16 +90,16 @@ def _search(
     others = sorted(folder.glob(f"{key}-*{SUFFIX}")) if folder.is_dir() else []
     for path in [own, *(other for other in others if other != own)]:
         with contextlib.suppress(OSError, ValueError):  # absent, out of reach, damaged, or of too few cycles
-            law = load(make, path, system).provenance["law"]
+            law = make.load(path, system).provenance["law"]
             if law is not None or not chosen.get("check_law", False):
                 return own, path
     return own, None
 
 
-def _keep(table: Nodes, own: Path) -> None:
+def _keep(table: Stored, own: Path) -> None:
     own.parent.mkdir(parents=True, exist_ok=True)
     mine = own.with_name(f"{own.stem}-{os.getpid()}{SUFFIX}")  # several processes may build the same table at once
-    save(table, mine, overwrite=True)
+    table.save(mine, overwrite=True)
     os.replace(mine, own)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.progress import of_part
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
@@ -116,7 +117,7 @@ def exposure_entries(
         some = slice(start, min(start + step, n))
         cells = Cells.of(signal[some], background[some], system)
         part = refined_moments(
-            cells, bins, tolerance=tolerance, threads=threads, progress=progress_of_part(progress, start, some.stop, n)
+            cells, bins, tolerance=tolerance, threads=threads, progress=of_part(progress, start, some.stop, n)
         )
         entries.cumulants[some], entries.rates[some] = part.cumulants, part.cumulant_rates
         entries.enough[some] = np.where(part.settled < 0, -1, np.maximum(part.settled - window, 1))
@@ -126,17 +127,3 @@ def exposure_entries(
             rest = part.histogram - system.cycles * part.histogram_rate
             entries.startup[some] = np.where(np.isnan(rest), 0.0, rest)
     return entries
-
-
-def progress_of_part(progress: Progress | None, first: int, last: int, total: int) -> Progress | None:
-    """Progress of one part of the work, from `first` to `last` of `total`; never backward."""
-    if progress is None:
-        return None
-    reached = first
-
-    def update(done: int, of: int) -> object:
-        nonlocal reached
-        reached = max(reached, first + (last - first) * done // max(of, 1))
-        return progress(reached, total)
-
-    return update

@@ -15,6 +15,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.distance import Pmf, total_variation
 from mars_lidar.statistics.exposure import exposure_moments
 from mars_lidar.statistics.exposure_result import normalised
+from mars_lidar.statistics.law import count_law
 from mars_lidar.statistics.phase_chain_operator import ConvergenceError
 from mars_lidar.table.nodes import INTERPOLATIONS, Interpolation, Nodes
 from mars_lidar.table.recipe import Recipe
@@ -249,7 +250,6 @@ def law_error(
 
     Some 10 to 20 ms a pixel. Parameters as `quantisation_error`.
     """
-    from mars_lidar.statistics.law import count_law
     from mars_lidar.statistics.matched import matched_pmf
 
     samples = checks.integer("samples", samples, low=1, high=100_000)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.cell_input import flat, reals, with_delays
 from mars_lidar.table.start_phase import StartPhases
@@ -93,8 +94,6 @@ def evaluate(
     threads: int,
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
     """Rows, weights and cumulants (P, 4) each of pixels (P,) inside the axes; `phase` in [0, 1) periods."""
-    from mars_lidar._base.native import _core
-
     rows = np.empty((signal.size, 4), np.int64)
     weights, out = np.empty((signal.size, 4)), np.empty((signal.size, 4))
     _core.table_lookup(

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
@@ -138,8 +139,6 @@ def _blocks(grids: IndexArray) -> list[tuple[IndexArray, int]]:
 
 def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tuple[FloatArray, IndexArray]:
     """Corrections (cells, p, 4) at phases on the grid of `bins`, and when they settled (cells,) (P7)."""
-    from mars_lidar._base.native import _core
-
     cells.check_history(bins)
     out = np.zeros((cells.size, phase.size * 4))
     law = blank(cells, 1)

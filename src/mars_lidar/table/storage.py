@@ -6,14 +6,14 @@ import hashlib
 import json
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import TemporarySibling, check_target, reading, whole
-from mars_lidar._base.hdf5 import new_file, open_hdf5, seal
+from mars_lidar._base.files import beside, check_target, reading, whole
+from mars_lidar._base.hdf5 import ForgivingFile, open_hdf5, seal
 from mars_lidar._base.types import FloatArray
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
@@ -56,27 +56,38 @@ def request_key(
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
 
-@checked
-def save(table: Nodes, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
-    path = Path(path)
-    if path.suffix not in _SUFFIXES:
-        raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
-    check_target(path, folder=False, overwrite=overwrite)
-    with TemporarySibling(path).writing() as unfinished, new_file(unfinished) as file:
-        for name, value in _header(table).items():
-            file.attrs[name] = value
-        for name, array in _arrays(table).items():
-            file.create_dataset(name, data=array)
-        seal(file)
+class Stored(Nodes):
+    """Nodes in files."""
 
+    @checked
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
+        path = Path(path)
+        if path.suffix not in _SUFFIXES:
+            raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
+        check_target(path, folder=False, overwrite=overwrite)
+        with beside(path) as unfinished, ForgivingFile(unfinished).hdf5() as file:
+            for name, value in _header(self).items():
+                file.attrs[name] = value
+            for name, array in _arrays(self).items():
+                file.create_dataset(name, data=array)
+            seal(file)
 
-def load(make: type[N], path: Path, system: System | None) -> N:
-    """A table of the class `make`; arguments and errors as `Table.load`."""
-    if system is not None and not isinstance(system, System):
-        raise TypeError(f"system must be a System, got {type(system).__name__}")
-    with reading(path, "a table of mars-lidar"):
-        return _loaded(make, path, system)
+    @classmethod
+    @checked
+    def load(cls, path: str | Path, system: System | None = None) -> Self:
+        """The table of a file, for `system` (None: for the one it was made for); shapes stay in the file, mapped.
+
+        Raises
+        ------
+        ValueError
+            Where the table is of another system, naming the field that differs. Another number of cycles is no
+            difference where every entry holds for it.
+        """
+        if system is not None and not isinstance(system, System):
+            raise TypeError(f"system must be a System, got {type(system).__name__}")
+        with reading(path, "a table of mars-lidar") as source:
+            return _loaded(cls, source, system)
 
 
 def _loaded(make: type[N], path: Path, system: System | None) -> N:
@@ -106,30 +117,6 @@ def _loaded(make: type[N], path: Path, system: System | None) -> N:
             "and not every entry holds for other cycles"
         )
     return table
-
-
-def read_header(path: Path) -> dict[str, Any]:
-    """What a file says about its table: system, axes, method, provenance; no shapes are read."""
-    with reading(path, "a table of mars-lidar"):
-        return _shown(path, *_read(path))
-
-
-def _shown(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    return {
-        "system": System.from_json(header["system"]),
-        "method": header["method"],
-        "rearm": header["rearm"],
-        "tolerance": float(header["tolerance"]),
-        "provenance": json.loads(header["provenance"]),
-        "signal": arrays["signal"],
-        "background": arrays["background"],
-        "phases": arrays["phase_phase"].size,
-        "enough": arrays["enough"],
-        "nbytes": path.stat().st_size,
-        "shape_bytes": arrays["shape"].nbytes,
-        "laws": arrays["law_row"].size,
-        "law_bytes": arrays["law_pmf"].nbytes,
-    }
 
 
 def _header(table: Nodes) -> dict[str, Any]:

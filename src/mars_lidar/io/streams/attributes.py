@@ -60,6 +60,23 @@ def from_attributes(
     )
 
 
+def fine_times(times: Timestamps, fine: int, part: slice = slice(None)) -> NDArray[np.int64]:
+    """Time since the laser pulse, in units of a histogram bin / `fine`, of some photons: the bin is kept exactly."""
+    bin_ = times.bin[part].astype(np.int64)
+    within = (times.times_ns[part] / times.period_ns - times.cycle[part]) * times.bins - bin_  # of a bin: 0 to 1
+    return bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)
+
+
+def of_fine_times(
+    attrs: Mapping[str, Any], cycle: NDArray[Any], since: NDArray[Any], fine: int, pixel: NDArray[Any]
+) -> Timestamps:
+    """Timestamps of photons in the order of their pixels, with the laser period and `fine_times` of each."""
+    times_ns = (cycle + (since + 0.5) / (int(attrs["bins"]) * fine)) * float(attrs["period_ns"])
+    height, width = attrs["shape"]
+    counts = np.bincount(pixel, minlength=int(height) * int(width))
+    return from_attributes(attrs, times_ns, cycle, since // fine, counts)
+
+
 def measured(
     cycle: NDArray[Any],
     fine: NDArray[Any],

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import open_npz
-from mars_lidar.io.mat_arrays import mat_arrays
+from mars_lidar.io.named_arrays import mat_arrays
 from mars_lidar.io.streams.attributes import of_pixels
 from mars_lidar.io.streams.photons import NoLaserError, Photons
 from mars_lidar.light.timestamps import Timestamps

@@ -14,7 +14,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.files import (
     INCOMPLETE_SUFFIX,
     IncompleteFileError,
-    TemporarySibling,
+    beside,
     check_target,
     open_npz,
     reading,
@@ -52,7 +52,7 @@ def save(path: str | Path, times: Timestamps, *, overwrite: bool = False, clock_
         )
     check_output(target, overwrite=overwrite, clock_ps=clock_ps)
     more = {} if clock_ps is None else {"clock_ps": clock_ps}
-    with TemporarySibling(target).writing() as unfinished:
+    with beside(target) as unfinished:
         write(unfinished, times, **more)
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.files import INCOMPLETE_SUFFIX, whole
 from mars_lidar._base.hdf5 import open_hdf5, seal
 from mars_lidar._base.optional import needed
-from mars_lidar.io.streams.attributes import attributes, from_attributes
+from mars_lidar.io.streams.attributes import attributes, fine_times, of_fine_times
 from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
 
@@ -44,9 +44,7 @@ def write(path: Path, times: Timestamps) -> None:
     save_photon_hdf5 = needed("phconvert.hdf5", "Photon-HDF5").save_photon_hdf5
     fine = units_per_bin(times.bins)
     kind = np.uint16 if times.bins * fine <= 2**16 else np.uint32
-    bin_ = times.bin.astype(np.int64)
-    within = (times.times_ns / times.period_ns - times.cycle) * times.bins - bin_  # of a bin: 0 to 1
-    nanotimes: NDArray[Any] = (bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)).astype(kind)
+    nanotimes: NDArray[Any] = fine_times(times, fine).astype(kind)
     counts = times.counts.ravel()
     pixels = np.arange(counts.size, dtype=np.uint16 if counts.size <= 2**16 else np.uint32)
     detectors = np.repeat(pixels, counts)
@@ -120,13 +118,9 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
         return found.timestamps(period_ns, bins)
     if period_ns is not None or bins is not None:
         raise ValueError(f"{path} tells its period and bins: period_ns and bins are for the streams of others")
-    fine, number = units_per_bin(int(attrs["bins"])), int(attrs["bins"])
     order = np.argsort(found.detector, kind="stable")
-    nano, cycle = found.fine[order].astype(np.int64), found.clock[order]
-    times_ns = (cycle + (nano + 0.5) / (number * fine)) * float(attrs["period_ns"])
-    height, width = attrs["shape"]
-    counts = np.bincount(found.detector, minlength=height * width)
-    return from_attributes(attrs, times_ns, cycle, nano // fine, counts)
+    since, fine = found.fine[order].astype(np.int64), units_per_bin(int(attrs["bins"]))
+    return of_fine_times(attrs, found.clock[order], since, fine, found.detector)
 
 
 def photons(path: Path) -> Photons:

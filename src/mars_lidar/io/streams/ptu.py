@@ -7,18 +7,21 @@ came is not in it; `mars_lidar.io.streams.ptu_stream` writes photons with their 
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.files import beside
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.optional import needed
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe
-from mars_lidar.io.store import FileWriter, LazyCounts, OpenedStore
+from mars_lidar.io.store import LazyCounts, OnDisk, OpenedStore, Writer
 from mars_lidar.io.streams import ptu_header
 
 KIND = "cube"
@@ -35,51 +38,39 @@ def check(recipe: Recipe) -> None:
         raise ValueError(f"a pixel of a .ptu must span fewer than 2^31 laser periods, got {_pixel_periods(recipe)}")
 
 
-class PtuWriter(FileWriter):
-    """Writes a cube image by image."""
+@contextlib.contextmanager
+def open_writer(path: Path, recipe: Recipe) -> Iterator[Writer]:
+    """Writes a cube image by image; the number of records comes into the header at the end."""
+    check(recipe)
+    _, height, width, bins = recipe.shape
+    size = height * width * bins * recipe.dtype.itemsize
+    check_memory(3 * size, f"the images of {path}, which are written whole,", "a .zarr or .h5 is written in parts")
+    image, periods = np.empty((height, width, bins), recipe.dtype), _pixel_periods(recipe)
+    attrs = {"kind": KIND, "complete": True, **layout.attributes(recipe)}
+    arrays = {v.name: v.data for v in layout.variables(recipe)}
 
-    def _begin(self, recipe: Recipe) -> None:
-        check(recipe)
-        _, height, width, bins = recipe.shape
-        size = height * width * bins * recipe.dtype.itemsize
-        what = f"the images of {self._path}, which are written whole,"
-        check_memory(3 * size, what, "a .zarr or .h5 is written in parts")
-        self.chunks = recipe.chunks(size)
-        self._image = np.empty((height, width, bins), recipe.dtype)
-        self._rows = 0
-        self._periods = _pixel_periods(recipe)
-        self._file = open(self._sibling.path, "w+b")  # noqa: SIM115  # closed by `finish` and `abandon`
-        self._parts.append(self._file)
-        attrs = {"kind": KIND, "complete": True, **layout.attributes(recipe)}
-        arrays = {v.name: v.data for v in layout.variables(recipe)}
-        self._ptu = ptu_header.new_file(
-            self._file, (height, width, bins), recipe.system.period_ns, self._periods, attrs, arrays, recipe.shape[0]
-        )
-        self._header_bytes = self._file.tell()
-
-    def write(self, realizations: slice, rows: slice, block: NDArray[Any]) -> None:
-        """Take rows of an image, or whole images; an image is written when its last row has come."""
-        for image in block:
-            self._image[rows] = image
-            self._rows += rows.stop - rows.start
-            if self._rows < self._image.shape[0]:
+    def put(realizations: slice, rows: slice, block: NDArray[Any]) -> None:
+        for part in block:
+            image[rows] = part
+            if rows.stop < height:  # an image is written when its last row has come
                 continue
-            self._rows = 0
-            most = int(self._image.sum(-1, dtype=np.uint64).max())
-            if most > self._periods:  # the writer would leave photons out without a word
-                raise ValueError(f"a pixel of {most} counts does not fit the {self._periods} laser periods of a .ptu")
-            self._ptu.write(self._image[None, :, :, None])
-            self._file.write(_OVERFLOW)  # the next image begins with its time at 0: time must not run backwards
+            most = int(image.sum(-1, dtype=np.uint64).max())
+            if most > periods:  # the writer would leave photons out without a word
+                raise ValueError(f"a pixel of {most} counts does not fit the {periods} laser periods of a .ptu")
+            ptu.write(image[None, :, :, None])
+            file.write(_OVERFLOW)  # the next image begins with its time at 0: time must not run backwards
 
-    def _end(self, registrations: int) -> None:
-        """Put the number of records into the header."""
-        records = (self._file.tell() - self._header_bytes) // 4
-        self._ptu.close()
-        ptu_header.set_integer(self._file, self._header_bytes, b"TTResult_NumberOfRecords", records)
-        ptu_header.set_integer(self._file, self._header_bytes, ptu_header.PHOTONS.encode(), registrations)
-
-
-open_writer = PtuWriter
+    with beside(path) as unfinished, open(unfinished, "w+b") as file:
+        ptu = ptu_header.new_file(
+            file, (height, width, bins), recipe.system.period_ns, periods, attrs, arrays, recipe.shape[0]
+        )
+        begin = file.tell()
+        writer = Writer(recipe.chunks(size), put)
+        yield writer
+        records = (file.tell() - begin) // 4
+        ptu.close()
+        ptu_header.set_integer(file, begin, b"TTResult_NumberOfRecords", records)
+        ptu_header.set_integer(file, begin, ptu_header.PHOTONS.encode(), writer.registrations)
 
 
 def open_store(path: Path) -> OpenedStore:
@@ -95,7 +86,7 @@ def open_store(path: Path) -> OpenedStore:
             f"ptufile.imread any image"
         )
     layout.check_format(path, attrs)
-    recipe = layout.recipe_from(attrs, frozenset(arrays), arrays.__getitem__, told)
+    recipe = layout.recipe_from(attrs, arrays, told)
     shape = recipe.shape
 
     def counts() -> NDArray[Any]:
@@ -108,7 +99,7 @@ def open_store(path: Path) -> OpenedStore:
             raise ValueError(f"{path} is damaged: its records make an image of {made}")
         return np.ascontiguousarray(image[:, :, :, 0])
 
-    return OpenedStore(attrs, frozenset(arrays), arrays.__getitem__, LazyCounts(shape, recipe.dtype, counts))
+    return OpenedStore(attrs, arrays | {"histogram": OnDisk(LazyCounts(shape, recipe.dtype, counts), path)})
 
 
 def _pixel_periods(recipe: Recipe) -> int:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import open_npz, reading
 from mars_lidar._base.optional import needed
+from mars_lidar._version import __version__
 from mars_lidar.io.streams import picoquant
 
 MAX_BINS = 2**15  # 15 bits of delay in a generic T3 record
@@ -42,8 +43,6 @@ def new_file(
     `cycles` are the laser periods of a pixel; the time that all records span is asked for by phconvert and PicoQuant's
     own software.
     """
-    from mars_lidar._version import __version__
-
     ptufile = needed("ptufile", "a .ptu")
     packed = BytesIO()
     arrays: dict[str, Any] = {name: np.asarray(array) for name, array in variables.items()}

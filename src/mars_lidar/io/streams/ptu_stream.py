@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mars_lidar._base.files import IncompleteFileError
 from mars_lidar._base.optional import needed
 from mars_lidar.io.streams import ptu_header
-from mars_lidar.io.streams.attributes import attributes, from_attributes
+from mars_lidar.io.streams.attributes import attributes, fine_times, of_fine_times
 from mars_lidar.io.streams.photons import Photons
 from mars_lidar.light.timestamps import Timestamps
 
@@ -96,9 +96,7 @@ def read(path: Path, period_ns: float | None, bins: int | None) -> Timestamps:
         raise ValueError(f"{path} is damaged: it has photons after the last of {height} x {width} pixels")
     fine = max(1, round(float(attrs["period_ns"]) / (number * unit_ns)))
     dtime = photons["dtime"].astype(np.int64)
-    times_ns = (cycle + (dtime + 0.5) / (number * fine)) * float(attrs["period_ns"])
-    counts = np.bincount(pixel, minlength=height * width)
-    return from_attributes(attrs, times_ns, cycle, dtime // fine, counts)
+    return of_fine_times(attrs, cycle, dtime, fine, pixel)
 
 
 def photons(path: Path) -> Photons:
@@ -142,9 +140,7 @@ def _row(times: Timestamps, row: int, fine: int) -> tuple[NDArray[np.int64], NDA
     part = slice(int(times.offsets[pixels[0]]), int(times.offsets[pixels[-1] + 1]))
     counts = np.diff(times.offsets[pixels[0] : pixels[-1] + 2])
     cycle = times.cycle[part].astype(np.int64)
-    bin_ = times.bin[part].astype(np.int64)
-    within = (times.times_ns[part] / times.period_ns - cycle) * times.bins - bin_  # of a bin: 0 to 1
-    dtime = bin_ * fine + np.clip(within * fine, 0, fine - 1).astype(np.int64)
+    dtime = fine_times(times, fine, part)
     period = np.repeat(pixels, counts) * times.cycles + cycle
     records = (dtime.astype(np.uint32) << np.uint32(10)) | (period % _WRAP).astype(np.uint32)
     ends = np.array([pixels[0], pixels[-1] + 1]) * times.cycles

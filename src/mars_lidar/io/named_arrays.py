@@ -1,16 +1,50 @@
-"""Arrays of numbers in .mat (v5, v7.3) and HDF5 files of others, by name."""
+"""Arrays of numbers in .npz, .mat (v5, v7.3) and HDF5 files of others, by name."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mars_lidar._base.files import read_mat5, whole
+from mars_lidar._base.files import open_npz, read_mat5, reading, whole
 from mars_lidar._base.hdf5 import open_hdf5
+from mars_lidar.io.store import OnDisk
 
 _CELLS = "#refs#"  # where MATLAB puts what the cells of a v7.3 file hold
+
+
+@dataclass(frozen=True)
+class NamedArrays:
+    """The arrays at the top of an open file."""
+
+    names: list[str]
+    read: Callable[[Iterable[str]], dict[str, Any]]  # those that are there; of HDF5 on disk until they are indexed
+    turned: bool = False  # whether axes are stored in reverse, as version 7.3 of a .mat has them
+
+
+@contextlib.contextmanager
+def open_arrays(path: Path) -> Iterator[NamedArrays]:
+    """An .npz, .mat or HDF5 file."""
+    import h5py
+
+    if path.suffix.lower() == ".npz":
+        with open_npz(path) as archive:
+            yield NamedArrays(archive.files, lambda some: {name: archive[name] for name in some if name in archive})
+    elif h5py.is_hdf5(path):
+        with open_hdf5(path) as file:
+            arrays = {name: OnDisk(data, path) for name, data in file.items() if isinstance(data, h5py.Dataset)}
+            turned = path.suffix.lower() == ".mat"
+            yield NamedArrays([*arrays], lambda some: {name: arrays[name] for name in some if name in arrays}, turned)
+    else:
+        from scipy.io import whosmat
+
+        with reading(path, "a .mat of version 5"):
+            names = [name for name, _, _ in whosmat(path)]
+        yield NamedArrays(names, lambda some: _plain(read_mat5(path, some)))
 
 
 def mat_arrays(path: Path, *, deep: bool = True) -> dict[str, Any]:
@@ -22,7 +56,12 @@ def mat_arrays(path: Path, *, deep: bool = True) -> dict[str, Any]:
 
     if h5py.is_hdf5(path):
         return hdf5_arrays(path, of_matlab=True, deep=deep)
-    return {name: found for name, found in read_mat5(path).items() if not name.startswith("__")}
+    return _plain(read_mat5(path))
+
+
+def _plain(found: dict[str, Any]) -> dict[str, Any]:
+    """Without what SciPy tells of the file."""
+    return {name: array for name, array in found.items() if not name.startswith("__")}
 
 
 def hdf5_arrays(path: Path, *, of_matlab: bool = False, deep: bool = True) -> dict[str, Any]:

@@ -90,7 +90,7 @@ def test_without_deepinv_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "deepinv", None)
     monkeypatch.delitem(sys.modules, "deepinv.physics", raising=False)
     monkeypatch.delitem(sys.modules, "mars_lidar.learn.inverse", raising=False)
-    monkeypatch.delattr(ml.learn, "LidarPhysics", raising=False)
+    monkeypatch.delitem(vars(ml.learn), "LidarPhysics", raising=False)
     with pytest.raises(ImportError, match="deepinv: pip install"):
         from mars_lidar.learn import LidarPhysics  # noqa: F401
 

@@ -206,12 +206,25 @@ class Transient:
         return Flux(waveform=waveform, background=background, info=info)
 
     @checked
-    def stored_flux(self, system: System, **level: Any) -> StoredFlux:
+    def stored_flux(
+        self,
+        system: System,
+        *,
+        signal: float | None = None,
+        photons_per_unit: float | None = None,
+        sbr: float = math.inf,
+        dark_counts_per_s: float = 0.0,
+        pulse: bool = True,
+        parts: int | None = None,
+    ) -> StoredFlux:
         """The flux as `flux` gives it, for a transient larger than memory: rows are read when they are used.
 
-        `mars_lidar.io.simulate_to` takes it band by band. `level` takes the other arguments of `flux` but `rows`, and
-        errors are the same; the transient is read once at this call, for its `totals`.
+        `mars_lidar.io.simulate_to` takes it band by band. Parameters and errors are those of `flux`; the transient
+        is read once at this call, for its `totals`.
         """
+
+        level: dict[str, Any] = {"signal": signal, "photons_per_unit": photons_per_unit, "sbr": sbr}
+        level |= {"dark_counts_per_s": dark_counts_per_s, "pulse": pulse, "parts": parts}
 
         def make(rows: slice) -> Flux:
             return self.flux(system, **level, rows=rows)

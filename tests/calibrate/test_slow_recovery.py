@@ -103,6 +103,13 @@ def test_inspect_tells_the_time_constant(dead: float, recovery: float, cycles: i
     assert abs(found.slow.dead_time_ns - dead) < 0.05 * recovery
     assert str(found.slow) in found.problems
     assert "recovery_ns of the detector" in str(found.slow)
+    light = found.calibration
+    if not known:  # the dead time, and the light, of a pixel that recovers so
+        assert light.edge_fits
+        assert light.dead_time_by == "recovery"
+        assert abs(light.dead_time_ns - dead) < 5.0 * light.dead_time_error_ns < recovery
+        assert abs(light.total - 1.5) < 5.0 * light.total_error < 0.1
+        assert not found.unknown
 
 
 @pytest.mark.parametrize(

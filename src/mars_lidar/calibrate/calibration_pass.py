@@ -32,7 +32,7 @@ class Watch:
     jitter_ns: float = 0.0
     jitter_error_ns: float = 0.0
     dead_error_ns: float = 0.0
-    by: Literal["given", "smallest interval", "edge"] = "given"
+    by: Literal["given", "smallest interval", "edge", "recovery"] = "given"
     recovery_ns: float = 0.0
 
     @property

@@ -63,7 +63,8 @@ class Calibration:
         makes: a slow quench, a second dead time, a clock too coarse.
     dead_time_by
         ``"given"``; ``"smallest interval"``, less its mean excess over the dead time, where the edge of the recovery is
-        sharp; ``"edge"``, the middle of an edge that jitter has blurred.
+        sharp; ``"edge"``, the middle of an edge that jitter has blurred; ``"recovery"`` (of `inspect`), with the time
+        constant of a slow one.
     simulated
         For a detector with effects: how many times longer than this one the simulated stream is by which the bias
         of the likelihood was taken off; else 0.
@@ -88,7 +89,7 @@ class Calibration:
     converged: bool
     jitter_ns: float = 0.0
     jitter_error_ns: float = 0.0
-    dead_time_by: Literal["given", "smallest interval", "edge"] = "given"
+    dead_time_by: Literal["given", "smallest interval", "edge", "recovery"] = "given"
     jitter_limit_ns: float = 0.0
     edge_fits: bool = True
     simulated: float = 0.0

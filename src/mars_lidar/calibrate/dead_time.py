@@ -25,6 +25,7 @@ _SAME = 0.05  # standard errors by which a last round may move the edge
 _AGREE = 4.0  # standard errors between the jitter by the edge and that by the shape of the pulse
 _STEP = 0.2  # of the light behind an edge that falls before it, where the dead time keeps it away
 _MOSTLY = 0.7  # of the recorded width of a bright pulse that is jitter: then pulse and signal hide in it
+_HOPELESS = 1e-12  # fit of an edge in some round below which no other light makes it one: jitters had 6e-7 and more
 _FOLLOWED = 0.5  # of a change of a bright pulse's jitter that the edge follows: then it is not the edge that tells it
 
 
@@ -105,7 +106,7 @@ class Unknown(SharpEdge):
             if found.armed.used < FEW or failed > 1:
                 return None
             edge = self._edge(ages, found, dead, width)
-            if edge is None or not self._is_step(found, edge, self._light.bins(width)):
+            if edge is None or edge.fits < _HOPELESS or not self._is_step(found, edge, self._light.bins(width)):
                 return None
             if ages.clock_ns > 0.0 and edge.jitter_ns < max(ages.clock_ns, 2.0 * edge.jitter_error_ns):
                 return self._clocked(first, edge, ages)

@@ -17,6 +17,7 @@ from mars_lidar.calibrate.periodicity import other_period
 from mars_lidar.calibrate.recovery import Recovery, recovery_of
 from mars_lidar.calibrate.same_phase import departure_of, too_coarse
 from mars_lidar.calibrate.slow_recovery import SlowRecovery, slow_recovery
+from mars_lidar.calibrate.unknowns import told
 from mars_lidar.light.timestamps import Timestamps
 
 _SURE = 1e-6  # false-alarm probability of what is told
@@ -106,6 +107,12 @@ def inspect(times: Timestamps, *, dead_time_ns: float | None = None) -> Inspecti
     low, middle, _ = free.summary.quantiles_ns
     hurried = middle < 1.2 * max(low, free.summary.smallest_ns[0])
     slow = slow_recovery(stream, dead_time_ns) if found.judged is not None and found.departure_ends_ns else None
+    if slow is not None and not free.edge_fits:  # the light as a pixel sees it that recovers so
+        error = slow.dead_time_error_ns
+        watch = Watch(
+            slow.dead_time_ns, slow.dead_time_ns, dead_error_ns=error, by="recovery", recovery_ns=slow.recovery_ns
+        )
+        free = told(fitted(stream, free.summary, "free", watch, 1), edge=False)
     problems, unknown = _problems(times, stream, free, found, slow, None if hurried else other_period(stream))
     return Inspection(free, found, histogram, edges, apart, tuple(problems), tuple(unknown), slow)
 

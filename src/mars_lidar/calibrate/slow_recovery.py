@@ -28,14 +28,16 @@ class SlowRecovery:
 
     Attributes
     ----------
-    dead_time_ns, recovery_ns, recovery_error_ns
-        t_d, r and the standard error of r. The dead time is that of greatest likelihood below the smallest interval,
-        or as given.
+    dead_time_ns, dead_time_error_ns
+        t_d and its standard error: of greatest likelihood below the smallest interval, or as given (error 0).
+    recovery_ns, recovery_error_ns
+        r and its standard error.
     p_value
         Probability of registrations by age as far from 1 - e^(-u / r), or farther.
     """
 
     dead_time_ns: float
+    dead_time_error_ns: float
     recovery_ns: float
     recovery_error_ns: float
     p_value: float
@@ -83,10 +85,12 @@ def slow_recovery(stream: Stream, dead_time_ns: float | None = None) -> SlowReco
     steps = _STEP * np.eye(free)
     curve = np.array([[minus(theta + a + b) - minus(theta + a - b) for b in steps] for a in steps])
     curve -= np.array([[minus(theta - a + b) - minus(theta - a - b) for b in steps] for a in steps])
-    error = law.recovery_ns * math.sqrt(max(float(np.linalg.pinv(curve / (4.0 * _STEP**2))[0, 0]), 0.0))
+    variance = np.maximum(np.diag(np.linalg.pinv(curve / (4.0 * _STEP**2))), 0.0)
+    error = law.recovery_ns * math.sqrt(float(variance[0]))
+    below = (smallest - law.dead_ns) * math.sqrt(float(variance[1])) if free == 2 else 0.0
     p = _p_of_ages(stream, dt, bins, law)
     fits = p > _FITS and 0.0 < error < _KNOWN * law.recovery_ns
-    return SlowRecovery(law.dead_ns, law.recovery_ns, error, p) if fits else None
+    return SlowRecovery(law.dead_ns, below, law.recovery_ns, error, p) if fits else None
 
 
 def _p_of_ages(stream: Stream, dt: FloatArray, bins: int, law: Sensitivity) -> float:

@@ -31,7 +31,8 @@ def interval_rows(found: Calibration, estimated: bool) -> list[tuple[str, str]]:
     low, middle, high = counted.quantiles_ns
     dead = f"{found.dead_time_ns:.6g} ns"
     if estimated:
-        by = {"edge": "the middle of an edge that jitter blurs"}.get(found.dead_time_by, "the smallest interval")
+        told = {"edge": "the middle of an edge that jitter blurs", "recovery": "a slow recovery"}
+        by = told.get(found.dead_time_by, "the smallest interval")
         dead += f" ± {found.dead_time_error_ns:.2g}, by {by}" if found.edge_fits else ": not known"
     rows = [
         ("intervals", f"smallest {counted.smallest_ns[0]:.6g} ns; 1, 50, 99 %: {low:.5g}, {middle:.5g}, {high:.5g} ns"),

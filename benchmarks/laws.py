@@ -101,7 +101,7 @@ def stationary_distribution(config: Config, bandwidth: Bandwidth) -> Section:
 
 def dense_stationary(chain: PhaseChain) -> NDArray[np.float64]:
     """Stationary distribution as the left eigenvector of the dense transition matrix for the eigenvalue 1."""
-    values, vectors = np.linalg.eig(chain.dense("rapp").T)
+    values, vectors = np.linalg.eig(chain.dense().T)
     vector = np.abs(vectors[:, np.argmin(np.abs(values - 1.0))])
     return np.asarray(vector / vector.sum())
 

@@ -66,7 +66,7 @@ def _parts(cell: Cell) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     q_mu = moment_matrices(chain).q_mu
     mean = q_mu.sum(axis=1)
     mu = float(pdf @ mean)
-    return chain.dense("rapp"), pdf, pdf @ q_mu - mu * pdf, mean - mu
+    return chain.dense(), pdf, pdf @ q_mu - mu * pdf, mean - mu
 
 
 def _by_solve(cell: Cell) -> float:

@@ -197,16 +197,8 @@ class PhaseChain:
         """`values` (n,) of the re-arming bins, read by the bin of the registration before."""
         return np.roll(values, -self.shift)
 
-    def dense(self, form: Literal["shift", "rapp"] = "shift") -> FloatArray:
-        """The transition matrix P (n, n), rows sum to 1; both forms agree to rounding.
-
-        ``"shift"``: rows of the first-arrival matrix, shifted cyclically by the dead time (2.3).
-        ``"rapp"``: element by element from the integrated flux between re-arming and arrival (2.1).
-        """
-        checks.choice("form", form, ("shift", "rapp"))
-        return self._dense_shift() if form == "shift" else self._dense_rapp()
-
-    def _dense_shift(self) -> FloatArray:
+    def dense(self) -> FloatArray:
+        """The transition matrix P (n, n), rows sum to 1: that of first arrivals, each row shifted round (2.3)."""
         n = self.bins
         order = (np.arange(n)[:, None] + np.arange(n)) % n  # bins in the order met after arming in bin a
         met = self.photons[order]
@@ -218,18 +210,6 @@ class PhaseChain:
         base = np.empty((n, n))
         np.put_along_axis(base, order, first, axis=1)
         return np.roll(base, -self.shift, axis=0)
-
-    def _dense_rapp(self) -> FloatArray:
-        n = self.bins
-        flux = np.concatenate([[0.0], np.cumsum(self.photons)])
-        j = np.arange(n)
-        arm = (j + self.shift) % n
-        start = flux[arm] + self.fraction * self.photons[arm]
-        exposure = flux[:-1][None, :] - start[:, None] + flux[-1] * (j[None, :] < arm[:, None])
-        exposure[j, arm] = 0.0
-        matrix = np.exp(-exposure) * -np.expm1(-self.photons) / self.loss
-        matrix[j, arm] = (self.refire + self.again())[arm]
-        return np.asarray(matrix, dtype=np.float64)
 
     def again(self) -> FloatArray:
         """Probability of passing the re-arming bin and firing in it one or more periods later (2.1)."""

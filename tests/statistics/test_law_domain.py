@@ -19,6 +19,7 @@ from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics import joint_pixel as pixel_module
 from mars_lidar.statistics import pmf as pmf_module
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.joint_factors import left_over
 from mars_lidar.statistics.joint_grid import FoldedGrid
 
 PERIOD_NS = 100.0
@@ -454,6 +455,24 @@ def test_law_of_the_rarest_counts():
 
 
 # A sweep: whatever is not refused agrees with all else
+
+
+def test_a_warm_state_that_is_not_found_is_refused():
+    """Nothing solved was taken for a solution: a uniform shape, and exposures that began armed (signal 1000, just below
+    a lock)."""
+    system = view(0.9997565745952581, 1, 0.011089244157797067, "stationary", bins=1430)
+    light: dict[str, Any] = {"signal": 1000.0, "background": 0.1484680065940475}
+    delay = 0.890211598817147 * PERIOD_NS
+    assert left_over(np.ones(3), np.zeros(3)) == math.inf
+    assert left_over(np.zeros(3), np.zeros(3)) == 0.0
+    for law in (
+        lambda: ml.registration_pdf(**light, system=system, method="stationary", delay_ns=delay),
+        lambda: mean_histogram(**light, system=system, delay_ns=delay),
+        lambda: ml.count_law(**light, system=system, delay_ns=delay),
+        lambda: ml.joint_law(**light, system=system, delay_ns=delay),
+    ):
+        with pytest.raises(ConvergenceError, match=r"engine 'exact'"):
+            law()
 
 
 @pytest.mark.parametrize("first", range(20_000, 20_032, 8))

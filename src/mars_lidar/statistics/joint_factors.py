@@ -5,6 +5,7 @@ Equation numbers are those of docs/joint_law.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -171,6 +172,6 @@ def _matrix(grid: FeedbackEquation) -> csc_matrix:
 
 
 def left_over(rest: FloatArray, x: FloatArray) -> float:
-    """Largest residual `rest` of a solution `x`, relative to its largest value."""
-    size = float(np.abs(x).max())
-    return float(np.abs(rest).max()) / size if size > 0.0 else 0.0
+    """Largest residual `rest` of a solution `x`, relative to its largest value; infinite of none where there is one."""
+    size, left = float(np.abs(x).max()), float(np.abs(rest).max())
+    return left / size if size > 0.0 else math.inf if left != 0.0 else 0.0

@@ -50,6 +50,22 @@ def one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
+TIERS = ("fast", "full", "nightly")  # a test without a marker is in the first; CONTRIBUTING.md says what each is for
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--tier", choices=TIERS, default="fast", help="run the tests up to this tier (default: fast)")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect the tests of the tiers above the one that `--tier` names."""
+    above = TIERS[TIERS.index(config.getoption("--tier")) + 1 :]
+    deselected = [item for item in items if any(item.get_closest_marker(tier) for tier in above)]
+    if deselected:
+        config.hook.pytest_deselected(items=deselected)
+        items[:] = [item for item in items if item not in set(deselected)]
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     lines = ledger.summary()
     if lines:

@@ -20,7 +20,7 @@ class ExactEngine(Engine):
     """Exact sampling without rejection, cost O(registrations) however bright the scene.
 
     After re-arming at u the next registration is ``C^-1(C(u) + E)``, with C the integrated flux and E ~ Exp(1).
-    The same seed gives the same cube, bit for bit, on any machine: counter-based random numbers, no libm, no
+    The same seed gives the same cube, bit for bit, on any machine: a random stream per item, no libm, no
     fused multiply-add. `level` forces one of ``_core.levels()`` (vector widths); it changes speed only.
     """
 

@@ -211,6 +211,7 @@ MARS_KERNEL exact_items(const DeviceTask task) {
                     delay, armed.frame, armed.phase);
     const Pair<uint32_t> key =
         stream_key(task.seed, task.first_realization + static_cast<uint32_t>(turn), task.pixel_index[pixel]);
+    WordStream<uint32_t> stream = word_stream(key);
     Memory memory = {false, 0, 0.0f};
     typename DeviceWriter<static_cast<DeviceSink>(sink_number)>::Type writer(task, item, place.lane, place.lanes);
 
@@ -218,7 +219,8 @@ MARS_KERNEL exact_items(const DeviceTask task) {
         Draw drawn[ahead];
         MARS_UNROLL
         for (int k = 0; k < ahead; ++k)
-            drawn[k] = draw(background, returns[0].flux, key.first, key.second, event + static_cast<uint32_t>(k));
+            drawn[k] =
+                draw(background, returns[0].flux, stream, key.first, key.second, event + static_cast<uint32_t>(k));
         MARS_UNROLL
         for (int k = 0; k < ahead; ++k) {
             const Registration next =

@@ -27,8 +27,8 @@ struct DeviceTask {
     const float* start_phase;
     void* out;               // counts int64 (items), or rows (items, bins), zero at first
     const int64_t* offsets;  // timestamps: first record of each item
-    double* times;           // in periods
-    int32_t *cycles, *bins;
+    int32_t* cycles;
+    float* phases;
     int64_t pixels, first, items;  // of this launch: [first, first + items) in the order (realization, place)
     uint32_t first_realization, padding;
 };
@@ -137,11 +137,10 @@ class DeviceTimestamps {
  public:
     MARS_INLINE DeviceTimestamps(const DeviceTask& task, int64_t item, int32_t, int32_t)
         : task_(task), next_(task.offsets[item]) {}
-    MARS_INLINE void take(const Registration& r, int32_t bin) {
+    MARS_INLINE void take(const Registration& r, int32_t) {
         if (r.lost) return;
-        task_.times[next_] = registration_time(r.cycle, r.phase);
         task_.cycles[next_] = r.cycle;
-        task_.bins[next_] = bin;
+        task_.phases[next_] = r.phase;
         ++next_;
     }
     MARS_INLINE void end() {}

@@ -30,6 +30,7 @@ class LaneLog {
           bins_(static_cast<size_t>(job.bins)),
           cycles_(job.cycles),
           most_(timed_ ? kLog / 2 : kLog),
+          follows_(sizeof(Phase) == sizeof(float) && !(job.recording && !job.recording->codes.edges.empty())),
           own_(output.sink == Sink::kHistogram16 && kLanes > 1 && bins_ <= kMostOwn) {
         for (int lane = 0; lane < kLanes; ++lane) items_[lane] = -1;
         if (own_) rows_of_lanes_.resize(kLanes * stride());
@@ -184,8 +185,9 @@ class LaneLog {
         int64_t next[n];
         for (int i = 0; i < n; ++i) next[i] = runs.used + i * most;
         for (int k = from; k < to;) {
-            if constexpr (n == 4 && sizeof(Phase) == 4) {
-                if (k + 4 <= to && ((odd_[k] | odd_[k + 1] | odd_[k + 2] | odd_[k + 3]) >> lane & 15) == 0) {
+            if constexpr (n == 4 && sizeof(Phase) == sizeof(float)) {
+                if (follows_ && k + 4 <= to &&
+                    ((odd_[k] | odd_[k + 1] | odd_[k + 2] | odd_[k + 3]) >> lane & 15) == 0) {
                     tell_four(lane, k, runs.at, next);
                     k += 4;
                     continue;
@@ -195,10 +197,11 @@ class LaneLog {
                 const int32_t bin = bin_[k][lane + i];
                 if (bin < 0) continue;
                 const int64_t record = next[i]++;
-                const int32_t cycle = round_exposure(cycle_[k][lane + i], cycles_);
-                runs.at.times[record] = registration_time(cycle, phase_[k][lane + i]);
-                runs.at.cycles[record] = cycle;
-                runs.at.bins[record] = bin;
+                const Phase phase = phase_[k][lane + i];
+                runs.at.cycles[record] = round_exposure(cycle_[k][lane + i], cycles_);
+                runs.at.phases[record] =
+                    follows_ ? static_cast<float>(phase)
+                             : phase_in_bin(static_cast<double>(phase), bin, static_cast<int32_t>(bins_));
             }
             ++k;
         }
@@ -211,19 +214,14 @@ class LaneLog {
 #if MARS_LANES > 1
     // Four rows of four lanes, all of them registered, and in the exposure.
     MARS_INLINE void tell_four(int lane, int row, const RecordArrays& at, int64_t (&next)[4]) const {
-        FourInts bin[4], cycle[4];
+        FourInts cycle[4];
         FourFloats phase[4];
-        columns_of_four(&bin_[row][lane], bin);
         columns_of_four(&cycle_[row][lane], cycle);
         columns_of_four(&phase_[row][lane], phase);
         for (int i = 0; i < 4; ++i) {
             const int64_t to = next[i];
-            const FourDoubles exact = __builtin_convertvector(phase[i], FourDoubles);  // as registration_time
-            const FourDoubles below = exact < FourDoubles{} + 1.0 ? exact : FourDoubles{} + (1.0 - 0x1p-25);
-            const FourDoubles time = __builtin_convertvector(cycle[i], FourDoubles) + below;
-            memcpy(at.times + to, &time, sizeof time);
             memcpy(at.cycles + to, &cycle[i], sizeof cycle[i]);
-            memcpy(at.bins + to, &bin[i], sizeof bin[i]);
+            memcpy(at.phases + to, &phase[i], sizeof phase[i]);
             next[i] = to + 4;
         }
     }
@@ -233,8 +231,9 @@ class LaneLog {
     const bool timed_;
     const size_t bins_;
     const int32_t cycles_;
-    const int most_;  // rows: as many as stay in the first cache
-    const bool own_;  // whether histograms are counted in the lanes' own rows
+    const int most_;      // rows: as many as stay in the first cache
+    const bool follows_;  // whether bins are those of the phases in single precision
+    const bool own_;      // whether histograms are counted in the lanes' own rows
     std::vector<Line> rows_of_lanes_;
     int64_t items_[kLanes];  // of the job, or -1
     int first_row_[kLanes] = {}, rows_ = 0;

@@ -73,7 +73,8 @@ def simulate(
         CuPy array, which
         ``torch.from_dlpack`` takes without a copy.
     out
-        C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill; with
+        C-contiguous array or memory map (realizations, H, W, bins) of ``system.histogram_dtype`` to fill, such as the
+        cube of a call before: fresh memory costs a fifth more time, in which the system clears its pages; with
         ``device="cuda"`` a CuPy array.
     progress
         Called as ``progress(done, total)`` a few times a second; an exception from it stops the run. True: a bar, or
@@ -134,8 +135,8 @@ def simulate_timestamps(
     Returns
     -------
     Timestamps
-        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when they are
-        asked for.
+        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when they
+        are asked for.
     """
     drawn_by = find_engine(engine)
     task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")

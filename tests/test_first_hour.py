@@ -133,7 +133,6 @@ def test_several_returns_go_into_a_flux():
 
 def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
     """Pixels without a detection have a depth that is a guess: the table counted it, the picture did not."""
-    pytest.importorskip("skimage")
     from mars_lidar.compare.views import depth_error_m
     from mars_lidar.reconstruct.quality import errors_against
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar.instrument import effects
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.effects import Jitter, SampledJitter
@@ -25,6 +26,7 @@ _MIN_GATE_PERIODS = 1e-5  # phases have 24 bits: at 1e-6 periods the counts behi
 _MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond it no digits are left
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class Detector:
     """A single-photon detector pixel.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.keywords import by_name, constructed_by_name
 from mars_lidar._base.native import _core
 
 _GAUSSIAN_REACH = 8.5  # half support in sigma: what lies outside, 1e-17, is below one photon in any exposure
@@ -90,6 +91,7 @@ class Pulse(ABC):
         return np.diff(self.wrapped_cumulative(edges - delay, period_ns), axis=-1)
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class GaussianPulse(Pulse):
     """Gaussian pulse of standard deviation `sigma_ns` (ns), centred on the delay.
@@ -103,6 +105,7 @@ class GaussianPulse(Pulse):
         object.__setattr__(self, "sigma_ns", checks.real("sigma_ns", self.sigma_ns, low=0.0, strict_low=True))
 
     @classmethod
+    @by_name
     def from_fwhm(cls, *, fwhm_ns: float) -> GaussianPulse:
         """Gaussian pulse of full width at half maximum `fwhm_ns` (ns)."""
         return cls(sigma_ns=checks.real("fwhm_ns", fwhm_ns, low=0.0, strict_low=True) / FWHM_PER_SIGMA)
@@ -149,6 +152,7 @@ class GaussianPulse(Pulse):
         return _core.PulseTable.gaussian(self.sigma_ns / period_ns)
 
 
+@constructed_by_name
 class SampledPulse(Pulse):
     """A measured impulse response: constant on samples of width `bin_ns`.
 

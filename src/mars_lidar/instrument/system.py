@@ -16,6 +16,7 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import check_claim, reading
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
@@ -32,6 +33,7 @@ _LINED_BYTES = 2**16  # of JSON that is read as YAML, a hundred times slower, so
 _MAX_DEAD_PERIODS = 2**20
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class System:
     """Laser, detector and histogram.

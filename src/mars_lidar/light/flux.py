@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base.arguments import checked, checked_with_masks
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray
@@ -20,6 +21,7 @@ from mars_lidar.light.photon_maps import broadcast, check_photons, common_shape,
 MAX_RETURNS = 16
 
 
+@constructed_by_name
 @dataclass(frozen=True, eq=False, init=False)
 class Flux:
     """Expected *detectable* photons per laser period at each pixel (photon detection efficiency included).

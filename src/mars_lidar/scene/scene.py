@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.files import reading
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
@@ -24,6 +25,7 @@ _EXAMPLES = ("room", "random")
 _MAX_DEPTH_M = 1e9  # beyond the Moon; keeps delays far inside what a double resolves to a picosecond
 
 
+@constructed_by_name
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class Scene:
     """Depth, reflectivity and ambient light of each pixel.

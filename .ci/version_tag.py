@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Compare a release's tag with the version of the package: `.ci/version_tag.py v0.3.0`; ends with 1 where they differ."""
+"""Compare a release tag with the version of the package: `.ci/version_tag.py v0.3.0`; ends with 1 if they differ."""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import time
 
 import imageio.v3 as imageio
@@ -145,6 +147,34 @@ def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
         told = errors_against(cube, found)["depth"]
     assert told.rmse == pytest.approx(float(np.sqrt(np.nanmean(drawn**2))))
     assert told.missing == pytest.approx(1.0 - float(found.seen.mean()))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ml.Detector(dead_time=50), r"Detector has no argument 'dead_time' \(did you mean 'dead_time_ns'\?\)"),
+        (lambda: ml.Detector(50), r"by name: Detector\(dead_time_ns=\.\.\.\)"),
+        (lambda: ml.GaussianPulse(0.3), r"by name: GaussianPulse\(sigma_ns=\.\.\.\)"),
+        (lambda: ml.GaussianPulse.from_fwhm(0.3), r"by name: GaussianPulse\.from_fwhm\(fwhm_ns=\.\.\.\)"),
+        (lambda: ml.System(period=100), "did you mean 'period_ns'"),
+        (lambda: ml.Flux(signals=1.0), "did you mean 'signal'"),
+        (lambda: ml.Scene(depth=np.ones((2, 2))), "did you mean 'depth_m'"),
+        (lambda: ml.Detector(), "missing a required argument: 'dead_time_ns'"),
+    ],
+)
+def test_a_wrong_keyword_names_the_argument_that_was_meant(call, message):
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+def test_the_package_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "mars_lidar", "--version"], capture_output=True, text=True)
+    assert done.stdout.strip() == f"mars-lidar {ml.__version__}"
+
+
+def test_objects_are_drawn_in_a_notebook():
+    for each in (ml.Detector(dead_time_ns=50.0, recovery_ns=5.0), SYSTEM.pulse, ml.SampledPulse([0, 1, 3, 1], 0.5)):
+        assert "data:image/png;base64" in each._repr_html_()
 
 
 def test_small_words():

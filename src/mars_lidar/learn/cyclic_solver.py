@@ -27,7 +27,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mars_lidar.learn.needed import torch
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.phase_chain import ConvergenceError
 
 Rows = torch.Tensor  # (pixels, bins), double
 

@@ -15,8 +15,7 @@ from mars_lidar._base.progress import of_part
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.statistics.exposure_result import normalised
+from mars_lidar.statistics.exposure import normalised, refined_moments
 
 Shapes = NDArray[np.float32]
 

@@ -13,10 +13,9 @@ from mars_lidar._base import checks
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.distance import Pmf, total_variation
-from mars_lidar.statistics.exposure import exposure_moments
-from mars_lidar.statistics.exposure_result import normalised
+from mars_lidar.statistics.exposure import exposure_moments, normalised
 from mars_lidar.statistics.law import count_law
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.table.nodes import INTERPOLATIONS, Interpolation, Nodes
 from mars_lidar.table.recipe import Recipe
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.cell_input import flat, reals, with_delays
+from mars_lidar.statistics.cells import flat, reals, with_delays
 from mars_lidar.table.start_phase import StartPhases
 
 

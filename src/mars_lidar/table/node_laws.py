@@ -10,8 +10,7 @@ import numpy as np
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_window import Pmf
-from mars_lidar.statistics.pmf import guessed_windows
+from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
 from mars_lidar.table.entries import Entries
 
 

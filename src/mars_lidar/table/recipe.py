@@ -9,8 +9,8 @@ import numpy as np
 
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import cell_name, default_bins
 from mars_lidar.statistics.chain import PhaseChain, Rearm
-from mars_lidar.statistics.grid import cell_name, default_bins
 from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.table.entries import Entries, exposure_entries
 from mars_lidar.table.nodes import Method

@@ -17,10 +17,8 @@ from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import _run
-from mars_lidar.statistics.exposure_result import blank
-from mars_lidar.statistics.native_light import native_light
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.exposure import _run, blank, native_light
+from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.table.axes import thinned
 
 _STEP = 0.2  # of log S and log B; bicubic between: errors below 1e-4 standard deviations (docs/table.md, 4)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 
 if TYPE_CHECKING:
@@ -88,7 +89,6 @@ class Feedback:
         return Solution(x, residual, steps, method)
 
     def _sweep(self, rhs: FloatArray, x: FloatArray, adjoint: bool, sweeps: int) -> tuple[int, float]:
-        from mars_lidar._base.native import _core
 
         steps, error = _core.feedback_sweeps(self.fire, self.refire, rhs, self.shift, adjoint, sweeps, _TOLERANCE, x)
         return int(steps), float(error)
@@ -198,7 +198,6 @@ def cyclic_recursion(keep: FloatArray, source: FloatArray, loss: float, *, backw
     `loss` is 1 - prod(keep), given so that it stays accurate where the product is nearly 1. With non-negative
     input the result is relatively accurate: no term is ever subtracted.
     """
-    from mars_lidar._base.native import _core
 
     out = np.empty(keep.size)
     _core.cyclic_recursion(keep, np.ascontiguousarray(source, dtype=np.float64), loss, backward, out)

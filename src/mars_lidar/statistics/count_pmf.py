@@ -1,26 +1,165 @@
-"""Exact count pmf of a finite exposure: generating function on the unit circle, turned by an FFT.
+"""Probabilities of the count of an exposure: closed forms, and the inversion of the generating function E z^N.
 
-The support comes first, from rigorous tail bounds; then only as many points of the circle as it has counts.
-Equation numbers: docs/theory_exposure.md, section 8.
+The support comes first, from rigorous bounds of the tails (`Window`); then the generating function is evaluated at as
+many points of the unit circle as the support has counts, and an FFT turns it into probabilities. Equation numbers:
+docs/theory_exposure.md, section 8.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray, IndexArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.characteristic import Purse, TooLongError, characteristic
-from mars_lidar.statistics.count_window import TAIL
-from mars_lidar.statistics.count_window import Pmf as Pmf
-from mars_lidar.statistics.count_window import gaussian_window as gaussian_window
-from mars_lidar.statistics.count_window import poisson_window as poisson_window
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.exposure import NOT_WARM, native_light, refined_moments, warm_history
+from mars_lidar.statistics.phase_chain import ConvergenceError
+
+# --- Support of the count, and closed forms ------------------------------------------------------------------------
+
+TAIL = 1e-12  # probability that may lie outside the support, at either end
+
+
+@dataclass(frozen=True, eq=False)
+class Pmf:
+    """Probabilities `p` (w,) of the counts `first`, `first` + 1, ...; at most `outside` lies elsewhere.
+
+    Of simulated counts their frequencies.
+    """
+
+    first: int
+    p: FloatArray
+    outside: float = 0.0
+
+    @classmethod
+    def of_counts(cls, counts: NDArray[np.integer[Any]]) -> Pmf:
+        """Frequencies of simulated counts (n,)."""
+        first = int(counts.min())
+        return cls(first, np.bincount((counts - first).astype(np.int64)) / counts.size)
+
+    def on(self, low: int, high: int) -> FloatArray:
+        """Probabilities of the counts low .. high (inclusive)."""
+        out = np.zeros(high - low + 1)
+        begin, end = max(low, self.first), min(high, self.last)
+        if begin <= end:
+            out[begin - low : end - low + 1] = self.p[begin - self.first : end - self.first + 1]
+        return out
+
+    @property
+    def last(self) -> int:
+        """The largest count with an entry."""
+        return self.first + self.p.size - 1
+
+
+def poisson_window(mean: float) -> Pmf:
+    """Poisson law: exact without dead time. The support comes from Bernstein's bounds of the two tails."""
+    from scipy.special import gammaln, xlogy
+
+    reach = -math.log(TAIL)
+    low = max(0, math.ceil(mean - math.sqrt(2.0 * reach * mean)))
+    high = math.floor(mean + reach / 3.0 + math.sqrt(reach**2 / 9.0 + 2.0 * reach * mean))
+    counts = np.arange(low, high + 1)
+    return Pmf(low, np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), TAIL * (1 + (low > 0)))
+
+
+def gaussian_window(mean: float, variance: float) -> Pmf:
+    """Normal law on the integers: P(n) = Phi((n + 1/2 - mean) / sd) - Phi((n - 1/2 - mean) / sd).
+
+    What lies below 0 is in P(0).
+    """
+    from scipy.special import ndtr
+
+    spread = math.sqrt(variance)
+    low = max(0, math.floor(mean - 8.5 * spread))
+    high = max(low, math.ceil(mean + 8.5 * spread))
+    counts = np.arange(low, high + 1)
+    if spread == 0.0:
+        return Pmf(low, (counts == round(mean)).astype(np.float64), 0.0)
+    edges = np.arange(low, high + 2) - 0.5 - mean
+    if low == 0:
+        edges[0] = -np.inf
+    # differences of the smaller of the two tails keep their digits at both ends
+    below, above = ndtr(edges / spread), ndtr(-edges / spread)
+    pmf = np.where(edges[:-1] > 0, above[:-1] - above[1:], below[1:] - below[:-1])
+    return Pmf(low, np.maximum(pmf, 0.0), float(below[0] + above[-1]))
+
+
+# --- The generating function and its cost --------------------------------------------------------------------------
+
+_UNSETTLED = -2
+_MAX_STEPS, _LANES = 80_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
+# A history of more bytes, or a dead time below a bin, makes a step cost as many; one beyond every cache six times that
+_NEAR_BYTES, _FAR_BYTES, _FAR = 1 << 20, 1 << 26, 4.0
+_PERIOD_BINS = 128.0  # bins that cost as much as what is done once a period
+
+
+class TooLongError(ConvergenceError):
+    """A transform whose state does not repeat for longer than a law is to take."""
+
+
+class Purse:
+    """Steps (bins x periods, `_LANES` points at once) that are left for the law of one cell."""
+
+    def __init__(self, share: float = 1.0) -> None:
+        self.left = share * _MAX_STEPS
+
+
+def characteristic(
+    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, purse: Purse | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
+
+    purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
+    dead = cells.system.dead_time_periods
+    reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
+    dear = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
+    dear *= 1.0 + _PERIOD_BINS / bins
+    # at real points the blind of every period of a dead time are summed
+    dear *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
+    steps = max(int(purse.left / dear) // batches, bins)
+    grid = cells.grid(bins, 1, steps)
+    re, im = np.empty(z_re.shape), np.empty(z_re.shape)
+    settled = np.empty(z_re.shape, np.int64)
+    points: dict[str, Any] = {
+        "tilted": z_im is None,
+        "z_re": np.ascontiguousarray(z_re),
+        "z_im": np.zeros(z_re.shape) if z_im is None else np.ascontiguousarray(z_im),
+        "re": re,
+        "im": im,
+        "settled": settled,
+    }
+    for part in cells.chunks(bins, 1):
+        mine: dict[str, Any] = points | {name: x[part] for name, x in points.items() if np.ndim(x)}
+        light = native_light(cells.part(part), bins)
+        _core.exposure_characteristic(grid=grid, light=light, **mine, threads=threads)
+    cold = np.flatnonzero((settled == NOT_WARM).any(-1))
+    if cold.size:
+        again: dict[str, Any] = points | {
+            name: np.ascontiguousarray(x[cold]) for name, x in points.items() if np.ndim(x)
+        }
+        light = native_light(cells.part(cold), bins, warm_history(cells, cold, bins))
+        _core.exposure_characteristic(grid=grid, light=light, **again, threads=threads)
+        for name, array in (("re", re), ("im", im), ("settled", settled)):
+            array[cold] = again[name]
+    lost = (settled == _UNSETTLED).any(-1)
+    if lost.any():
+        raise TooLongError(
+            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
+            f"{steps:.1g} bins x periods, too many to run the exposure to its end at {z_re.shape[1]} points; mean, "
+            f"variance and two more cumulants are known; for the law {cells.instead}"
+        )
+    taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
+    purse.left = max(purse.left - float(taken) * bins * batches * dear, 1.0)
+    return re, im
+
+
+# --- Probabilities -------------------------------------------------------------------------------------------------
 
 _TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # standard deviations of reach
 _MAX_TILT = 25.0
@@ -121,7 +260,6 @@ def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
 
 
 def _alone(cell: Cells, threads: int) -> Pmf:
-    from mars_lidar.statistics.exposure import refined_moments
 
     own = refined_moments(cell, 1, tolerance=1e-4, threads=threads)
     return exact_windows(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]

@@ -18,8 +18,8 @@ from mars_lidar import io
 from mars_lidar._base import progress as bars
 from mars_lidar.cli import app
 from mars_lidar.cli.simulate import each_ns
-from mars_lidar.compare.comparison import compare
 from mars_lidar.io.advice import advice
+from studies.compare.comparison import compare
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=50, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
@@ -135,7 +135,7 @@ def test_several_returns_go_into_a_flux():
 
 def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
     """Pixels without a detection have a depth that is a guess: the table counted it, the picture did not."""
-    from mars_lidar.compare.views import depth_error_m
+    from mars_lidar.plot.views import depth_error_m
     from mars_lidar.reconstruct.quality import errors_against
 
     flux = ml.Scene.example("room", size=12).flux(SYSTEM, signal=0.02, sbr=0.5)

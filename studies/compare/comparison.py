@@ -20,21 +20,21 @@ from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
-from mars_lidar.compare.expected import Expected, PixelLaw, expected_counts, pixel_law
-from mars_lidar.compare.pixel import (
+from mars_lidar.engines import ENGINES, Engine, find_engine
+from mars_lidar.engines.image_table import image_table
+from mars_lidar.instrument.system import System
+from mars_lidar.light.flux import Flux
+from mars_lidar.statistics import ConvergenceError
+from studies.compare.expected import Expected, PixelLaw, expected_counts, pixel_law
+from studies.compare.pixel import (
     PixelStatistics,
     draw_pixel,
     pixel_statistics,
     signal_window,
     telling_pixels,
 )
-from mars_lidar.compare.sample import Sample
-from mars_lidar.compare.scene import SceneStatistics, scene_statistics
-from mars_lidar.engines import ENGINES, Engine, find_engine
-from mars_lidar.engines.image_table import image_table
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
-from mars_lidar.statistics import ConvergenceError
+from studies.compare.sample import Sample
+from studies.compare.scene import SceneStatistics, scene_statistics
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mars_lidar.cli.console import grid, screen
-from mars_lidar.compare.sample import SIGNIFICANT, Distance, Estimate, Moments
 from mars_lidar.instrument.system import System
+from studies.compare.sample import SIGNIFICANT, Distance, Estimate, Moments
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from mars_lidar.compare.comparison import Comparison
+    from studies.compare.comparison import Comparison
 
 _MARK = "!"
 _SMALL = 4  # numbers in an array that is written as such

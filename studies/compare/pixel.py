@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
-from mars_lidar.compare.expected import PixelLaw
-from mars_lidar.compare.sample import Distance, Estimate, Moments, Sample, law_distance, ratio, score, shape_distance
-from mars_lidar.compare.views import by_signal, example_pixels, incident_rate, with_pixels
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.plot.views import by_signal, example_pixels, incident_rate, with_pixels
 from mars_lidar.simulate import simulate
 from mars_lidar.statistics.distance import Pmf
+from studies.compare.expected import PixelLaw
+from studies.compare.sample import Distance, Estimate, Moments, Sample, law_distance, ratio, score, shape_distance
 
 _FIRST_BATCH = 50  # realizations after which the time for the rest is known
 _WINDOW_EDGE = np.exp(-4.5)  # of the largest signal rate: three standard deviations of a Gaussian pulse

@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 import mars_lidar as ml
-from mars_lidar.cli.compare_tables import show
-from mars_lidar.compare.comparison import compare
-from mars_lidar.compare.pixel import telling_pixels
 from mars_lidar.engines import ENGINES, Engine
-from mars_lidar.plot.compare import comparison
+from studies.compare.comparison import compare
+from studies.compare.figures import comparison
+from studies.compare.pixel import telling_pixels
+from studies.compare.tables import show
 
 SYSTEM = ml.System(
     period_ns=100.0,
@@ -210,7 +210,7 @@ def test_engines_that_cannot_are_skipped_and_told():
 
 
 def test_without_a_prediction_the_reference_engine_is_the_goal(monkeypatch, capsys):
-    monkeypatch.setattr("mars_lidar.compare.comparison.pixel_law", lambda *_: "it does not settle")
+    monkeypatch.setattr("studies.compare.comparison.pixel_law", lambda *_: "it does not settle")
     found = compare(scene(), SYSTEM, [*TRUE, "poisson"], realizations=1000, repeats=2, pixels=2, seed=8, **CALM)
     assert found.unpredicted == {"bright": "it does not settle", "dim": "it does not settle"}
     for pixel, row in found.statistics.items():

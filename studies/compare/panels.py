@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from mars_lidar.compare.sample import Distance, Estimate
 from mars_lidar.plot.style import COLOURS, INK, MUTED
+from studies.compare.sample import Distance, Estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mars_lidar.compare.comparison import Comparison
+    from studies.compare.comparison import Comparison
 
 _MORE = ("#8c564b", "#999933", "#332288", "#aa4499")
 

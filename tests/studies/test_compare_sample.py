@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mars_lidar.compare.sample import Moments, Sample, law_distance, ratio, shape_distance
 from mars_lidar.statistics.distance import Pmf
+from studies.compare.sample import Moments, Sample, law_distance, ratio, shape_distance
 
 
 def test_standard_errors_are_those_of_repeated_samples():

@@ -1,28 +1,34 @@
-"""`mars-lidar compare`: several engines on one scene, in tables and a picture."""
+"""``python -m studies compare``: several engines on one scene, in tables and a picture."""
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
+
+import typer
 
 from mars_lidar._base import checks
 from mars_lidar._base.files import beside
 from mars_lidar._base.progress import span
 from mars_lidar.cli.console import check_new, check_picture, progress_bar, reported, save_picture, table, two_integers
 from mars_lidar.cli.effect_options import Effects
-from mars_lidar.cli.groups import examples
+from mars_lidar.cli.groups import examples, flowing_help, grouped
 from mars_lidar.cli.options import SEED, THREADS, of_output, of_run
 from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.scene_options import LightOptions, SceneOptions
 from mars_lidar.cli.scene_view import seen
 from mars_lidar.cli.system_options import SystemOptions
 from mars_lidar.engines import ENGINES
+from studies.compare.comparison import compare as run
+from studies.compare.figures import comparison
+from studies.compare.tables import as_data, show
 
-COMPARE_EPILOG = examples(
-    "mars-lidar compare --scene room --size 64 -o compare.png",
-    "mars-lidar compare --scene room --engines exact,poisson --signal 0.1 --realizations 40000 -o dim.png",
-    "mars-lidar compare --depth depth.png --system spad.yaml --against sequential --json numbers.json -o all.pdf",
+_EPILOG = examples(
+    "python -m studies compare --scene room --size 64 -o compare.png",
+    "python -m studies compare --scene room --engines exact,poisson --signal 0.1 --realizations 40000 -o dim.png",
+    "python -m studies compare --depth depth.png --system spad.yaml --against sequential --json all.json -o all.pdf",
     "What deviates by more than 5 standard errors is red and marked with !. Numbers in brackets are the standard error "
     "in the last digits.",
 )
@@ -69,10 +75,6 @@ def compare(
         places = {text.replace(" ", ""): two_integers("--pixel", text) for text in pixel or ()}
         system = instrument.build(effects)
         view = seen(scene, light, system)
-        from mars_lidar.cli.compare_tables import as_data, show
-        from mars_lidar.compare.comparison import compare as run
-        from mars_lidar.plot.compare import comparison
-
         with progress_bar("comparing") as progress:
             found = run(
                 view.flux,
@@ -97,3 +99,21 @@ def compare(
         rows = [("table", found.table)] if found.table else []
         rows += [("picture", str(out)), ("time", f"{span(time.perf_counter() - began)} in all")]
         table(rows if numbers is None else [*rows, ("numbers", str(numbers))])
+
+
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command(help=flowing_help(compare), epilog=_EPILOG, no_args_is_help=True)(grouped(compare))
+
+
+def main(arguments: Sequence[str], command: str) -> int:
+    """Run the command `command` with its arguments; returns the exit code."""
+    try:
+        app(list(arguments), prog_name=command)
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0

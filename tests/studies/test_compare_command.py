@@ -1,4 +1,4 @@
-"""The command `mars-lidar compare`: what it prints and writes, and its exit codes."""
+"""The command ``python -m studies compare``: what it prints and writes, and its exit codes."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import math
 import pytest
 from typer.testing import CliRunner
 
-from mars_lidar.cli import app
-from mars_lidar.cli.compare_tables import cell, with_error
-from mars_lidar.compare.sample import Estimate
+from studies.compare.command import app
+from studies.compare.sample import Estimate
+from studies.compare.tables import cell, with_error
 
 SMALL = ["--scene", "room", "--size", "12", "--cycles", "50", "--bins", "64"]
 SMALL += ["--realizations", "300", "--budget-s", "600"]
@@ -18,7 +18,7 @@ SMALL += ["--realizations", "300", "--budget-s", "600"]
 
 def test_the_command_prints_draws_and_writes_numbers(tmp_path):
     out, numbers = tmp_path / "c.png", tmp_path / "c.json"
-    arguments = ["compare", *SMALL, "--engines", "exact, poisson", "--pixels", "2", "--repeats", "2", "-o", str(out)]
+    arguments = [*SMALL, "--engines", "exact, poisson", "--pixels", "2", "--repeats", "2", "-o", str(out)]
     done = CliRunner().invoke(app, [*arguments, "--json", str(numbers)])
     assert done.exit_code == 0, done.output
     assert out.read_bytes().startswith(b"\x89PNG")
@@ -56,7 +56,7 @@ def test_the_command_prints_draws_and_writes_numbers(tmp_path):
 def test_bad_input_of_the_command_is_exit_code_2(tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
     out = [] if "-o" in arguments else ["-o", "c.png"]
-    done = CliRunner().invoke(app, ["compare", *SMALL, "--pixels", "1", "--repeats", "1", *out, *arguments])
+    done = CliRunner().invoke(app, [*SMALL, "--pixels", "1", "--repeats", "1", *out, *arguments])
     assert done.exit_code == 2
     assert words in done.stderr
     assert len(done.stderr.splitlines()) == 1
@@ -65,7 +65,7 @@ def test_bad_input_of_the_command_is_exit_code_2(tmp_path, monkeypatch, argument
 def test_own_pixels_are_compared(tmp_path):
     out = tmp_path / "c.svg"
     own = ["--engines", "exact", "--repeats", "1", "--pixel", "3,4", "--pixel", "7,8"]
-    done = CliRunner().invoke(app, ["compare", *SMALL, *own, "-o", str(out)])
+    done = CliRunner().invoke(app, [*SMALL, *own, "-o", str(out)])
     assert done.exit_code == 0, done.output
     assert "3,4 pixel (y 3, x 4)" in done.stdout
     assert "7,8 pixel (y 7, x 8)" in done.stdout

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.compare.expected import Expected
-from mars_lidar.compare.sample import Estimate, score
 from mars_lidar.engines import Engine
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.simulate import simulate
+from studies.compare.expected import Expected
+from studies.compare.sample import Estimate, score
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.compare.sample import Moments
-from mars_lidar.compare.views import law_arguments
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
+from mars_lidar.plot.views import law_arguments
 from mars_lidar.statistics import ConvergenceError, count_law, exposure_moments, joint_law, mean_histogram
 from mars_lidar.statistics.distance import Pmf
+from studies.compare.sample import Moments
 
 _PIXELS = 4096  # of an image, at most: a larger one is predicted on a coarser grid
 _WAVEFORMS = 256  # the same where each pixel has a shape of its own

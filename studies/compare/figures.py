@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar.compare.views import instrument
-from mars_lidar.plot.compare_panels import draw_points, draw_times, engine_colours
 from mars_lidar.plot.figures import _draw_map
 from mars_lidar.plot.pixel import _steps, _zoom_ns, quiet_corner
 from mars_lidar.plot.style import DPI, INK, style
+from mars_lidar.plot.views import instrument
+from studies.compare.panels import draw_points, draw_times, engine_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from mars_lidar.compare.comparison import Comparison
+    from studies.compare.comparison import Comparison
 
 _WIDTH = 13.0  # inches
 _ACROSS = 5  # maps in a row

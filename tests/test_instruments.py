@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar.cli import app
-from mars_lidar.instrument.instruments import ASSUMED, INSTRUMENTS, sourced, table
-from mars_lidar.instrument.presets import PRESETS
+from mars_lidar.instrument.presets import ASSUMED, INSTRUMENTS, PRESETS, sourced, table
 
 ROOT = Path(__file__).resolve().parents[1]
 

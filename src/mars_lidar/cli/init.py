@@ -11,8 +11,7 @@ from mars_lidar.cli.groups import argument, option
 from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
 from mars_lidar.instrument.effects import FIELDS
-from mars_lidar.instrument.instruments import INSTRUMENTS, sourced
-from mars_lidar.instrument.presets import PRESETS
+from mars_lidar.instrument.presets import INSTRUMENTS, PRESETS, sourced
 
 _FILE = Path("system.yaml")
 # The values are those of `system_options.DEFAULT_SYSTEM`; a test reads the file back and compares.

@@ -216,10 +216,10 @@ class Scene:
         seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
         shape = image_size(size if isinstance(size, tuple | list) else (size, size))
         if name == "random":
-            from mars_lidar.scene.random_scene import random_scene
+            from mars_lidar.scene.rooms import random_scene
 
             return cls(*random_scene(shape, seed))
-        from mars_lidar.scene.room import room
+        from mars_lidar.scene.rooms import room
 
         return cls(*room(shape, seed))
 

@@ -381,7 +381,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         Factor on the depth: a number or a range.
     flips
         Mirror scenes at random, up-down and left-right.
-    attenuation, ambient, dark_counts_per_s
+    attenuation, ambient, dark_count_hz
         As for `mars_lidar.Scene.flux`.
     engine
         Name or `Engine`, as for `mars_lidar.simulate`.
@@ -433,7 +433,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         flips: bool = True,
         attenuation: Literal["none", "inverse_square"] = "none",
         ambient: Literal["uniform", "reflectivity", "map"] | None = None,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
         engine: str | Engine = "exact",
         device: str | torch.device = "cpu",
         layout: Literal["dense", "sparse"] = "dense",
@@ -455,7 +455,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         drawn = as_systems(systems)
         checks.choice("attenuation", attenuation, ATTENUATIONS)
         checks.choice("ambient", "map" if ambient is None else ambient, AMBIENTS)
-        dark = checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
+        dark = checks.real("dark_count_hz", dark_count_hz, low=0.0)
         self._recipe = Recipe(
             source=as_source(scenes, shape, reuse),
             systems=drawn,
@@ -464,7 +464,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             signal=as_range("signal", signal),
             sbr=as_range("sbr", sbr, infinite=True),
             depth_scale=as_range("depth_scale", depth_scale),
-            lit={"attenuation": attenuation, "ambient": ambient, "dark_counts_per_s": dark},
+            lit={"attenuation": attenuation, "ambient": ambient, "dark_count_hz": dark},
             seed=checks.integer("seed", seed, low=0, high=2**63 - 1),
         )
         self._end = _LAST if epoch_size is None else checks.integer("epoch_size", epoch_size, low=1, high=_LAST)

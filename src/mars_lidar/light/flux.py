@@ -204,7 +204,7 @@ class Flux:
         """The flux of a rendered transient (H, W, T): light in bins of `bin_ns` from the time `start_ns`.
 
         `level` takes the arguments of `mars_lidar.io.Transient.flux`: ``signal`` or ``photons_per_unit``, and
-        ``sbr``, ``dark_counts_per_s``, ``pulse``, ``parts``. Files are read by `mars_lidar.io.read_transient`.
+        ``sbr``, ``dark_count_hz``, ``pulse``, ``parts``. Files are read by `mars_lidar.io.read_transient`.
         """
         rendered = late("light.transient:Transient")(values, bin_ns, start_ns=start_ns)
         flux: Flux = rendered.flux(system, **level)

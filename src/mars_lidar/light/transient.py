@@ -177,7 +177,7 @@ class Transient:
         signal: float | None = None,
         photons_per_unit: float | None = None,
         sbr: float = math.inf,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
         pulse: bool = True,
         parts: int | None = None,
         rows: slice = slice(None),
@@ -187,7 +187,7 @@ class Transient:
         With L the light of a pixel, summed over all bins, and V the pixels with any light::
 
             S = signal * L / mean_V(L)      or      S = photons_per_unit * L
-            B = mean_V(S) / sbr  +  dark_counts_per_s * t_r / detection_efficiency
+            B = mean_V(S) / sbr  +  dark_count_hz * t_r / detection_efficiency
 
         Time is folded with the laser period: light that arrives after its end comes in the next one.
 
@@ -201,7 +201,7 @@ class Transient:
             Instead of `signal`: detectable photons per laser period for one unit of light, > 0.
         sbr
             Mean signal over ambient photons, uniform over the image; inf: no ambient light.
-        dark_counts_per_s
+        dark_count_hz
             Dark counts of a pixel, counts/s, besides those of the detector (`Detector.dark_count_hz`): what is counted,
             whatever the detection efficiency.
         pulse
@@ -225,7 +225,7 @@ class Transient:
                 checks.real(name, value, low=0.0, strict_low=True)
         if sbr != math.inf:
             checks.real("sbr", sbr, low=0.0, strict_low=True)
-        checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
+        checks.real("dark_count_hz", dark_count_hz, low=0.0)
         first, last, stride = rows.indices(self.shape[0])
         if stride != 1 or first >= last:
             raise ValueError(f"rows must select a run of at least one of {self.shape[0]}, got {rows!r}")
@@ -236,7 +236,7 @@ class Transient:
             raise ValueError(f"{self._named}values must have light in some pixel, got none")
         mean = float(lit.mean())
         scale = signal / mean if signal is not None else float(photons_per_unit or 0.0)
-        dark = dark_counts_per_s * 1e-9 * system.period_ns / system.detector.detection_efficiency
+        dark = dark_count_hz * 1e-9 * system.period_ns / system.detector.detection_efficiency
         background = (scale * mean / sbr if sbr != math.inf else 0.0) + dark
         size = 8 * (last - first) * self.shape[1] * number
         check_memory(4 * size, "the waveforms of these rows", "take fewer rows at a time")  # Flux keeps a copy
@@ -255,7 +255,7 @@ class Transient:
             "mean_signal": scale * mean,
             "mean_background": background,
             "sbr": None if sbr == math.inf else sbr,
-            "dark_counts_per_s": dark_counts_per_s,
+            "dark_count_hz": dark_count_hz,
             "pulse_convolved": pulse,
         }
         return Flux(waveform=waveform, background=background, info=info)
@@ -268,7 +268,7 @@ class Transient:
         signal: float | None = None,
         photons_per_unit: float | None = None,
         sbr: float = math.inf,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
         pulse: bool = True,
         parts: int | None = None,
     ) -> StoredFlux:
@@ -279,7 +279,7 @@ class Transient:
         """
 
         level: dict[str, Any] = {"signal": signal, "photons_per_unit": photons_per_unit, "sbr": sbr}
-        level |= {"dark_counts_per_s": dark_counts_per_s, "pulse": pulse, "parts": parts}
+        level |= {"dark_count_hz": dark_count_hz, "pulse": pulse, "parts": parts}
 
         def make(rows: slice) -> Flux:
             return self.flux(system, **level, rows=rows)

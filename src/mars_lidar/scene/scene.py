@@ -136,14 +136,14 @@ class Scene:
         sbr: float,
         attenuation: Literal["none", "inverse_square"] = "none",
         ambient: Literal["uniform", "reflectivity", "map"] | None = None,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
     ) -> Flux:
         """The photon flux at each pixel, at a stated mean signal level and signal-to-background ratio.
 
         With V the set of valid pixels (those with a return), z the depth, rho the reflectivity::
 
             S   = signal * w / mean_V(w),             w = rho * g(z),   g = 1 or 1 / z^2
-            B   = signal / sbr * a / mean_V(a)  +  dark_counts_per_s * t_r / detection_efficiency
+            B   = signal / sbr * a / mean_V(a)  +  dark_count_hz * t_r / detection_efficiency
             tau = 2 z / c
 
         so that ``mean_V(S) = signal`` and ``mean_V(S) / mean_V(B - dark) = sbr``. Pixels without return have
@@ -165,7 +165,7 @@ class Scene:
             a: ``"uniform"``, ``"reflectivity"`` (sunlight or lamps scattered by the same surface; radiance
             does not fall with distance) or ``"map"`` (the scene's background map). None: the map where there
             is one, else uniform.
-        dark_counts_per_s
+        dark_count_hz
             Dark counts of a pixel, counts/s, the same in all, besides those of the detector (`Detector.dark_count_hz`):
             what is counted, whatever the detection efficiency.
 
@@ -187,7 +187,7 @@ class Scene:
             reached because reflectivity or ambient light is zero at every valid pixel.
         """
         maps = self.depth_m[None], self.reflectivity[None], self.background
-        return scene_flux(*maps, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+        return scene_flux(*maps, system, signal, sbr, attenuation, ambient, dark_count_hz)
 
     @staticmethod
     def example_names() -> tuple[str, ...]:

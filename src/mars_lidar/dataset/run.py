@@ -184,6 +184,8 @@ class _Totals:
 
     def __init__(self, done: int, total: int, progress: Progress | None) -> None:
         self._done, self._total, self._progress = done, total, progress
+        if progress is not None:
+            progress(done, total)  # what an earlier run has done, before this one begins
         self.simulate_s = self.write_s = 0.0
 
     def add(self, made: Made) -> None:

@@ -106,7 +106,7 @@ export function inPeriods(state) {
     cycles: state.cycles, bins: state.bins, sigma: state.sigma / period, dead: state.dead / period,
     stationary: state.start === "stationary", mode: MODES.indexOf(state.mode),
     gateStart: gated ? turn((state.gateStart % period) / period) : 0, gateWidth: gated ? Math.min(state.gateWidth / period, 1) : 1,
-    afterpulses: state.afterpulses, trapDelay: state.trapDelay / period,
+    afterpulses: state.afterpulses, trapDelay: state.afterpulses > 0 ? state.trapDelay / period : 0, // warm-ups last as long as what avalanches leave
     twilight: state.mode === "nonparalyzable" ? state.twilight / period : 0,
     electronics: state.electronics / period, jitter: state.jitter / period,
   };

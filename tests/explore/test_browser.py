@@ -322,13 +322,20 @@ EFFECTS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.parametrize("start", ["armed", "stationary"])
 @pytest.mark.parametrize("mode", ["nonparalyzable", "paralyzable", "synchronous", "gated"])
-def test_every_pair_of_effects_draws_python_s_bits(page: Page, mode: str):
-    """Each effect alone (beside "none") and with every other, in every mode: 29 histograms a mode, bit for bit."""
+def test_every_pair_of_effects_draws_python_s_bits(page: Page, mode: str, start: str):
+    """Each effect alone (beside "none") and with every other, in every mode: 36 histograms, bit for bit."""
     table = {}
     for first, second in itertools.combinations_with_replacement(EFFECTS, 2):
         gate = {"gateStart": 30, "gateWidth": 40}
-        state = BASE | gate | {"mode": mode, "signal": 5, "cycles": 400, "bins": 64} | EFFECTS[first] | EFFECTS[second]
+        state = (
+            BASE
+            | gate
+            | {"mode": mode, "start": start, "signal": 5, "cycles": 400, "bins": 64}
+            | EFFECTS[first]
+            | EFFECTS[second]
+        )
         counts, drawn = (
             page.tab.evaluate("(s) => explorer.counts(s).then((c) => Array.from(c))", state),
             python_counts(state),
@@ -344,8 +351,8 @@ def test_random_settings_draw_python_s_bits(page: Page):
     random = np.random.default_rng(38)
     for _ in range(300):
         state = BASE | {
-            "mode": random.choice(["nonparalyzable", "paralyzable", "synchronous", "gated"]),
-            "start": random.choice(["armed", "stationary"]),
+            "mode": str(random.choice(["nonparalyzable", "paralyzable", "synchronous", "gated"])),
+            "start": str(random.choice(["armed", "stationary"])),
             "signal": round(float(10 ** random.uniform(-2, 1.7)), 3),
             "background": round(float(10 ** random.uniform(-2, 1)), 3),
             "delay": round(float(random.uniform(0, 100)), 1),
@@ -360,9 +367,7 @@ def test_random_settings_draw_python_s_bits(page: Page):
         for effect in EFFECTS.values():
             if random.random() < 0.4:
                 state |= effect
-        counts = page.tab.evaluate(
-            "(s) => explorer.counts(s).then((c) => Array.from(c))", json.loads(json.dumps(state))
-        )
+        counts = page.tab.evaluate("(s) => explorer.counts(s).then((c) => Array.from(c))", state)
         assert np.array_equal(counts, python_counts(state)), state
 
 
@@ -475,9 +480,8 @@ def test_nothing_is_clipped_or_covered(browser: Any, size: tuple[int, int]):
     width = small.tab.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
     assert width[0] == width[1]
     for name in ("histogram", "law"):
-        inner, outer = small.tab.evaluate(
-            f"(() => {{ const e = document.getElementById('{name}'); return [e.querySelector('.uplot').offsetWidth, e.clientWidth]; }})()"
-        )
+        chart = small.tab.locator(f"#{name}")
+        inner, outer = chart.evaluate("e => [e.querySelector('.uplot').offsetWidth, e.clientWidth]")
         assert inner <= outer
     if size[1] < 700:
         assert small.tab.evaluate("getComputedStyle(document.getElementById('controls')).position") != "sticky"

@@ -1,13 +1,20 @@
-"""The documentation's site: ``python -m sphinx -W -b html docs build/site`` builds it and runs the gallery."""
+"""The documentation's site: ``python -m sphinx -W -b html docs build/site`` builds it and runs the gallery.
+
+Equations become HTML while the site is built (KaTeX, run by Node): pages need neither scripts nor a network for them.
+"""
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import shutil
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import matplotlib.style
+import sphinxcontrib.katex
 from sphinx.application import Sphinx
 
 import mars_lidar
@@ -24,18 +31,24 @@ extensions = [
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
+    "sphinxcontrib.katex",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["gallery/**/*.ipynb", "gallery/**/*.py", "gallery/**/*.json", "gallery/**/*.md5"]
+exclude_patterns = ["katex", "gallery/**/*.ipynb", "gallery/**/*.py", "gallery/**/*.json", "gallery/**/*.md5"]
 templates_path = ["_templates"]
 default_role = "py:obj"
+smartquotes_action = "qe"  # quotes and ellipses: two hyphens are those of an option, not a dash
 suppress_warnings = ["config.cache"]  # the gallery's settings hold a function
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 4
+
+katex_prerender = True
+katex_css_path = "katex/katex.min.css"
+sphinxcontrib.katex.STARTUP_TIMEOUT = sphinxcontrib.katex.RENDER_TIMEOUT = 120.0  # s; 5 s are short on a busy machine
 
 autosummary_generate = True
 autodoc_typehints = "none"  # in the signature they are longer than the text; numpydoc shows each parameter's own
@@ -66,7 +79,7 @@ sphinx_gallery_conf = {
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"mars-lidar {version}"
-html_static_path = ["_static"]
+html_static_path = ["_static", "copied/static"]
 html_css_files = ["site.css"]
 html_theme_options = {
     "show_prev_next": False,
@@ -97,6 +110,22 @@ def _copy(source: Path, target: Path) -> None:
     target.write_text(text, encoding="utf-8")
 
 
+def _katex_style() -> None:
+    """KaTeX's style sheet and fonts, of the release that the extension runs, from npm."""
+    package = ROOT / "docs" / "katex"
+    if not (package / "node_modules" / "katex").is_dir():
+        npm = shutil.which("npm")
+        if npm is None:
+            raise RuntimeError("building the site needs Node and npm, which render its equations: https://nodejs.org")
+        subprocess.run([npm, "ci", "--silent", "--no-audit", "--no-fund"], cwd=package, check=True)
+    dist, target = package / "node_modules" / "katex" / "dist", COPIED / "static" / "katex"
+    shutil.rmtree(target, ignore_errors=True)
+    (target / "fonts").mkdir(parents=True)
+    shutil.copy(dist / "katex.min.css", target)
+    for font in dist.glob("fonts/*.woff2"):
+        shutil.copy(font, target / "fonts")
+
+
 def _commands() -> str:
     """The command line, as it describes itself."""
     import typer
@@ -109,9 +138,46 @@ def _commands() -> str:
     return re.sub(r"\[/?(?:bold|dim)\]", "", text)
 
 
+_katex_style()
 for copied in COPIES.items():
     _copy(*copied)
 COPIED.joinpath("commands.md").write_text(_commands(), encoding="utf-8")
+
+
+_HEADING = re.compile(r"^(Parameters|Attributes)$")
+
+
+def _annotations(thing: Any, section: str) -> dict[str, str]:
+    """Types of a callable's parameters, or of a class's attributes, as the source spells them."""
+    if section == "Parameters":
+        try:
+            parameters = inspect.signature(thing).parameters.values()
+        except (TypeError, ValueError):
+            return {}
+        return {p.name: str(p.annotation) for p in parameters if p.annotation is not p.empty}
+    types: dict[str, str] = {}
+    for base in reversed(getattr(thing, "__mro__", ())):
+        types |= {name: str(text) for name, text in inspect.get_annotations(base).items()}
+        for name, member in vars(base).items():
+            getter = getattr(member, "fget", None) or getattr(member, "func", None)  # a property, also a cached one
+            text = getattr(getter, "__annotations__", {}).get("return")
+            if text is not None:
+                types[name] = str(text)
+    return types
+
+
+def _document_types(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Puts the types of the annotations beside the names of the sections Parameters and Attributes."""
+    types: dict[str, str] = {}
+    for number, line in enumerate(lines):
+        following = lines[number + 1] if number + 1 < len(lines) else ""
+        if following.startswith("---"):
+            heading = _HEADING.match(line)
+            types = _annotations(thing, heading[1]) if heading else {}
+        elif types and re.fullmatch(r"\*{0,2}\w+(, \w+)*", line):
+            of_names = [types.get(each.strip("* ")) for each in line.split(",")]
+            if of_names[0] is not None and len(set(of_names)) == 1:
+                lines[number] = f"{line} : " + re.sub(r"_(?!\w)", r"\_", of_names[0])  # not a link of reStructuredText
 
 
 def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
@@ -128,4 +194,5 @@ def _take_explorer(app: Sphinx, error: Exception | None) -> None:
 def setup(app: Sphinx) -> None:
     """Hooks of Sphinx."""
     app.connect("source-read", _link_copies)
+    app.connect("autodoc-process-docstring", _document_types, priority=400)  # before numpydoc, 500
     app.connect("build-finished", _take_explorer)

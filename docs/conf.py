@@ -37,7 +37,7 @@ extensions = [
     "sphinxcontrib.katex",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["katex", "gallery/**/*.ipynb", "gallery/**/*.py", "gallery/**/*.json", "gallery/**/*.md5"]
+exclude_patterns = ["katex", *(f"{folder}/**/*.{kind}" for folder in ("gallery", "lessons") for kind in ("ipynb", "py", "json", "md5"))]
 templates_path = ["_templates"]
 default_role = "py:obj"
 smartquotes_action = "qe"  # quotes and ellipses: two hyphens are those of an option, not a dash
@@ -63,8 +63,8 @@ def _style(gallery: dict[str, object], name: str) -> None:
 
 
 sphinx_gallery_conf = {
-    "examples_dirs": ["../examples/gallery"],
-    "gallery_dirs": ["gallery"],
+    "examples_dirs": ["../examples/lessons", "../examples/gallery"],
+    "gallery_dirs": ["lessons", "gallery"],
     "filename_pattern": r"\.py$",
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
@@ -79,19 +79,20 @@ sphinx_gallery_conf = {
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"mars-lidar {version}"
+html_favicon = "_static/favicon.svg"
 html_static_path = ["_static", "copied/static"]
 html_css_files = ["site.css"]
 html_theme_options = {
     "show_prev_next": False,
     "secondary_sidebar_items": ["page-toc"],
     "navbar_align": "left",
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 8,
     "footer_start": ["copyright"],
     "footer_end": [],
     "show_toc_level": 2,
 }
 html_show_sourcelink = False
-html_sidebars = {page: [] for page in ("start", "explorer", "coming_from")}  # pages without pages below them
+html_sidebars = {page: [] for page in ("start", "seven_pictures", "explorer", "coming_from")}  # pages without pages below them
 
 # Pages that stand elsewhere, where the programs or the hosts of repositories look for them, and what a program says.
 COPIED = ROOT / "docs" / "copied"
@@ -180,6 +181,22 @@ def _document_types(app: Sphinx, what: str, name: str, thing: Any, options: Any,
                 lines[number] = f"{line} : " + re.sub(r"_(?!\w)", r"\_", of_names[0])  # not a link of reStructuredText
 
 
+# Reports that one program made more than once, each with a title of its own.
+TITLES = {
+    "results/count_law_sequential/count_law": "Count laws against simulation photon by photon (T1)",
+    "results/sanitize_address": "The native core under the address sanitizer",
+    "results/sanitize_thread": "The native core under the thread sanitizer",
+    "copied/benchmarks/default": "Benchmarks: Intel Xeon",
+    "copied/benchmarks/epyc": "Benchmarks: AMD EPYC",
+    "copied/benchmarks/full": "Benchmarks: AMD EPYC, more cases",
+}
+
+
+def _title(app: Sphinx, page: str, source: list[str]) -> None:
+    if page in TITLES:
+        source[0] = re.sub(r"^# .*$", f"# {TITLES[page]}", source[0], count=1, flags=re.MULTILINE)
+
+
 def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = source[0].replace("](../benchmarks/results/", "](copied/benchmarks/")
 
@@ -194,5 +211,6 @@ def _take_explorer(app: Sphinx, error: Exception | None) -> None:
 def setup(app: Sphinx) -> None:
     """Hooks of Sphinx."""
     app.connect("source-read", _link_copies)
+    app.connect("source-read", _title)
     app.connect("autodoc-process-docstring", _document_types, priority=400)  # before numpydoc, 500
     app.connect("build-finished", _take_explorer)

@@ -37,7 +37,10 @@ extensions = [
     "sphinxcontrib.katex",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["katex", *(f"{folder}/**/*.{kind}" for folder in ("gallery", "lessons") for kind in ("ipynb", "py", "json", "md5"))]
+exclude_patterns = [
+    "katex",
+    *(f"{folder}/**/*.{kind}" for folder in ("gallery", "lessons") for kind in ("ipynb", "py", "json", "md5")),
+]
 templates_path = ["_templates"]
 default_role = "py:obj"
 smartquotes_action = "qe"  # quotes and ellipses: two hyphens are those of an option, not a dash
@@ -92,7 +95,9 @@ html_theme_options = {
     "show_toc_level": 2,
 }
 html_show_sourcelink = False
-html_sidebars = {page: [] for page in ("start", "seven_pictures", "explorer", "coming_from")}  # pages without pages below them
+html_sidebars = {
+    page: [] for page in ("start", "seven_pictures", "explorer", "coming_from")
+}  # pages without pages below them
 
 # Pages that stand elsewhere, where the programs or the hosts of repositories look for them, and what a program says.
 COPIED = ROOT / "docs" / "copied"

@@ -16,7 +16,7 @@ from PIL import Image
 import mars_lidar as ml
 
 DOCS = Path(__file__).resolve().parent
-PIXEL = (34, 83)  # on the sphere in front
+PIXEL = (34, 83)  # row and column, on the door
 
 
 def main() -> None:
@@ -35,9 +35,9 @@ def main() -> None:
     mean = ml.statistics.mean_histogram(signal, background, system, delay_ns=delay_ns)
 
     fig, axes = plt.subplot_mosaic([["counts", "depth"], ["histogram", "histogram"]], figsize=(7.2, 6.0))
-    for name, values, title in (("counts", cube.sum(-1), "counts"), ("depth", found.depth_m, "depth (m)")):
+    for name, values, title in (("counts", cube.sum(-1), "counts"), ("depth", found.depth_m, "depth from them (m)")):
         image = axes[name].imshow(values, cmap={"counts": "magma", "depth": "viridis"}[name])
-        axes[name].set(title=f"{title} of a simulated exposure", xticks=[], yticks=[])
+        axes[name].set(title=title, xticks=[], yticks=[])
         axes[name].plot(column, row, "o", mfc="none", mec="w", mew=2)
         fig.colorbar(image, ax=axes[name], shrink=0.8)
     plot = axes["histogram"]
@@ -46,7 +46,7 @@ def main() -> None:
     plot.plot(system.time_ns, mean, color="C0", label="their exact mean")
     plot.set_yscale("symlog", linthresh=1.0)
     plot.set(xlabel="time in the laser period (ns)", ylabel="per bin", xlim=(0, 100), ylim=(-0.2, None))
-    plot.legend(loc="upper right")
+    plot.legend(loc="upper left")
     for name, size in (("start.png", None), ("_static/preview.png", (1200, 630))):
         fig.savefig(DOCS / name, dpi=150)
         picture = Image.open(DOCS / name).convert("RGB")
@@ -55,7 +55,7 @@ def main() -> None:
             sheet = Image.new("RGB", size, "white")
             sheet.paste(picture, ((size[0] - picture.width) // 2, (size[1] - picture.height) // 2))
             picture = sheet
-        picture.quantize(128).save(DOCS / name, optimize=True)
+        picture.quantize(256).save(DOCS / name, optimize=True)
 
 
 if __name__ == "__main__":

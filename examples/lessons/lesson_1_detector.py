@@ -51,7 +51,7 @@ def registered(times: np.ndarray) -> np.ndarray:
     return np.array(kept)
 
 
-photons = arrivals(2.0, 0.5, 6)
+photons = arrivals(1.5, 1.5, 6)
 clicks = registered(photons)
 
 fig, ax = plt.subplots(figsize=(7.2, 2.2))
@@ -61,7 +61,7 @@ for click in clicks:
     ax.axvspan(click, click + dead_time_ns, ymax=0.45, color="C1", alpha=0.2, lw=0)
 ax.eventplot([photons, clicks], lineoffsets=[1.6, 0.5], linelengths=0.7, colors=["0.4", "C1"])
 ax.set(xlim=(0, 600), ylim=(0, 2.2), yticks=[0.5, 1.6], yticklabels=["registered", "photons"], xlabel="time (ns)")
-ax.set_title("Six laser periods (grey lines): photons, and those registered with the blind time after each (shaded)")
+ax.set_title("Six laser periods (grey lines); the blind time after each registration is shaded")
 plt.show()
 
 # %%

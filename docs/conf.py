@@ -1,13 +1,20 @@
-"""The documentation's site: ``python -m sphinx -W -b html docs build/site`` builds it and runs the gallery."""
+"""The documentation's site: ``python -m sphinx -W -b html docs build/site`` builds it and runs the gallery.
+
+Equations become HTML while the site is built (KaTeX, run by Node): pages need neither scripts nor a network for them.
+"""
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import shutil
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import matplotlib.style
+import sphinxcontrib.katex
 from sphinx.application import Sphinx
 
 import mars_lidar
@@ -24,18 +31,27 @@ extensions = [
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
+    "sphinxcontrib.katex",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["gallery/**/*.ipynb", "gallery/**/*.py", "gallery/**/*.json", "gallery/**/*.md5"]
+exclude_patterns = [
+    "katex",
+    *(f"{folder}/**/*.{kind}" for folder in ("gallery", "lessons") for kind in ("ipynb", "py", "json", "md5")),
+]
 templates_path = ["_templates"]
 default_role = "py:obj"
+smartquotes_action = "qe"  # quotes and ellipses: two hyphens are those of an option, not a dash
 suppress_warnings = ["config.cache"]  # the gallery's settings hold a function
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 4
+
+katex_prerender = True
+katex_css_path = "katex/katex.min.css"
+sphinxcontrib.katex.STARTUP_TIMEOUT = sphinxcontrib.katex.RENDER_TIMEOUT = 120.0  # s; 5 s are short on a busy machine
 
 autosummary_generate = True
 autodoc_typehints = "none"  # in the signature they are longer than the text; numpydoc shows each parameter's own
@@ -50,8 +66,8 @@ def _style(gallery: dict[str, object], name: str) -> None:
 
 
 sphinx_gallery_conf = {
-    "examples_dirs": ["../examples/gallery"],
-    "gallery_dirs": ["gallery"],
+    "examples_dirs": ["../examples/lessons", "../examples/gallery"],
+    "gallery_dirs": ["lessons", "gallery"],
     "filename_pattern": r"\.py$",
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
@@ -66,19 +82,22 @@ sphinx_gallery_conf = {
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"mars-lidar {version}"
-html_static_path = ["_static"]
+html_favicon = "_static/favicon.svg"
+html_static_path = ["_static", "copied/static"]
 html_css_files = ["site.css"]
 html_theme_options = {
     "show_prev_next": False,
     "secondary_sidebar_items": ["page-toc"],
     "navbar_align": "left",
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 8,
     "footer_start": ["copyright"],
     "footer_end": [],
     "show_toc_level": 2,
 }
 html_show_sourcelink = False
-html_sidebars = {page: [] for page in ("start", "explorer", "coming_from")}  # pages without pages below them
+html_sidebars = {
+    page: [] for page in ("start", "seven_pictures", "explorer", "coming_from")
+}  # pages without pages below them
 
 # Pages that stand elsewhere, where the programs or the hosts of repositories look for them, and what a program says.
 COPIED = ROOT / "docs" / "copied"
@@ -97,6 +116,22 @@ def _copy(source: Path, target: Path) -> None:
     target.write_text(text, encoding="utf-8")
 
 
+def _katex_style() -> None:
+    """KaTeX's style sheet and fonts, of the release that the extension runs, from npm."""
+    package = ROOT / "docs" / "katex"
+    if not (package / "node_modules" / "katex").is_dir():
+        npm = shutil.which("npm")
+        if npm is None:
+            raise RuntimeError("building the site needs Node and npm, which render its equations: https://nodejs.org")
+        subprocess.run([npm, "ci", "--silent", "--no-audit", "--no-fund"], cwd=package, check=True)
+    dist, target = package / "node_modules" / "katex" / "dist", COPIED / "static" / "katex"
+    shutil.rmtree(target, ignore_errors=True)
+    (target / "fonts").mkdir(parents=True)
+    shutil.copy(dist / "katex.min.css", target)
+    for font in dist.glob("fonts/*.woff2"):
+        shutil.copy(font, target / "fonts")
+
+
 def _commands() -> str:
     """The command line, as it describes itself."""
     import typer
@@ -109,9 +144,62 @@ def _commands() -> str:
     return re.sub(r"\[/?(?:bold|dim)\]", "", text)
 
 
+_katex_style()
 for copied in COPIES.items():
     _copy(*copied)
 COPIED.joinpath("commands.md").write_text(_commands(), encoding="utf-8")
+
+
+_HEADING = re.compile(r"^(Parameters|Attributes)$")
+
+
+def _annotations(thing: Any, section: str) -> dict[str, str]:
+    """Types of a callable's parameters, or of a class's attributes, as the source spells them."""
+    if section == "Parameters":
+        try:
+            parameters = inspect.signature(thing).parameters.values()
+        except (TypeError, ValueError):
+            return {}
+        return {p.name: str(p.annotation) for p in parameters if p.annotation is not p.empty}
+    types: dict[str, str] = {}
+    for base in reversed(getattr(thing, "__mro__", ())):
+        types |= {name: str(text) for name, text in inspect.get_annotations(base).items()}
+        for name, member in vars(base).items():
+            getter = getattr(member, "fget", None) or getattr(member, "func", None)  # a property, also a cached one
+            text = getattr(getter, "__annotations__", {}).get("return")
+            if text is not None:
+                types[name] = str(text)
+    return types
+
+
+def _document_types(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Puts the types of the annotations beside the names of the sections Parameters and Attributes."""
+    types: dict[str, str] = {}
+    for number, line in enumerate(lines):
+        following = lines[number + 1] if number + 1 < len(lines) else ""
+        if following.startswith("---"):
+            heading = _HEADING.match(line)
+            types = _annotations(thing, heading[1]) if heading else {}
+        elif types and re.fullmatch(r"\*{0,2}\w+(, \w+)*", line):
+            of_names = [types.get(each.strip("* ")) for each in line.split(",")]
+            if of_names[0] is not None and len(set(of_names)) == 1:
+                lines[number] = f"{line} : " + re.sub(r"_(?!\w)", r"\_", of_names[0])  # not a link of reStructuredText
+
+
+# Reports that one program made more than once, each with a title of its own.
+TITLES = {
+    "results/count_law_sequential/count_law": "Count laws against simulation photon by photon (T1)",
+    "results/sanitize_address": "The native core under the address sanitizer",
+    "results/sanitize_thread": "The native core under the thread sanitizer",
+    "copied/benchmarks/default": "Benchmarks: Intel Xeon",
+    "copied/benchmarks/epyc": "Benchmarks: AMD EPYC",
+    "copied/benchmarks/full": "Benchmarks: AMD EPYC, more cases",
+}
+
+
+def _title(app: Sphinx, page: str, source: list[str]) -> None:
+    if page in TITLES:
+        source[0] = re.sub(r"^# .*$", f"# {TITLES[page]}", source[0], count=1, flags=re.MULTILINE)
 
 
 def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
@@ -128,4 +216,6 @@ def _take_explorer(app: Sphinx, error: Exception | None) -> None:
 def setup(app: Sphinx) -> None:
     """Hooks of Sphinx."""
     app.connect("source-read", _link_copies)
+    app.connect("source-read", _title)
+    app.connect("autodoc-process-docstring", _document_types, priority=400)  # before numpydoc, 500
     app.connect("build-finished", _take_explorer)

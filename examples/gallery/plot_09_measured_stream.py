@@ -2,8 +2,8 @@
 A measured stream inspected, calibrated, validated
 ==================================================
 
-A laboratory gives photon times (PTU, Photon-HDF5, .mat, .npz). `mars_lidar.calibrate` finds the light behind them, and
-`mars_lidar.validate` asks whether the model predicts the stream. Here the stream is simulated and read back as a
+A laboratory gives photon times (PTU, Photon-HDF5, .mat, .npz). `mars_lidar.calibrate` finds the light behind them,
+and `mars_lidar.validate` asks whether the model predicts the stream. Here the stream is simulated and read back as a
 stranger's would be; its pixel has afterpulses. The recovery after a photon shows them, and a model without them is
 refused until they are told.
 """

@@ -51,7 +51,7 @@ def reconstruct(
     foreign: ForeignOptions,
     out: Path = out_option("The maps: .zarr, .h5, .hdf5 or .npz.", panel=None),
     method: str = option(
-        "One or more methods, separated by commas, or all that suit the detector.",
+        "One or more methods, separated by commas, or all that suit the detector; image for 1 to 10 photons a pixel.",
         default="maximum_likelihood",
     ),
     level: float | None = option(
@@ -65,12 +65,6 @@ def reconstruct(
         default=1,
         min=1,
         max=8,
-    ),
-    neighbourhood: int | None = option(
-        "For dim cubes: take neighbours within up to so many pixels together, on a plane; such as 4.",
-        "each pixel alone",
-        min=1,
-        max=12,
     ),
     threads: int | None = option("Threads.", "all cores", min=1),
     cloud: Path | None = option(
@@ -112,7 +106,6 @@ def reconstruct(
                     level=level,
                     attenuation=attenuation,
                     returns=returns,
-                    neighbourhood=neighbourhood,
                     threads=threads,
                     progress=progress,
                 )

@@ -148,7 +148,7 @@ def _train_choose(torch: Any, images: list[_Prepared], plan: Plan, tell: Tell) -
 
 
 def _choose_net(torch: Any) -> Any:
-    class Choose(torch.nn.Module):  # type: ignore[misc, name-defined]
+    class Choose(torch.nn.Module):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__()
             linear, relu = torch.nn.Linear, torch.nn.ReLU
@@ -228,7 +228,7 @@ def _train_weigh(
 def _weigh_net(torch: Any) -> Any:
     nn = torch.nn
 
-    class Weigh(nn.Module):  # type: ignore[misc]
+    class Weigh(nn.Module):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
             super().__init__()
             around = {"padding": 1, "padding_mode": "replicate"}

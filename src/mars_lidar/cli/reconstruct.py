@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 RECONSTRUCT_EPILOG = examples(
     "mars-lidar reconstruct room.zarr -o maps.zarr",
     "mars-lidar reconstruct room.zarr --method all -o maps.h5",
+    "mars-lidar reconstruct dim.zarr --method image -o maps.zarr",
     "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
     "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
     "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",

@@ -148,6 +148,7 @@ def reconstruct(
     method
         A name in `mars_lidar.reconstruct.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says what
         each assumes), or a `Method` of your own settings. Each refuses detectors that it does not hold for.
+        ``"image"``, for images (..., H, W, bins) of 1 to 20 photons a pixel, takes the pixels around into account.
     level
         Detectable signal photons per period of a surface of reflectivity 1 (at 1 m, with
         ``attenuation="inverse_square"``).
@@ -199,8 +200,7 @@ def with_returns(method: Method, returns: int) -> Method:
         return method
     if not isinstance(method, MaximumLikelihood):
         raise ValueError(
-            f"returns={returns} needs the likelihood of each pixel, which method {method.name!r} has not; "
-            "use 'maximum_likelihood'"
+            f"returns={returns} needs the likelihood, which method {method.name!r} has not; use 'maximum_likelihood'"
         )
     return replace(method, returns=int(returns))
 

@@ -48,7 +48,7 @@ class Settings:
     frozen: int
 
 
-FULL = Settings(72, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN))
+FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN))
 QUICK = Settings(24, (2.0,), (1.0,), 1)
 
 

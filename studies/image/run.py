@@ -104,6 +104,7 @@ def run(request: Request) -> Facts:
     if request.rgbd is not None:
         shown |= rgbd(request.rgbd, settings.size)
     rows: list[Row] = []
+    thin: list[Row] = []
     maps: Mapping[str, Reconstruction | FloatArray] = {}
 
     def add(part: str, name: str, scene: Scene, system: System, photons: float, sbr: float, words: str) -> None:
@@ -113,6 +114,8 @@ def run(request: Request) -> Facts:
         rows.extend({"part": part, "scene": name, "system": words, "photons": photons, "sbr": sbr} | x for x in lines)
         if part == "scenes" and (name, photons, sbr) == (SHOWN[0], *_nearest(settings)):
             maps = results
+        if name == "sticks" and sbr == _nearest(settings)[1]:
+            thin.append(_thin(scene, system, photons, results))
 
     for name, scene in shown.items():
         for photons in settings.photons:
@@ -140,8 +143,30 @@ def run(request: Request) -> Facts:
         "blind": _table(rows, "dead time", ("system",)),
         "frozen": _table(rows, "frozen", ("photons",)),
         "bright": _table(rows, "bright", ("photons",)),
+        "thin": thin,
         "rows": rows,
         "figures": {"": _figure(maps, settings)},
+    }
+
+
+def _thin(
+    scene: Scene, system: System, photons: float, results: Mapping[str, Reconstruction | FloatArray]
+) -> dict[str, float]:
+    """Of the pixels of the sticks, and of those that maximum likelihood sees: how many are off by each method."""
+    most = OUTLIER_SIGMA * float(system.depth_m(relative_width(system) * system.period_ns))
+    sticks = scene.depth_m < 5.0
+    off = {}
+    for name, each in results.items():
+        if isinstance(each, Reconstruction):
+            off[name] = ~(np.abs(each.depth_m - scene.depth_m) < most)
+    single = results["maximum_likelihood"]
+    assert isinstance(single, Reconstruction)
+    seen = sticks & single.seen & ~off["maximum_likelihood"]
+    line = {"photons": photons}
+    line |= {f"{name}, off %": 100.0 * float(x[sticks].mean()) for name, x in off.items()}
+    return line | {
+        "seen alone %": 100.0 * float(seen.sum() / sticks.sum()),
+        "of these off, image %": 100.0 * float(off["image"][seen].mean()) if seen.any() else float("nan"),
     }
 
 

@@ -79,11 +79,11 @@ def train(out: Path, plan: Plan = FULL, tell: Tell = str) -> list[Path]:
     images = [_prepared(scenes.example(k, plan.seed)) for k in range(plan.images)]
     tell(f"image: {len(images)} images drawn, {time.process_time() - began:.0f} s of processor time")
     choose, facts = _train_choose(torch, images, plan, tell)
-    first = Networks(_flat(choose), {"hidden": np.zeros(HIDDEN, np.float32)}, {})
+    first = Networks(_flat(choose), {}, {})
     weigh, more = _train_weigh(torch, images, first, plan, tell)
     out.mkdir(parents=True, exist_ok=True)
-    arrays = {"choose": _flat(choose), "hidden": np.zeros(HIDDEN, np.float32), **_layers(weigh)}
-    np.savez(out / WEIGHTS.name, allow_pickle=False, **arrays)
+    arrays: dict[str, Any] = {"choose": _flat(choose), **_layers(weigh)}
+    np.savez(out / WEIGHTS.name, **arrays)
     card = _card(plan, facts | more, time.process_time() - began, torch.__version__)
     (out / CARD.name).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
     return [out / WEIGHTS.name, out / CARD.name]

@@ -54,7 +54,7 @@ def test_native_networks_are_those_that_were_trained():
     given = posterior, posterior, posterior, place, mass, signal, np.arange(0, pixels, 7)
     features = torch.from_numpy(stages.candidate_features(*given, 1))
     chances = torch.softmax(net(features), -1).detach().numpy()[:, : train.PEAKS]
-    nets = Networks(train._flat(net), {"hidden": np.zeros(train.HIDDEN, np.float32)}, {})
+    nets = Networks(train._flat(net), {}, {})
     chosen, confidence = stages._chosen(*given, nets, 2)
     assert np.array_equal(chosen, chances.argmax(1))
     np.testing.assert_allclose(confidence, chances.max(1), atol=1e-6)

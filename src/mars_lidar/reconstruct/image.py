@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.types import FloatArray, Progress
+from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct import image_stages as stages
 from mars_lidar.reconstruct.histograms import Histograms
@@ -63,7 +63,7 @@ class Image(Method):
                 histograms.progress(k + 1, len(cubes))
         return Estimates.joined(found)
 
-    def of_photons(self, photons: Photons, system: System, threads: int, progress: Progress | None = None) -> Estimates:
+    def of_photons(self, photons: Photons, system: System, threads: int) -> Estimates:
         """Estimates of one image."""
         return _estimate(photons, system, self._networks(), threads)
 

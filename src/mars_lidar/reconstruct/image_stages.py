@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.reconstruct.image_network import OFFSETS, PEAKS, RADII, Floats, Networks, offsets
+from mars_lidar.reconstruct.image_network import HIDDEN, OFFSETS, PEAKS, RADII, Floats, Networks, offsets
 from mars_lidar.reconstruct.image_pulse import Cells
 from mars_lidar.reconstruct.photons import Photons
 
@@ -284,7 +284,7 @@ def _chosen(
         down=down,
         right=right,
         weights=nets.choose,
-        hidden=len(nets.weigh["hidden"]),
+        hidden=HIDDEN,
         chosen=chosen,
         confidence=confidence,
         threads=threads,

@@ -26,7 +26,7 @@ inline float fast_log(float x) {
     int32_t bits;
     std::memcpy(&bits, &x, 4);
     const int32_t exponent = (bits - 0x3f2aaaab) >> 23;
-    const int32_t mantissa = bits - (exponent << 23);
+    const int32_t mantissa = bits - exponent * (1 << 23);
     float m;
     std::memcpy(&m, &mantissa, 4);
     const float r = m - 1.0f;  // in [-1/3, 1/3)

@@ -29,7 +29,8 @@ _RICHARDSON = 4.0 / 3.0  # of a distance to a grid of half the width, where erro
 _CELLS_OF_DEAD_TIME = 4  # at least
 _LEVELS = 4  # of light: what is between two powers of it shares a grid, that of the worst of both
 _DIMMEST = (-4, -6)  # powers of signal and background; dimmer pixels take their grid
-_PHASES = (0.03, 0.37, 0.71)  # delays within a bin at which grids are judged
+_PHASES = (0.002, 0.145, 0.287, 0.43, 0.57, 0.713, 0.855, 0.998)  # delays within a bin at which grids are judged
+_GRADING = 2  # halvings at most from a bin to the next
 _MOST_KIND = 15  # halvings of a bin: kKinds of native/feedback/kernel.h, for the finer grid too
 _SOME_KIND = 3  # halvings that are cheaper than slow sweeps
 _ROUNDS = 4  # after which cells are only halved, so that there is an end
@@ -241,9 +242,12 @@ def _recut(kinds: KindArray, widest: KindArray, distance: FloatArray, parts: Flo
     low, high = math.log(goal * 1e-12), math.log(max(float((worst / cells).max()), goal)) + 20.0
     for _ in range(40):
         middle = 0.5 * (low + high)
-        more = halvings(math.exp(middle)).astype(np.float64)
-        low, high = (middle, high) if (worst * 16.0**-more).sum() <= goal else (low, middle)
+        left = worst * 16.0 ** -halvings(math.exp(middle)).astype(np.float64)
+        low, high = (middle, high) if left.sum() <= goal else (low, middle)
     more = halvings(math.exp(low))
     if not fine and not (more > 0).any():
         more[np.argmax(worst)] = 1
-    return np.asarray(now + more, np.uint8)
+    kinds = now + more
+    for turn in (1, -1) * (_MOST_KIND // _GRADING + 1):
+        kinds = np.maximum(kinds, np.roll(kinds, turn) - _GRADING)
+    return np.asarray(kinds, np.uint8)

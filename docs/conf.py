@@ -15,6 +15,7 @@ from typing import Any
 
 import matplotlib.style
 import sphinxcontrib.katex
+from docutils import nodes
 from sphinx.application import Sphinx
 
 import mars_lidar
@@ -78,9 +79,11 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "reset_modules": ("matplotlib", _style),
     "image_srcset": [],
+    "write_computation_times": False,
 }
 
 html_theme = "pydata_sphinx_theme"
+html_context = {"default_mode": "auto"}
 html_title = f"mars-lidar {version}"
 html_favicon = "_static/favicon.svg"
 html_static_path = ["_static", "copied/static"]
@@ -206,6 +209,17 @@ def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = source[0].replace("](../benchmarks/results/", "](copied/benchmarks/")
 
 
+def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
+    """Alternative texts for the pictures of the programs: else sphinx-gallery writes the name of a file."""
+    if not app.env.docname.startswith(("gallery/", "lessons/")):
+        return
+    title = next(iter(doctree.findall(nodes.title)), nodes.title()).astext()
+    for number, image in enumerate(doctree.findall(nodes.image), 1):
+        description = image.get("alt", "")
+        if not description or re.match(r"(plot|lesson) \d", description):
+            image["alt"] = f"{title}: picture {number}, described in the text beside it"
+
+
 def _take_explorer(app: Sphinx, error: Exception | None) -> None:
     if not error:
         target = Path(app.outdir) / "explorer" / "index.html"
@@ -218,4 +232,5 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", _link_copies)
     app.connect("source-read", _title)
     app.connect("autodoc-process-docstring", _document_types, priority=400)  # before numpydoc, 500
+    app.connect("doctree-read", _describe_pictures)
     app.connect("build-finished", _take_explorer)

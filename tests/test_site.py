@@ -56,7 +56,8 @@ CONTRAST = """() => {
     if (box.width < 2 || style.visibility === "hidden" || colour[3] === 0) continue;
     const [a, b] = [light(colour), light(behind(element))].sort((x, y) => y - x);
     const size = parseFloat(style.fontSize), large = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
-    if ((a + 0.05) / (b + 0.05) < (large ? 3 : 4.5)) low.push(`${text.slice(0, 30)}: ${style.color} on ${behind(element)}`);
+    if ((a + 0.05) / (b + 0.05) < (large ? 3 : 4.5))
+      low.push(`${text.slice(0, 30)}: ${style.color} on ${behind(element)}`);
   }
   return [...new Set(low)];
 }"""

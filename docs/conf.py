@@ -6,6 +6,7 @@ Equations become HTML while the site is built (KaTeX, run by Node): pages need n
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import re
 import shutil
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.style
-import sphinxcontrib.katex
+from docutils import nodes
 from sphinx.application import Sphinx
 
 import mars_lidar
@@ -34,7 +35,6 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
-    "sphinxcontrib.katex",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = [
@@ -48,10 +48,8 @@ suppress_warnings = ["config.cache"]  # the gallery's settings hold a function
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 4
+html_math_renderer = "katex"  # of this file
 
-katex_prerender = True
-katex_css_path = "katex/katex.min.css"
-sphinxcontrib.katex.STARTUP_TIMEOUT = sphinxcontrib.katex.RENDER_TIMEOUT = 120.0  # s; 5 s are short on a busy machine
 
 autosummary_generate = True
 autodoc_typehints = "none"  # in the signature they are longer than the text; numpydoc shows each parameter's own
@@ -78,13 +76,15 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "reset_modules": ("matplotlib", _style),
     "image_srcset": [],
+    "write_computation_times": False,
 }
 
 html_theme = "pydata_sphinx_theme"
+html_context = {"default_mode": "auto"}
 html_title = f"mars-lidar {version}"
 html_favicon = "_static/favicon.svg"
 html_static_path = ["_static", "copied/static"]
-html_css_files = ["site.css"]
+html_css_files = ["katex/katex.min.css", "site.css"]
 html_theme_options = {
     "show_prev_next": False,
     "secondary_sidebar_items": ["page-toc"],
@@ -117,7 +117,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _katex_style() -> None:
-    """KaTeX's style sheet and fonts, of the release that the extension runs, from npm."""
+    """KaTeX from npm, and a copy of its style sheet and fonts for the pages."""
     package = ROOT / "docs" / "katex"
     if not (package / "node_modules" / "katex").is_dir():
         npm = shutil.which("npm")
@@ -130,6 +130,46 @@ def _katex_style() -> None:
     shutil.copy(dist / "katex.min.css", target)
     for font in dist.glob("fonts/*.woff2"):
         shutil.copy(font, target / "fonts")
+
+
+class Formulas:
+    """Formulas as HTML, by a process of Node with KaTeX that begins with the first one."""
+
+    process: subprocess.Popen[str] | None = None
+
+    def html(self, tex: str, display: bool) -> str:
+        """ValueError for a formula that KaTeX cannot read."""
+        if self.process is None:
+            command = ["node", ROOT / "docs" / "katex" / "render.js"]
+            self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps({"tex": tex, "display": display}) + "\n")
+        self.process.stdin.flush()
+        answer = json.loads(self.process.stdout.readline())
+        if "error" in answer:
+            raise ValueError(f"{answer['error']}: {tex}")
+        return str(answer["html"])
+
+    def close(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.communicate()
+            self.process = None
+
+
+FORMULAS = Formulas()
+
+
+def _inline_math(writer: Any, node: nodes.math) -> None:
+    writer.body.append(f'<span class="math">{FORMULAS.html(node.astext(), display=False)}</span>')
+    raise nodes.SkipNode
+
+
+def _display_math(writer: Any, node: nodes.math_block) -> None:
+    writer.body.append(writer.starttag(node, "div", "", CLASS="math"))
+    writer.body.append(FORMULAS.html(node.astext(), display=True) + "</div>\n")
+    raise nodes.SkipNode
 
 
 def _commands() -> str:
@@ -206,6 +246,17 @@ def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = source[0].replace("](../benchmarks/results/", "](copied/benchmarks/")
 
 
+def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
+    """Alternative texts for the pictures of the programs: else sphinx-gallery writes the name of a file."""
+    if not app.env.docname.startswith(("gallery/", "lessons/")):
+        return
+    title = next(iter(doctree.findall(nodes.title)), nodes.title()).astext()
+    for number, image in enumerate(doctree.findall(nodes.image), 1):
+        description = image.get("alt", "")
+        if not description or re.match(r"(plot|lesson) \d", description):
+            image["alt"] = f"{title}: picture {number}, described in the text beside it"
+
+
 def _take_explorer(app: Sphinx, error: Exception | None) -> None:
     if not error:
         target = Path(app.outdir) / "explorer" / "index.html"
@@ -218,4 +269,7 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", _link_copies)
     app.connect("source-read", _title)
     app.connect("autodoc-process-docstring", _document_types, priority=400)  # before numpydoc, 500
+    app.connect("doctree-read", _describe_pictures)
+    app.connect("build-finished", lambda app, error: FORMULAS.close())
+    app.add_html_math_renderer("katex", inline_renderers=(_inline_math, None), block_renderers=(_display_math, None))
     app.connect("build-finished", _take_explorer)

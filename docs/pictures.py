@@ -1,6 +1,7 @@
 """Makes the picture of the first page and of links to the site: python docs/pictures.py.
 
-Written to docs/start.png and docs/_static/preview.png, with the style sheet of the gallery and few colours, so that both are small.
+Written to docs/start.png and docs/_static/preview.png, in the style of the gallery and in few colours, so that both are
+small.
 """
 
 from __future__ import annotations

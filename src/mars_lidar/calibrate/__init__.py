@@ -1,7 +1,18 @@
 """Calibration: what a recorded stream of photons says about its light and its detector, and whether a model fits it."""
 
 from mars_lidar.calibrate.calibration import Calibration, Estimate, Limit, Suspect, calibrate
+from mars_lidar.calibrate.histograms import CubeCalibration, calibrate_cube
 from mars_lidar.calibrate.look import Look
 from mars_lidar.calibrate.suspects import Drift
 
-__all__ = ["Calibration", "Drift", "Estimate", "Limit", "Look", "Suspect", "calibrate"]
+__all__ = [
+    "Calibration",
+    "CubeCalibration",
+    "Drift",
+    "Estimate",
+    "Limit",
+    "Look",
+    "Suspect",
+    "calibrate",
+    "calibrate_cube",
+]

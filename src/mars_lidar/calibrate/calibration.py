@@ -89,7 +89,8 @@ class Suspect:
         size = "" if np.isnan(self.size) else f" {self.size:.3g} ± {self.error:.2g}"
         gain = "" if np.isnan(self.gain) else f", taking it in gains {self.gain:.1f} standard deviations of the misfit"
         state = "in the result" if self.included else f"not in the result: {self.option}"
-        return f"{self.name}{size} ({self.z:.1f} standard deviations{gain}); {state}"
+        clear = f"{self.z:.1f} standard deviations{gain}" if self.z > 0.0 else f"no score of its own{gain}"
+        return f"{self.name}{size} ({clear}); {state}"
 
 
 @dataclass(frozen=True)
@@ -529,11 +530,15 @@ def _estimates(fitted: Fitted, fixed: dict[str, float], growth: FloatArray) -> d
             put("dead_time_ns", observed / (1.0 + float(values[0])), dead / (1.0 + columns[:, 0]), "electronics_excess")
             dead_name = ""
         elif effect.names[0] == "afterpulse_probability":  # in the option's units: those lost in the dead time included
-            carriers = np.array([all_carriers(after, np.exp(log), hold) for after, log, hold in np.c_[columns, dead]])
-            delay = float(np.exp(values[1]))
-            all_left = all_carriers(float(values[0]), delay, observed)
-            put("afterpulse_probability", all_left, carriers, "afterpulse_probability")
-            put("afterpulse_delay_ns", delay, np.exp(columns[:, 1]), "log afterpulse delay")
+            delay = effect.delay_ns
+            pairs = zip(columns[:, 0], dead, strict=True)
+            carriers = np.array([all_carriers(after, delay, hold) for after, hold in pairs])
+            everything = all_carriers(float(values[0]), delay, observed)
+            put("afterpulse_probability", everything, carriers, "afterpulse_probability")
+            ratio = 2.0**0.5  # of neighbours on the grid of delays, halfway
+            out["afterpulse_delay_ns"] = Estimate(
+                delay, delay * (ratio - 1.0), delay / ratio, delay * ratio, "the best of a grid in steps of 2"
+            )
             put("afterpulses_after_dead_time", float(values[0]), columns[:, 0], "afterpulse_probability")
         elif not effect.onoff:
             put(effect.names[0], float(values[0]), columns[:, 0], effect.names[0])

@@ -22,6 +22,7 @@ from mars_lidar.simulate import simulate_timestamps
 
 _NARROWEST = 2e-6  # periods: the narrowest pulse that the engines draw
 _WIDEST_JITTER = 0.0499  # periods: the widest that `Jitter` takes
+_DELAYS = (0.4, 0.8, 1.6, 3.2, 6.4)  # dead times: delays of afterpulses that are tried
 _MOST_CARRIERS = 0.95  # of an avalanche
 Fields = dict[str, Any]
 
@@ -31,7 +32,8 @@ class Effect:
     """What a detector may do beside dead time and jitter.
 
     `names` of its parameters, each an option of the detector; `start` values that a test for it tries; `most` the
-    largest ones; `apply` makes the fields of a `Detector` with it; `words` for a table; `onoff` where it has no size.
+    largest ones; `apply` makes the fields of a `Detector` with it; `words` for a table;
+    `delay_ns` that of afterpulses, one of a grid; `onoff` where it has no size.
     """
 
     names: tuple[str, ...]
@@ -40,6 +42,7 @@ class Effect:
     most: tuple[float, ...]
     apply: Callable[[Fields, tuple[float, ...]], Fields]
     words: str
+    delay_ns: float = float("nan")
     onoff: bool = False
 
 
@@ -52,12 +55,14 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
     """Effects that are looked for in a stream of a detector with this dead time."""
     dead = dead_time_ns
 
-    def afterpulses(fields: Fields, value: tuple[float, ...]) -> Fields:
-        if value[0] < 1e-7:
-            return fields
-        delay = float(np.exp(value[1]))
-        carriers = all_carriers(value[0], delay, fields["dead_time_ns"])
-        return fields | {"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)}
+    def afterpulses(delay: float) -> Callable[[Fields, tuple[float, ...]], Fields]:
+        def apply(fields: Fields, value: tuple[float, ...]) -> Fields:
+            if value[0] < 1e-7:
+                return fields
+            carriers = all_carriers(value[0], delay, fields["dead_time_ns"])
+            return fields | {"afterpulsing": Afterpulsing(probability=carriers, delay_ns=delay)}
+
+        return apply
 
     def electronics(fields: Fields, value: tuple[float, ...]) -> Fields:
         observed = fields["dead_time_ns"]  # that of the electronics, over a detector that is ready earlier
@@ -65,14 +70,9 @@ def effects(dead_time_ns: float) -> tuple[Effect, ...]:
 
     listed = [
         Effect(
-            ("afterpulse_probability", "log afterpulse delay"),
-            (0.03, float(np.log(scale * dead))),
-            (0.0, float(np.log(0.1 * dead))),
-            (0.5, float(np.log(30.0 * dead))),
-            afterpulses,
-            "afterpulses",
+            ("afterpulse_probability",), (0.03,), (0.0,), (0.5,), afterpulses(scale * dead), "afterpulses", scale * dead
         )
-        for scale in (0.4, 1.2, 4.0)
+        for scale in _DELAYS
     ]
     return (
         *listed,

@@ -83,7 +83,6 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
     low = np.sort(np.diff(t))
     n = low.size
     ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
-    rare = ranks / n
     observed = low[ranks]
     hold = observed[-3] + 3 * (observed[-3] - observed[0]) + 2 * model.clock.unit_ns
     hold = max(hold, fixed.get("dead_time_ns", 0.0) + 2 * model.clock.unit_ns)
@@ -107,12 +106,8 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
             for name, value in zip(effect.names, effect.start, strict=True):
                 theta[at] = fixed.get(name, value)
                 at += 1
-        for _ in range(4 if "dead_time_ns" not in fixed else 0):
-            made = np.sort(
-                np.concatenate([np.diff(x) for x in model.streams(np.tile(theta, (4, 1)), cycles, fit.next_seed())])
-            )
-            here = made[np.minimum((rare * made.size).astype(int), made.size - 1)]
-            theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])
+        if "dead_time_ns" not in fixed:
+            theta = with_edge(fit, model, theta, low)
         cells = fit.cells(model, theta, photons)
         rows = np.array([cells(x) for x in model.streams(np.tile(theta, (LIGHTS, 1)), cycles, fit.next_seed())])
         seen = cells.of(recording) * (photons / recording.photons)
@@ -121,6 +116,21 @@ def starts(fit: Fit, recording: Recording, model: Model, fixed: dict[str, float]
         if "jitter2" in fixed:
             break
     return sorted(found, key=lambda pair: pair[0])
+
+
+def with_edge(fit: Fit, model: Model, theta: FloatArray, low: FloatArray) -> FloatArray:
+    """Parameters with the dead time at which simulated streams have the smallest intervals of `low` (n,), sorted."""
+    n, k = low.size, model.light
+    ranks = np.unique(np.minimum([1, 5, 20, max(30, n // 500), max(60, n // 100), max(120, n // 30)], n - 1))
+    observed = low[ranks]
+    cycles = max(2, round(fit.exposure(min(fit.recording.photons, fit.effort.first))))
+    for _ in range(4):
+        streams = model.streams(np.tile(theta, (4, 1)), cycles, fit.next_seed())
+        made = np.sort(np.concatenate([np.diff(x) for x in streams]))
+        here = made[np.minimum((ranks / n * made.size).astype(int), made.size - 1)]
+        theta = theta.copy()
+        theta[k + 2] = max(theta[k + 2] + float((observed - here)[1:-1].mean()), 0.05 * observed[0])
+    return theta
 
 
 def first_spread(model: Model, theta: FloatArray) -> FloatArray:
@@ -137,8 +147,8 @@ def first_spread(model: Model, theta: FloatArray) -> FloatArray:
     out[k + 2] = 0.3 * width + 0.5 * unit
     at = k + 3
     for effect in model.effects:
-        for name, value in zip(effect.names, effect.start, strict=True):
-            out[at] = 0.5 if name.startswith("log") else 0.4 * max(value, abs(theta[at]))
+        for value in effect.start:
+            out[at] = 0.4 * max(value, abs(theta[at]))
             at += 1
     return out
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,13 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.fit import LIGHTS, Fit, Fitted, counted
 from mars_lidar.calibrate.model import Effect, Model, effects
 from mars_lidar.calibrate.recording import Recording
-from mars_lidar.calibrate.start import first_spread
+from mars_lidar.calibrate.start import first_spread, with_edge
 
 _STREAMS = 4 * LIGHTS  # that tell the direction of an effect
 NAMED = 4.0  # standard deviations of a score beyond which an effect is refitted: 3e-5 by chance
 _FINISHED = 2  # refits that fresh streams judge
 _MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted too
+_FACTOR = 100.0  # of the probability of the misfit, for a refit that gains less in its square
 _GAIN = 2.0  # standard deviations of the misfit that a refit must gain
 _PARTS = 16  # of a recording, for drift
 _PART_PHOTONS = 300  # of a part, at least
@@ -86,33 +87,65 @@ class Named:
     gain: float
 
 
+_Stepped = tuple[Model, FloatArray, FloatArray, NDArray[np.intp], bool, float]
+
+
 def refitted(fit: Fit, fitted: Fitted, listed: list[Score]) -> tuple[Fitted, Named] | None:
     """The fit with the one effect that takes most of the misfit; None where no effect is clear.
 
     Effects are named by the refit: a slow recovery may have the score of a paralyzable detector, and one that the
-    dead time has taken up has no score at all.
+    dead time has taken up has no score at all. So where the misfit is clear, effects without a score are tried too.
     """
     clear = [score for score in listed if score.z > NAMED]
-    if not clear and fitted.p_value < _MISFIT:
-        clear = listed
-    trials, families = [], set()
-    for score in clear:
-        family = score.effect.names[0]
-        if family not in families:
-            families.add(family)
-            trial = _stepped(fit, fitted, score)
-            if trial is not None:
-                trials.append((trial[-1], score, trial))
-    best: tuple[Fitted, Named] | None = None
-    for _, score, (model, theta, root, free, settled, _) in sorted(trials, key=lambda trial: trial[0])[:_FINISHED]:
-        final = fit.finish(model, theta, root, free, settled)
-        named = Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
-        if named.gain > _GAIN and (best is None or final.misfit_z < best[0].misfit_z):
-            best = final, named
+    best = _best(fit, fitted, clear, listed)
+    if best is None and fitted.p_value < _MISFIT:
+        families = {score.effect.names[0] for score in clear}
+        best = _best(fit, fitted, [score for score in listed if score.effect.names[0] not in families], listed)
     return best
 
 
-_Stepped = tuple[Model, FloatArray, FloatArray, NDArray[np.intp], bool, float]
+def _best(fit: Fit, fitted: Fitted, tried: list[Score], listed: list[Score]) -> tuple[Fitted, Named] | None:
+    trials: list[tuple[float, Score, _Stepped]] = []
+    families: set[str] = set()
+    for score in tried:
+        family = score.effect.names[0]
+        if family in families:
+            continue
+        families.add(family)
+        grid = sorted((s for s in listed if s.effect.names[0] == family), key=lambda s: s.effect.delay_ns)
+        place, least = grid.index(score), np.inf  # upwards: scores prefer short delays, unlike refits
+        while place < len(grid):
+            trial = _stepped(fit, fitted, grid[place])
+            if trial is None or trial[-1] >= least:
+                break
+            least = trial[-1]
+            trials.append((least, grid[place], trial))
+            place += 1
+    best: tuple[Fitted, Named] | None = None
+    finals: list[tuple[Fitted, Named]] = []
+    for _, score, (model, theta, root, free, settled, _) in sorted(trials, key=lambda trial: trial[0])[:_FINISHED]:
+        final = fit.finish(model, theta, root, free, settled)
+        named = Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
+        gains = named.gain > _GAIN or final.p_value > max(_FACTOR * fitted.p_value, _MISFIT)
+        if gains and final.converged:
+            finals.append((final, named))
+            if best is None or final.misfit_z < best[0].misfit_z:
+                best = final, named
+    if best is None:
+        return None
+    # delays of a grid that fit about as well: their difference is part of the error
+    for final, named in finals:
+        same = named.effect.names == best[1].effect.names and final is not best[0]
+        if same and final.misfit_z < best[0].misfit_z + _GAIN:
+            off = (final.theta - best[0].theta)[best[0].free]
+            more = np.outer(off, off)
+            wider = replace(
+                best[0],
+                covariance=best[0].covariance + more,
+                unbounded_covariance=best[0].unbounded_covariance + more,
+            )
+            best = wider, best[1]
+    return best
 
 
 def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
@@ -121,6 +154,8 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
     size = effect.start[0] if effect.onoff else float(np.clip(score.size, 0.3 * effect.start[0], effect.most[0]))
     moved = fitted.theta.copy()
     moved[fitted.free] -= score.shift * min(size, effect.start[0])
+    if fitted.model.light + 2 in fitted.free and effect.names[0] in ("twilight_ns", "recovery_ns"):
+        moved, size = fitted.theta.copy(), effect.start[0]  # the dead time has taken up what it could of them
     theta = model.bounded(np.r_[moved, size, effect.start[1:]])
     spread = first_spread(model, theta)
     own = np.sqrt(np.diag(fitted.covariance))
@@ -129,6 +164,9 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
     free = np.r_[fitted.free, np.array(more, np.intp)].astype(np.intp)
     photons = float(fit.recording.photons)
     try:
+        if effect.names[0] in ("twilight_ns", "recovery_ns") and fitted.model.light + 2 in fitted.free:
+            gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
+            theta = with_edge(fit, model, theta, np.sort(gaps))
         theta, root, misfit, settled = fit.steps(model, theta, np.diag(spread[free]), free, photons, 5, photons / 6.0)
     except (ValueError, np.linalg.LinAlgError):
         return None

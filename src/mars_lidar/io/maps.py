@@ -48,7 +48,8 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
     "signal_error": ("signal_error", _PHOTONS, "standard error of the signal"),
     "background_error": ("background_error", _PHOTONS, "standard error of the background"),
     "significance": ("significance", "1", "significance of the signal, standard deviations"),
-    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns"),
+    "p_value": ("p_value", "1", "probability of a histogram as far from the law of its estimate"),
+    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns, 32 misfit"),
     "returns": ("returns.count", "1", "number of returns"),
     "radius": ("radius", "pixel", "radius of the window whose photons were taken together"),
 }

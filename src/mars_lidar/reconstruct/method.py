@@ -40,6 +40,8 @@ class Flags(IntFlag):
     """The iteration did not come to rest."""
     MORE_RETURNS = 16
     """There is light of further returns than the most that were asked for."""
+    MISFIT = 32
+    """The histogram is not one of the estimate's (p below 1e-3): a wrong dead time or pulse, another return."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,10 @@ class Estimates:
     background_error: FloatArray | None = None
     delay_error: FloatArray | None = None
     significance: FloatArray | None = field(default=None)
+    p_value: FloatArray | None = None  # of the fit; NaN where too few photons tell
+    longer: FloatArray | None = None  # scores, standard deviations: where a longer dead time, ...
+    shorter: FloatArray | None = None  # ... a shorter one, ...
+    wider: FloatArray | None = None  # ... a wider pulse would fit better
     radius: NDArray[np.uint8] | None = None  # of the window whose photons were taken together, pixels
     returns: FloatArray | None = None  # (pixels, most, len(RETURN_COLUMNS)), NaN beyond those of a pixel
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import typer
 
 from mars_lidar._base import checks
-from mars_lidar.calibrate import Calibration
+from mars_lidar._base.files import read_npy
+from mars_lidar.calibrate import Calibration, CubeCalibration, calibrate_cube
 from mars_lidar.calibrate import calibrate as calibrated
 from mars_lidar.cli.console import MISFIT, check_picture, refuse_existing, reported, save_picture, table
 from mars_lidar.cli.groups import argument, examples
 from mars_lidar.cli.options import of_output
 from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.stream_options import KnownOptions, StreamOptions
-from mars_lidar.instrument.system import MAX_CYCLES, SPEED_OF_LIGHT_M_PER_NS
+from mars_lidar.instrument.system import MAX_CYCLES, SPEED_OF_LIGHT_M_PER_NS, System
 
 CALIBRATE_EPILOG = examples(
     "mars-lidar calibrate lab.ptu --look",
@@ -22,13 +24,16 @@ CALIBRATE_EPILOG = examples(
     "mars-lidar calibrate lab.ptu --given dead_time_ns=50 --given jitter_ns=0.1",
     "mars-lidar calibrate photons.mat --variable tPhoton --unit-ns 0.064 --period-ns 50.048 --free",
     "mars-lidar calibrate lab.ptu --pixel 0,2 --pulse-file irf.npy --pulse-bin-ns 0.008 --cycles 9975",
+    "mars-lidar calibrate face.npy --system lab.yaml -o face.yaml",
     "Exit code 3 where the model does not fit the stream. docs/calibration.md has the whole recipe.",
 )
 _UNITS = {"signal": " photons per period", "background": " photons per period", "light": " photons per period"}
 
 
 def calibrate(
-    stream: Path = argument("Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat or .npz."),
+    stream: Path = argument(
+        "Photon stream: .ptu, .pt2, .pt3, .ht2, .ht3, .t3r, .spc, Photon-HDF5, .mat, .npz; or a cube: .zarr, .npy."
+    ),
     *,
     source: StreamOptions,
     known: KnownOptions,
@@ -42,7 +47,7 @@ def calibrate(
     """Light and detector of a photon stream, each with an error, a verdict, and what is suspect.
 
     Nothing is assumed but what --given says; of a simulated stream only the photons are used. Without a laser: dead
-    time, jitter and afterpulses in constant light.
+    time, jitter and afterpulses in constant light. Of a cube: dead time and pulse width that its pixels share.
     """
     with reported():
         from mars_lidar.io.streams.photons import NoLaserError
@@ -56,6 +61,10 @@ def calibrate(
             refuse_existing(out, overwrite)
         if cycles is not None:
             checks.integer("--cycles", cycles, low=1, high=MAX_CYCLES)
+        if stream.suffix in (".npy", ".zarr"):
+            if not _cube(stream, known, out).fits:
+                raise typer.Exit(MISFIT)
+            return
         given, shape = known.known(), known.shape()
         try:
             times, rows = source.load(stream)
@@ -82,6 +91,33 @@ def calibrate(
             table(written)
         if not look and not result.fits:
             raise typer.Exit(MISFIT)
+
+
+def _cube(path: Path, known: KnownOptions, out: Path | None) -> CubeCalibration:
+    """What the pixels of a cube share: printed, and written as a system."""
+    if path.suffix == ".zarr":
+        from mars_lidar.io import load
+
+        with load(path) as cube:
+            system = cube.system if known.system is None else System.load(known.system)
+            counts = np.asarray(cube.histogram)
+    else:
+        if known.system is None:
+            raise ValueError(
+                f"{path} needs --system: laser period, cycles and bins of its histograms, and where to begin"
+            )
+        system, counts = System.load(known.system), read_npy(path)
+    result = calibrate_cube(counts, system)
+    rows = [("file", f"{path}: {counts.size // counts.shape[-1]:,} histograms of {counts.shape[-1]:,} bins")]
+    units = {"background_floor": " photons per period, of the darkest of them"}
+    rows += [(name, f"{estimate}{units.get(name, '')}") for name, estimate in result.estimates.items()]
+    verdict = "their histograms fit" if result.fits else "their histograms do NOT fit: another return, or an effect"
+    rows.append(("verdict", f"{100 * result.misfits:.3g} % of {result.p_values.size} pixels have p < 1 %: {verdict}"))
+    table(rows)
+    if out is not None:
+        result.system.save(out)
+        table([("wrote", str(out))])
+    return result
 
 
 def look_rows(result: Calibration) -> list[tuple[str, str]]:

@@ -67,16 +67,6 @@ def test_maps(files, name):
     assert list(maps["method"]) == ["peak", "maximum_likelihood"]
 
 
-def test_table(files):
-    table = ml.Table.load(files / "table.h5")
-    assert table.provenance["version"] == "0.1.0"
-    system = table.system
-    cube = ml.simulate(ml.Flux(0.3, 0.2, 40.0), system, engine="mars", table=table, realizations=200, seed=1)
-    law = ml.count_law(0.3, 0.2, system, delay_ns=40.0)
-    error = np.sqrt(law.variance / 200)
-    assert abs(cube.sum() / 200 - law.mean) < 5.5 * error  # 4e-8
-
-
 def test_dataset(files):
     data = open_dataset(files / "set.zarr")
     counts = np.asarray(data.histogram)

@@ -22,7 +22,7 @@ LIGHT: Fields = {
     ),
     "attenuation": values.choice("Signal against depth.", ("none", "inverse_square")).or_else("none"),
     "ambient": values.choice("Ambient light over the image.", ("uniform", "reflectivity", "map")),
-    "dark_counts_per_s": values.real("Dark counts of a pixel, counts/s.", low=0.0).or_else(0.0),
+    "dark_count_hz": values.real("Dark counts of a pixel, counts/s.", low=0.0).or_else(0.0),
 }
 
 
@@ -36,7 +36,7 @@ class Light:
     levels: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
     attenuation: str = "none"
     ambient: str | None = None
-    dark_counts_per_s: float = 0.0
+    dark_count_hz: float = 0.0
     photons_per_unit: float | None = None
 
 

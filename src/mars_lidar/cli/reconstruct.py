@@ -147,7 +147,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     from mars_lidar.reconstruct.quality import errors_against, ssim_available
 
     realizations, height, width, _ = cube.shape
-    head = ["method", "seconds", "seen %", "saturated %"]
+    head = ["method", "seconds", "seen %", "saturated %", "misfit %"]
     lines: list[list[str]] = []
     errors = {name: errors_against(cube, each.found) for name, each in found.items()}
     several = any(each.found.returns is not None for each in found.values())
@@ -167,6 +167,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
             f"{each.seconds:.3g}",
             f"{100.0 * each.found.seen.mean():.4g}",
             f"{100.0 * ((flags & Flags.SATURATED) > 0).mean():.3g}",
+            "-" if math.isnan(each.found.misfits) else f"{100.0 * each.found.misfits:.3g}",
         ]
         if several:
             count = np.zeros(1) if each.found.returns is None else each.found.returns.count
@@ -182,6 +183,10 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     for line in lines:
         shown.add_row(*line)
     screen().print(shown)
+    for name, each in found.items():
+        if advice := each.found.advice:
+            share = f"{100.0 * each.found.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
+            say(f"warning: {name}: {share}; would fit better: {advice}; mars-lidar calibrate CUBE finds the value")
 
 
 def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:

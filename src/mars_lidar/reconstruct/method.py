@@ -42,6 +42,8 @@ class Flags(IntFlag):
     """There is light of further returns than the most that were asked for."""
     FILLED = 32
     """An outlier is likelier than not, or nothing came: the delay is that of the pixels around."""
+    MISFIT = 64
+    """The histogram is not one of the estimate's (p below 1e-3): a wrong dead time or pulse, another return."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,10 @@ class Estimates:
     significance: FloatArray | None = field(default=None)
     half_width: FloatArray | None = None  # of the 90 % interval of the delay
     outlier: FloatArray | None = None  # probability that the delay is another surface's
+    p_value: FloatArray | None = None  # of the fit; NaN where too few photons tell
+    longer: FloatArray | None = None  # scores, standard deviations: where a longer dead time, ...
+    shorter: FloatArray | None = None  # ... a shorter one, ...
+    wider: FloatArray | None = None  # ... a wider pulse would fit better
     returns: FloatArray | None = None  # (pixels, most, len(RETURN_COLUMNS)), NaN beyond those of a pixel
 
     @staticmethod

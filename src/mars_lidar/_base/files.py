@@ -12,6 +12,7 @@ import math
 import os
 import shutil
 import stat
+import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -20,15 +21,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.mat5 import check_elements
+from mars_lidar._base import mat5
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.sparse import check_sparse, is_sparse
 
 if TYPE_CHECKING:
     from numpy.lib.npyio import NpzFile
 
 LIMIT = "MARS_LIDAR_READ_GIB"  # of the environment: what the arrays of one file may take in memory
 _FEW_CHUNKS, _CHUNK_ENTRY = 10_000, 4  # of HDF5: so many anywhere; bytes of a file that each of more takes at least
-_LEAST_LIMIT, _TIMES = 512 * 2**20, 512  # without it: so many bytes, or so many times the file
+_TIMES = 512  # without it: so many times the file, or, if that is more, what follows
+_LEAST_IN_PARTS, _LEAST_WHOLE = 512 * 2**20, 64 * 2**20  # bytes
+_SMALL_FILE, _MOST_OF_SMALL = 10**6, 128 * 2**20  # no smaller file takes more memory than this before it is refused
 INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is written to
 
 
@@ -168,10 +172,13 @@ def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts
     Nothing that was ever recorded is smaller by 512 times when it is packed; a bomb, or a damaged header, is.
     """
     given = os.environ.get(LIMIT)
-    try:
-        limit = max(_LEAST_LIMIT, _TIMES * size_on_disk(path)) if given is None else float(given) * 2**30
-    except ValueError:
-        raise ValueError(f"{LIMIT} must be a number of GiB, got {given!r}") from None
+    if given is None:
+        limit = float(_packed_limit(size_on_disk(path), in_parts))
+    else:
+        try:
+            limit = float(given) * 2**30
+        except ValueError:
+            raise ValueError(f"{LIMIT} must be a number of GiB, got {given!r}") from None
     if nbytes > limit:
         raise FileError(
             f"{path}: {what} would take {nbytes / 2**30:.3g} GiB, more than {limit / 2**30:.3g}: is it damaged? "
@@ -179,6 +186,14 @@ def check_claim(path: Path, nbytes: float, what: str = "its arrays", *, in_parts
         )
     if not in_parts:
         check_memory(math.ceil(nbytes), f"{what} of {path}", "read it on a larger machine")
+
+
+def _packed_limit(size: int, in_parts: bool) -> int:
+    """Bytes that the arrays of a file of this size may claim."""
+    if in_parts:
+        return max(_LEAST_IN_PARTS, _TIMES * size)
+    limit = max(_LEAST_WHOLE, _TIMES * size)
+    return limit if size >= _SMALL_FILE else min(limit, _MOST_OF_SMALL)
 
 
 @contextlib.contextmanager
@@ -189,13 +204,16 @@ def open_npz(path: Path, stream: Any = None, *, beside: str = "") -> Iterator[Np
     """
     with reading(path, "an .npz"):
         with zipfile.ZipFile(stream or path) as archive:
-            members = [one for one in archive.infolist() if one.filename != f"{beside}.npy"]
-            check_claim(path, sum(one.file_size for one in members))
+            members = archive.infolist()
+            check_claim(path, sum(one.file_size for one in members if one.filename != f"{beside}.npy"))
             for one in members:
                 with archive.open(one) as member:
                     shape, dtype = npy_header(member)
-                    if math.prod(shape) * dtype.itemsize > one.file_size:
+                    nbytes = math.prod(shape) * dtype.itemsize
+                    if nbytes > one.file_size:
                         raise ValueError(f"{one.filename} cannot hold an array of shape {shape}")
+                    if one.filename == f"{beside}.npy":
+                        check_claim(path, nbytes, beside, in_parts=True)
         if stream is not None:
             stream.seek(0)
         with np.load(stream or path, allow_pickle=False) as arrays:
@@ -219,14 +237,22 @@ def read_npy(path: Path) -> NDArray[Any]:
 def check_data(path: Path, data: Any, name: str, *, in_parts: bool = False) -> None:
     """`check_claim` of a data set of HDF5 or an array of Zarr.
 
-    And, of HDF5, raise where it claims more chunks than its file can list, each of which takes some 4 kB to read.
+    And, of HDF5, raise where its values lie in another file, or where it claims more than what is stored of it can
+    hold, or more chunks than its file can list, each of which takes some 4 kB to read.
     """
+    if hasattr(data, "file"):
+        check_inside(path, data)
+        steps = zip(data.shape, data.chunks or data.shape, strict=True)
+        count = math.prod(-(-size // max(1, step)) for size, step in steps)
+        if count > max(_FEW_CHUNKS, size_on_disk(path) // _CHUNK_ENTRY):
+            raise FileError(f"{path}: {name} would have {count} chunks, more than it can list: is it damaged?")
     check_claim(path, math.prod(data.shape) * data.dtype.itemsize, name, in_parts=in_parts)
-    if not (hasattr(data, "file") and data.chunks):
-        return
-    count = math.prod(-(-size // step) for size, step in zip(data.shape, data.chunks, strict=True))
-    if count > max(_FEW_CHUNKS, size_on_disk(path) // _CHUNK_ENTRY):
-        raise FileError(f"{path}: {name} would have {count} chunks, more than it can list: is it damaged?")
+
+
+def check_inside(path: Path, data: Any) -> None:
+    """Raise FileError for a data set of HDF5 whose values lie in another file: any that this process can read."""
+    if data.is_virtual or data.external:
+        raise FileError(f"{path}: the values of {data.name} lie in other files, which are not read: copy them into it")
 
 
 def whole(data: Any) -> NDArray[Any]:
@@ -243,12 +269,29 @@ def size_on_disk(path: Path) -> int:
 
 
 def read_mat5(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
-    """Variables of a MATLAB file of version 5, all or those of these names that are there."""
-    from scipy.io import loadmat, whosmat
+    """Variables of a MATLAB file of version 5, all or those of these names that are there; sparse ones are checked."""
+    from scipy.io import loadmat, matlab
 
     with reading(path, "a .mat of version 5"):
-        check_elements(path)
         wanted = None if names is None else list(names)
-        listed = [(math.prod(shape), kind) for name, shape, kind in whosmat(path) if wanted is None or name in wanted]
-        check_claim(path, sum(8 * size for size, kind in listed if kind != "sparse"))
-        return dict(loadmat(path, variable_names=wanted))
+        heads = [head for head in mat5.variables(path) if wanted is None or head.name in wanted]
+        check_claim(path, sum(8 * math.prod(head.shape) for head in heads if head.kind != "sparse"))
+        check_claim(path, mat5.check_elements(path, wanted))
+        with warnings.catch_warnings():  # of variables of the same name, the last of which is the variable
+            warnings.simplefilter("ignore", matlab.MatReadWarning)
+            found = dict(loadmat(path, variable_names=wanted))
+        for name, value in found.items():
+            _check_sparse_within(name, value)
+        return found
+
+
+def _check_sparse_within(name: str, value: Any) -> None:
+    """Check a sparse matrix, also in the cells and structures of a variable."""
+    if is_sparse(value):
+        check_sparse(name, value, sorted_rows=True)
+    elif isinstance(value, np.ndarray) and value.dtype == object:
+        for part in value.ravel():
+            _check_sparse_within(name, part)
+    elif isinstance(value, np.ndarray) and value.dtype.names and value.dtype.hasobject:
+        for field in value.dtype.names:
+            _check_sparse_within(f"{name}.{field}", value[field])

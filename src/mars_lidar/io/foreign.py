@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.files import check_claim, open_npz, read_npy, reading
+from mars_lidar._base.sparse import check_sparse, dense_bytes, is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.measured import from_histograms, from_photon_times, in_order
@@ -102,6 +103,8 @@ def read_counts(
     if isinstance(array, np.ndarray) and array.dtype == object:
         return ForeignCounts(source, name, None, array, "")
     told = _guessed(source, array.shape, bins) if axes is None else axes
+    if is_sparse(array):
+        check_claim(source, dense_bytes(array), f"the counts of {name}".rstrip())
     try:
         return ForeignCounts(source, name, in_order(array, told, image), None, told, told_by)
     except (ValueError, TypeError) as error:
@@ -165,7 +168,9 @@ def _npz(path: Path) -> dict[str, Any]:
         if {"format", "shape", "data"} <= set(archive.files):
             from scipy import sparse
 
-            return {"": sparse.load_npz(path)}
+            matrix = sparse.load_npz(path)
+            check_sparse("", matrix)
+            return {"": matrix}
         return {name: archive[name] for name in archive.files if archive[name].dtype.kind in "iuf"}
 
 
@@ -173,7 +178,7 @@ def _mat(path: Path) -> dict[str, Any]:
     found = mat_arrays(path)
     arrays: dict[str, Any] = {}
     for name, array in found.items():
-        if hasattr(array, "toarray"):
+        if is_sparse(array):
             arrays[name] = array
         elif isinstance(array, np.ndarray) and array.dtype.kind in "iuf":
             arrays[name] = np.squeeze(array)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.files import beside
-from mars_lidar._base.hdf5 import ForgivingFile, check_heaps, require, seal, with_checksums
+from mars_lidar._base.hdf5 import ForgivingFile, check_heaps, check_links, require, seal, with_checksums
 from mars_lidar.io import layout
 from mars_lidar.io.recipe import Recipe, Recording
 from mars_lidar.io.store import OnDisk, OpenedStore, Writer
@@ -92,6 +92,7 @@ def open_store(path: Path, check: layout.Check = layout.check_format) -> OpenedS
     try:
         attrs = {name: v.item() if isinstance(v, np.generic) else v for name, v in file.attrs.items()}
         check(path, attrs)
+        check_links(file, path)
         require(file, path)
     except BaseException:
         file.close()

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.memory import check_memory
+from mars_lidar._base.sparse import dense_bytes, dense_counts, is_sparse
 from mars_lidar.instrument.system import System
 from mars_lidar.io.cube import Cube
 from mars_lidar.io.recipe import Recording
@@ -131,9 +132,9 @@ def from_photon_times(
 
 def in_order(counts: Any, axes: str | None, image: tuple[int, int] | None) -> NDArray[Any]:
     """`counts` as (exposures, H, W, T)."""
-    if hasattr(counts, "toarray"):  # a sparse matrix or array of SciPy
-        check_memory(8 * counts.shape[0] * counts.shape[1], "the counts of the sparse matrix", "take a part of it")
-        counts = counts.toarray()
+    if is_sparse(counts):
+        check_memory(dense_bytes(counts), "the counts of the sparse matrix", "take a part of it")
+        counts = dense_counts("counts", counts)
     if isinstance(counts, np.ma.MaskedArray):
         raise TypeError("counts must not be a masked array: fill it, or leave those pixels out")
     array = np.asarray(counts)

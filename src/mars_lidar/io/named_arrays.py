@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from mars_lidar._base import mat5
 from mars_lidar._base.files import open_npz, read_mat5, reading, whole
-from mars_lidar._base.hdf5 import open_hdf5
+from mars_lidar._base.hdf5 import CELLS, open_hdf5
+from mars_lidar._base.sparse import check_sparse
 from mars_lidar.io.store import OnDisk
-
-_CELLS = "#refs#"  # where MATLAB puts what the cells of a v7.3 file hold
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,8 @@ def open_arrays(path: Path) -> Iterator[NamedArrays]:
             turned = path.suffix.lower() == ".mat"
             yield NamedArrays([*arrays], lambda some: {name: arrays[name] for name in some if name in arrays}, turned)
     else:
-        from scipy.io import whosmat
-
         with reading(path, "a .mat of version 5"):
-            names = [name for name, _, _ in whosmat(path)]
+            names = [head.name for head in mat5.variables(path)]
         yield NamedArrays(names, lambda some: _plain(read_mat5(path, some)))
 
 
@@ -76,13 +74,14 @@ def hdf5_arrays(path: Path, *, of_matlab: bool = False, deep: bool = True) -> di
     parts: set[str] = set()
 
     def visit(name: str, item: Any) -> None:
-        if (not deep and "/" in name) or name.partition("/")[0] == _CELLS or name in parts:
+        if (not deep and "/" in name) or name.partition("/")[0] == CELLS or name in parts:
             return
         if isinstance(item, h5py.Group) and "MATLAB_sparse" in item.attrs:
             columns = whole(item["jc"]).astype(np.int64)
             data, rows = (whole(item[part]) if part in item else np.zeros(0) for part in ("data", "ir"))
             shape = (int(item.attrs["MATLAB_sparse"]), len(columns) - 1)
             out[name] = sparse.csc_array((data, rows.astype(np.int64), columns), shape=shape)
+            check_sparse(name, out[name], sorted_rows=True)
             parts.update(f"{name}/{part}" for part in item)
         elif not isinstance(item, h5py.Dataset):
             return

@@ -221,7 +221,8 @@ import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.io.foreign import foreign_cube
 import h5py, scipy.io, scipy.sparse
-system = ml.System(period_ns=100.0, cycles=5000, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0))
+detector = ml.Detector(dead_time_ns=30.0)
+system = ml.System(period_ns=100.0, cycles=5000, bins=32, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=detector)
 used = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 before, began = used(), time.process_time()
 for read in (lambda p: foreign_cube(p, system), lambda p: io.load(p)):

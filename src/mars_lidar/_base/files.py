@@ -8,15 +8,20 @@ and renamed at the end, so that what is half written never looks complete, whate
 from __future__ import annotations
 
 import contextlib
+import errno
+import glob
 import math
 import os
+import re
+import secrets
 import shutil
 import stat
+import struct
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +38,8 @@ _FEW_CHUNKS, _CHUNK_ENTRY = 10_000, 4  # of HDF5: so many anywhere; bytes of a f
 _TIMES = 512  # without it: so many times the file, or, if that is more, what follows
 _LEAST_IN_PARTS, _LEAST_WHOLE = 512 * 2**20, 64 * 2**20  # bytes
 _SMALL_FILE, _MOST_OF_SMALL = 10**6, 128 * 2**20  # no smaller file takes more memory than this before it is refused
-INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that an .h5 or .npz is written to
+INCOMPLETE_SUFFIX = ".incomplete"  # of the sibling that a file is written to, after eight random digits
+_UNFINISHED = re.compile(r"(\.[0-9a-f]{8})?\.incomplete$")
 
 
 class FileError(ValueError):
@@ -67,20 +73,121 @@ def telling(left: Callable[[], str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def beside(target: Path) -> Iterator[Path]:
-    """The path beside `target` to write a file or folder to: renamed to it at the end, at once, or else removed."""
-    path = target.with_name(target.name + INCOMPLETE_SUFFIX)
+def beside(target: Path, *, folder: bool = False) -> Iterator[Path]:
+    """A new file (or `folder`) beside `target` to write to: renamed to it at the end, at once, or else removed.
+
+    A store or file at `target` is replaced. What a killed run left there is removed.
+    """
+    for leftover in unfinished_of(target):
+        with contextlib.suppress(OSError), _held(leftover):  # its run is gone: it would hold the lock
+            _remove(leftover)
+    path = _created(target, folder)
 
     def removed() -> str:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+        _remove(path)
         return f"{target} is what it was before" if target.exists() else f"nothing was left at {target}"
 
-    with telling(removed):
+    with telling(removed), contextlib.ExitStack() as lock:
+        with contextlib.suppress(OSError):  # a file system without locks: leftovers are then nobody's to remove
+            lock.enter_context(_held(path))
         yield path
+        if folder:
+            exchange(path, target)
+        else:
+            os.replace(path, target)
+
+
+@contextlib.contextmanager
+def replacing(target: Path) -> Iterator[BinaryIO]:
+    """A stream whose content replaces `target` at the end; what stops the writing removes it."""
+    path = _created(target, folder=False)
+    try:
+        with open(path, "r+b") as stream:
+            yield stream
         os.replace(path, target)
+    except BaseException:
+        _remove(path)
+        raise
+
+
+def exchange(path: Path, target: Path) -> None:
+    """Put the folder `path` in the place of `target`, if there is one, and remove that.
+
+    Who reads `target` reads the old one or the new one, never a mixture under one name.
+    """
+    if not target.exists() and not target.is_symlink():
+        os.rename(path, target)
+        return
+    old = _unused(target)
+    os.rename(target, old)
+    os.rename(path, target)
+    _remove(old)
+
+
+def open_own(path: Path) -> BinaryIO:
+    """A file to write to at a name that others know, such as that of a lock: a link of this name is not followed."""
+    try:
+        number = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise FileExistsError(f"{path} is a link to another file, which is not written to: remove it") from None
+        raise
+    return os.fdopen(number, "r+b")
+
+
+def finished_name(path: Path) -> Path:
+    """The path that a file will have which a run left unfinished at `path`; `path` itself for others."""
+    return path.with_name(_UNFINISHED.sub("", path.name))
+
+
+def unfinished_of(target: Path) -> list[Path]:
+    """What stopped runs left beside `target`."""
+    names = sorted(target.parent.glob(f"{glob.escape(target.name)}*{INCOMPLETE_SUFFIX}"))
+    return [path for path in names if finished_name(path) == target]
+
+
+@contextlib.contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Hold a lock on an unfinished file or folder; OSError where another process has it, or there are no locks."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        raise OSError("no locks") from None
+    folder = path.is_dir()
+    number = os.open(path, (os.O_RDONLY if folder else os.O_RDWR) | os.O_NOFOLLOW)
+    try:
+        if folder:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        elif hasattr(fcntl, "F_OFD_SETLK"):  # one that the locks of HDF5 do not meet
+            whole_file = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+            fcntl.fcntl(number, fcntl.F_OFD_SETLK, whole_file)
+        else:
+            raise OSError("no locks of open files")
+        yield
+    finally:
+        os.close(number)
+
+
+def _created(target: Path, folder: bool) -> Path:
+    """A new empty file or folder beside `target`, of a name that nobody can know before; never a link."""
+    path = _unused(target)
+    if folder:
+        os.mkdir(path)
+    else:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0)
+        os.close(os.open(path, flags, 0o666))
+    return path
+
+
+def _unused(target: Path) -> Path:
+    return target.with_name(f"{target.name}.{secrets.token_hex(4)}{INCOMPLETE_SUFFIX}")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def reason(error: OSError) -> str:

@@ -6,7 +6,6 @@ the process. Layout: MathWorks, MAT-File Format, chapter 1.
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -53,11 +52,10 @@ def check_elements(path: Path, names: Iterable[str] | None = None) -> int:
     wanted, total = None if names is None else set(names), 0
     for order, read, head in _variables(path):
         if wanted is None or head.name in wanted:
-            unpacked = read.size if isinstance(read, _Plain) else math.inf
             kind, size = read.tag(order)
             _element(read.read, order, kind, size, 0)
-            total += min(size, unpacked)
-    return int(total)
+            total += size
+    return total
 
 
 def _variables(path: Path) -> Iterator[tuple[str, _Unpacked | _Plain, Variable]]:

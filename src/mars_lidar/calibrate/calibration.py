@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.calibrate.calibration_pass import CERTAIN, Watch, fitted, with_division
 from mars_lidar.calibrate.calibration_result import Calibration
 from mars_lidar.calibrate.dead_time import Unknown
@@ -26,6 +27,7 @@ _LEAST_USED = 3
 _MOST_LIGHT = 1e6  # photons per period: what a `Flux` may have
 
 
+@checked
 def calibrate(
     times: Timestamps | Sequence[Timestamps],
     system: System | None = None,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration_light import Light
@@ -45,6 +46,7 @@ class Bound:
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
+@checked
 def calibration_bound(
     signal: float, background: float, system: System, *, delay_ns: float | None = None, fit_width: bool = False
 ) -> Bound:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.armed_time import armed_time
@@ -117,6 +118,7 @@ class Validation:
         return not self.failed and not self.too_short
 
 
+@checked
 def validate(
     times: Timestamps | Sequence[Timestamps],
     calibration: Calibration | None = None,

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.cyclic_solver import TOLERANCE, Delay, blocks, by_rows, fired, registered
@@ -17,6 +18,7 @@ _FINE = 4.0  # parts of a sigma of the pulse
 _BLOCK = 2**22  # pixels x bins of photons that are held at a time
 
 
+@checked
 def expected_histogram(
     signal: torch.Tensor,
     background: torch.Tensor,

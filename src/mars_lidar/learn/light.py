@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.effects import LIGHT_EFFECTS
 from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.needed import torch
 
 
+@checked
 def bin_photons(
     signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor, system: System, *, refine: int = 1
 ) -> torch.Tensor:

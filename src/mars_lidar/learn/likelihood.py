@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from mars_lidar._base.arguments import checked
 from mars_lidar.instrument.system import System
 from mars_lidar.learn.cyclic_solver import Delay
 from mars_lidar.learn.light import bin_photons, check_detector, detected, inputs
 from mars_lidar.learn.needed import torch
 
 
+@checked
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
     """Periods D (..., bins) in which the pixel was armed in each bin, as its own histogram (..., bins) tells.
 
@@ -27,6 +29,7 @@ def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
     return (system.cycles - covered).clamp_min(0.0)
 
 
+@checked
 def histogram_log_likelihood(
     histogram: torch.Tensor,
     signal: torch.Tensor,

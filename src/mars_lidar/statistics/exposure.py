@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.detector import Mode
@@ -37,6 +38,7 @@ UNSETTLED = -2  # the native core's code: gave up
 _ENERGY_STEPS = 10.0  # of the native recursion, that the light of a bin and what follows from it costs
 
 
+@checked
 def exposure_moments(
     signal: ArrayLike | None,
     background: ArrayLike,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cell_input import MAX_PHOTONS
@@ -18,6 +19,7 @@ _MIN_BINS = 512  # below it the chain's own discretisation shows in the count va
 _BINS_PER_WIDTH = 7.5  # of the equivalent width 1 / max s, 2.507 sigma for a Gaussian: a third of sigma
 
 
+@checked
 def photons_per_bin(
     signal: float | None,
     background: float,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
@@ -19,6 +20,7 @@ from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, sync
 from mars_lidar.statistics.timing import recorded
 
 
+@checked
 def mean_histogram(
     signal: ArrayLike | None,
     background: ArrayLike,

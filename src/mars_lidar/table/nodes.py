@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray
@@ -44,6 +45,7 @@ class Nodes:
 
     __repr__ = brief
 
+    @checked
     def lookup(
         self,
         signal: ArrayLike,

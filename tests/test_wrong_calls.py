@@ -360,7 +360,6 @@ ACCEPTED: dict[tuple[str, str, str], str] = {
     ("reconstruct.log_likelihood", "*", "shape"): "of an image of any shape",
     ("reconstruct.log_likelihood", "*", "empty"): "no light, no likelihood",
     ("Table.lookup", "*", "shape"): "of an image of any shape",
-    ("plot.depth_error_m", "estimate_m", "*"): "an estimate may be anything, also missing",
     ("plot.map_image", "label", "*"): "free text",
     ("plot.overview", "title", "*"): "free text",
     ("Timestamps.pixel", "*", "-1"): "from the end, as everywhere in Python",

@@ -187,7 +187,7 @@ def _has_members(value: Any, protocol: Any) -> bool:
 def _words(members: tuple[Any, ...]) -> str:
     """The members of a union for people."""
     plain: dict[Any, str] = {_Array: "an array of real numbers", float: "a number", int: "an integer", bool: "a bool"}
-    plain |= {Path: "a path", dict: "a mapping", slice: "a slice", collections.abc.Callable: "a function"}
+    plain |= {Path: "a path", dict: "a mapping", slice: "a slice", collections.abc.Callable: "a callable"}
     sequence = (tuple, list, collections.abc.Sequence, collections.abc.Iterable)
     said: list[str] = []
     for member in members:
@@ -201,7 +201,7 @@ def _words(members: tuple[Any, ...]) -> str:
         elif origin in sequence:
             word = "a sequence"
         else:
-            word = plain.get(origin) or f"a {origin.__name__}"
+            word = plain.get(origin) or f"{'an' if origin.__name__[0] in 'AEIO' else 'a'} {origin.__name__}"
         if word not in said:
             said.append(word)
     return " or ".join(said)

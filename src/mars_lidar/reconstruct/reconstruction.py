@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import arguments, checks
+from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray, Progress
@@ -118,7 +118,6 @@ class Recorded(Protocol):
         """(..., bins)."""
 
 
-@arguments.checked
 def reconstruct(
     cube: ArrayLike | Recorded,
     system: System | None = None,

@@ -73,7 +73,12 @@ LAYOUTS = {
         size=(512, 512),
     ),
     "gutierrez": Layout(
-        {_SPAD: ("spad", "rates", "bin", "range_bins", "est_range_bins_argmax", "intensity", "photons", *_MEANS)},
+        {
+            _SPAD: (
+                *("spad", "rates", "bin", "range_bins", "est_range_bins_argmax", "est_range_bins_lmf"),
+                *("intensity", "photons", *_MEANS),
+            )
+        },
         _SPAD,
         root={"PSF_used_for_simulation.mat": lambda system: {"psf": psf(system)}},
     ),

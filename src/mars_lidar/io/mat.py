@@ -179,7 +179,11 @@ def _rate_bands(flux: Flux, system: System) -> Iterator[NDArray[np.float64]]:
 
 def open_store(path: Path) -> OpenedStore:
     """Open a file for reading; its variables are read at once, its counts stay sparse until they are used."""
-    if not _is_hdf5(path) and "mars_lidar" not in {head.name for head in mat5.variables(path)}:
+    if _is_hdf5(path):
+        raise ValueError(
+            f"{path} is not a cube written by mars-lidar: those are of MATLAB's version 5, and this is 7.3 (HDF5)"
+        )
+    if "mars_lidar" not in {head.name for head in mat5.variables(path)}:
         raise ValueError(
             f"{path} is not a cube written by mars-lidar (no variable 'mars_lidar'); "
             f"mars_lidar.io.read_mat reads such files of others"

@@ -17,6 +17,7 @@ from studies import STUDIES, OtherRunsError, Request, run
 def _parser(command: str) -> argparse.ArgumentParser:
     told = "\n".join(f"  {name:<17} {words}" for name, (_, words) in STUDIES.items())
     told += "\n\nthe network of the neural baseline:\n  neural train|info  see neural --help"
+    told += "\n\nengines side by side on a scene:\n  compare            see compare --help"
     parser = argparse.ArgumentParser(
         prog=command,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -58,6 +59,10 @@ def main(arguments: Sequence[str] | None = None, command: str = "python -m studi
             print(f"{command} neural: {error}", file=sys.stderr)
             return 1
         return neural(asked[1:], f"{command} neural")
+    if asked[:1] == ["compare"]:
+        from studies.compare.command import main as compare
+
+        return compare(asked[1:], f"{command} compare")
     parser = _parser(command)
     given = parser.parse_args(asked)
     if "reference" in given.studies and given.data is None:

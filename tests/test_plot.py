@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import mars_lidar as ml
 from mars_lidar import io, plot
-from mars_lidar.compare import views
+from mars_lidar.plot import views
 
 SYSTEM = ml.System(
     period_ns=100.0,

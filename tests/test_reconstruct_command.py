@@ -168,12 +168,15 @@ def test_nothing_is_overwritten_unasked(cube, tmp_path):
     assert load_maps(out)[0]["depth"].shape == (1, 2, 12, 12)
 
 
-def test_without_scikit_image_the_maps_are_written_all_the_same(cube, tmp_path, monkeypatch):
+def test_without_scikit_image_only_ssim_is_missing(cube, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage", None)
     monkeypatch.setitem(sys.modules, "skimage.metrics", None)  # where another test has imported it
     done = run("reconstruct", cube, "--no-picture", "-o", tmp_path / "m.npz")
     assert done.exit_code == 0
     assert "mars-lidar[estimate]" in done.stderr
+    assert "RMSE mm" in done.stdout
+    assert "PSNR dB" in done.stdout
+    assert "SSIM" not in done.stdout
     assert (tmp_path / "m.npz").exists()
 
 

@@ -455,10 +455,6 @@ def test_what_is_documented_as_taken_is_taken(here):
 # The command line: arguments that make each command do something small, by the files of `here`.
 COMMANDS: dict[str, Callable[[Path], list[Any]]] = {
     "simulate": lambda at: ["--scene", "room", "--size", 3, "-o", at / f"cli{next(NUMBERS)}.npz"],
-    "compare": lambda at: [
-        *("--scene", "room", "--size", 3, "--engines", "exact", "--realizations", 50),
-        *("-o", at / f"cli{next(NUMBERS)}.png"),
-    ],
     "generate": lambda at: ["room", "--size", 3, "-o", at / f"cli{next(NUMBERS)}.zarr"],
     "verify": lambda at: [at / "set.zarr"],
     "export": lambda at: [at / "set.zarr", "--layout", "sun", "-o", at / f"cli{next(NUMBERS)}"],

@@ -36,7 +36,7 @@ def test_every_sample_is_what_simulate_makes(tmp_path, recipe, layout):
         one = data.isel(sample=k)
         scene = ml.Scene.example("room", (12, 10), (0, 3)[int(one.scene)])
         system = systems[int(one.system)]
-        flux = scene.flux(system, signal=float(one.signal_level), sbr=float(one.sbr), dark_counts_per_s=1e5)
+        flux = scene.flux(system, signal=float(one.signal_level), sbr=float(one.sbr), dark_count_hz=1e5)
         cube = ml.simulate(flux, system, realizations=3, seed=int(one.seed))
         np.testing.assert_array_equal(one.histogram, cube)
         for name, there in (

@@ -22,7 +22,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from mars_lidar._base.checks import named, numbers, unmasked, whole
+from mars_lidar._base.checks import did_you_mean, numbers, unmasked, whole
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -153,7 +153,7 @@ def _require(name: str, value: Any, members: tuple[Any, ...], masks: bool) -> No
         return
     choices = [word for each in members if typing.get_origin(each) is typing.Literal for word in each.__args__]
     if choices and (isinstance(value, str) or len(members) == 1):
-        raise ValueError(f"{name} must be {_words(members)}, got {value!r}{named(value, choices)}")
+        raise ValueError(f"{name} must be {_words(members)}, got {value!r}{did_you_mean(value, choices)}")
     raise TypeError(f"{name} must be {_words(members)}, got {_told(value)}")
 
 

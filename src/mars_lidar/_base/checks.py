@@ -45,7 +45,7 @@ def choice(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     """One of a few strings."""
     if not isinstance(value, str) or value not in allowed:
         told = f"{name} must be one of {', '.join(map(repr, allowed))}"
-        raise ValueError(f"{told}, got {value!r}{named(value, allowed)}")
+        raise ValueError(f"{told}, got {value!r}{did_you_mean(value, allowed)}")
     return value
 
 
@@ -88,12 +88,12 @@ def known_keys(name: str, mapping: Any, allowed: tuple[str, ...]) -> dict[str, A
         raise TypeError(f"{name} must be a mapping with keys {', '.join(allowed)}, got {mapping!r}")
     unknown = [key for key in mapping if key not in allowed]
     if unknown:
-        meant = named(unknown[0], allowed)
+        meant = did_you_mean(unknown[0], allowed)
         raise ValueError(f"{name} has unknown key {unknown[0]!r}{meant}; allowed: {', '.join(allowed)}")
     return mapping
 
 
-def named(word: Any, allowed: Sequence[str]) -> str:
-    """The allowed word that was probably meant, for the end of a message; empty where none is near."""
+def did_you_mean(word: Any, allowed: Sequence[str]) -> str:
+    """`` (did you mean 'near'?)`` for the allowed word nearest to `word`, or an empty text where none is near."""
     near = difflib.get_close_matches(str(word), [str(each) for each in allowed], 1)
     return f" (did you mean {near[0]!r}?)" if near else ""

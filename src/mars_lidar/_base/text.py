@@ -11,7 +11,7 @@ from mars_lidar._base.files import check_claim
 
 
 def read_column(path: Path) -> NDArray[np.float64]:
-    """The last of one or two columns of numbers in a .csv or .txt, below lines of words; ValueError for anything else."""
+    """The last of one or two columns of numbers in a text file, below lines of words; else a ValueError."""
     check_claim(path, 64 * path.stat().st_size)
     rows: list[list[float]] = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():

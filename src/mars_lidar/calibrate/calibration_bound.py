@@ -13,7 +13,7 @@ from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.calibration_light import Light
 from mars_lidar.instrument.pulse import GaussianPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.grid import default_bins
+from mars_lidar.statistics.cells import default_bins
 from mars_lidar.statistics.histogram import mean_histogram
 
 

@@ -28,7 +28,7 @@ class LightEffects:
     """What changes the light that a pixel counts; None: as in the file."""
 
     detection_efficiency: float | None = _declared("detection_efficiency")
-    dark_count_hz: float | None = _declared("dark_count_hz", "--dark-count-hz", "--dark-counts")
+    dark_count_hz: float | None = _declared("dark_count_hz")
 
 
 @group

@@ -207,24 +207,22 @@ def _methods(text: str, cube: Cube) -> list[str]:
 
 def _show(cube: Cube, found: dict[str, Timed]) -> None:
     """One line a method on standard output."""
-    from mars_lidar._base.optional import MissingLibraryError
-    from mars_lidar.reconstruct.quality import errors_against
+    from mars_lidar.reconstruct.quality import errors_against, ssim_available
 
     realizations, height, width, _ = cube.shape
     head = ["method", "seconds", "seen %", "saturated %"]
     lines: list[list[str]] = []
-    errors = {}
-    try:
-        errors = {name: errors_against(cube, each.found) for name, each in found.items()}
-    except MissingLibraryError as error:
-        say(f"no errors against the truth: {error}")
+    errors = {name: errors_against(cube, each.found) for name, each in found.items()}
     several = any(each.found.returns is not None for each in found.values())
     if several:
         head += ["2 returns %", "3 or more %"]
     kinds = list(next(iter(errors.values()), {}))
+    ssim = ["SSIM"] if ssim_available() else []
+    if kinds and not ssim:
+        say("SSIM is left out: it needs the library skimage: pip install 'mars-lidar[estimate]'")
     for kind in kinds:
         unit, wide = ("mm", "depth") if kind == "depth" else ("", kind)
-        head += [f"{wide} RMSE {unit}".strip(), "median", "PSNR dB", "SSIM"]
+        head += [f"{wide} RMSE {unit}".strip(), "median", "PSNR dB", *ssim]
     for name, each in found.items():
         flags = each.found.flags
         line = [
@@ -238,7 +236,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
             line += [f"{100.0 * (count == 2).mean():.4g}", f"{100.0 * (count > 2).mean():.4g}"]
         for kind in kinds:
             off, scale = errors[name][kind], 1e3 if kind == "depth" else 1.0
-            values = (scale * off.rmse, scale * off.median, off.psnr, off.ssim)
+            values = (scale * off.rmse, scale * off.median, off.psnr, *([off.ssim] if ssim else []))
             line += ["-" if math.isnan(value) else f"{value:.4g}" for value in values]
         lines.append(line)
     told = ", errors against the cube's own truth" if kinds else ""

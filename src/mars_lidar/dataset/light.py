@@ -24,7 +24,7 @@ LIGHT: Fields = {
     ),
     "attenuation": values.choice("Signal against depth.", ("none", "inverse_square")).or_else("none"),
     "ambient": values.choice("Ambient light over the image.", ("uniform", "reflectivity", "map")),
-    "dark_counts_per_s": values.real("Dark counts of a pixel, counts/s.", low=0.0).or_else(0.0),
+    "dark_count_hz": values.real("Dark counts of a pixel, counts/s.", low=0.0).or_else(0.0),
 }
 
 
@@ -38,7 +38,7 @@ class Light:
     levels: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
     attenuation: str = "none"
     ambient: str | None = None
-    dark_counts_per_s: float = 0.0
+    dark_count_hz: float = 0.0
     photons_per_unit: float | None = None
 
     def __post_init__(self) -> None:
@@ -48,7 +48,7 @@ class Light:
         checks.choice("attenuation", self.attenuation, ("none", "inverse_square"))
         if self.ambient is not None:
             checks.choice("ambient", self.ambient, ("uniform", "reflectivity", "map"))
-        checks.real("dark_counts_per_s", self.dark_counts_per_s, low=0.0)
+        checks.real("dark_count_hz", self.dark_count_hz, low=0.0)
         if self.photons_per_unit is not None:
             checks.real("photons_per_unit", self.photons_per_unit, low=0.0, strict_low=True)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.keywords import constructed_by_name
 
 _MAX_GENERATIONS = 1_000_000
 _MAX_SAMPLES = 2**24
@@ -20,6 +21,7 @@ _KERNELS = {
 }
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Afterpulsing:
     """Carriers that an avalanche leaves in traps and that are released later: each is an arrival like a photon.
@@ -141,6 +143,7 @@ class Afterpulsing:
         return cls(**known)
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class Crosstalk:
     """Optical crosstalk: an avalanche triggers neighbouring pixels at the same time, where they are armed.

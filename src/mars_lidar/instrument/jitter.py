@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class Jitter:
     """Timing jitter: a record is later than its avalanche by a Gaussian number, some by an exponential one on top.
@@ -111,6 +113,7 @@ class Jitter:
         return {"kind": "gaussian", "sigma_ns": self.sigma_ns, **tail}
 
 
+@constructed_by_name
 @dataclass(frozen=True)
 class SampledJitter:
     """A measured jitter: the density of the delay of a record behind its avalanche, constant on samples.

@@ -16,11 +16,12 @@ from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.files import check_claim, reading
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.yaml import Lines, located, read_yaml
 from mars_lidar.instrument.detector import Detector as Detector
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
-from mars_lidar.instrument.instruments import sourced
+from mars_lidar.instrument.presets import sourced
 from mars_lidar.instrument.pulse import Pulse, pulse_from_dict
 from mars_lidar.instrument.units import check_units, period_hint
 
@@ -33,6 +34,7 @@ _LINED_BYTES = 2**16  # of JSON that is read as YAML, a hundred times slower, so
 _MAX_DEAD_PERIODS = 2**20
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class System:
     """Laser, detector and histogram.
@@ -198,7 +200,7 @@ class System:
 
     @classmethod
     def preset(cls, name: str) -> System:
-        """An instrument by its name in `mars_lidar.instrument.instruments.INSTRUMENTS`, with its laser and time bins.
+        """An instrument by its name in `mars_lidar.instrument.presets.INSTRUMENTS`, with its laser and time bins.
 
         Where each value is from, or that it is an assumption, stands in docs/detectors.md and in the file that
         ``mars-lidar init --preset NAME`` writes. ValueError for one that is a detector alone (`Detector.preset`).

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import reading, whole
 from mars_lidar._base.memory import check_memory
-from mars_lidar.light.rate_parts import RateArray
+from mars_lidar.light.transient import RateArray
 
 
 class CountArray(RateArray, Protocol):

@@ -16,8 +16,8 @@ from mars_lidar._base.files import FileError
 from mars_lidar.dataset.arrays import MAPS
 from mars_lidar.dataset.samples import sample_parts
 from mars_lidar.dataset.store import Dataset, open_dataset
-from mars_lidar.learn.distributed import rank_of, worker_of
 from mars_lidar.learn.needed import torch
+from mars_lidar.learn.stream import rank_of, worker_of
 
 _NUMBERS = ("sample", "realization", "scene", "system", "signal_level", "sbr")
 

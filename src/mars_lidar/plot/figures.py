@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar.compare.views import count_maps, depth_error_m, example_pixels, fitted, incident_rate, instrument
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.plot.pixel import draw_pixel, quiet_corner
 from mars_lidar.plot.style import COLOURS, DPI, MISSING, style
+from mars_lidar.plot.views import count_maps, depth_error_m, example_pixels, fitted, incident_rate, instrument
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,9 +20,9 @@ from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import cell_name, photons_per_bin
 from mars_lidar.statistics.gate import require_mode
-from mars_lidar.statistics.grid import cell_name, photons_per_bin
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError, Feedback, Solution, cyclic_recursion
+from mars_lidar.statistics.phase_chain import ConvergenceError, Feedback, Solution, cyclic_recursion
 
 Rearm = Literal["centre", "edge"]
 

@@ -18,14 +18,13 @@ from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import LAW_STEPS, Cells
-from mars_lidar.statistics.count_window import Pmf, gaussian_window, poisson_window
-from mars_lidar.statistics.electronics_law import record_windows
+from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
+from mars_lidar.statistics.electronics import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
 from mars_lidar.statistics.gate import PLAIN
-from mars_lidar.statistics.histogram import histogram_effects
-from mars_lidar.statistics.pmf import exact_windows
-from mars_lidar.statistics.shape import chain_of, rearm_of
-from mars_lidar.statistics.shape import registration_pdf as registration_pdf
+from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_of
+from mars_lidar.statistics.histogram import registration_pdf as registration_pdf
+from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
@@ -214,7 +213,6 @@ def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]
         from mars_lidar.statistics.baselines import renewal_moments
 
         return renewal_moments(cells.signal, cells.background, cells.system)
-    from mars_lidar.statistics.renewal import holding_times
 
     mean, variance = np.zeros(cells.size), np.zeros(cells.size)
     for k in range(cells.size):

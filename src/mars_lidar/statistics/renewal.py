@@ -18,10 +18,10 @@ from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.statistics.cells import cell_name, default_bins, photons_per_bin
 from mars_lidar.statistics.chain import PhaseChain, Rearm, Stationary, stationary_from
 from mars_lidar.statistics.gate import require_mode
-from mars_lidar.statistics.grid import cell_name, default_bins, photons_per_bin
-from mars_lidar.statistics.phase_chain_operator import cyclic_recursion
+from mars_lidar.statistics.phase_chain import cyclic_recursion
 
 _AGREEMENT = 1e-7  # two independent routes to a moment may differ by this much, relative to its largest term
 _MAX_DENSE = 8192

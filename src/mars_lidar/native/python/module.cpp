@@ -4,6 +4,8 @@
 
 NB_MODULE(_core, module) {
     module.doc() = "Native core of mars_lidar.";
+    // At exit PyTorch and pytest still hold references to modules; nanobind would list every function of ours as leaked.
+    nanobind::set_leak_warnings(false);
     mars::bind_pulse(module);
     mars::bind_recording(module);
     mars::bind_job(module);

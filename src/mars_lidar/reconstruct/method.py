@@ -159,7 +159,10 @@ class RateMethod(Method):
         self.check(system)
         flat = None
         if total is not None:
-            flat = np.ascontiguousarray(np.broadcast_to(np.asarray(total, np.float64), shape).reshape(-1))
+            known = np.asarray(total, np.float64)
+            if known.shape not in ((), tuple(shape)):
+                raise ValueError(f"total must be a number or {tuple(shape)} as the pixels, got shape {known.shape}")
+            flat = np.ascontiguousarray(np.broadcast_to(known, shape).reshape(-1))
             if not ((flat > 0) & np.isfinite(flat)).all():
                 raise ValueError("total must be finite and positive, photons per period")
         out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)

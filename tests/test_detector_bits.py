@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 import mars_lidar as ml
 from mars_lidar import _core, io
 from mars_lidar.cli import app
-from mars_lidar.compare.views import predicted_counts
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.plot.views import predicted_counts
 
 GATE = {"mode": "gated", "gate_start_ns": 83.0, "gate_width_ns": 31.0}
 MOVING = GATE | {"gate_step_ns": -7.3, "gate_cycles": 3}

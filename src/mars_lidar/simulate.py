@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _MAX_REGISTRATIONS = 2.0**32  # the event counter of one pixel's random stream
 
 
+@checked
 def simulate(
     flux: Flux,
     system: System,
@@ -92,6 +94,23 @@ def simulate(
     NDArray
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
         with ``device="cuda"``.
+
+    See Also
+    --------
+    simulate_timestamps, count_law, reconstruct, System
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> cube = ml.simulate(ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system, realizations=3, seed=0)
+    >>> cube.shape  # (realizations, H, W, bins)
+    (3, 1, 2, 128)
+    >>> bool(cube.sum(-1).max() <= system.cycles * 100 / 75 + 1)  # at most one count a dead time
+    True
     """
     if not isinstance(report, dict | None):
         raise TypeError(f"report must be a dictionary, got {type(report).__name__}")
@@ -115,6 +134,7 @@ def simulate(
     return cube
 
 
+@checked
 def simulate_timestamps(
     flux: Flux,
     system: System,
@@ -135,8 +155,23 @@ def simulate_timestamps(
     Returns
     -------
     Timestamps
-        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when they
-        are asked for.
+        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when asked
+        for.
+
+    See Also
+    --------
+    simulate, Timestamps
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> times = ml.simulate_timestamps(ml.Flux(0.5, 0.5, 40.0), system, seed=0)
+    >>> times.histogram().shape
+    (1, 1, 128)
     """
     drawn_by = find_engine(engine)
     task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")

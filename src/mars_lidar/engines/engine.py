@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.types import Progress
 from mars_lidar.instrument.detector import MODES, Detector, Mode
-from mars_lidar.instrument.effects import AVALANCHE_EFFECTS, LIGHT_EFFECTS, RECORDING_EFFECTS, native_fields
-from mars_lidar.instrument.native_pulse import native_pulse
+from mars_lidar.instrument.effects import (
+    AVALANCHE_EFFECTS,
+    LIGHT_EFFECTS,
+    RECORDING_EFFECTS,
+    native_fields,
+    native_pulse,
+)
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
 from mars_lidar.light.records import record_bins, record_times

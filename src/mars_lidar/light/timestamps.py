@@ -43,6 +43,21 @@ class Timestamps:
     info
         Where they come from: ``system`` (as `System.to_dict` gives it), ``engine``, ``seed``, ``realization``,
         ``source``, ``unit_ns`` (resolution of the clock that recorded them), as far as they are known.
+
+    See Also
+    --------
+    simulate_timestamps, simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> times = ml.simulate_timestamps(ml.Flux(0.5, 0.5, 40.0), system, seed=0)
+    >>> bool((times.histogram() == ml.simulate(ml.Flux(0.5, 0.5, 40.0), system, seed=0)[0]).all())
+    True
     """
 
     times_ns: NDArray[np.float64]

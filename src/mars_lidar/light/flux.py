@@ -14,8 +14,16 @@ from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
+from mars_lidar.light.photon_maps import (
+    MAX_DELAY_NS,
+    broadcast,
+    check_photons,
+    common_shape,
+    frozen,
+    light_map,
+    waveform_maps,
+)
 from mars_lidar.light.photon_maps import MAX_PHOTONS as MAX_PHOTONS
-from mars_lidar.light.photon_maps import broadcast, check_photons, common_shape, frozen, light_map, waveform_maps
 
 MAX_RETURNS = 16
 
@@ -37,8 +45,8 @@ class Flux:
     background
         Background photons per period B, uniform in time: scalar or (H, W).
     delay_ns
-        Delay tau of the return, ns: scalar or (H, W), or (R, H, W). Any finite value: it wraps into the laser period.
-        NaN, for "no return", is allowed where the signal is 0.
+        Delay tau of the return, ns: scalar or (H, W), or (R, H, W). Up to a second either way (1e9 ns): it wraps into
+        the laser period. NaN, for "no return", is allowed where the signal is 0.
     waveform
         Instead of `signal` and `delay_ns`: photons per period in each of T equal parts of the period
         (..., T), as they reach the detector (the pulse of the system is *not* applied), constant inside
@@ -276,6 +284,11 @@ def made(
     if lost.any() and (lost := lost & (signal > 0)).any():
         where = tuple(int(k) for k in np.argwhere(lost)[0][1:])
         raise ValueError(f"delay_ns must be finite where signal > 0, got NaN at pixel {where}")
+    if (far := np.abs(delay_ns) > MAX_DELAY_NS).any():
+        raise ValueError(
+            f"delay_ns must be within {MAX_DELAY_NS:g} ns either way, got {delay_ns[far][0]:g}; give it modulo the "
+            "laser period"
+        )
     if waveform is not None:
         total, nearest = waveform.sum(-1), np.full(background.shape, np.nan)
     elif len(signal) == 1:

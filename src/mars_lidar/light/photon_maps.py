@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from mars_lidar._base import checks
 from mars_lidar._base.types import FloatArray
 
+MAX_DELAY_NS = 1e9  # a second: beyond, float64 does not tell the phase in a laser period to 1e-6 ns
 MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
 
 

@@ -12,12 +12,11 @@ from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Row, Section
 from benchmarks.timing import Timing, in_turn
 from benchmarks.workload import PERIOD_NS, system
-from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.cells import Cells, photons_per_bin
 from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics.count_pmf import guessed_windows
 from mars_lidar.statistics.exposure import exposure_moments, refined_moments
-from mars_lidar.statistics.grid import photons_per_bin
 from mars_lidar.statistics.law import count_law
-from mars_lidar.statistics.pmf import guessed_windows
 
 GOAL_MOMENTS_MS, GOAL_PMF_MS, GOAL_STATIONARY_MS, GOAL_TABLE_S = 3.0, 20.0, 50.0, 30.0
 TABLE = (256, 100)  # of the paper: S x B, log-spaced on [0.01, 10]

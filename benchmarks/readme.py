@@ -117,7 +117,7 @@ def _exposure(saved: Saved, cycles: int) -> dict[str, str]:
 
 
 BLOCKS = {"speed": speed, "figures": figures, "exposures": exposures}
-TABLES = ("README.md", "docs/engines.md", "docs/speed.md", "paper.md")
+TABLES = ("README.md", "docs/engines.md", "docs/speed.md")
 
 
 def filled(name: str) -> tuple[str, str]:

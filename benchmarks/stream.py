@@ -19,7 +19,7 @@ from benchmarks.floor import Bandwidth
 from benchmarks.report import Goal, Row, Section
 from benchmarks.timing import in_turn
 from mars_lidar.learn import CubeStream
-from mars_lidar.learn.sample import Sample
+from mars_lidar.learn.scenes import Sample
 
 BATCH, GOAL_SHARE = 8, 0.85
 LEVELS = (1.0, 0.1)

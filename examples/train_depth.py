@@ -27,12 +27,14 @@ def train(batches=300, size=32):
     layers = Conv2d(64, 64, 1), ReLU(), Conv2d(64, 32, 3, padding=1), ReLU(), Conv2d(32, 64, 3, padding=1)
     net, losses = torch.nn.Sequential(*layers), []
     optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
-    for counts, place in cubes(1, batches, size):
+    for batch, (counts, place) in enumerate(cubes(1, batches, size)):
         loss = torch.nn.functional.cross_entropy(net(counts.log1p()), place.long() % 64)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
+        if batch % 25 == 0:
+            print(f"batch {batch} of {batches}: cross entropy {losses[-1]:.2f}", flush=True)
     return net, losses
 
 

@@ -77,20 +77,18 @@ def check_commands(extra: str, folder: Path) -> int:
             code, out, _ = run(*each, "--help")
             assert (code, "Usage" in out) == (0, True), (each, out)
     cube, few = folder / "a.zarr", ("--size", 8, "--cycles", 20, "--bins", 32)
-    some = ("--pixels", 1, "--realizations", 50, "--repeats", 1, "--engines", "exact,poisson")
     every = "," in extra
     for needs, *arguments in (
         ("always", "simulate", "--scene", "room", *few, "--no-picture", "-o", cube),
         ("", "info", cube),
         ("", "view", cube, "-o", folder / "view.png"),
-        ("", "compare", "--scene", "room", *few, *some, "-o", folder / "compare.png"),
         ("estimate", "reconstruct", cube, "--no-picture", "-o", folder / "maps.zarr"),
         ("", "convert", cube, folder / "b.h5"),
         ("io", "convert", cube, folder / "b.ptu"),
         ("", "timestamps", cube, "-o", folder / "a.npz"),
         ("io", "timestamps", cube, "-o", folder / "a.h5"),
         ("io", "timestamps", cube, "-o", folder / "a.ptu"),
-        ("", "inspect", folder / "a.npz"),
+        ("", "calibrate", folder / "a.npz", "--look"),
         ("", "generate", "room", *few, "-o", folder / "set.zarr"),
         ("cluster", "generate", "room", *few, "--workers", 1, "-o", folder / "set1.zarr"),
         ("", "verify", folder / "set.zarr"),

@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 import mars_lidar as ml
 from mars_lidar import _core, io
 from mars_lidar.cli import app
-from mars_lidar.compare.views import predicted_counts
 from mars_lidar.engines import ENGINES
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
+from mars_lidar.plot.views import predicted_counts
 
 GATE = {"mode": "gated", "gate_start_ns": 83.0, "gate_width_ns": 31.0}
 MOVING = GATE | {"gate_step_ns": -7.3, "gate_cycles": 3}
@@ -30,35 +30,35 @@ DETECTORS: dict[str, dict[str, Any]] = {
 # Start of the SHA-256 of the cubes (2 realizations, seed 2**63 + 1), as little-endian uint32; see
 # test_reproducibility.py.
 GOLDEN = {
-    "paralyzable gaussian": "5f5cf4fe0c38",
-    "paralyzable returns": "d7419dd0c829",
-    "paralyzable sampled": "9fff60047604",
-    "paralyzable waveform": "f35863b26818",
-    "paralyzable stationary": "56db753afa5d",
-    "paralyzable stationary waveform": "e83890e03949",
-    "paralyzable whole periods": "e088963f935b",
-    "paralyzable long dead time": "4d1a5c43b3fb",
-    "synchronous gaussian": "b87b9d6581cf",
-    "synchronous returns": "f2744bc135c1",
-    "synchronous sampled": "94a5ebd0452a",
-    "synchronous waveform": "c7ec0f7dcfe3",
-    "synchronous stationary": "25ad1046e795",
-    "synchronous stationary waveform": "c4e5a2f6867e",
-    "synchronous whole periods": "97dd3d32e5ae",
-    "synchronous long dead time": "10d522d54136",
-    "gated gaussian": "443a62a92ec5",
-    "gated returns": "7f6339138fe4",
-    "gated sampled": "dc4108905423",
-    "gated waveform": "abc2a80584fd",
-    "gated stationary": "27a946319e0f",
-    "gated stationary waveform": "890a8a12c901",
-    "gated whole periods": "082281f9b5d4",
-    "gated long dead time": "ab90f27dc963",
-    "moving gaussian": "91c830aa01b6",
-    "moving returns": "4414a691fc0d",
-    "moving sampled": "da91575ce999",
-    "moving waveform": "fe843247cb81",
-    "moving whole periods": "a5e1cc36b6dc",
+    "paralyzable gaussian": "195c64d00133",
+    "paralyzable returns": "0746b1a76141",
+    "paralyzable sampled": "09a4993f2b09",
+    "paralyzable waveform": "bbf85cb92979",
+    "paralyzable stationary": "9cb3fca214e0",
+    "paralyzable stationary waveform": "8dbfe198298a",
+    "paralyzable whole periods": "95832b01433d",
+    "paralyzable long dead time": "b1c2de556d0f",
+    "synchronous gaussian": "5e2fb06ab885",
+    "synchronous returns": "2f1c241ef0d2",
+    "synchronous sampled": "96f180e01f65",
+    "synchronous waveform": "e23bb5c64d7f",
+    "synchronous stationary": "fac5eb740995",
+    "synchronous stationary waveform": "12cdfd8f949c",
+    "synchronous whole periods": "30365f65cb2c",
+    "synchronous long dead time": "434dfebbb61e",
+    "gated gaussian": "1ccd551675ad",
+    "gated returns": "c2337b2c598a",
+    "gated sampled": "431a09af007d",
+    "gated waveform": "96f0446f147c",
+    "gated stationary": "fa61095eae92",
+    "gated stationary waveform": "dd4589e48507",
+    "gated whole periods": "89c8e0890dda",
+    "gated long dead time": "7d1f00c9c48d",
+    "moving gaussian": "012d4c326ae5",
+    "moving returns": "5b03b7940810",
+    "moving sampled": "b8ba805d477c",
+    "moving waveform": "c2e7cf93ecb5",
+    "moving whole periods": "ffa11c61a6ed",
 }
 KINDS = [
     (mode, kind)

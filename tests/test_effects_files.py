@@ -21,9 +21,9 @@ from mars_lidar import (
     io,
 )
 from mars_lidar.cli import app
-from mars_lidar.compare.views import predicted_counts
 from mars_lidar.engines import ENGINES
 from mars_lidar.instrument.effects import EFFECTS, FIELDS, TIMING_EFFECTS
+from mars_lidar.plot.views import predicted_counts
 
 REAL = Detector(
     dead_time_ns=20.0,

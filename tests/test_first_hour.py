@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import time
 
 import imageio.v3 as imageio
@@ -16,8 +18,8 @@ from mars_lidar import io
 from mars_lidar._base import progress as bars
 from mars_lidar.cli import app
 from mars_lidar.cli.simulate import each_ns
-from mars_lidar.compare.comparison import compare
 from mars_lidar.io.advice import advice
+from studies.compare.comparison import compare
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=50, bins=64, pulse=ml.GaussianPulse(sigma_ns=0.5), detector=ml.Detector(dead_time_ns=50.0)
@@ -133,8 +135,7 @@ def test_several_returns_go_into_a_flux():
 
 def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
     """Pixels without a detection have a depth that is a guess: the table counted it, the picture did not."""
-    pytest.importorskip("skimage")
-    from mars_lidar.compare.views import depth_error_m
+    from mars_lidar.plot.views import depth_error_m
     from mars_lidar.reconstruct.quality import errors_against
 
     flux = ml.Scene.example("room", size=12).flux(SYSTEM, signal=0.02, sbr=0.5)
@@ -146,6 +147,45 @@ def test_depth_is_judged_in_the_table_as_in_the_picture(tmp_path):
         told = errors_against(cube, found)["depth"]
     assert told.rmse == pytest.approx(float(np.sqrt(np.nanmean(drawn**2))))
     assert told.missing == pytest.approx(1.0 - float(found.seen.mean()))
+
+
+def test_what_an_earlier_run_did_is_no_part_of_the_speed(monkeypatch, capsys):
+    """`generate --resume`: 90 of 100 parts were there, 5 more took 40 s, so that 5 take another 40 s."""
+    now = [0.0]
+    monkeypatch.setattr(bars.time, "monotonic", lambda: now[0])
+    bar = bars.Bar("generating")
+    bar(90, 100)
+    now[0] = 40.0
+    bar(95, 100)
+    assert "95 % after 40 s, about 40 s left" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ml.Detector(dead_time=50), r"Detector has no argument 'dead_time' \(did you mean 'dead_time_ns'\?\)"),
+        (lambda: ml.Detector(50), r"by name: Detector\(dead_time_ns=\.\.\.\)"),
+        (lambda: ml.GaussianPulse(0.3), r"by name: GaussianPulse\(sigma_ns=\.\.\.\)"),
+        (lambda: ml.GaussianPulse.from_fwhm(0.3), r"by name: GaussianPulse\.from_fwhm\(fwhm_ns=\.\.\.\)"),
+        (lambda: ml.System(period=100), "did you mean 'period_ns'"),
+        (lambda: ml.Flux(signals=1.0), "did you mean 'signal'"),
+        (lambda: ml.Scene(depth=np.ones((2, 2))), "did you mean 'depth_m'"),
+        (lambda: ml.Detector(), "missing a required argument: 'dead_time_ns'"),
+    ],
+)
+def test_a_wrong_keyword_names_the_argument_that_was_meant(call, message):
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+def test_the_package_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "mars_lidar", "--version"], capture_output=True, text=True)
+    assert done.stdout.strip() == f"mars-lidar {ml.__version__}"
+
+
+def test_objects_are_drawn_in_a_notebook():
+    for each in (ml.Detector(dead_time_ns=50.0, recovery_ns=5.0), SYSTEM.pulse, ml.SampledPulse([0, 1, 3, 1], 0.5)):
+        assert "data:image/png;base64" in each._repr_html_()
 
 
 def test_small_words():

@@ -9,13 +9,20 @@ from typer.testing import CliRunner
 
 import mars_lidar as ml
 from mars_lidar.cli import app
-from mars_lidar.instrument.instruments import ASSUMED, INSTRUMENTS, sourced, table
+from mars_lidar.instrument.presets import ASSUMED, INSTRUMENTS, PRESETS, sourced, table
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_the_documentation_is_the_declaration():
     assert table() in (ROOT / "docs/detectors.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_of_a_detector_can_be_written(tmp_path, name):
+    path = tmp_path / "system.yaml"
+    assert CliRunner().invoke(app, ["init", "--preset", name, str(path)]).exit_code == 0
+    assert ml.System.load(path).detector == ml.Detector.preset(name)
 
 
 @pytest.mark.parametrize("name", INSTRUMENTS)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mars_lidar.scene.raycast import Box, Camera, Sphere, cast
+from mars_lidar.scene.rooms import Box, Camera, Sphere, cast
 from mars_lidar.scene.scene import Scene
 
 

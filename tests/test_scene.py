@@ -193,7 +193,7 @@ def test_ambient_is_the_map_where_there_is_one(scene, system):
 
 
 def test_dark_counts_come_on_top(scene, system):
-    flux = scene.flux(system, signal=2.0, sbr=4.0, dark_counts_per_s=1e5)
+    flux = scene.flux(system, signal=2.0, sbr=4.0, dark_count_hz=1e5)
     assert flux.background.mean() == pytest.approx(0.5 + 0.01, rel=1e-12)  # 1e5 /s in 100 ns
     assert flux.info["achieved_sbr"] == pytest.approx(4.0, rel=1e-12)
     assert flux.info["achieved_sbr_with_dark"] == pytest.approx(2.0 / 0.51, rel=1e-12)
@@ -204,7 +204,7 @@ def test_dark_counts_are_counts_whatever_the_efficiency(scene, system):
     blind = system.replace(detector=replace(system.detector, detection_efficiency=0.25))
     noisy = system.replace(detector=replace(blind.detector, dark_count_hz=1e5))
     light = scene.flux(blind, signal=2.0, sbr=4.0)
-    given = scene.flux(blind, signal=2.0, sbr=4.0, dark_counts_per_s=1e5)
+    given = scene.flux(blind, signal=2.0, sbr=4.0, dark_count_hz=1e5)
     expected = 0.25 * light.background + 0.01
     for flux in (given.detected(blind), light.detected(noisy), light.with_dark_counts(1e5, blind).detected(blind)):
         np.testing.assert_allclose(flux.background, expected, rtol=1e-12)
@@ -216,7 +216,7 @@ def test_no_ambient_light(scene, system):
     assert (flux.background == 0.0).all()
     assert flux.info["sbr"] is None
     assert flux.info["achieved_sbr"] is None
-    dark = scene.flux(system, signal=2.0, sbr=math.inf, dark_counts_per_s=1e3)
+    dark = scene.flux(system, signal=2.0, sbr=math.inf, dark_count_hz=1e3)
     np.testing.assert_allclose(dark.background, 1e-4, rtol=1e-15)
     assert dark.info["achieved_sbr_with_dark"] == pytest.approx(2e4, rel=1e-12)
 
@@ -258,7 +258,7 @@ def test_no_warning_where_nothing_is_lost(scene, system):
 
 
 def test_info_is_plain_json_and_repeats_the_request(scene, system):
-    flux = scene.flux(system, signal=1.5, sbr=3.0, attenuation="inverse_square", dark_counts_per_s=50.0)
+    flux = scene.flux(system, signal=1.5, sbr=3.0, attenuation="inverse_square", dark_count_hz=50.0)
     info = json.loads(json.dumps(flux.info, allow_nan=False))
     assert info == flux.info
     expected = {
@@ -266,7 +266,7 @@ def test_info_is_plain_json_and_repeats_the_request(scene, system):
         "sbr": 3.0,
         "attenuation": "inverse_square",
         "ambient": "uniform",
-        "dark_counts_per_s": 50.0,
+        "dark_count_hz": 50.0,
         "n_pixels": 35,
         "n_valid": 35,
         "n_wrapped": 0,
@@ -299,7 +299,7 @@ def test_extreme_depths_and_maps_do_not_overflow(system):
         ({"attenuation": "1/z2"}, ValueError, "attenuation must be one of 'none', 'inverse_square', got"),
         ({"ambient": "dark"}, ValueError, "ambient must be one of 'uniform', 'reflectivity', 'map', got"),
         ({"ambient": "map"}, ValueError, "ambient='map' needs a scene with a background map"),
-        ({"dark_counts_per_s": -1.0}, ValueError, "dark_counts_per_s must be"),
+        ({"dark_count_hz": -1.0}, ValueError, "dark_count_hz must be"),
         ({"system": None}, TypeError, "system must be a System, got None"),
         ({"signal": 1e7}, ValueError, r"signal must lie in \[0, 1e\+06\]"),
     ],

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar.cli import app
+from studies.compare.command import app as compare_app
 
 SMALL = ["--period-ns", "20", "--cycles", "30", "--bins", "64", "--dead-time-ns", "5"]
 
@@ -35,6 +36,10 @@ def transient(tmp_path):
     return tmp_path
 
 
+def compared(*arguments: object):
+    return CliRunner().invoke(compare_app, [str(each) for each in arguments])
+
+
 def options_of(*names: str) -> dict[str, object]:
     command = get_command(app)
     for name in names:
@@ -43,7 +48,8 @@ def options_of(*names: str) -> dict[str, object]:
 
 
 def test_the_commands_that_take_a_system_take_the_same_options():
-    simulate, compare, table = options_of("simulate"), options_of("compare"), options_of("table", "build")
+    simulate, table = options_of("simulate"), options_of("table", "build")
+    compare = {opt: p.help for p in get_command(compare_app).params for opt in p.opts if opt.startswith("--")}
     system = list(simulate)[list(simulate).index("--system") : list(simulate).index("--max-events-per-exposure") + 1]
     assert len(system) > 30
     assert {"--detector", "--mode", "--jitter-fwhm-ns", "--electronics-dead-time-ns", "--crosstalk"} < set(system)
@@ -56,8 +62,7 @@ def test_the_commands_that_take_a_system_take_the_same_options():
 def test_effects_reach_compare(tmp_path):
     out = tmp_path / "c.json"
     effects = ["--detector", "excelitas-spcm-aqrh", "--jitter-fwhm-ns", "0.4", "--electronics-dead-time-ns", "90"]
-    done = run(
-        "compare",
+    done = compared(
         "--scene",
         "room",
         "--size",
@@ -85,7 +90,7 @@ def test_effects_reach_compare(tmp_path):
     preset = ml.Detector.preset("excelitas-spcm-aqrh")
     jitter = ml.Jitter.from_fwhm(fwhm_ns=0.4)
     assert detector == replace(preset, jitter=jitter, electronics_dead_time_ns=90.0)
-    refused = run("compare", "--scene", "room", "--crosstalk", 0.1, "--against", "sequential", "-o", tmp_path / "d.png")
+    refused = compared("--scene", "room", "--crosstalk", 0.1, "--against", "sequential", "-o", tmp_path / "d.png")
     assert refused.exit_code == 2
     assert "compare draws single pixels" in refused.stderr
 
@@ -116,8 +121,7 @@ def test_a_scene_file_of_a_transient_is_its_options(transient):
     by_file, _ = simulated(out, "--scene", transient / "scene.yaml", "--transient-start-ns", 3, "--signal", 2)
     assert np.array_equal(by_file, by_options)
     png = transient / "c.png"
-    done = run(
-        "compare",
+    done = compared(
         "--scene",
         transient / "scene.yaml",
         *SMALL,

@@ -13,7 +13,7 @@ import mars_lidar as ml
 import studies
 from mars_lidar.statistics import ConvergenceError, count_law
 from mars_lidar.statistics.chain import PhaseChain
-from mars_lidar.statistics.count_window import gaussian_window
+from mars_lidar.statistics.count_pmf import gaussian_window
 from mars_lidar.statistics.distance import Pmf, g_test, sampling_floor, total_variation, variance_score
 from studies import STUDIES, Request
 from studies.__main__ import main

@@ -39,7 +39,7 @@ def test_bins_that_fit_the_period_are_taken_over(light):
 
 
 def test_levels_are_means_over_the_pixels_with_light(light):
-    flux = ml.Flux.from_transient(light, SYSTEM, bin_ns=0.5, signal=1.5, sbr=3.0, dark_counts_per_s=1e6)
+    flux = ml.Flux.from_transient(light, SYSTEM, bin_ns=0.5, signal=1.5, sbr=3.0, dark_count_hz=1e6)
     lit = np.ones((5, 3), bool)
     lit[1, 2] = False
     assert flux.signal[lit].mean() == pytest.approx(1.5, rel=1e-12)
@@ -47,7 +47,7 @@ def test_levels_are_means_over_the_pixels_with_light(light):
     np.testing.assert_allclose(flux.background, 1.5 / 3.0 + 1e6 * 100e-9, rtol=1e-14)
     assert flux.info["mean_signal"] == pytest.approx(1.5)
     blind = SYSTEM.replace(detector=replace(SYSTEM.detector, detection_efficiency=0.25))
-    flux = ml.Flux.from_transient(light, blind, bin_ns=0.5, signal=1.5, sbr=3.0, dark_counts_per_s=1e6)
+    flux = ml.Flux.from_transient(light, blind, bin_ns=0.5, signal=1.5, sbr=3.0, dark_count_hz=1e6)
     np.testing.assert_allclose(flux.detected(blind).background, 0.25 * 1.5 / 3.0 + 1e6 * 100e-9, rtol=1e-14)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mars_lidar import Scene, Table, simulate
 from mars_lidar.engines import Engine, MarsEngine, RenewalEngine
 from mars_lidar.learn import CubeStream, Uniform
-from mars_lidar.table.start_phase import StartPhases
+from mars_lidar.table.entries import StartPhases
 from studies.common.sample import system_of
 from studies.neural import NeuralEngine
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mars_lidar import JointLaw
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.joint_pixel import Pixel
+from mars_lidar.statistics.joint import Pixel
 from studies.joint.cases import OFTEN, Case
 from studies.joint.covariance import Outcome, named
 

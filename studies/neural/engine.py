@@ -21,8 +21,8 @@ from mars_lidar.engines.synthesis import Batch, Run
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.statistics import photons_per_bin
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.pmf import gaussian_window
-from mars_lidar.statistics.shape import pixel_of
+from mars_lidar.statistics.count_pmf import gaussian_window
+from mars_lidar.statistics.histogram import pixel_of
 from studies.neural.model import NeuralMap
 
 

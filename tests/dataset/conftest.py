@@ -21,7 +21,7 @@ def recipe() -> dict[str, Any]:
         "seed": 5,
         "scenes": [{"example": "room", "size": [12, 10], "seeds": [0, 3]}],
         "systems": [SYSTEM, SYSTEM.replace(cycles=80)],
-        "light": {"signal": [0.2, 1.0], "sbr": "inf", "dark_counts_per_s": 1e5},
+        "light": {"signal": [0.2, 1.0], "sbr": "inf", "dark_count_hz": 1e5},
         "realizations": 3,
         "store": {"chunk_mib": 0.004, "shard_mib": 0.016},
     }

@@ -47,12 +47,6 @@ def test_a_scene_means_the_same_in_a_recipe_a_scene_file_and_python(tmp_path, be
     with xarray.open_zarr(tmp_path / "set.zarr") as data:
         again = ml.simulate(view.flux, SYSTEM, seed=int(data.seed[0]))
         assert np.array_equal(data.histogram[0], again)
-    compared = ["--engines", "exact,poisson", "--pixels", 1, "--realizations", 50, "--repeats", 1]
-    done = run("compare", "--scene", tmp_path / "scene.yaml", "--system", tmp_path / "spad.yaml", *compared)
-    assert done.exit_code == 2  # no --out
-    more = ["-o", tmp_path / "c.png"]
-    done = run("compare", "--scene", tmp_path / "scene.yaml", "--system", tmp_path / "spad.yaml", *compared, *more)
-    assert done.exit_code == 0, done.output
 
 
 def test_layers_of_a_file_are_simulated_too(tmp_path):

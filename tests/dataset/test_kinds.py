@@ -73,7 +73,7 @@ def test_transients(tmp_path, of_transients, renders):
         one = data.isel(sample=k)
         file = tmp_path / ("a.npz", "b.h5", "c.mat")[int(one.scene)]
         system = stored.recipe.systems[int(one.system)]
-        level = {"signal": float(one.signal_level), "sbr": float(one.sbr), "dark_counts_per_s": 1e5}
+        level = {"signal": float(one.signal_level), "sbr": float(one.sbr), "dark_count_hz": 1e5}
         flux = io.read_transient(file).flux(system, **level)
         np.testing.assert_array_equal(one.histogram, ml.simulate(flux, system, realizations=3, seed=int(one.seed)))
         np.testing.assert_allclose(one.signal, flux.signal, rtol=1e-6)
@@ -104,7 +104,7 @@ def test_crops_and_sizes_of_transients(tmp_path, of_transients, renders, monkeyp
         assert len(places) == 1
     assert not np.array_equal(*crops)
     system = stored.recipe.systems[0]
-    flux = stored.scene(1).flux(system, signal=0.2, sbr=np.inf, dark_counts_per_s=1e5, pulse=False)
+    flux = stored.scene(1).flux(system, signal=0.2, sbr=np.inf, dark_count_hz=1e5, pulse=False)
     cube = ml.simulate(flux, system, realizations=3, seed=int(stored.seeds[4]))
     np.testing.assert_array_equal(np.asarray(stored.histogram[4]), cube)
     assert verify(tmp_path / "set.zarr", chunks=None).good
@@ -119,7 +119,7 @@ def test_fog_and_panes(tmp_path, recipe):
     scene = LayeredScene.behind_pane(room, **PANE)
     for k in range(8):
         system, signal, fog = stored.recipe.systems[k // 2 % 2], (0.2, 1.0)[k % 2], FOGS[k // 4]
-        clear = scene.flux(system, signal=signal, sbr=2.0, attenuation="inverse_square", dark_counts_per_s=1e5)
+        clear = scene.flux(system, signal=signal, sbr=2.0, attenuation="inverse_square", dark_count_hz=1e5)
         flux = clear.in_fog(system, **fog | {"backscatter": signal * fog["backscatter"]})
         cube = ml.simulate(flux, system, realizations=3, seed=int(stored.seeds[k]))
         np.testing.assert_array_equal(np.asarray(stored.histogram[k]), cube)
@@ -144,7 +144,7 @@ def test_layers_of_a_file(tmp_path, recipe):
     delay = SYSTEM.delay_ns(np.nan_to_num(depth))
     fluxes = [ml.Flux(one / total.sum(0).mean(), 0.0, tau) for one, tau in zip(total, delay, strict=True)]
     flux = ml.Flux.multi(*fluxes, ml.Flux(0.0, 1e5 * 100e-9))  # signal 1
-    made = read.flux(SYSTEM, signal=1.0, sbr=np.inf, dark_counts_per_s=1e5)
+    made = read.flux(SYSTEM, signal=1.0, sbr=np.inf, dark_count_hz=1e5)
     np.testing.assert_allclose(made.returns_signal, flux.returns_signal[:3], rtol=1e-12)
     np.testing.assert_allclose(made.background, flux.background, rtol=1e-12)
     cube = ml.simulate(made, SYSTEM, realizations=3, seed=int(stored.seeds[1]))

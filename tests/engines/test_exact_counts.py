@@ -160,7 +160,7 @@ def test_usual_pixels_are_drawn_as_before():
 def test_parts_batches_and_threads_do_not_show(monkeypatch: pytest.MonkeyPatch):
     from mars_lidar.engines import count_shape as _count_shape
     from mars_lidar.engines import synthesis as _synthesis
-    from mars_lidar.statistics import pmf as _pmf
+    from mars_lidar.statistics import count_pmf as _pmf
 
     flux = doubted(pixels=160)
     whole = ml.simulate(flux, SYSTEM, engine="mars", table=table(), realizations=3, threads=2)

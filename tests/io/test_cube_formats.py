@@ -16,8 +16,8 @@ from store_cases import SYSTEM, one_return
 import mars_lidar as ml
 from mars_lidar import io
 from mars_lidar._base import optional
-from mars_lidar.compare.views import incident_rate
 from mars_lidar.io import mat, recipe
+from mars_lidar.plot.views import incident_rate
 
 FIELD_MAT = Path(__file__).resolve().parents[2].parent / "shared/data/rgbd/nyuv2_home_office_spad_0161_p1.mat"
 PTU = pytest.param(

@@ -14,8 +14,8 @@ from scipy.io import savemat
 
 import mars_lidar as ml
 from mars_lidar import io
-from mars_lidar.compare.views import fitted
 from mars_lidar.io.foreign import read_counts
+from mars_lidar.plot.views import fitted
 
 SYSTEM = ml.System(
     period_ns=50.0,

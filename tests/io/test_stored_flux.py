@@ -89,8 +89,8 @@ def test_effects_of_a_detector(transient, tmp_path):
 @pytest.mark.parametrize("suffix", [".zarr", ".h5", ".npz"])
 @pytest.mark.usefixtures("small_bands")
 def test_cubes_are_those_of_the_flux_in_memory(transient, tmp_path, suffix):
-    stored = transient.stored_flux(SYSTEM, photons_per_unit=0.01, dark_counts_per_s=1e5)
-    whole = transient.flux(SYSTEM, photons_per_unit=0.01, dark_counts_per_s=1e5)
+    stored = transient.stored_flux(SYSTEM, photons_per_unit=0.01, dark_count_hz=1e5)
+    whole = transient.flux(SYSTEM, photons_per_unit=0.01, dark_count_hz=1e5)
     out = tmp_path / f"cube{suffix}"
     io.simulate_to(out, stored, SYSTEM, realizations=2, seed=4)
     with io.load(out) as cube:

@@ -10,7 +10,6 @@ import mars_lidar as ml
 from mars_lidar.learn import (
     armed_periods,
     bin_photons,
-    cyclic_solver,
     expected_histogram,
     forward,
     histogram_log_likelihood,
@@ -98,7 +97,7 @@ def test_transforms_of_torch_func(start):
 def test_blocks_of_another_size_are_solved_alike(monkeypatch):
     at = point(*AT)
     whole = expected_histogram(*at, system())
-    monkeypatch.setattr(cyclic_solver, "_BLOCK", 1)
+    monkeypatch.setattr(forward, "_ROWS", 1)
     monkeypatch.setattr(forward, "_BLOCK", 1)
     parts = expected_histogram(*at, system())
     torch.testing.assert_close(parts, whole, rtol=1e-11, atol=0)

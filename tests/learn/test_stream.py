@@ -17,8 +17,8 @@ from torch.utils.data import DataLoader
 
 import mars_lidar as ml
 from mars_lidar.learn import Choice, CubeStream, LogUniform, SystemRange, Uniform
-from mars_lidar.learn.ahead import ahead
-from mars_lidar.learn.scene_cache import SharedScenes
+from mars_lidar.learn.scenes import SharedScenes
+from mars_lidar.learn.stream import prefetched
 
 SYSTEM = ml.System(
     period_ns=100.0, cycles=60, bins=64, pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=30.0)
@@ -493,7 +493,7 @@ def test_examples_are_made_ahead_in_order_and_what_fails_is_told():
                 raise OSError("a file is gone")
             yield k
 
-    got = ahead(items(), 2)
+    got = prefetched(items(), 2)
     assert [next(got) for _ in range(4)] == [0, 1, 2, 3]
     with pytest.raises(OSError, match="a file is gone"):
         next(got)
@@ -508,7 +508,7 @@ def test_a_stream_that_is_left_makes_no_more():
             made.append(k)
             yield k
 
-    got = ahead(items(), 2)
+    got = prefetched(items(), 2)
     assert next(got) == 0
     got.close()
     number = len(made)

@@ -13,9 +13,7 @@ from mars_lidar.statistics import ConvergenceError, PhaseChain
 from mars_lidar.statistics import cells as cells_module
 from mars_lidar.statistics import exposure as exposure_module
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import exposure_moments
-from mars_lidar.statistics.native_light import native_light
-from mars_lidar.statistics.stationary import stationary_histogram
+from mars_lidar.statistics.exposure import exposure_moments, native_light, stationary_histogram
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar.statistics import fine_bins, joint
+from mars_lidar.statistics import cells, joint
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.histogram import mean_histogram
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.phase_chain import ConvergenceError
 
 BINS = 150_001  # no grid of a power of two is a multiple of it
 
@@ -58,7 +58,7 @@ def test_mean_histogram(name: str, monkeypatch: pytest.MonkeyPatch):
     for method in ("exposure", "stationary"):
         found = ml.registration_pdf(signal, background, system, method, **light_of(waveform))
         with monkeypatch.context() as patch:
-            patch.setattr(fine_bins, "MANY_BINS", 2**20)
+            patch.setattr(cells, "MANY_BINS", 2**20)
             patch.setattr("mars_lidar.statistics.histogram.LAW_STEPS", 10**9)  # a reference may take its time
             known = ml.registration_pdf(signal, background, system, method, **light_of(waveform))
         assert 0.5 * np.abs(found - known).sum() < 1e-6
@@ -114,9 +114,9 @@ def test_light_that_cells_do_not_see():
     system = view(0.45, 100, 2e-6)
     cell = Cells.of(8.0, 0.2, system, delay_ns=33.3)
     edges = np.arange(BINS + 1) / BINS
-    light = fine_bins.light_before(cell, edges)
-    coarse = fine_bins.light_before(cell, np.arange(2**15 + 1) / 2**15)
-    assert fine_bins.misplaced(coarse, edges, light) > 0.3
+    light = cells.light_before(cell, edges)
+    coarse = cells.light_before(cell, np.arange(2**15 + 1) / 2**15)
+    assert cells.misplaced(coarse, edges, light) > 0.3
     histogram = mean_histogram(8.0, 0.2, system, delay_ns=33.3)
     known = mean_histogram(8.0, 0.2, system.replace(bins=1001), delay_ns=33.3)
     assert abs(histogram[: BINS // 2].sum() - known[:500].sum() - 0.5 * known[500]) < 1e-3 * known.sum()

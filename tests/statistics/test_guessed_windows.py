@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import mars_lidar as ml
-from mars_lidar.statistics import pmf as _pmf
+from mars_lidar.statistics import count_pmf as _pmf
 from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.count_pmf import exact_windows, guessed_windows
 from mars_lidar.statistics.distance import total_variation
 from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.statistics.pmf import exact_windows, guessed_windows
 
 SYSTEM = ml.System(
     period_ns=100.0,

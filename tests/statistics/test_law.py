@@ -10,7 +10,7 @@ from scipy import stats
 
 import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, mars_moments
-from mars_lidar.statistics import pmf as pmf_module
+from mars_lidar.statistics import count_pmf as pmf_module
 from mars_lidar.statistics.law import count_law, registration_pdf
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"

@@ -15,12 +15,11 @@ import mars_lidar as ml
 from benchmarks.law_map import disagreements, draw, laws
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram
 from mars_lidar.statistics import cells as cells_module
+from mars_lidar.statistics import count_pmf as pmf_module
 from mars_lidar.statistics import exposure as exposure_module
-from mars_lidar.statistics import joint_pixel as pixel_module
-from mars_lidar.statistics import pmf as pmf_module
+from mars_lidar.statistics import joint as pixel_module
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.joint_factors import left_over
-from mars_lidar.statistics.joint_grid import FoldedGrid
+from mars_lidar.statistics.joint_grid import FoldedGrid, left_over
 
 PERIOD_NS = 100.0
 

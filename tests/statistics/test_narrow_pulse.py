@@ -18,7 +18,7 @@ import mars_lidar as ml
 from mars_lidar.statistics import ConvergenceError, exposure_moments, mean_histogram, paralyzable_moments
 from mars_lidar.statistics.cells import Cells
 from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.table.start_phase import start_phases
+from mars_lidar.table.entries import start_phases
 
 PERIOD_NS = 100.0
 WIDE = 1e-3

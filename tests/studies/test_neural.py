@@ -10,10 +10,10 @@ import pytest
 from harness import mean_vector, require
 
 import mars_lidar as ml
-from mars_lidar.compare.comparison import compare
 from mars_lidar.engines import find_engine
 from mars_lidar.statistics import PhaseChain, holding_times
 from studies.__main__ import main
+from studies.compare.comparison import compare
 from studies.neural import FluxRange, NeuralEngine, NeuralMap, Training, train
 from studies.neural.pairs import Pairs
 

@@ -10,9 +10,8 @@ import mars_lidar as ml
 from mars_lidar import _core
 from mars_lidar.statistics import exposure_moments
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure_result import blank
-from mars_lidar.statistics.native_light import native_light
-from mars_lidar.table.start_phase import start_phases
+from mars_lidar.statistics.exposure import blank, native_light
+from mars_lidar.table.entries import start_phases
 
 PHASES = np.array([0, 60, 200, 240, 256, 262, 300, 400, 512])
 GRID = 512

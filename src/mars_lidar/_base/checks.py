@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -44,7 +45,7 @@ def choice(name: str, value: Any, allowed: tuple[str, ...]) -> str:
     """One of a few strings."""
     if not isinstance(value, str) or value not in allowed:
         told = f"{name} must be one of {', '.join(map(repr, allowed))}"
-        raise ValueError(f"{told}, got {value!r}{_meant(value, allowed)}")
+        raise ValueError(f"{told}, got {value!r}{did_you_mean(value, allowed)}")
     return value
 
 
@@ -69,10 +70,15 @@ def numbers(name: str, value: Any) -> Any:
     """The value, unless an array made of it would hold anything but real numbers."""
     even_rows(name, value)
     dtype = getattr(value, "dtype", None)
-    if dtype is None and not hasattr(value, "__array__"):
-        dtype = np.asarray(value).dtype
-    if isinstance(dtype, np.dtype) and dtype.kind not in "biuf":
-        raise TypeError(f"{name} must be real numbers, got dtype {dtype}")
+    if not isinstance(dtype, np.dtype):
+        try:
+            dtype = np.asarray(value).dtype
+        except Exception as error:  # whatever makes an array of it, such as a tensor on another device
+            told = " ".join(str(error).split())
+            raise TypeError(f"{name} must be real numbers, got {type(value).__name__} ({told[:200]})") from None
+    if dtype.kind not in "biuf":
+        shown = type(value).__name__ if dtype.kind == "O" else f"dtype {dtype}"
+        raise TypeError(f"{name} must be real numbers, got {shown}")
     return value
 
 
@@ -82,11 +88,12 @@ def known_keys(name: str, mapping: Any, allowed: tuple[str, ...]) -> dict[str, A
         raise TypeError(f"{name} must be a mapping with keys {', '.join(allowed)}, got {mapping!r}")
     unknown = [key for key in mapping if key not in allowed]
     if unknown:
-        meant = _meant(unknown[0], allowed)
+        meant = did_you_mean(unknown[0], allowed)
         raise ValueError(f"{name} has unknown key {unknown[0]!r}{meant}; allowed: {', '.join(allowed)}")
     return mapping
 
 
-def _meant(word: Any, allowed: tuple[str, ...]) -> str:
-    near = difflib.get_close_matches(str(word), allowed, 1)
+def did_you_mean(word: Any, allowed: Sequence[str]) -> str:
+    """`` (did you mean 'near'?)`` for the allowed word nearest to `word`, or an empty text where none is near."""
+    near = difflib.get_close_matches(str(word), [str(each) for each in allowed], 1)
     return f" (did you mean {near[0]!r}?)" if near else ""

@@ -12,15 +12,14 @@ from typing import Annotated, Any
 
 import typer
 
-from mars_lidar.cli.compare import COMPARE_EPILOG, compare
 from mars_lidar.cli.convert import CONVERT_EPILOG, TIMESTAMPS_EPILOG, convert, timestamps
 from mars_lidar.cli.explore import EXPLORE_EPILOG, explore
 from mars_lidar.cli.export import EXPORT_EPILOG, export
 from mars_lidar.cli.generate import GENERATE_EPILOG, generate, verify
-from mars_lidar.cli.groups import grouped
+from mars_lidar.cli.groups import flowing_help, grouped
 from mars_lidar.cli.info import info, view
 from mars_lidar.cli.init import init, schema
-from mars_lidar.cli.measured import CALIBRATE_EPILOG, INSPECT_EPILOG, VALIDATE_EPILOG, calibrate, inspect, validate
+from mars_lidar.cli.measured import CALIBRATE_EPILOG, calibrate
 from mars_lidar.cli.reconstruct import RECONSTRUCT_EPILOG, reconstruct
 from mars_lidar.cli.simulate import EPILOG, simulate
 from mars_lidar.cli.table import app as table_app
@@ -36,15 +35,11 @@ app = typer.Typer(
 
 
 def _add(command: Callable[..., None], epilog: str | None = None, **more: Any) -> None:
-    """A command whose help flows: typer keeps the line ends of a docstring, whatever the width of the screen."""
-    paragraphs = (command.__doc__ or "").split("\n\n")
-    shown = "\n\n".join(" ".join(text.split()) for text in paragraphs)
-    app.command(help=shown, epilog=epilog, **more)(grouped(command))
+    app.command(help=flowing_help(command), epilog=epilog, **more)(grouped(command))
 
 
 for _command, _epilog in (
     (simulate, EPILOG),
-    (compare, COMPARE_EPILOG),
     (generate, GENERATE_EPILOG),
     (verify, None),
     (export, EXPORT_EPILOG),
@@ -52,9 +47,7 @@ for _command, _epilog in (
     (view, None),
     (convert, CONVERT_EPILOG),
     (timestamps, TIMESTAMPS_EPILOG),
-    (inspect, INSPECT_EPILOG),
     (calibrate, CALIBRATE_EPILOG),
-    (validate, VALIDATE_EPILOG),
     (reconstruct, RECONSTRUCT_EPILOG),
 ):
     _add(_command, _epilog, no_args_is_help=True)
@@ -70,7 +63,8 @@ _EPILOG = "\n\n".join(
         "mars-lidar simulate --scene room -o room.zarr",
         "mars-lidar info room.zarr",
         "mars-lidar view room.zarr --pixel 40,64 -o pixel.png",
-        "Exit codes: 0 done, 1 failed, 2 bad input, 130 interrupted. [bold]mars-lidar COMMAND --help[/bold] says more.",
+        "Exit codes: 0 done, 1 failed, 2 bad input, 3 a model that does not fit, 130 interrupted. "
+        "[bold]mars-lidar COMMAND --help[/bold] says more.",
     )
 )
 

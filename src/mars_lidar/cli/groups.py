@@ -40,6 +40,11 @@ def panel(name: str) -> Callable[..., Any]:
     return partial(option, rich_help_panel=name)
 
 
+def flowing_help(command: Callable[..., None]) -> str:
+    """The docstring in paragraphs that flow: typer keeps its line ends, whatever the width of the screen."""
+    return "\n\n".join(" ".join(text.split()) for text in (command.__doc__ or "").split("\n\n"))
+
+
 def examples(*lines: str) -> str:
     """The end of a command's help."""
     return "\n\n".join(("[bold]Examples[/bold]", *lines))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from mars_lidar._base import checks
 from mars_lidar.cli.console import refuse_existing, reported, table
 from mars_lidar.cli.groups import argument, option
 from mars_lidar.cli.options import out as out_option
 from mars_lidar.cli.system_options import DEFAULT_SYSTEM
 from mars_lidar.instrument.effects import FIELDS
-from mars_lidar.instrument.instruments import INSTRUMENTS, sourced
+from mars_lidar.instrument.presets import INSTRUMENTS, PRESETS, sourced
 
 _FILE = Path("system.yaml")
 # The values are those of `system_options.DEFAULT_SYSTEM`; a test reads the file back and compares.
@@ -69,15 +70,16 @@ def commented(file: Path) -> str:
 
 def of_instrument(name: str) -> str:
     """A system file of an instrument, each value with its source; a detector alone gets the default's laser."""
-    told = sourced(name)
+    checks.choice("preset", name, tuple(PRESETS))
+    fields = sourced(name) if name in INSTRUMENTS else {"preset": (name, "fields as published: docs/detectors.md")}
     of_default = "not of the detector: the default of mars-lidar"
     default = {key: (getattr(DEFAULT_SYSTEM, key), of_default) for key in ("period_ns", "cycles", "bins")}
-    laser = {**default, "pulse_fwhm_ns": (0.5, of_default), **INSTRUMENTS[name].get("laser", {})}
+    laser = {**default, "pulse_fwhm_ns": (0.5, of_default), **INSTRUMENTS.get(name, {}).get("laser", {})}
     lines = [f"# {name}, for mars-lidar (docs/detectors.md). Check what is an assumption before you rely on it."]
     lines += [f"{key}: {value}  # {source}" for key, (value, source) in laser.items() if key != "pulse_fwhm_ns"]
     fwhm, source = laser["pulse_fwhm_ns"]
     lines += ["pulse:", "  kind: gaussian", f"  fwhm_ns: {fwhm}  # {source}", "detector:"]
-    lines += [f"  {key}: {value}  # {source}" for key, (value, source) in told.items() if key not in laser]
+    lines += [f"  {key}: {value}  # {source}" for key, (value, source) in fields.items() if key not in laser]
     return "\n".join([*lines, "start: armed", ""])
 
 
@@ -103,7 +105,7 @@ def schema(
 def init(
     file: Path = argument("Where to write it: .yaml or .yml. [dim]Default: system.yaml.[/dim]", _FILE),
     out: Path | None = out_option("The same, as with the other commands.", None, panel=None),
-    preset: str | None = option(f"An instrument: {', '.join(INSTRUMENTS)}."),
+    preset: str | None = option(f"An instrument: {', '.join(PRESETS)}."),
     overwrite: bool = option("Replace an existing file.", default=False),
 ) -> None:
     """Write a commented YAML file that describes a system: laser, detector, histogram.

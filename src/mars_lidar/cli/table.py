@@ -64,7 +64,7 @@ def build(
         }
         with progress_bar("building") as progress:
             if out is None:
-                path = cache.cached_path(Table, system, *axes, progress=progress, **chosen)
+                path = Table.cached_path(system, *axes, progress=progress, **chosen)
             else:
                 Table.build(system, *axes, progress=progress, **chosen).save(out, overwrite=overwrite)
                 path = out

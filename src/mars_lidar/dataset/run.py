@@ -11,7 +11,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Any
 
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import Interrupted, WriteError, check_target
+from mars_lidar._base.files import INCOMPLETE_SUFFIX, Interrupted, WriteError, check_target, exchange, open_own
 from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import Progress
@@ -29,9 +29,11 @@ from mars_lidar.dataset.cluster import Team
 from mars_lidar.dataset.ingest import create
 from mars_lidar.dataset.recipe import DatasetRecipe
 from mars_lidar.dataset.store import Dataset, Item, open_dataset
-from mars_lidar.dataset.write import Made, Maker
+from mars_lidar.dataset.write import Failed, Made, Maker
 from mars_lidar.io.scan import Problem
 
+_LOOK_S = 1.0  # after which it is looked whether there are more workers to give parts to
+_NAMED = 5  # parts that an error names
 BUFFER_BYTES = 512 * 2**20  # of all chunks that are made at the same time on one machine
 
 
@@ -93,7 +95,8 @@ def generate(
     resume
         Continue what was interrupted; of a complete store nothing is made. The recipe must be the same.
     overwrite
-        Replace an existing store.
+        Replace an existing store: by one that is made beside it, ``NAME.incomplete.zarr``, and takes its place when it
+        is complete. Who reads the old one gets an error then, never a mixture of both.
     threads
         Threads of this process; default: all processors it may use. With `workers`: of each worker, default 1.
     workers
@@ -130,10 +133,15 @@ def generate(
     if workers is not None or scheduler is not None:
         cluster.reach(scheduler)  # before the scenes are read
     with _alone(target):  # what is there is looked at under the lock: before, another run may have finished it
-        there = target.exists() and resume
+        successor = _successor(target)
+        if overwrite and successor.exists():
+            shutil.rmtree(successor)  # of a stopped run that is started again
+        replacing = overwrite and target.exists()  # by a store that is made beside it, or one that was begun so
+        store = successor if replacing or (resume and successor.exists()) else target
+        there = store.exists() and resume
         if there:
-            dataset = open_dataset(target, allow_incomplete=True)
-            _check_same(target, dataset, wanted)
+            dataset = open_dataset(store, allow_incomplete=True)
+            _check_same(store, dataset, wanted)
         elif wanted is None:
             raise ValueError(f"{target} does not exist: there is nothing to resume, and no recipe is given")
         check_target(target, folder=True, overwrite=overwrite or there)
@@ -141,8 +149,8 @@ def generate(
             if not there or not dataset.planned:
                 if wanted is None:
                     raise ValueError(f"{target} was stopped before its scenes were in: give the recipe again to resume")
-                create(target, wanted, folder)
-                dataset = open_dataset(target, allow_incomplete=True)
+                create(store, wanted, folder)
+                dataset = open_dataset(store, allow_incomplete=True)
             dataset.tidy()
             todo = [] if dataset.complete else dataset.missing()
             for item in todo:
@@ -158,12 +166,15 @@ def generate(
             if not dataset.complete:
                 dataset.tidy()  # of workers that were killed while others went on
                 dataset.finish()
+            if store != target:
+                exchange(store, target)
+                dataset = open_dataset(target)
         except KeyboardInterrupt:
-            raise Interrupted(f"interrupted; {_left(target)}") from None
+            raise Interrupted(f"interrupted; {_left(store, target)}") from None
         except OSError as error:
-            if isinstance(error, FileNotFoundError | FileExistsError) and not target.exists():
+            if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
                 raise
-            raise WriteError(error.errno, f"{error.strerror or error}; {_left(target)}") from error
+            raise WriteError(error.errno, f"{error.strerror or error}; {_left(store, target)}") from error
     problems = tuple(dataset.problems)
     shape = tuple(dataset.histogram.shape)
     seconds = time.perf_counter() - began
@@ -184,6 +195,8 @@ class _Totals:
 
     def __init__(self, done: int, total: int, progress: Progress | None) -> None:
         self._done, self._total, self._progress = done, total, progress
+        if progress is not None:
+            progress(done, total)  # what an earlier run has done, before this one begins
         self.simulate_s = self.write_s = 0.0
 
     def add(self, made: Made) -> None:
@@ -208,30 +221,48 @@ def _here(dataset: Dataset, parts: int, threads: int | None) -> Iterator[Team]:
     teams = max(1, min(team, parts, BUFFER_BYTES // chunk))
     stop, local = threading.Event(), threading.local()
 
-    def make(item: Item) -> Made:
+    def make(items: Sequence[Item]) -> list[Made | Failed]:
         if not hasattr(local, "maker"):
             local.maker = Maker(dataset, max(1, team // teams), stop)
-        made: Made = local.maker.make(item)
-        return made
+        return [local.maker.attempt(item) for item in items]
 
     with ThreadPoolExecutor(teams) as pool:
         try:
-            yield pool, make, teams
+            yield Team(pool, make, lambda: teams)
         except BaseException:
             stop.set()  # the simulator looks at it every 50 ms, and the pool waits for all threads
             raise
 
 
 def _make_all(team: AbstractContextManager[Team], todo: Sequence[Item], add: Callable[[Made], None]) -> None:
-    """Make parts, a few of them at a time."""
-    waiting = iter(todo)
-    with team as (executor, make, ahead):
-        running = {executor.submit(make, item) for item in itertools.islice(waiting, ahead)}
-        while running:
-            done, running = wait(running, return_when=FIRST_COMPLETED)
+    """Make parts, some of them at a time; raises WriteError at the end where some could not be written."""
+    waiting, failed, seconds = iter(todo), list[Failed](), 0.0
+    with team as crew:
+        running: set[Future[list[Made | Failed]]] = set()
+        while True:
+            while len(running) < crew.capacity():
+                batch = list(itertools.islice(waiting, crew.parts_of_a_task(seconds)))
+                if not batch:
+                    break
+                running.add(crew.executor.submit(crew.make, batch))
+            if not running:
+                break
+            done, running = wait(running, timeout=_LOOK_S, return_when=FIRST_COMPLETED)  # workers may come and go
             for future in done:
-                add(future.result())
-                running |= {executor.submit(make, item) for item in itertools.islice(waiting, 1)}
+                for each in future.result():
+                    if isinstance(each, Failed):
+                        failed.append(each)
+                        continue
+                    add(each)
+                    own = each.simulate_s + each.write_s
+                    seconds = own if seconds == 0.0 else 0.9 * seconds + 0.1 * own
+    if failed:
+        names = ", ".join(sorted(each.name for each in failed)[:_NAMED])
+        more = f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else ""
+        raise WriteError(
+            failed[0].number,
+            f"{len(failed)} parts could not be written in four attempts ({failed[0].reason}): {names}{more}",
+        )
 
 
 def making_bytes(chunk: Sequence[int], itemsize: int, waveform_parts: int) -> int:
@@ -256,18 +287,25 @@ def _check_same(target: Path, dataset: Dataset, wanted: DatasetRecipe | None) ->
             )
 
 
-def _left(target: Path) -> str:
+def _successor(target: Path) -> Path:
+    """Where the store is made that will replace `target`: readers keep the old one until the new one is complete."""
+    return target.with_name(f"{target.stem}{INCOMPLETE_SUFFIX}{target.suffix}")
+
+
+def _left(store: Path, target: Path) -> str:
     """What is on the disk, for the text of an error."""
     free = shutil.disk_usage(target.parent).free
     try:
-        dataset = Dataset(target)
+        dataset = Dataset(store)
         if not dataset.planned:
             raise ValueError
         dataset.tidy()
         total, missing = sum(1 for _ in dataset.items()), len(dataset.missing())
-        told = f"{total - missing} of {total} parts of {target} are written, marked incomplete"
+        told = f"{total - missing} of {total} parts of {store} are written, marked incomplete"
     except (OSError, ValueError, KeyError):
-        told = f"{target} is left behind without counts, marked incomplete"
+        told = f"{store} is left behind without counts, marked incomplete"
+    if store != target:
+        told += f", and {target} is what it was before"
     return f"{told} ({free / 1e9:.3g} GB free there): continue with --resume (resume=True)"
 
 
@@ -276,7 +314,7 @@ def _alone(target: Path) -> Iterator[None]:
     """Hold a lock beside the store while it is written; a lock of a process that was killed holds nobody up."""
     lock = target.with_name(target.name + ".lock")
     while True:
-        with open(lock, "w") as held:
+        with open_own(lock) as held:
             try:
                 import fcntl
             except ImportError:  # Windows

@@ -75,7 +75,7 @@ class Surfaces:
                 sbr=sbr,
                 attenuation=light.attenuation,  # type: ignore[arg-type]  # checked by the recipe
                 ambient=light.ambient,  # type: ignore[arg-type]
-                dark_counts_per_s=light.dark_counts_per_s if dark is None else dark,
+                dark_count_hz=light.dark_count_hz if dark is None else dark,
             )
         return clear if self.fog is None else self.fog.before(clear, system, signal)
 
@@ -127,7 +127,7 @@ class Rendered:
             photons_per_unit=light.photons_per_unit,
             sbr=sbr,
             pulse=self.pulse,
-            dark_counts_per_s=light.dark_counts_per_s if dark is None else dark,
+            dark_count_hz=light.dark_count_hz if dark is None else dark,
         )
 
 

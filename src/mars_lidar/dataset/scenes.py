@@ -34,8 +34,7 @@ from mars_lidar.io.layout import Variable
 from mars_lidar.io.store import OnDisk
 from mars_lidar.io.zarr_store import add, blosc
 from mars_lidar.light.fog import Fog
-from mars_lidar.light.rate_parts import Rows
-from mars_lidar.light.transient import Transient
+from mars_lidar.light.transient import Rows, Transient
 from mars_lidar.scene.layers import MOST, LayeredScene
 from mars_lidar.scene.scene import Scene
 

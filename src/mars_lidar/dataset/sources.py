@@ -262,7 +262,7 @@ def _check_levels(scene: Shown, recipe: DatasetRecipe) -> None:
         if system.period_ns not in units:
             units[system.period_ns] = scene.flux(system, light, 1.0, unit_sbr, dark=0.0)
         unit = units[system.period_ns]
-        dark = light.dark_counts_per_s * system.period_ns * 1e-9 / system.detector.detection_efficiency
+        dark = light.dark_count_hz * system.period_ns * 1e-9 / system.detector.detection_efficiency
         pixels: dict[tuple[int, int], Flux] = {}
         for signal, sbr in light.levels:
             total = unit.signal + unit.background / sbr

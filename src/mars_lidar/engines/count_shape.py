@@ -15,7 +15,7 @@ from mars_lidar.engines.synthesis import Run
 from mars_lidar.engines.table_reader import PIXELS, Entries, TableReader
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.statistics.exposure_result import normalised
+from mars_lidar.statistics.exposure import normalised
 
 if TYPE_CHECKING:
     from mars_lidar.table import Table

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.count_window import Pmf
+from mars_lidar.statistics.count_pmf import Pmf
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,8 +90,8 @@ class MarsEngine(CountTimesShape):
             run.draw(batch)
 
     def _evaluated(self, run: Run, group: Group) -> Batch:
+        from mars_lidar.statistics.count_pmf import exact_windows
         from mars_lidar.statistics.exposure import recorded_moments
-        from mars_lidar.statistics.pmf import exact_windows
 
         task = run.task
         exposure = recorded_moments(group.cells, tolerance=1e-4, threads=task.threads, progress=run.waiting)

@@ -83,7 +83,7 @@ def _laws(system: System, signal: FloatArray, background: FloatArray) -> CountLa
 
 def _chains(run: Run, group: Group) -> tuple[NDArray[np.float32], FloatArray]:
     """Shapes (cells, bins) and registrations per period (cells,)."""
-    from mars_lidar.statistics.shape import chain_of
+    from mars_lidar.statistics.histogram import chain_of
 
     cells, system = group.cells, run.task.system
     shapes, rates = np.zeros((cells.size, system.bins)), np.zeros(cells.size)

@@ -7,8 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from mars_lidar._base import checks
 from mars_lidar._base.brief import brief
+from mars_lidar._base.keywords import constructed_by_name
+from mars_lidar._base.notebook import as_html
 from mars_lidar.instrument import effects
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.effects import Jitter, SampledJitter
@@ -22,9 +26,11 @@ _MAX_RECOVERY_PERIODS = 1e6  # beyond it a pixel that has rested would not be to
 _GATE = ("gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
 _MAX_GATE_CYCLES = 100_000_000
 _MIN_GATE_PERIODS = 1e-5  # phases have 24 bits: at 1e-6 periods the counts behind a gate were 4 % off
+_NOTEBOOK_POINTS = 301  # of the curve in a notebook: more than its pixels
 _MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond it no digits are left
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class Detector:
     """A single-photon detector pixel.
@@ -87,6 +93,18 @@ class Detector:
         Non-linearity of the time-to-digital converter: relative widths (n,) of n neighbouring codes, as a code-density
         test finds them. n divides the number of bins, and the pattern repeats (the taps of a delay line in each cycle
         of the clock); n = bins gives every bin its own.
+
+    See Also
+    --------
+    System, Afterpulsing, Crosstalk, Jitter
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> ml.Detector(dead_time_ns=75.0, detection_efficiency=0.3).dead_time_ns
+    75.0
+    >>> ml.Detector(dead_time_ns=10.0, mode="synchronous").mode
+    'synchronous'
     """
 
     dead_time_ns: float
@@ -151,6 +169,15 @@ class Detector:
         `dataclasses.replace` changes fields. Efficiencies are left at 1: they go with the wavelength.
         """
         return cls(**preset(name))
+
+    def _repr_html_(self) -> str:
+        """Draw the sensitivity over the time since the last registration."""
+        blind, slow = self.dead_time_ns, self.recovery_ns
+        t = np.linspace(0.0, 1.5 * blind + 5.0 * slow or 1.0, _NOTEBOOK_POINTS)
+        after = np.maximum(t - blind, 0.0)
+        recovered = 1.0 - np.exp(-after / slow) if slow else 1.0
+        sensitivity = np.where(t < blind, 0.0, self.detection_efficiency * recovered)
+        return as_html(self, {"sensitivity, after a registration (ns)": (t, sensitivity)})
 
     def _check_avalanches(self) -> None:
         if self.twilight_ns > 0.0 and self.mode != "nonparalyzable":

@@ -10,18 +10,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 
 from mars_lidar._base import checks
+from mars_lidar._base.native import _core
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.avalanches import Afterpulsing, Crosstalk
 from mars_lidar.instrument.jitter import Jitter as Jitter
 from mars_lidar.instrument.jitter import SampledJitter as SampledJitter
 from mars_lidar.instrument.jitter import jitter_from_dict
-from mars_lidar.instrument.native_pulse import native_pulse
-from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+
+# --- Native forms of pulses ----------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=16)
+def native_pulse(pulse: Pulse, period_ns: float) -> _core.PulseTable:
+    """The native form of a pulse for a laser period, ns."""
+    return pulse._native(period_ns)
+
+
+# --- Effects -------------------------------------------------------------------------------------------------------
 
 _MAX_RATE_HZ = 1e12
 _MAX_EVENTS = 2**31 - 1

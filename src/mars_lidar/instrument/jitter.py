@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, SampledPulse
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class Jitter:
     """Timing jitter: a record is later than its avalanche by a Gaussian number, some by an exponential one on top.
@@ -27,6 +29,16 @@ class Jitter:
         Mean of the exponential delay of carriers that diffuse into the multiplication region, ns.
     tail_fraction
         Share of the avalanches that have it, in [0, 1].
+
+    See Also
+    --------
+    SampledJitter, Detector
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> ml.Detector(dead_time_ns=75.0, jitter=ml.Jitter(sigma_ns=0.1)).jitter.sigma_ns
+    0.1
     """
 
     sigma_ns: float
@@ -111,6 +123,7 @@ class Jitter:
         return {"kind": "gaussian", "sigma_ns": self.sigma_ns, **tail}
 
 
+@constructed_by_name
 @dataclass(frozen=True)
 class SampledJitter:
     """A measured jitter: the density of the delay of a record behind its avalanche, constant on samples.
@@ -123,6 +136,17 @@ class SampledJitter:
         Sample width, ns; n x bin_ns must fit in the laser period.
     origin
         Where the jitter is 0: ``"peak"``, ``"centroid"`` or ``"first"``, see `SampledPulse`.
+
+    See Also
+    --------
+    Jitter, Detector
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> jitter = ml.SampledJitter([1.0, 4.0, 2.0, 1.0], bin_ns=0.05)
+    >>> ml.Detector(dead_time_ns=75.0, jitter=jitter).dead_time_ns
+    75.0
     """
 
     values: tuple[float, ...]

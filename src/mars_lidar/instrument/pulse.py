@@ -15,11 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.keywords import by_name, constructed_by_name
 from mars_lidar._base.native import _core
+from mars_lidar._base.notebook import as_html
 
 _GAUSSIAN_REACH = 8.5  # half support in sigma: what lies outside, 1e-17, is below one photon in any exposure
 _WIDE = 0.3  # periods of sigma from which a train of pulses is summed by frequency
 _BLOCK = 1 << 15  # times at once
+_NOTEBOOK_POINTS = 300  # of the curve in a notebook: more than its pixels
 _SMALL = 40.0  # e^-40 is rounding
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _ORIGINS = ("peak", "centroid", "first")
@@ -47,6 +50,12 @@ class Pulse(ABC):
     @abstractmethod
     def _native(self, period_ns: float) -> _core.PulseTable:
         """The sampler's table; built without libm, so the same to the last bit on every machine."""
+
+    def _repr_html_(self) -> str:
+        """Draw the pulse over its support."""
+        edges = np.linspace(*self.support_ns(), _NOTEBOOK_POINTS + 1)
+        density = np.diff(self.cumulative(edges)) / np.diff(edges)
+        return as_html(self, {"pulse (1/ns) over the time after the delay (ns)": (edges[1:], density)})
 
     def wrapped_cumulative(self, t_ns: ArrayLike, period_ns: float) -> NDArray[np.float64]:
         """Energy of the periodic pulse train in (-inf, t], counted from a fixed origin: grows by 1 a period.
@@ -90,11 +99,23 @@ class Pulse(ABC):
         return np.diff(self.wrapped_cumulative(edges - delay, period_ns), axis=-1)
 
 
+@constructed_by_name
 @dataclass(frozen=True, kw_only=True)
 class GaussianPulse(Pulse):
     """Gaussian pulse of standard deviation `sigma_ns` (ns), centred on the delay.
 
     FWHM = 2.355 sigma; `GaussianPulse.from_fwhm(fwhm_ns=...)` takes that instead.
+
+    See Also
+    --------
+    SampledPulse, System
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> pulse = ml.GaussianPulse(sigma_ns=0.5)
+    >>> round(pulse.sigma_ns, 2)
+    0.5
     """
 
     sigma_ns: float
@@ -103,6 +124,7 @@ class GaussianPulse(Pulse):
         object.__setattr__(self, "sigma_ns", checks.real("sigma_ns", self.sigma_ns, low=0.0, strict_low=True))
 
     @classmethod
+    @by_name
     def from_fwhm(cls, *, fwhm_ns: float) -> GaussianPulse:
         """Gaussian pulse of full width at half maximum `fwhm_ns` (ns)."""
         return cls(sigma_ns=checks.real("fwhm_ns", fwhm_ns, low=0.0, strict_low=True) / FWHM_PER_SIGMA)
@@ -149,6 +171,7 @@ class GaussianPulse(Pulse):
         return _core.PulseTable.gaussian(self.sigma_ns / period_ns)
 
 
+@constructed_by_name
 class SampledPulse(Pulse):
     """A measured impulse response: constant on samples of width `bin_ns`.
 
@@ -168,6 +191,17 @@ class SampledPulse(Pulse):
         For ``"peak"`` and ``"centroid"`` the record is cyclic and is cut opposite the origin, so a response
         whose rising edge was stored at the end of the array is put together again. For ``"first"`` it is
         taken as it stands.
+
+    See Also
+    --------
+    GaussianPulse, System
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> pulse = ml.SampledPulse([0.0, 1.0, 3.0, 1.0, 0.0], bin_ns=0.1)
+    >>> round(pulse.bin_ns, 2)
+    0.1
     """
 
     __slots__ = ("_bytes", "_cumulative", "_start_ns", "bin_ns", "origin", "values")

@@ -209,6 +209,9 @@ def _frames(path: Path, image: Path | None, problems: list[Problem]) -> Iterator
         yield SceneFile(depth=path, image=image)
         return
     try:
+        if not nyu.is_labelled(path):
+            yield SceneFile(depth=path, image=image)
+            return
         count = nyu.frames(path)
     except BAD_FILE as error:
         problems.append(Problem.of(path, error))
@@ -218,7 +221,8 @@ def _frames(path: Path, image: Path | None, problems: list[Problem]) -> Iterator
 
 
 def _is_depth(path: Path) -> bool:
-    return path.stem.lower().endswith("depth") or path.parent.name.lower() in _DEPTH_FOLDERS
+    stem = path.stem.lower()
+    return stem.startswith("depth") or stem.endswith("depth") or path.parent.name.lower() in _DEPTH_FOLDERS
 
 
 def _partner(path: Path) -> Path | None:
@@ -228,6 +232,10 @@ def _partner(path: Path) -> Path | None:
         stems += [path.with_name(path.stem[:-5] + word) for word in _IMAGE_WORDS]
         if bare := path.stem[:-5].rstrip("_-. "):
             stems.append(path.with_name(bare))  # 0001_depth.png and 0001.jpg
+    elif path.stem.lower().startswith("depth"):
+        stems += [path.with_name(word + path.stem[5:]) for word in _IMAGE_WORDS]
+        if bare := path.stem[5:].lstrip("_-. "):
+            stems.append(path.with_name(bare))  # depth_0001.png and 0001.jpg
     elif path.suffix.lower() in _ALONE:
         stems.append(path.with_suffix(""))
     if path.parent.name.lower() in _DEPTH_FOLDERS:
@@ -249,7 +257,7 @@ def _tell_images(root: Path, found: list[SceneFile]) -> None:
         warnings.warn(
             f"{root}: no image was found to any of {len(found)} depth files, so that reflectivity is 1 everywhere; "
             f"{alone[0].depth.name} takes one of the same name without 'depth', or with 'rgb', 'color' or 'image' in "
-            "place of it (docs/formats.md), or give pattern and image",
+            "place of it; or name the files by pattern and image (--pattern, --image)",
             UserWarning,
             stacklevel=4,  # of `scan`, through what checks its arguments
         )

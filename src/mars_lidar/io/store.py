@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.files import reading, whole
 from mars_lidar._base.memory import check_memory
-from mars_lidar.light.rate_parts import RateArray
+from mars_lidar.light.transient import RateArray
 
 
 class CountArray(RateArray, Protocol):
@@ -100,6 +100,7 @@ class OpenedStore:
     arrays: Mapping[str, Any]  # variables by name; on disk until they are indexed, where the format allows it
     progress: str = ""  # how far an incomplete file got, for people; empty where that is not known
     close: Callable[[], None] = lambda: None
+    identity: str = ""  # of the content, where the format has a sum over it
 
     @property
     def complete(self) -> bool:

@@ -1,22 +1,426 @@
-"""The expected histogram under dead time, differentiable in signal, background and delay (PyTorch)."""
+"""Expected histograms and their likelihood under dead time, differentiable in signal, background and delay (PyTorch).
+
+Registrations round the laser period under dead time: a linear equation in each pixel, solved at a cost of O(bins).
+
+With l photons in a bin, p = 1 - e^-l is the chance that an armed pixel fires in it, q = 1 - p / l that of one which is
+re-armed in it (uniformly). G counts the registrations of the preceding dead time, L moves them by it, and
+
+    A h = s,     A = 1 + diag(p) G - diag(q) L                                                          (1)
+
+gives registrations h from a source s: s = p for one settled period (docs/joint_law.md, 3.1). G need not be formed:
+c = G h grows from bin to bin by h - L h, so that with (1) it obeys a recursion of first order round the circle,
+
+    c_{j+1} = e^-l_j c_j + s_j - (1 - q_j) (L h)_j,     in short c = C [s - (1 - q) L h],                (2)
+    h = T L h + (s - p C s),     T x = q x + p C [(1 - q) x].                                            (3)
+
+T L is the chain of the phases of successive registrations (arXiv 2512.04924), without a matrix. How many there are (3)
+leaves open: the pixel is blind for t_d after each, so that mean(c) = t_d sum(h). Hence
+
+    B h = Q s,     B h = h - T L h + v (t_d sum(h) + mean C [(1 - q) L h]),     Q s = s - p C s + v mean(C s)   (4)
+
+for any v that does not sum to 0. B = Q A, so that (1) transposed, A' y = g, is y = Q' z with B' z = g. Both are solved
+by GMRES (Saad & Schultz 1986), all pixels of a batch at a time.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from mars_lidar._base import checks
-from mars_lidar.instrument.pulse import GaussianPulse
+from mars_lidar._base.arguments import checked
+from mars_lidar.instrument.effects import LIGHT_EFFECTS
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse, SampledPulse
 from mars_lidar.instrument.system import System
-from mars_lidar.learn.cyclic_solver import TOLERANCE, Delay, blocks, by_rows, fired, registered
-from mars_lidar.learn.light import alike, check_detector, check_values, detected, photons_in
 from mars_lidar.learn.needed import torch
+from mars_lidar.statistics.phase_chain import ConvergenceError
+
+# --- Photons of each bin -------------------------------------------------------------------------------------------
+
+
+@checked
+def bin_photons(
+    signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor, system: System, *, refine: int = 1
+) -> torch.Tensor:
+    """Photons per period in each bin, l = S s + B / n (..., bins x refine); the pulse wraps into the period.
+
+    Parameters
+    ----------
+    signal, background, delay_ns
+        Tensors (...) of one floating type and device that broadcast: S and B photons per period, delay in ns.
+    refine
+        Parts that each bin is cut into.
+    """
+    signal, background, delay_ns = inputs(signal, background, delay_ns)
+    return photons_in(signal, background, delay_ns, system, checks.integer("refine", refine, low=1, high=2**16))
+
+
+def photons_in(
+    signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor, system: System, refine: int
+) -> torch.Tensor:
+    """`bin_photons` of what has been checked, also where `torch.vmap` does not let values be looked at."""
+    bins = system.bins * refine
+    edges = torch.arange(bins + 1, dtype=signal.dtype, device=signal.device) * (system.period_ns / bins)
+    time = edges - torch.remainder(delay_ns, system.period_ns).unsqueeze(-1)
+    energy = wrapped_energy(system, time)
+    return signal.unsqueeze(-1) * energy.diff(dim=-1).clamp_min(0.0) + background.unsqueeze(-1) / bins
+
+
+def wrapped_energy(system: System, time: torch.Tensor) -> torch.Tensor:
+    """Energy of the periodic pulse train up to a time (ns) after the delay; grows by 1 a period."""
+    period = system.period_ns
+    whole = torch.round(time.detach() / period)
+    rest = time - whole * period  # within half a period of the nearest pulse
+    reach = max(map(abs, system.pulse.support_ns()))
+    further = max(0, math.ceil(reach / period - 0.5))
+    for turn in range(-further, further + 1):
+        whole = whole + _cumulative(system.pulse, rest - turn * period)
+    return whole
+
+
+def _cumulative(pulse: Pulse, time: torch.Tensor) -> torch.Tensor:
+    """Energy before a time after the delay, differentiable."""
+    if isinstance(pulse, GaussianPulse):
+        below: torch.Tensor = torch.special.ndtr(time / pulse.sigma_ns)
+        return below
+    assert isinstance(pulse, SampledPulse)
+    knots = torch.tensor(pulse._cumulative, dtype=time.dtype, device=time.device)
+    place = ((time - pulse._start_ns) / pulse.bin_ns).clamp(0.0, len(knots) - 1.0)
+    cell = place.detach().floor().clamp_max(len(knots) - 2.0).long()
+    energy: torch.Tensor = knots[cell] + (place - cell) * (knots[cell + 1] - knots[cell])
+    return energy
+
+
+def inputs(*given: torch.Tensor) -> list[torch.Tensor]:
+    """Checked, and of one shape."""
+    found = alike(*given)
+    check_values(*found)
+    return found
+
+
+def check_values(signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> None:
+    """Raise where they are no light and no time."""
+    if not (bool((signal >= 0).all()) and bool((background >= 0).all()) and bool(torch.isfinite(delay_ns).all())):
+        raise ValueError("signal and background must be >= 0 and delay_ns finite")
+
+
+def alike(*given: torch.Tensor) -> list[torch.Tensor]:
+    """Checked for type and shape, and of one shape."""
+    for name, one in zip(("signal", "background", "delay_ns"), given, strict=True):
+        if not isinstance(one, torch.Tensor) or not one.is_floating_point():
+            raise TypeError(f"{name} must be a tensor of floating point numbers, got {one!r}")
+    try:
+        return list(torch.broadcast_tensors(*given))  # type: ignore[no-untyped-call]
+    except RuntimeError:
+        told = ", ".join(str(tuple(one.shape)) for one in given)
+        raise ValueError(f"signal, background and delay_ns must broadcast, got shapes {told}") from None
+
+
+def detected(
+    signal: torch.Tensor, background: torch.Tensor, system: System
+) -> tuple[torch.Tensor, torch.Tensor, System]:
+    """What the pixel detects of them, and the system for that: as `Flux.detected`, efficiency and dark counts."""
+    detector = system.detector
+    dark = 1e-9 * detector.dark_count_hz * system.period_ns
+    if detector.detection_efficiency == 1.0 and dark == 0.0:
+        return signal, background, system.detected()
+    share = detector.detection_efficiency
+    return signal * share, background * share + dark, system.detected()
+
+
+def check_detector(system: System, *, light: bool = False) -> None:
+    """Raise where the differentiable model does not describe it; `light`: efficiency and dark counts are welcome."""
+    if not isinstance(system, System):
+        raise TypeError(f"system must be a System, got {type(system).__name__}")
+    detector = system.detector
+    effects = [name for name in detector.effects if not (light and name in LIGHT_EFFECTS)]
+    if detector.mode != "nonparalyzable" or effects:
+        beyond = " beyond efficiency and dark counts" if light else ""
+        raise ValueError(
+            f"the detector must be nonparalyzable and without effects{beyond}, got mode {detector.mode!r}"
+            + (f" and {', '.join(effects)}" if effects else "")
+        )
+
+
+# --- The cyclic solver ---------------------------------------------------------------------------------------------
+
+Rows = torch.Tensor  # (pixels, bins), double
+
+_KRYLOV, _RESTARTS = 40, 25
+TOLERANCE = 1e-13  # of the residual, relative to the source
+_GOOD = 1e-9  # that is still accepted where rounding ends the descent
+_ROWS = 2**15  # pixels x bins solved at a time on a CPU: what is used again and again stays in the cache
+_HELD = 24  # arrays (pixels, bins) beside the Krylov space, the powers of two of the recursion among them
+
+
+def fired(light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """p and q of photons in a bin."""
+    p = -torch.expm1(-light)
+    dim = light < 0.02
+    series = light * (0.5 - light * (1 / 6 - light * (1 / 24 - light * (1 / 120 - light / 720))))
+    return p, torch.where(dim, series, 1 - p / torch.where(dim, torch.ones_like(light), light))
+
+
+def slopes(light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Derivatives of p and q in the photons of a bin."""
+    dim = light < 0.02
+    series = 0.5 - light * (1 / 3 - light * (1 / 8 - light * (1 / 30 - light * (1 / 144 - light / 840))))
+    some = torch.where(dim, torch.ones_like(light), light)
+    return torch.exp(-light), torch.where(dim, series, (-torch.expm1(-some) / some - torch.exp(-some)) / some)
+
+
+class Delay:
+    """A dead time of K + (d + f) / n periods on n bins: what re-arms where, and who is blind."""
+
+    def __init__(self, dead: float, bins: int) -> None:
+        self.periods, self.bins = dead, bins
+        self.whole = math.floor(dead)
+        steps = (dead - self.whole) * bins  # whole periods apart first: else they cost digits of the fraction
+        self.shift = min(math.floor(steps + 1e-9), bins - 1)
+        self.part = max(steps - self.shift, 0.0)
+
+    def rearmed(self, h: torch.Tensor, near: Any = 1.0, far: Any = 1.0) -> torch.Tensor:
+        """L h, its two parts weighted."""
+        d, f = self.shift, self.part
+        moved: torch.Tensor = near * (1.0 - f) * torch.roll(h, d, -1) + far * f * torch.roll(h, d + 1, -1)
+        return moved
+
+    def rearmed_transposed(self, y: torch.Tensor) -> torch.Tensor:
+        """L' y."""
+        d, f = self.shift, self.part
+        return (1.0 - f) * torch.roll(y, -d, -1) + f * torch.roll(y, -d - 1, -1)
+
+    def blind(self, h: torch.Tensor) -> torch.Tensor:
+        """G h: registrations that keep the pixel blind at the start of each bin."""
+        n, d = self.bins, self.shift
+        below = torch.nn.functional.pad(torch.cat([h, h], -1).cumsum(-1), (1, 0))
+        window = below[..., n : 2 * n] - below[..., n - d : 2 * n - d] + self.part * torch.roll(h, d + 1, -1)
+        return window + self.whole * h.sum(-1, keepdim=True)
+
+    def left(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """What dead time at the end of the exposure leaves of settled registrations h a period: e and its falls.
+
+        With (4.6) of docs/joint_law.md, e: expected periods, of those that follow the exposure, in which the pixel is
+        still blind at the start of a bin; its falls: re-armings that come after the end.
+        """
+        k, j = self.whole, torch.arange(self.bins, device=h.device)
+        falls = self.rearmed(h, k + (j < self.shift).to(h.dtype), k + (j <= self.shift).to(h.dtype))
+        total = h.sum(-1, keepdim=True)
+        first = (k + 1) * (self.blind(h)[..., :1] - k * total) + 0.5 * k * (k + 1) * total
+        return first - torch.nn.functional.pad(falls.cumsum(-1), (1, -1)), falls
+
+
+class Circle:
+    """(4) and its transpose for rows of photons per bin."""
+
+    def __init__(self, photons: Rows, delay: Delay) -> None:
+        self.delay = delay
+        n = photons.shape[1]
+        # a pixel without light fires never: as good as once in 1e12 periods, and nothing is divided by 0
+        photons = torch.where(photons.sum(-1, keepdim=True) > 0.0, photons, torch.full_like(photons, 1e-12 / n))
+        self.p, self.q = fired(photons)
+        before = torch.nn.functional.pad(photons.cumsum(-1), (1, 0))
+        self.decays = []  # of 1, 2, 4, .. bins: recursions by doubling, for they are many short sums
+        step = 1
+        while step < n:
+            self.decays.append((step, torch.exp(before[:, :-step] - before[:, step:])))
+            step *= 2
+        total = before[:, -1:]
+        self.since, self.until = torch.exp(-before[:, 1:]), torch.exp(before[:, :-1] - total)
+        self.closing = -1.0 / torch.expm1(-total)
+        x = delay.rearmed(torch.ones_like(photons) / n)
+        shape = self.q * x + self.p * self.recursion((1.0 - self.q) * x)  # T L of uniform registrations
+        wait = self.recursion((1.0 - self.q) * delay.rearmed(shape)).mean(-1, keepdim=True)
+        self.v = shape / (delay.periods + wait)
+
+    def recursion(self, x: Rows) -> Rows:
+        """C x: c_{j+1} = e^-l_j c_j + x_j round the circle."""
+        y = x.clone()
+        for step, decay in self.decays:
+            y[:, step:] += decay[:, 1:] * y[:, :-step]
+        return torch.roll(y + self.since * (self.closing * y[:, -1:]), 1, -1)
+
+    def recursion_transposed(self, x: Rows) -> Rows:
+        """C' x."""
+        y = x.clone()
+        for step, decay in self.decays:
+            y[:, :-step] += decay[:, :-1] * y[:, step:]
+        return torch.roll(y + self.until * (self.closing * y[:, :1]), -1, -1)
+
+    def apply(self, h: Rows) -> Rows:
+        """B h."""
+        x = self.delay.rearmed(h)
+        c = self.recursion((1.0 - self.q) * x)
+        total = self.delay.periods * h.sum(-1, keepdim=True) + c.mean(-1, keepdim=True)
+        return h - self.q * x - self.p * c + self.v * total
+
+    def source(self, s: Rows) -> Rows:
+        """Q s."""
+        c = self.recursion(s)
+        return s - self.p * c + self.v * c.mean(-1, keepdim=True)
+
+    def _back(self, z: Rows) -> tuple[Rows, Rows]:
+        """v' z, and C' of it as a mean over the bins less p z, which B' and Q' are made of."""
+        weight = (self.v * z).sum(-1, keepdim=True)
+        return weight, self.recursion_transposed(weight / z.shape[-1] - self.p * z)
+
+    def apply_transposed(self, z: Rows) -> Rows:
+        """B' z."""
+        weight, c = self._back(z)
+        back = self.delay.rearmed_transposed((1.0 - self.q) * c - self.q * z)
+        return z + back + self.delay.periods * weight
+
+    def solve(self, s: Rows, tolerance: float = TOLERANCE, turned: bool = False) -> Rows:
+        """x of A x = s, (1), or of A' x = s."""
+        if not turned:
+            return gmres(self.apply, self.source(s), tolerance)
+        z = gmres(self.apply_transposed, s, tolerance)
+        return z + self._back(z)[1]  # Q' z
+
+
+def gmres(apply: Callable[[Rows], Rows], wanted: Rows, tolerance: float = TOLERANCE) -> Rows:
+    """x (rows, n) of apply(x) = wanted, of rows that are independent; ConvergenceError for a residual above 1e-9."""
+    size = torch.linalg.vector_norm(wanted, dim=-1).clamp_min(1e-300)
+    x, rest, last = torch.zeros_like(wanted), wanted, math.inf
+    for _ in range(_RESTARTS):
+        left = float((torch.linalg.vector_norm(rest, dim=-1) / size).max())
+        if left <= tolerance or (left <= _GOOD and left > 0.3 * last):  # the latter: rounding
+            return x
+        last = left
+        x = x + _krylov(apply, rest, tolerance * size)
+        rest = wanted - apply(x)
+    if not last <= _GOOD:
+        raise ConvergenceError(
+            f"the feedback equation is left with a relative residual of {last:.1e} after {_KRYLOV * _RESTARTS} steps"
+        )
+    return x
+
+
+def _krylov(apply: Callable[[Rows], Rows], rest: Rows, enough: torch.Tensor) -> Rows:
+    """What to add to x: the least residual in the space that `apply` makes of `rest`."""
+    least = torch.finfo(rest.dtype).tiny
+    size = torch.linalg.vector_norm(rest, dim=-1)
+    basis = rest.new_empty((len(rest), _KRYLOV + 1, rest.shape[-1]))
+    basis[:, 0] = rest / size.clamp_min(least)[:, None]
+    triangle = rest.new_zeros((len(rest), _KRYLOV, _KRYLOV))
+    target, cosines, sines = [size], list[torch.Tensor](), list[torch.Tensor]()
+    for k in range(_KRYLOV):
+        fresh = apply(basis[:, k])
+        known = basis[:, : k + 1]
+        column = torch.bmm(known, fresh.unsqueeze(-1)).squeeze(-1)  # once: what rounding leaves, a restart takes away
+        fresh = fresh - torch.bmm(column.unsqueeze(1), known).squeeze(1)
+        length = torch.linalg.vector_norm(fresh, dim=-1)
+        basis[:, k + 1] = fresh / length.clamp_min(least)[:, None]
+        entries = list(column.unbind(-1))
+        for i, (c, s) in enumerate(zip(cosines, sines, strict=True)):  # Givens rotations
+            entries[i], entries[i + 1] = c * entries[i] + s * entries[i + 1], c * entries[i + 1] - s * entries[i]
+        radius = torch.hypot(entries[k], length).clamp_min(least)
+        cosines.append(entries[k] / radius)
+        sines.append(length / radius)
+        entries[k] = radius
+        triangle[:, : k + 1, k] = torch.stack(entries, -1)
+        target.append(-sines[k] * target[k])
+        target[k] = cosines[k] * target[k]
+        if bool((target[k + 1].abs() <= enough).all()):
+            break
+    used = len(cosines)
+    right = torch.stack(target[:used], -1).unsqueeze(-1)
+    steps = torch.linalg.solve_triangular(triangle[:, :used, :used], right, upper=True)
+    return torch.bmm(steps.mT, basis[:, :used]).squeeze(1)
+
+
+class _Solution(torch.autograd.Function):
+    """x of A x = s, or of A' x = s, for rows of photons and sources.
+
+    Derivatives of any order and of both modes, for they are solutions themselves: with y of A' y = g,
+
+        dx = A^-1 (ds - dA x),     dA x = dp G x - dq L x,     s -> y,     l -> y (q' L x - p' G x).
+    """
+
+    @staticmethod
+    def forward(photons: Rows, source: Rows, known: Rows | None, delay: Delay, tolerance: float, turned: bool) -> Rows:
+        if known is not None:
+            return known.clone()
+        every = blocks(_block(photons.device), photons.shape[-1], photons, source)
+        return torch.cat([Circle(light, delay).solve(wanted, tolerance, turned) for light, wanted in every])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Rows) -> None:
+        photons, _, _, *ctx.settings = inputs
+        ctx.save_for_backward(photons, output)
+        ctx.save_for_forward(photons, output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Rows) -> tuple[Rows, Rows, None, None, None, None]:
+        photons, x = ctx.saved_tensors
+        delay, tolerance, turned = ctx.settings
+        y = _Solution.apply(photons, gradient, None, delay, tolerance, not turned)  # type: ignore[no-untyped-call]
+        (p, q), (right, left) = slopes(photons), (y, x) if turned else (x, y)
+        return left * (q * delay.rearmed(right) - p * delay.blind(right)), y, None, None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, photons_moved: Rows | None, source_moved: Rows | None, *_: None) -> Rows:
+        photons, x = ctx.saved_tensors
+        delay, tolerance, turned = ctx.settings
+        moved = torch.zeros_like(x) if source_moved is None else source_moved
+        if photons_moved is not None:
+            p, q = (slope * photons_moved for slope in slopes(photons))
+            if turned:
+                blind = delay.blind((p * x).flip(-1)).flip(-1)  # G' x: G is a correlation round the circle
+                moved = moved + delay.rearmed_transposed(q * x) - blind
+            else:
+                moved = moved + q * delay.rearmed(x) - p * delay.blind(x)
+        out: Rows = _Solution.apply(photons, moved, None, delay, tolerance, turned)  # type: ignore[no-untyped-call]
+        return out
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return by_rows(_Solution, info, in_dims, given)
+
+
+def by_rows(function: Any, info: Any, in_dims: tuple[int | None, ...], given: tuple[Any, ...]) -> Any:
+    """The rule of `torch.vmap` for a function of rows that are independent of each other: more of them."""
+    number, flat = info.batch_size, []
+    for one, dim in zip(given, in_dims, strict=True):
+        if isinstance(one, torch.Tensor):
+            whole = one.expand(number, *one.shape) if dim is None else one.movedim(dim, 0)
+            one = whole.reshape(-1, *whole.shape[2:])
+        flat.append(one)
+    out = function.apply(*flat)
+    if isinstance(out, torch.Tensor):
+        return out.reshape(number, -1, *out.shape[1:]), 0
+    return tuple(one.reshape(number, len(one) // number, *one.shape[1:]) for one in out), (0,) * len(out)
+
+
+def registered(
+    photons: Rows, source: Rows, delay: Delay, tolerance: float = TOLERANCE, known: Rows | None = None
+) -> Rows:
+    """h of (1), differentiable in photons and sources, (pixels, bins) in double; `known`: h, if it was found before."""
+    h: Rows = _Solution.apply(photons, source, known, delay, tolerance, False)  # type: ignore[no-untyped-call]
+    return h
+
+
+def blocks(most: int, bins: int, *rows: torch.Tensor) -> Any:
+    """Some rows of each at a time, of at most so many rows x bins."""
+    return zip(*(torch.split(one, max(1, most // bins)) for one in rows), strict=True)
+
+
+def _block(device: torch.device) -> int:
+    """Pixels x bins solved at a time on a device: what a cache holds, or half of what a GPU has free."""
+    if device.type != "cuda":
+        return _ROWS
+    free, _ = torch.cuda.mem_get_info(device)
+    return max(_ROWS, free // (2 * 8 * (_KRYLOV + _HELD)))
+
+
+# --- The expected histogram ----------------------------------------------------------------------------------------
 
 _FINE = 4.0  # parts of a sigma of the pulse
 _BLOCK = 2**22  # pixels x bins of photons that are held at a time
 
 
+@checked
 def expected_histogram(
     signal: torch.Tensor,
     background: torch.Tensor,
@@ -57,7 +461,7 @@ def expected_histogram(
 
     Notes
     -----
-    O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.cyclic_solver`). At less cost and to
+    O(bins) a pixel, in double precision, on the CPU or a GPU (`mars_lidar.learn.forward`). At less cost and to
     the accuracy of a table: `HistogramTable`.
     """
     check_detector(system, light=True)
@@ -158,3 +562,49 @@ def _refuse_nested_forward() -> None:
 
 def _summed(fine: torch.Tensor, parts: int) -> torch.Tensor:
     return fine.reshape(len(fine), -1, parts).sum(-1)
+
+
+# --- The likelihood ------------------------------------------------------------------------------------------------
+
+
+@checked
+def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
+    """Periods D (..., bins) in which the pixel was armed in each bin, as its own histogram (..., bins) tells.
+
+    ``N_r`` less the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration in the bin
+    and a re-arming count half. What the dead time covers after the end of the exposure is taken for its beginning,
+    where the pixel was armed (or blind from before): D is at most t_d / t_r + 1 periods off, whatever the exposure.
+    """
+    check_detector(system, light=True)
+    if not isinstance(histogram, torch.Tensor) or histogram.shape[-1:] != (system.bins,):
+        told = getattr(histogram, "shape", histogram)
+        raise ValueError(f"histogram must be a tensor (..., {system.bins}), got {told!r}")
+    counts = histogram if histogram.is_floating_point() else histogram.to(torch.float64)
+    if system.dead_time_periods == 0.0:
+        return torch.full_like(counts, float(system.cycles))
+    delay = Delay(system.dead_time_periods, system.bins)
+    covered = delay.blind(counts) + 0.5 * (counts - delay.rearmed(counts))
+    return (system.cycles - covered).clamp_min(0.0)
+
+
+@checked
+def histogram_log_likelihood(
+    histogram: torch.Tensor,
+    signal: torch.Tensor,
+    background: torch.Tensor,
+    delay_ns: torch.Tensor,
+    system: System,
+) -> torch.Tensor:
+    """``sum_j h_j log l_j - l_j D_j`` (...): the log likelihood of histograms (..., bins), up to a constant.
+
+    D_j comes from the data (`armed_periods`), so nothing is solved: O(bins). Dead time is in it exactly but for the
+    width of a bin and the ends of the exposure, which move it by less than (S + B) (t_d / t_r + 1), by as much as one
+    or two registrations do. Background must be > 0. Its negative is a loss that needs no truth.
+    """
+    armed = armed_periods(histogram, system)
+    signal, background, delay_ns = inputs(signal, background, delay_ns)
+    signal, background, system = detected(signal, background, system)
+    photons = bin_photons(signal, background, delay_ns, system)
+    counts = histogram.to(photons.dtype)
+    out: torch.Tensor = (torch.xlogy(counts, photons) - photons * armed.to(photons.dtype)).sum(-1)
+    return out

@@ -1,22 +1,103 @@
-"""Where the scenes of a stream come from: ray-cast without end, files, or arrays; and which one a sample gets."""
+"""Scenes of a stream of training examples, and the sample that is made of each.
+
+A scene is ray-cast without end, read from files, or taken from arrays; the workers of a loader share the scenes that
+one of them has cast. A sample is a function of numbers alone: which scene, turned how, in what light, seen by what
+system.
+"""
 
 from __future__ import annotations
 
+import math
+import mmap
+import os
 import warnings
+import zlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+from multiprocessing import context, reduction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.types import FloatArray
+from mars_lidar.instrument.pulse import GaussianPulse, Pulse
+from mars_lidar.instrument.system import System
 from mars_lidar.io.scan import SceneFile, scan
 from mars_lidar.learn.needed import torch
-from mars_lidar.learn.scene_cache import SharedScenes
+from mars_lidar.learn.ranges import Range, SystemList, SystemRange
+from mars_lidar.light.flux import Flux
 from mars_lidar.scene.scene import Scene
+
+# --- Ray-cast scenes that workers share ----------------------------------------------------------------------------
+
+_SLOTS = 64  # pages are taken as scenes come
+_WRITTEN = 1 << 32
+
+
+class SharedScenes:
+    """Scenes by number, in anonymous memory (memfd) of a process and of those that it starts.
+
+    There is no lock: a checksum of number and content tells a reader whether what it copied is whole, and what it
+    wanted. If not, it casts the scene itself, and gets the same. Outside Linux nothing is shared.
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._size = size
+        self._file = os.memfd_create("mars_lidar", os.MFD_CLOEXEC) if hasattr(os, "memfd_create") else -1
+        self._map()
+
+    def _map(self) -> None:
+        shape = (_SLOTS, 2, *self._size)
+        content = 8 * int(np.prod(shape))
+        self._memory: mmap.mmap | None = None
+        if self._file < 0:
+            return
+        os.ftruncate(self._file, content + 16 * _SLOTS)
+        self._memory = mmap.mmap(self._file, content + 16 * _SLOTS)
+        self._maps = np.frombuffer(self._memory, np.float64, content // 8).reshape(shape)
+        self._heads = np.frombuffer(self._memory, np.uint64, 2 * _SLOTS, content).reshape(_SLOTS, 2)
+
+    def get(self, number: int) -> Scene | None:
+        """A scene that some worker has cast."""
+        place = number % _SLOTS
+        if self._memory is None or int(self._heads[place, 0]) != number:
+            return None
+        maps = self._maps[place].copy()
+        return Scene(*maps) if int(self._heads[place, 1]) == _checksum(number, maps) else None
+
+    def put(self, number: int, scene: Scene) -> None:
+        """Let the others have it; for scenes without a background map."""
+        if self._memory is None:
+            return
+        maps, place = np.stack([scene.depth_m, scene.reflectivity]), number % _SLOTS
+        self._maps[place] = maps
+        self._heads[place] = number, _checksum(number, maps)
+
+    def __getstate__(self) -> dict[str, Any]:
+        starts = self._file >= 0 and context.get_spawning_popen() is not None  # a process, not a copy
+        return {"_size": self._size, "_file": reduction.DupFd(self._file) if starts else None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._size = state["_size"]
+        self._file = -1 if state["_file"] is None else state["_file"].detach()
+        self._map()
+
+    def __del__(self) -> None:
+        if self._file >= 0:
+            os.close(self._file)
+
+
+def _checksum(number: int, maps: NDArray[np.float64]) -> int:
+    return _WRITTEN | zlib.crc32(maps.data, zlib.crc32(number.to_bytes(8, "little")))
+
+
+# --- Where scenes come from ----------------------------------------------------------------------------------------
 
 POOL = 16  # ray-cast scenes that are in use at a time
 _MARGIN = 1.5  # they are cast larger than what is cropped from them
@@ -203,3 +284,123 @@ def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSou
     if hasattr(scenes, "shape"):
         return Arrays({"depth": scenes})
     raise TypeError(f"scenes must be a name, a folder, Scenes, or arrays, got a {type(scenes).__name__}")
+
+
+# --- One sample ----------------------------------------------------------------------------------------------------
+
+_TRIES = 20  # places tried for a crop with a return in it
+
+
+@dataclass(frozen=True)
+class Sample:
+    """All that a cube is simulated from."""
+
+    index: int
+    scene: Scene
+    system: System
+    flux: Flux
+    signal_level: float
+    sbr: float
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """What samples are drawn from."""
+
+    source: SceneSource
+    systems: SystemRange | SystemList
+    size: tuple[int, int] | None
+    flips: bool
+    signal: Range
+    sbr: Range
+    depth_scale: Range
+    lit: dict[str, Any]  # further arguments of `Scene.flux`
+    seed: int
+
+    def sample(self, epoch: int, index: int) -> Sample:
+        """Sample `index` of an epoch. What is drawn for one purpose does not depend on the settings of another."""
+        drawn = self.systems.corners() if isinstance(self.systems, SystemList) else ()
+        system = drawn[0] if len(drawn) == 1 else self.systems.draw(generator(4, self.seed, epoch, index))
+        level, sbr, stretch = self._light(epoch, index)
+        scene = self._placed(self.source.scene(self.seed, epoch, index), epoch, index)
+        if stretch != 1.0:
+            scene = Scene(scene.depth_m * stretch, scene.reflectivity, scene.background)
+        with warnings.catch_warnings():  # pixels without return or beyond the range: told by the maps, not every time
+            warnings.simplefilter("ignore", UserWarning)
+            flux = scene.flux(system, signal=level, sbr=sbr, **self.lit)
+        seed = int(generator(6, self.seed, epoch, index).integers(2**63))
+        return Sample(index, scene, system, flux, level, sbr, seed)
+
+    def _light(self, epoch: int, index: int) -> tuple[float, ...]:
+        """Signal, sbr and the factor on the depth."""
+        given = (self.signal, self.sbr, self.depth_scale)
+        if all(len(set(one.ends)) == 1 for one in given):  # nothing to draw, and a generator takes 10 us
+            return tuple(one.ends[0] for one in given)
+        light = generator(5, self.seed, epoch, index)
+        return tuple(one.draw(light) for one in given)
+
+    def _placed(self, scene: Scene, epoch: int, index: int) -> Scene:
+        """A crop of the scene, mirrored or not: the scene is, before anything is simulated."""
+        random = generator(7, self.seed, epoch, index)
+        down, right = (-1 if self.flips and random.integers(2) else 1 for _ in range(2))
+        height, width = scene.shape if self.size is None else self.size
+        if height > scene.shape[0] or width > scene.shape[1]:
+            raise ValueError(f"size must be at most that of every scene, got {height} × {width} and {scene!r}")
+        for _ in range(_TRIES):
+            y = int(random.integers(scene.shape[0] - height + 1))
+            x = int(random.integers(scene.shape[1] - width + 1))
+            crop = scene[_run(y, height, down), _run(x, width, right)]
+            if (crop.valid & (crop.reflectivity > 0.0)).any():
+                return crop
+        seen = np.argwhere(scene.valid & (scene.reflectivity > 0.0))  # few and far between: about one of them
+        if not len(seen):
+            raise ValueError(f"a scene must have a pixel with a return, got {scene!r}")
+        at = seen[int(random.integers(len(seen)))]
+        y, x = (
+            int(random.integers(max(0, place - wanted + 1), min(place, whole - wanted) + 1))
+            for place, wanted, whole in zip(at.tolist(), (height, width), scene.shape, strict=True)
+        )
+        return scene[_run(y, height, down), _run(x, width, right)]
+
+
+def _run(first: int, number: int, step: int) -> slice:
+    """So many pixels from `first` on, in this order or, with the step -1, in the other."""
+    if step > 0:
+        return slice(first, first + number)
+    return slice(first + number - 1, first - 1 if first else None, -1)
+
+
+def example_of(samples: Sequence[Sample], cube: torch.Tensor) -> dict[str, Any]:
+    """What a loader gives of some samples: cubes, and maps and settings as float32, each with a leading axis."""
+
+    def maps(get: Callable[[Sample], FloatArray]) -> torch.Tensor:
+        return torch.from_numpy(np.stack([get(one) for one in samples]).astype(np.float32)).to(cube.device)
+
+    def settings(get: Callable[[Sample], float]) -> torch.Tensor:
+        return torch.tensor([float(get(one)) for one in samples], device=cube.device)
+
+    return {
+        "cube": cube,
+        "depth": maps(lambda one: one.scene.depth_m),
+        "reflectivity": maps(lambda one: one.scene.reflectivity),
+        "flux": {
+            "signal": maps(lambda one: one.flux.signal),
+            "background": maps(lambda one: one.flux.background),
+            "delay": maps(lambda one: one.flux.delay_ns),
+        },
+        "system": {
+            "period_ns": settings(lambda one: one.system.period_ns),
+            "cycles": settings(lambda one: one.system.cycles),
+            "dead_time_ns": settings(lambda one: one.system.detector.dead_time_ns),
+            "sigma_ns": settings(lambda one: _sigma_ns(one.system.pulse)),
+        },
+        "signal_level": settings(lambda one: one.signal_level),
+        "sbr": settings(lambda one: one.sbr),
+        "index": torch.tensor([one.index for one in samples]),
+        "seed": torch.tensor([one.seed for one in samples]),
+    }
+
+
+def _sigma_ns(pulse: Pulse) -> float:
+    return pulse.sigma_ns if isinstance(pulse, GaussianPulse) else math.nan

@@ -1,28 +1,343 @@
-"""Training examples simulated as they are needed: no two alike, and the same whoever makes them."""
+"""Training examples simulated as they are needed: no two alike, and the same whoever makes them.
+
+Passes. A loader hands copies of its dataset to workers, and tells nobody when a pass begins: each worker calls ``iter``
+once a pass, the parent never does. So passes are counted in memory that all copies share. Every worker has a place
+there, in which it alone writes, one number at a time: how many passes it has begun, and the seed that a loader gives to
+all workers of one pass. A worker that finds this seed in another's place joins that pass; one that finds it nowhere, or
+in its own place (workers that live on keep theirs), begins the next.
+"""
 
 from __future__ import annotations
 
 import math
+import os
+import queue
+import sys
+import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.memory import check_memory
 from mars_lidar._base.resample import image_size
 from mars_lidar._base.threads import thread_count
-from mars_lidar.engines import Engine, find_engine
+from mars_lidar.engines import Engine, check_detector, find_engine
 from mars_lidar.instrument.system import System
 from mars_lidar.io.scan import SceneFile
-from mars_lidar.learn.ahead import ahead as made_ahead
-from mars_lidar.learn.cubes import CubeMaker
-from mars_lidar.learn.distributed import rank_of, worker_of
 from mars_lidar.learn.needed import torch
-from mars_lidar.learn.passes import Passes, warn_if_put_together
 from mars_lidar.learn.ranges import LogUniform, Range, SystemRange, as_range, as_systems
-from mars_lidar.learn.sample import Recipe, Sample, example_of
-from mars_lidar.learn.scenes import as_source
+from mars_lidar.learn.scenes import Recipe, Sample, as_source, example_of
 from mars_lidar.scene.radiometry import AMBIENTS, ATTENUATIONS
 from mars_lidar.scene.scene import Scene
+from mars_lidar.simulate import simulate
+
+# --- Ranks and workers ---------------------------------------------------------------------------------------------
+
+
+def rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
+    """Rank and number of ranks: as given; of torch.distributed where it runs; of the environment; 0 of 1."""
+    if (rank is None) != (world_size is None):
+        raise ValueError("rank and world_size go together, got one of them")
+    if rank is None or world_size is None:
+        running = torch.distributed.is_available() and torch.distributed.is_initialized()
+        if running:
+            return torch.distributed.get_rank(), torch.distributed.get_world_size()
+        # torchrun sets these before a process group exists: without them every rank would train on the same samples
+        told = [os.environ.get(name, "") for name in ("RANK", "WORLD_SIZE")]
+        if not all(one.isdigit() for one in told):
+            return 0, 1
+        rank, world_size = map(int, told)
+    world = checks.integer("world_size", world_size, low=1, high=2**31)
+    return checks.integer("rank", rank, low=0, high=world - 1), world
+
+
+def worker_of() -> tuple[int, int, bool]:
+    """Number of this worker and of all workers of a DataLoader, and whether this is one; else 0 of 1."""
+    info = torch.utils.data.get_worker_info()
+    return (0, 1, False) if info is None else (info.id, info.num_workers, True)
+
+
+# --- Passes --------------------------------------------------------------------------------------------------------
+
+_WORKERS = 1024  # most of one loader
+_SEED_BITS = 24
+_SEEDS = (1 << _SEED_BITS) - 1
+_BY_WORKER = 1 << (_SEED_BITS - 1)  # set in the seed part of a worker's mark; those of the main process have 0 there
+
+
+class Passes:
+    """Counts the passes since `begin_at`, in shared memory."""
+
+    def __init__(self) -> None:
+        # epoch of the first pass, its first sample, whether the last pass has ended; then a mark for each worker
+        self._shared = torch.zeros(3 + _WORKERS, dtype=torch.int64)
+        self._shared.share_memory_()  # type: ignore[no-untyped-call]
+
+    def begin_at(self, epoch: int, start: int) -> None:
+        """The next pass is the first: of this epoch, from this sample on."""
+        self._shared[3:] = 0
+        self._shared[2] = 0
+        self._shared[1], self._shared[0] = start, epoch
+
+    def join(self, epoch: int, start: int) -> None:
+        """In a worker: go on with a pass of an epoch. All workers of the pass write the same here, in any order."""
+        self._shared[1], self._shared[0] = start, epoch
+        self._shared[3:] = (1 << _SEED_BITS) | _mark()
+
+    def begin(self, worker: int) -> tuple[int, int]:
+        """Begin a pass, or join the one that other workers have begun: passes before it, and its first sample."""
+        if worker >= _WORKERS:
+            raise ValueError(f"a loader may have at most {_WORKERS} workers, got worker {worker}")
+        mark, marks = _mark(), self._shared[3:].tolist()
+        same = [
+            (one >> _SEED_BITS) + (place == worker) for place, one in enumerate(marks) if mark and one & _SEEDS == mark
+        ]
+        number = max(same) if same else (max(marks) >> _SEED_BITS) + 1
+        self._shared[3 + worker] = (number << _SEED_BITS) | mark
+        self._shared[2] = 0
+        return number - 1, int(self._shared[1]) if number == 1 else 0
+
+    def end(self) -> None:
+        """The pass has given all that it has."""
+        self._shared[2] = 1
+
+    @property
+    def first(self) -> tuple[int, int]:
+        """Epoch of the first pass, and its first sample."""
+        return int(self._shared[0]), int(self._shared[1])
+
+    @property
+    def begun(self) -> int:
+        """Passes begun."""
+        return int(self._shared[3:].max()) >> _SEED_BITS
+
+    @property
+    def start(self) -> int:
+        """First sample of the pass that is going on, or of the next one."""
+        return int(self._shared[1]) if self.begun == 0 or (self.begun == 1 and not self._shared[2]) else 0
+
+    @property
+    def by_workers(self) -> bool:
+        """Whether the last pass was begun by workers of a loader."""
+        return bool(int(self._shared[3:].max()) & _BY_WORKER)
+
+
+def _mark() -> int:
+    """Of the seed that all workers of a pass share; 0 outside of workers."""
+    info = torch.utils.data.get_worker_info()
+    return 0 if info is None else ((info.seed - info.id) & _SEEDS) | _BY_WORKER
+
+
+def warn_if_put_together(batched: bool) -> None:
+    """In ``__iter__``: warn where it was called by a loader that stacks what the stream gives.
+
+    No interface tells a dataset so; the loader's fetcher has it in a variable.
+    """
+    caller = sys._getframe(2)
+    if not caller.f_locals.get("auto_collation", False) or "torch" not in caller.f_code.co_filename:
+        return
+    info = torch.utils.data.get_worker_info()
+    if info is not None and info.id > 0:
+        return
+    why = (
+        "stacks the batches of the stream once more"
+        if batched
+        else "puts batches together worker by worker: they depend on the number of workers, and cannot be resumed"
+    )
+    warnings.warn(
+        f"this loader {why}: give batch_size to CubeStream and batch_size=None to the loader", UserWarning, stacklevel=4
+    )
+
+
+# --- Examples made ahead -------------------------------------------------------------------------------------------
+
+T = TypeVar("T")
+_WAIT_S = 0.1  # after which a thread that cannot hand on its item looks whether anybody still wants it
+
+
+def prefetched(items: Iterator[T], number: int) -> Iterator[T]:
+    """The items of an iterator, in order, up to `number` of them made before they are asked for.
+
+    What the iterator raises is raised here, in its place. The thread ends with the last item, or after the one it is
+    making when this iterator is closed.
+    """
+    ready: queue.Queue[tuple[Any, BaseException | None]] = queue.Queue(number)
+    closed = threading.Event()
+
+    def hand_on(item: Any, error: BaseException | None) -> bool:
+        while not closed.is_set():
+            try:
+                ready.put((item, error), timeout=_WAIT_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def make() -> None:
+        try:
+            for item in items:
+                if not hand_on(item, None):
+                    return
+        except BaseException as error:
+            hand_on(None, error)
+        else:
+            hand_on(None, StopIteration())
+
+    thread = threading.Thread(target=make, name="mars_lidar.learn", daemon=True)
+    thread.start()
+    try:
+        while True:
+            item, error = ready.get()
+            if isinstance(error, StopIteration):
+                return
+            if error is not None:
+                raise error
+            yield item
+            del item
+    finally:
+        closed.set()
+        thread.join()
+
+
+# --- Counts as tensors ---------------------------------------------------------------------------------------------
+
+_UNSIGNED = {np.dtype(np.uint16): torch.uint16, np.dtype(np.uint32): torch.uint32}
+
+
+class CubeMaker:
+    """Makes the cubes of a batch; `systems` are the extremes of what will be asked for."""
+
+    def __init__(
+        self, engine: Engine, systems: Sequence[System], device: Any, layout: str, axes: str, dtype: Any
+    ) -> None:
+        for system in systems:
+            check_detector(engine, system)
+        self._engine = engine
+        self._layout = checks.choice("layout", layout, ("dense", "sparse"))
+        self._axes = checks.choice("axes", axes, ("THW", "HWT"))
+        if dtype is not None and not isinstance(dtype, torch.dtype):
+            raise TypeError(f"dtype must be a torch.dtype, or None for the counts as they are, got {dtype!r}")
+        self._counts = max((system.histogram_dtype for system in systems), key=lambda dtype: dtype.itemsize)
+        self._dtype = dtype
+        self._buffers = Buffers()
+        self.device = torch.device(device)
+        if self.device.type not in ("cpu", "cuda"):
+            raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
+        self.on_gpu = self.device.type == "cuda"
+        if self.on_gpu and not torch.cuda.is_available():
+            raise ValueError(
+                "device='cuda' needs a GPU and a build of PyTorch for it; torch.cuda.is_available() is False"
+            )
+
+    def cubes(self, samples: Sequence[Sample], threads: int) -> torch.Tensor:
+        """(samples, T, H, W) or (samples, H, W, T)."""
+        shapes = {sample.flux.shape for sample in samples}
+        if len(shapes) > 1:
+            raise ValueError(f"scenes must be of one size to be stacked, got {sorted(shapes)}; give size")
+        shape = (len(samples), *shapes.pop(), samples[0].system.bins)
+        if self.on_gpu:
+            counts = torch.stack([self._simulated_on_gpu(sample) for sample in samples])
+            return self._finished(counts if self._layout == "dense" else counts.to_sparse())
+        check_memory(int(np.prod(shape)) * self._counts.itemsize, f"cubes of shape {shape}", "use a smaller batch_size")
+        kind = _UNSIGNED[self._counts]
+        wanted = kind if self._dtype is None else self._dtype
+        if self._layout == "sparse":
+            counts = self._buffers.take(shape, kind)
+            for place, sample in enumerate(samples):
+                self._simulated(sample, counts[place : place + 1].numpy(), threads)
+            return self._finished(_sparse(counts.numpy()))
+        cube = self._buffers.take(shape, wanted)
+        for place, sample in enumerate(samples):
+            part = cube[place : place + 1]
+            if wanted == kind:
+                self._simulated(sample, part.numpy(), threads)
+                continue
+            counts = self._buffers.take((1, *shape[1:]), kind)  # converted while it is still in the cache
+            self._simulated(sample, counts.numpy(), threads)
+            if wanted == torch.bfloat16:  # which NumPy does not know
+                part.copy_(counts)
+            else:  # by this thread: those of torch would spin for longer than this takes
+                np.copyto(part.numpy(), counts.numpy(), casting="unsafe")
+        return self._turned(cube)
+
+    def _simulated(self, sample: Sample, out: NDArray[Any], threads: int) -> None:
+        own = sample.system.histogram_dtype == self._counts
+        made = simulate(
+            sample.flux,
+            sample.system,
+            engine=self._engine,
+            seed=sample.seed,
+            threads=threads,
+            out=out if own else None,
+        )
+        if not own:
+            out[:] = made
+
+    def _finished(self, cube: torch.Tensor) -> torch.Tensor:
+        return self._turned(cube if self._dtype is None else cube.to(self._dtype))
+
+    def _turned(self, cube: torch.Tensor) -> torch.Tensor:
+        if self._axes == "HWT":
+            return cube
+        turned = cube.permute(0, 3, 1, 2)
+        return turned.coalesce() if cube.layout == torch.sparse_coo else turned
+
+    def _simulated_on_gpu(self, sample: Sample) -> torch.Tensor:
+        with torch.cuda.device(self.device):
+            made: Any = simulate(sample.flux, sample.system, engine=self._engine, seed=sample.seed, device="cuda")
+        tensor: torch.Tensor = torch.utils.dlpack.from_dlpack(made)[0]
+        return tensor
+
+
+def _sparse(counts: NDArray[Any]) -> torch.Tensor:
+    """COO (samples, H, W, T) of int32."""
+    where = np.flatnonzero(counts)
+    values = torch.from_numpy(counts.reshape(-1)[where].astype(np.int32))
+    indices = torch.from_numpy(np.stack(np.unravel_index(where, counts.shape)).astype(np.int64, copy=False))
+    return torch.sparse_coo_tensor(indices, values, counts.shape, is_coalesced=True, check_invariants=False)
+
+
+class Buffers:
+    """Memory of tensors that nobody holds any more, given out again: fresh pages cost as much as simulating dim light.
+
+    A tensor made from a NumPy array holds a reference to it, and so do all its views through their storage: an array
+    with no reference but the one here is free.
+    """
+
+    _KEPT = 4
+
+    def __init__(self) -> None:
+        self._arrays: list[NDArray[np.uint8]] = []
+
+    def take(self, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+        """A tensor of any content."""
+        size = int(np.prod(shape)) * dtype.itemsize
+        for place in range(len(self._arrays)):
+            if sys.getrefcount(self._arrays[place]) == _ALONE and self._arrays[place].size == size:
+                return torch.from_numpy(self._arrays[place]).view(dtype).view(shape)
+        array = np.empty(size, np.uint8)
+        self._arrays = [*self._arrays[1 - self._KEPT :], array]
+        return torch.from_numpy(array).view(dtype).view(shape)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_arrays": []}
+
+
+def _alone() -> int:
+    """What `sys.getrefcount` tells of an object that only a list holds; it differs between versions of Python."""
+    held = [object()]
+    return sys.getrefcount(held[0])
+
+
+_ALONE = _alone()
+
+
+# --- The stream ----------------------------------------------------------------------------------------------------
 
 _LAST = 2**62
 
@@ -66,7 +381,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         Factor on the depth: a number or a range.
     flips
         Mirror scenes at random, up-down and left-right.
-    attenuation, ambient, dark_counts_per_s
+    attenuation, ambient, dark_count_hz
         As for `mars_lidar.Scene.flux`.
     engine
         Name or `Engine`, as for `mars_lidar.simulate`.
@@ -118,7 +433,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         flips: bool = True,
         attenuation: Literal["none", "inverse_square"] = "none",
         ambient: Literal["uniform", "reflectivity", "map"] | None = None,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
         engine: str | Engine = "exact",
         device: str | torch.device = "cpu",
         layout: Literal["dense", "sparse"] = "dense",
@@ -140,7 +455,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         drawn = as_systems(systems)
         checks.choice("attenuation", attenuation, ATTENUATIONS)
         checks.choice("ambient", "map" if ambient is None else ambient, AMBIENTS)
-        dark = checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
+        dark = checks.real("dark_count_hz", dark_count_hz, low=0.0)
         self._recipe = Recipe(
             source=as_source(scenes, shape, reuse),
             systems=drawn,
@@ -149,7 +464,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             signal=as_range("signal", signal),
             sbr=as_range("sbr", sbr, infinite=True),
             depth_scale=as_range("depth_scale", depth_scale),
-            lit={"attenuation": attenuation, "ambient": ambient, "dark_counts_per_s": dark},
+            lit={"attenuation": attenuation, "ambient": ambient, "dark_count_hz": dark},
             seed=checks.integer("seed", seed, low=0, high=2**63 - 1),
         )
         self._end = _LAST if epoch_size is None else checks.integer("epoch_size", epoch_size, low=1, high=_LAST)
@@ -264,7 +579,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
             if place >= given and place % workers == worker
         )
         alone = self._ahead and not in_worker and not self._maker.on_gpu
-        return self._given_out(made_ahead(examples, self._ahead) if alone else examples)
+        return self._given_out(prefetched(examples, self._ahead) if alone else examples)
 
     def _given_out(self, examples: Iterator[tuple[int, dict[str, Any]]]) -> Iterator[Any]:
         for place, example in examples:

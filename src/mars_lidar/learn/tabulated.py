@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mars_lidar.learn.cyclic_solver import Delay, blocks
-from mars_lidar.learn.light import check_detector, inputs, wrapped_energy
+from mars_lidar.learn.forward import Delay, blocks, check_detector, inputs, wrapped_energy
 from mars_lidar.learn.needed import torch
 from mars_lidar.table import Table
 

@@ -1,33 +1,103 @@
-"""Photon flux at the pixels: what arrives at the detector, per laser period."""
+"""Photon flux at the pixels: what arrives at the detector, per laser period (`Flux`)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.light.photon_maps import (
-    MAX_DELAY_NS,
-    broadcast,
-    check_photons,
-    common_shape,
-    frozen,
-    light_map,
-    waveform_maps,
-)
-from mars_lidar.light.photon_maps import MAX_PHOTONS as MAX_PHOTONS
+
+# --- Maps of photons -----------------------------------------------------------------------------------------------
+
+MAX_DELAY_NS = 1e9  # a second: beyond, float64 does not tell the phase in a laser period to 1e-6 ns
+MAX_PHOTONS = 1e6  # per period; the samplers are tested to 1e3
+
+
+def light_map(name: str, value: ArrayLike, *, photons: bool = True) -> FloatArray:
+    """A scalar or (H, W) as float64 of two axes: photons per period, or any finite number or NaN."""
+    if isinstance(value, np.ma.MaskedArray):  # a masked delay is no return; masked light is refused, not taken as it is
+        value = np.where(np.ma.getmaskarray(value), np.nan, value.data)
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        raise TypeError(f"{name} must be real numbers, got dtype {array.dtype}")
+    array = array.astype(np.float64)
+    if array.ndim > 2:
+        raise ValueError(f"{name} must be a scalar or (H, W), got shape {array.shape}")
+    if array.size == 0:
+        raise ValueError(f"{name} must have at least one pixel, got shape {array.shape}")
+    if photons:
+        check_photons(name, array)
+    elif np.isinf(array).any():
+        raise ValueError(f"{name} must be finite (or NaN where there is no return), got inf")
+    return np.atleast_2d(array)
+
+
+def check_photons(name: str, array: FloatArray) -> None:
+    """Raise ValueError, naming the first one, for numbers that are no photons per period."""
+    if not (array.min() >= 0 and array.max() <= MAX_PHOTONS):  # NaN is neither
+        bad = ~((array >= 0) & (array <= MAX_PHOTONS))
+        where = tuple(int(k) for k in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name} must lie in [0, {MAX_PHOTONS:g}] photons per period, got {array[where]} at index {where}"
+        )
+
+
+def common_shape(names: Sequence[str], shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    """The shape that all broadcast to."""
+    try:
+        return np.broadcast_shapes(*shapes)
+    except ValueError:
+        told = ", ".join(f"{n} {s}" for n, s in zip(names, shapes, strict=True))
+        raise ValueError(f"shapes must broadcast to one (H, W), got {told}") from None
+
+
+def broadcast(names: Sequence[str], maps: Sequence[FloatArray]) -> list[FloatArray]:
+    """Maps of one shape."""
+    shape = common_shape(names, [m.shape for m in maps])
+    return [m if m.shape == shape else np.broadcast_to(m, shape) for m in maps]
+
+
+def waveform_maps(waveform: ArrayLike, background: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Waveforms (H, W, T) and background (H, W)."""
+    wave = np.asarray(checks.unmasked("waveform", waveform))
+    if wave.dtype.kind not in "fiub":
+        raise TypeError(f"waveform must be real numbers, got dtype {wave.dtype}")
+    if wave.ndim not in (1, 2, 3) or wave.size == 0:
+        raise ValueError(f"waveform must be (T,), (W, T) or (H, W, T), got shape {wave.shape}")
+    wave = wave.astype(np.float64)
+    check_photons("waveform", wave)
+    wave = wave.reshape((1,) * (3 - wave.ndim) + wave.shape)
+    check_photons("waveform summed over a period", wave.sum(-1))
+    back = light_map("background", background)
+    shape = common_shape(("waveform", "background"), [wave.shape[:2], back.shape])
+    return np.broadcast_to(wave, (*shape, wave.shape[-1])), np.broadcast_to(back, shape)
+
+
+def frozen(array: FloatArray) -> FloatArray:
+    """A contiguous copy that nobody writes to."""
+    copy = np.ascontiguousarray(array, dtype=np.float64)
+    if copy is array or copy.base is not None:
+        copy = copy.copy()
+    copy.flags.writeable = False
+    return copy
+
+
+# --- The flux ------------------------------------------------------------------------------------------------------
 
 MAX_RETURNS = 16
 
 
+@constructed_by_name
 @dataclass(frozen=True, eq=False, init=False)
 class Flux:
     """Expected *detectable* photons per laser period at each pixel (photon detection efficiency included).
@@ -63,6 +133,19 @@ class Flux:
         (H, W, T) or None.
     info
         What made this flux, for the record (scene radiometry puts its achieved means here).
+
+    See Also
+    --------
+    Scene, simulate, System
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> flux.shape
+    (1, 2)
+    >>> flux.signal
+    array([[0.5, 2. ]])
     """
 
     signal: FloatArray
@@ -135,7 +218,7 @@ class Flux:
         """The flux of a rendered transient (H, W, T): light in bins of `bin_ns` from the time `start_ns`.
 
         `level` takes the arguments of `mars_lidar.io.Transient.flux`: ``signal`` or ``photons_per_unit``, and
-        ``sbr``, ``dark_counts_per_s``, ``pulse``, ``parts``. Files are read by `mars_lidar.io.read_transient`.
+        ``sbr``, ``dark_count_hz``, ``pulse``, ``parts``. Files are read by `mars_lidar.io.read_transient`.
         """
         rendered = late("light.transient:Transient")(values, bin_ns, start_ns=start_ns)
         flux: Flux = rendered.flux(system, **level)

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base.memory import check_memory
 from mars_lidar._base.types import FloatArray
-from mars_lidar.light.flux import Flux
-from mars_lidar.light.photon_maps import check_photons
+from mars_lidar.light.flux import Flux, check_photons
 
 BAND_BYTES = 64 * 2**20  # of waveforms that are made together
 

@@ -1,15 +1,15 @@
 """Rendered transients: light against time at each pixel, as the detector's input.
 
-A transient path tracer gives what a delta pulse sends back. `Transient.flux` puts it on the laser period, gives
-it the system's pulse, and scales it to photons.
+A transient path tracer gives what a delta pulse sends back. `Transient.flux` puts it on the laser period, gives it the
+pulse of the system, and scales it to photons. Rates (H, W, T) may stay on disk: rows are read as needed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,13 +17,68 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked
 from mars_lidar._base.memory import check_memory
-from mars_lidar._base.resample import new_size, window
+from mars_lidar._base.resample import area_mean, new_size, window
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.pulse import Pulse
 from mars_lidar.instrument.system import System
 from mars_lidar.light.flux import Flux
-from mars_lidar.light.rate_parts import RateArray, cropped, resized
 from mars_lidar.light.stored_flux import StoredFlux
+
+# --- Parts of rates that stay on disk ------------------------------------------------------------------------------
+
+
+class RateArray(Protocol):
+    """An array in memory or on disk, such as rates (H, W, T): `shape`, and rows by ``values[first:last]``."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Length of each axis."""
+
+    def __getitem__(self, key: Any) -> Any:
+        """The selected rows, in memory."""
+
+
+class Rows:
+    """Rates (H, W, T) whose rows are read when they are sliced."""
+
+    def __init__(self, shape: tuple[int, ...], read: Callable[[slice], NDArray[Any]]) -> None:
+        self.shape, self._read = shape, read
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        return self._read(rows)
+
+
+def cropped(values: RateArray, rows: slice, columns: slice) -> Rows:
+    """Some rows and columns."""
+    height, width, bins = values.shape
+    inside = range(height)[rows]
+
+    def read(key: slice) -> NDArray[Any]:
+        wanted = inside[key]
+        return np.asarray(values[min(wanted) : max(wanted) + 1])[:: wanted.step, columns]
+
+    return Rows((len(inside), len(range(width)[columns]), bins), read)
+
+
+def resized(values: RateArray, size: tuple[int, int]) -> Rows:
+    """Mean light over the area of larger or smaller pixels."""
+    old, (new, width) = values.shape[0], size
+
+    def read(key: slice) -> NDArray[Any]:
+        return area_mean(np.stack([row(k) for k in range(new)[key]]), width, axis=1)
+
+    def row(k: int) -> NDArray[np.float64]:
+        """Mean of the old rows that a new one covers, each by its share."""
+        first, last = k * old // new, math.ceil((k + 1) * old / new)
+        edges = np.clip(np.arange(first, last + 1) * new, k * old, (k + 1) * old)
+        share = np.diff(edges) / old
+        rows = np.asarray(values[first:last], dtype=np.float64)
+        return np.asarray((share[:, None, None] * rows).sum(axis=0))
+
+    return Rows((*size, values.shape[2]), read)
+
+
+# --- The transient -------------------------------------------------------------------------------------------------
 
 _BAND_BYTES = 64 * 2**20
 _WORK_BYTES = 8 * 2**20  # of rows that are folded and convolved together, some six times over
@@ -122,7 +177,7 @@ class Transient:
         signal: float | None = None,
         photons_per_unit: float | None = None,
         sbr: float = math.inf,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
         pulse: bool = True,
         parts: int | None = None,
         rows: slice = slice(None),
@@ -132,7 +187,7 @@ class Transient:
         With L the light of a pixel, summed over all bins, and V the pixels with any light::
 
             S = signal * L / mean_V(L)      or      S = photons_per_unit * L
-            B = mean_V(S) / sbr  +  dark_counts_per_s * t_r / detection_efficiency
+            B = mean_V(S) / sbr  +  dark_count_hz * t_r / detection_efficiency
 
         Time is folded with the laser period: light that arrives after its end comes in the next one.
 
@@ -146,7 +201,7 @@ class Transient:
             Instead of `signal`: detectable photons per laser period for one unit of light, > 0.
         sbr
             Mean signal over ambient photons, uniform over the image; inf: no ambient light.
-        dark_counts_per_s
+        dark_count_hz
             Dark counts of a pixel, counts/s, besides those of the detector (`Detector.dark_count_hz`): what is counted,
             whatever the detection efficiency.
         pulse
@@ -170,7 +225,7 @@ class Transient:
                 checks.real(name, value, low=0.0, strict_low=True)
         if sbr != math.inf:
             checks.real("sbr", sbr, low=0.0, strict_low=True)
-        checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
+        checks.real("dark_count_hz", dark_count_hz, low=0.0)
         first, last, stride = rows.indices(self.shape[0])
         if stride != 1 or first >= last:
             raise ValueError(f"rows must select a run of at least one of {self.shape[0]}, got {rows!r}")
@@ -181,7 +236,7 @@ class Transient:
             raise ValueError(f"{self._named}values must have light in some pixel, got none")
         mean = float(lit.mean())
         scale = signal / mean if signal is not None else float(photons_per_unit or 0.0)
-        dark = dark_counts_per_s * 1e-9 * system.period_ns / system.detector.detection_efficiency
+        dark = dark_count_hz * 1e-9 * system.period_ns / system.detector.detection_efficiency
         background = (scale * mean / sbr if sbr != math.inf else 0.0) + dark
         size = 8 * (last - first) * self.shape[1] * number
         check_memory(4 * size, "the waveforms of these rows", "take fewer rows at a time")  # Flux keeps a copy
@@ -200,7 +255,7 @@ class Transient:
             "mean_signal": scale * mean,
             "mean_background": background,
             "sbr": None if sbr == math.inf else sbr,
-            "dark_counts_per_s": dark_counts_per_s,
+            "dark_count_hz": dark_count_hz,
             "pulse_convolved": pulse,
         }
         return Flux(waveform=waveform, background=background, info=info)
@@ -213,7 +268,7 @@ class Transient:
         signal: float | None = None,
         photons_per_unit: float | None = None,
         sbr: float = math.inf,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
         pulse: bool = True,
         parts: int | None = None,
     ) -> StoredFlux:
@@ -224,7 +279,7 @@ class Transient:
         """
 
         level: dict[str, Any] = {"signal": signal, "photons_per_unit": photons_per_unit, "sbr": sbr}
-        level |= {"dark_counts_per_s": dark_counts_per_s, "pulse": pulse, "parts": parts}
+        level |= {"dark_count_hz": dark_count_hz, "pulse": pulse, "parts": parts}
 
         def make(rows: slice) -> Flux:
             return self.flux(system, **level, rows=rows)

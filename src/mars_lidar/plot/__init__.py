@@ -4,8 +4,8 @@ Every figure is a `matplotlib.figure.Figure` and touches no global state of matp
 backend is chosen, and figures can be made in any thread. ``figure.savefig(path)`` writes one.
 """
 
-from mars_lidar.compare.views import count_maps, depth_error_m, example_pixels, incident_rate
 from mars_lidar.plot.figures import map_image, overview, pixel_histogram
+from mars_lidar.plot.views import count_maps, depth_error_m, example_pixels, incident_rate
 
 __all__ = [
     "count_maps",

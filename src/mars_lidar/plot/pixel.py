@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar.compare.views import incident_rate, predicted_counts
 from mars_lidar.instrument.system import System
 from mars_lidar.io.layout import MEASURED
 from mars_lidar.plot.style import INK, MUTED
+from mars_lidar.plot.views import incident_rate, predicted_counts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mars_lidar.compare.views import depth_error_m
 from mars_lidar.plot.figures import _draw_map, _limits, _metres
 from mars_lidar.plot.style import DPI, style
+from mars_lidar.plot.views import depth_error_m
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -25,7 +25,7 @@ _OUTSIDE_CORE = 0.0015  # of the energy on either side of the window in which th
 def recording_of(system: System) -> _core.HistogramRecord:
     """The native form of a system whose gate, if any, does not move; times in laser periods."""
     from mars_lidar._base.native import _core
-    from mars_lidar.statistics.grid import whole_bins
+    from mars_lidar.statistics.cells import whole_bins
 
     low, cell, energy, slope = _curve(system.pulse, system.period_ns)
     peak = low + cell * (int(np.argmax(np.diff(energy))) + 0.5)

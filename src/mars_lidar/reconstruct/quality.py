@@ -1,14 +1,15 @@
-"""Errors of reconstructed maps against the truth; PSNR and SSIM by scikit-image (extra ``estimate``)."""
+"""Errors of reconstructed maps against the truth; SSIM by scikit-image (extra ``estimate``)."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mars_lidar._base.optional import needed
-from mars_lidar._base.types import FloatArray
+from mars_lidar._base.optional import MissingLibraryError, needed
+from mars_lidar._base.types import BoolArray, FloatArray
 from mars_lidar.instrument.system import System
 
 if TYPE_CHECKING:
@@ -27,7 +28,8 @@ class MapError:
     psnr
         Peak signal-to-noise ratio, dB: range of the truth over `rmse`.
     ssim
-        Structural similarity (Wang et al., 2004), mean over pixels; NaN for images of less than 7 pixels a side.
+        Structural similarity (Wang et al., 2004), mean over pixels; NaN for images of less than 7 pixels a side, and
+        where scikit-image is not installed.
     missing
         Share of pixels without an estimate; SSIM takes them as the median of the others.
     """
@@ -41,7 +43,6 @@ class MapError:
 
 def map_error(truth: FloatArray, estimate: FloatArray) -> MapError:
     """Errors of `estimate` (..., H, W) against `truth` (H, W); NaN is unknown in either."""
-    metrics = needed("skimage.metrics", "a comparison by PSNR and SSIM", "estimate")
     truth, estimate = np.asarray(truth, np.float64), np.asarray(estimate, np.float64)
     if truth.ndim != 2 or estimate.shape[-2:] != truth.shape:
         raise ValueError(
@@ -57,19 +58,34 @@ def map_error(truth: FloatArray, estimate: FloatArray) -> MapError:
     span = float(np.ptp(truth[known]))
     psnr = ssim = float("nan")
     if span > 0.0:
-        where = np.broadcast_to(truth, images.shape)[both]
-        psnr = float(metrics.peak_signal_noise_ratio(where, images[both], data_range=span)) if rmse > 0 else np.inf
-        if min(truth.shape) >= _LEAST_SIDE:
-            plain = np.where(known, truth, np.median(truth[known]))
-            each = []
-            for image, good in zip(images, both, strict=True):
-                middle = np.median(image[good]) if good.any() else plain.mean()
-                filled = np.where(known, np.where(good, image, middle), plain)
-                local = metrics.structural_similarity(plain, filled, data_range=span, full=True)[1]
-                each.append(float(local[known].mean()))
-            ssim = float(np.mean(each))
+        psnr = 20.0 * math.log10(span / rmse) if rmse > 0 else math.inf
+        if ssim_available() and min(truth.shape) >= _LEAST_SIDE:
+            ssim = _mean_ssim(truth, images, known, span)
     missing = 1.0 - float(both.sum()) / (len(images) * int(known.sum()))
     return MapError(rmse, float(np.median(np.abs(error))), psnr, ssim, missing)
+
+
+def ssim_available() -> bool:
+    """Whether scikit-image is installed."""
+    try:
+        needed("skimage.metrics", "SSIM", "estimate")
+    except MissingLibraryError:
+        return False
+    return True
+
+
+def _mean_ssim(truth: FloatArray, images: FloatArray, known: BoolArray, span: float) -> float:
+    """Mean SSIM of `images` (n, H, W) against `truth`; a missing estimate is the median of its image."""
+    metrics = needed("skimage.metrics", "SSIM", "estimate")
+    plain = np.where(known, truth, np.median(truth[known]))
+    means = []
+    for image in images:
+        good = known & np.isfinite(image)
+        middle = np.median(image[good]) if good.any() else plain.mean()
+        filled = np.where(known, np.where(good, image, middle), plain)
+        local = metrics.structural_similarity(plain, filled, data_range=span, full=True)[1]
+        means.append(float(local[known].mean()))
+    return float(np.mean(means))
 
 
 def errors_against(cube: Cube, found: Reconstruction) -> dict[str, MapError]:

@@ -97,7 +97,7 @@ class LayeredScene:
         sbr: float,
         attenuation: Literal["none", "inverse_square"] = "none",
         ambient: Literal["uniform", "reflectivity", "map"] | None = None,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
     ) -> Flux:
         """The photon flux, one return for each layer.
 
@@ -110,4 +110,4 @@ class LayeredScene:
         layers, in whatever order they come.
         """
         depth, share = (np.stack([getattr(one, name) for one in self.layers]) for name in ("depth_m", "reflectivity"))
-        return scene_flux(depth, share, self.background, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+        return scene_flux(depth, share, self.background, system, signal, sbr, attenuation, ambient, dark_count_hz)

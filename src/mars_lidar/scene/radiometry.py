@@ -28,7 +28,7 @@ def scene_flux(
     sbr: float,
     attenuation: str,
     ambient: str | None,
-    dark_counts_per_s: float,
+    dark_count_hz: float,
 ) -> Flux:
     """The body of `Scene.flux` and `LayeredScene.flux`, which document arguments, formulas and warnings.
 
@@ -41,7 +41,7 @@ def scene_flux(
     checks.choice("attenuation", attenuation, ATTENUATIONS)
     light_name = ("uniform" if background is None else "map") if ambient is None else ambient
     checks.choice("ambient", light_name, AMBIENTS)
-    rate = checks.real("dark_counts_per_s", dark_counts_per_s, low=0.0)
+    rate = checks.real("dark_count_hz", dark_count_hz, low=0.0)
     surface = ~np.isnan(depth_m)
     valid, share = surface.any(0), np.where(surface, reflectivity, 0.0)
     if light_name == "uniform":
@@ -78,7 +78,7 @@ def scene_flux(
         "sbr_definition": "mean signal / mean ambient photons over the pixels with a return; no dark counts",
         "attenuation": attenuation,
         "ambient": light_name,
-        "dark_counts_per_s": rate,
+        "dark_count_hz": rate,
         "n_pixels": int(valid.size),
         "n_valid": number,
         "n_wrapped": wrapped,

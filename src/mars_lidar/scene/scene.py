@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mars_lidar._base import checks
 from mars_lidar._base.arguments import checked, checked_with_masks
 from mars_lidar._base.files import reading
+from mars_lidar._base.keywords import constructed_by_name
 from mars_lidar._base.late import late
 from mars_lidar._base.notebook import as_html
 from mars_lidar._base.resample import area_mean, image_size, nearest, new_size, window
@@ -24,6 +25,7 @@ _EXAMPLES = ("room", "random")
 _MAX_DEPTH_M = 1e9  # beyond the Moon; keeps delays far inside what a double resolves to a picosecond
 
 
+@constructed_by_name
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class Scene:
     """Depth, reflectivity and ambient light of each pixel.
@@ -46,6 +48,23 @@ class Scene:
         Read-only float64 (H, W); `background` may be None.
     valid
         Pixels with a return (H, W), bool.
+
+    See Also
+    --------
+    Flux, simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> scene = ml.Scene.example("room", size=(48, 64))
+    >>> scene.depth_m.shape
+    (48, 64)
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> scene.flux(system, signal=0.5, sbr=1.0).signal.mean().round(3)
+    np.float64(0.5)
     """
 
     depth_m: FloatArray
@@ -134,14 +153,14 @@ class Scene:
         sbr: float,
         attenuation: Literal["none", "inverse_square"] = "none",
         ambient: Literal["uniform", "reflectivity", "map"] | None = None,
-        dark_counts_per_s: float = 0.0,
+        dark_count_hz: float = 0.0,
     ) -> Flux:
         """The photon flux at each pixel, at a stated mean signal level and signal-to-background ratio.
 
         With V the set of valid pixels (those with a return), z the depth, rho the reflectivity::
 
             S   = signal * w / mean_V(w),             w = rho * g(z),   g = 1 or 1 / z^2
-            B   = signal / sbr * a / mean_V(a)  +  dark_counts_per_s * t_r / detection_efficiency
+            B   = signal / sbr * a / mean_V(a)  +  dark_count_hz * t_r / detection_efficiency
             tau = 2 z / c
 
         so that ``mean_V(S) = signal`` and ``mean_V(S) / mean_V(B - dark) = sbr``. Pixels without return have
@@ -163,7 +182,7 @@ class Scene:
             a: ``"uniform"``, ``"reflectivity"`` (sunlight or lamps scattered by the same surface; radiance
             does not fall with distance) or ``"map"`` (the scene's background map). None: the map where there
             is one, else uniform.
-        dark_counts_per_s
+        dark_count_hz
             Dark counts of a pixel, counts/s, the same in all, besides those of the detector (`Detector.dark_count_hz`):
             what is counted, whatever the detection efficiency.
 
@@ -185,7 +204,7 @@ class Scene:
             reached because reflectivity or ambient light is zero at every valid pixel.
         """
         maps = self.depth_m[None], self.reflectivity[None], self.background
-        return scene_flux(*maps, system, signal, sbr, attenuation, ambient, dark_counts_per_s)
+        return scene_flux(*maps, system, signal, sbr, attenuation, ambient, dark_count_hz)
 
     @staticmethod
     def example_names() -> tuple[str, ...]:
@@ -214,10 +233,10 @@ class Scene:
         seed = checks.integer("seed", seed, low=0, high=2**64 - 1)
         shape = image_size(size if isinstance(size, tuple | list) else (size, size))
         if name == "random":
-            from mars_lidar.scene.random_scene import random_scene
+            from mars_lidar.scene.rooms import random_scene
 
             return cls(*random_scene(shape, seed))
-        from mars_lidar.scene.room import room
+        from mars_lidar.scene.rooms import room
 
         return cls(*room(shape, seed))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.count_window import Pmf as Pmf
+from mars_lidar.statistics.count_pmf import Pmf as Pmf
 
 _POOLED = 5.0  # expected counts below which cells of a G-test are pooled
 KL_FLOOR = 1e-12  # of a law's probabilities in a Kullback-Leibler divergence, which is infinite without

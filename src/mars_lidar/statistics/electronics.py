@@ -1,30 +1,234 @@
-"""A free-running pixel behind electronics with a dead time of their own: mean, variance, mean histogram.
+"""Free-running pixels behind electronics with a dead time of their own: count law, mean histogram, stationary shape.
 
 An avalanche is recorded iff t_e have passed since the last record; the pixel runs on meanwhile, blind for t_d after
 each of its avalanches. So records are a Markov-renewal process whose state is the phase of a record: docs/detectors.md,
-equations (10) to (13).
+equations (10) to (13). Its transition probabilities are the kernel (10) folded over the periods. The stationary law of
+the phases is the mean histogram of a pixel that has been running for long (20), the case of Rapp et al., IEEE TSP 2019.
+Weighting each record with z gives the generating function of their number, and on the unit circle its law (19).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.electronics_grid import MOST_EFFORT, Effort, RecordGrid, RecordRun
-from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.statistics.exposure_result import Moments
+from mars_lidar.statistics.count_pmf import Pmf, exact_windows
+from mars_lidar.statistics.exposure import Moments, refined_moments, stationary_histogram
 from mars_lidar.statistics.gate import photons_before
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
+
+# --- From record to record -----------------------------------------------------------------------------------------
+
+_ONE_THREAD = 250_000  # multiplications
+_BLOCK = 64  # bins that are advanced together
+
+Rows = NDArray[Any]  # real or complex
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What a statistic may cost: numbers of a kernel, multiplications of an exposure, and of a law's points."""
+
+    numbers: int
+    moments: float
+    points: float
+
+    @property
+    def instead(self) -> str:
+        """What to use where that is not enough, for errors."""
+        goes_on = self.numbers < MOST_EFFORT.numbers
+        return f"{'use electronics_moments, which goes on for longer, or ' * goes_on}simulate it with engine 'exact'"
+
+
+MOST_EFFORT = Effort(1 << 27, 4e10, 3e11)  # 1 GiB, and half a minute
+LAW_EFFORT = Effort(1 << 24, 1.2e9, 2e10)  # of the laws, which are to take 2 s at most
+
+
+class RecordGrid:
+    """One pixel on a grid of the period: first records, and the kernel from record to record (10), (11).
+
+    Attributes
+    ----------
+    kernel
+        (bins, steps - off + 1) next records `off` to `steps` bins after one in each bin: all those until the avalanches
+        before the electronics were ready have re-armed.
+    late
+        (bins,) probability of being armed, without a further record, at the start of the bin after those.
+    first, first_armed
+        (m,) first records of the exposure in its first m bins, and the probability of being armed after them.
+    periods
+        Within which the next record is, but for waiting.
+    """
+
+    def __init__(self, cell: Cells, bins: int, electronics: float, effort: Effort = MOST_EFFORT) -> None:
+        self.cell, self.bins, self.cycles, self.effort = cell, bins, cell.system.cycles, effort
+        before = photons_before(cell, np.arange(bins + 1) / bins)[0]
+        self.photons = np.maximum(np.diff(before), 0.0)
+        self.shift, self.part = bins_of(cell.system.dead_time_periods, bins)
+        self.off, self.off_part = bins_of(electronics, bins)
+        self.steps = self.off + self.shift + 4
+        self.periods = (self.steps + bins) // bins + 2
+        if self.steps * bins > effort.numbers:
+            raise ConvergenceError(
+                f"statistics of {cell.name(0)}, t_e = {electronics:g} periods: {bins} bins per period are not enough, "
+                f"and more take too long or do not fit in 1 GiB; {effort.instead}"
+            )
+        self.kernel, self.late = self._kernel()
+        self.first, self.first_armed = self._first()
+
+    def _advance(self, armed: FloatArray, rearmed: FloatArray, photons: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Armed probability at the end of a bin and avalanches in it, re-armed evenly over it (9)."""
+        keep = np.exp(-photons)
+        lasting = np.where(photons > 1e-12, -np.expm1(-photons) / np.maximum(photons, 1e-300), 1.0)
+        after = armed * keep + rearmed * lasting
+        return after, armed + rearmed - after
+
+    def _kernel(self) -> tuple[FloatArray, FloatArray]:
+        n, steps = self.bins, self.steps
+        photons = np.concatenate([self.photons, self.photons])
+        armed = np.zeros(n)
+        unseen = np.zeros((steps + 1, n))  # the record itself, then avalanches that are not recorded
+        unseen[0] = 1.0
+        seen = np.zeros((steps - self.off + 1, n))
+        for j in range(1, steps + 1):
+            rearmed = np.zeros(n)
+            if j >= self.shift:
+                rearmed += (1.0 - self.part) * unseen[j - self.shift]
+            if j > self.shift:
+                rearmed += self.part * unseen[j - self.shift - 1]
+            armed, hit = self._advance(armed, rearmed, photons[j % n : j % n + n])
+            ready = self._ready(j)
+            unseen[j] = (1.0 - ready) * hit
+            if j >= self.off:
+                seen[j - self.off] = ready * hit
+        return np.ascontiguousarray(seen.T), armed
+
+    def _ready(self, step: int) -> float:
+        """Share of the bin `step` after a record, both evenly in their bins, that lies beyond t_e."""
+        if step < self.off:
+            return 0.0
+        if step == self.off:
+            return 0.5 * (1.0 - self.off_part) ** 2
+        return 1.0 - 0.5 * self.off_part**2 if step == self.off + 1 else 1.0
+
+    def _first(self) -> tuple[FloatArray, float]:
+        n, system = self.bins, self.cell.system
+        if system.start == "armed":
+            return np.zeros(0), 1.0
+        rate = stationary_histogram(self.cell, n, tolerance=1e-4, threads=None)[0]
+        at = self.shift + 1
+        past = np.tile(rate, at // n + 2)[-(at + 1) :]  # of the bins -(at + 1) .. -1
+        blind = past[1:].sum() - (1.0 - self.part) * past[1]
+        armed, first = np.array([1.0 - blind]), np.zeros(at)
+        for j in range(at):
+            back = at + 1 + j - self.shift  # the place of bin j - shift
+            rearmed = (1.0 - self.part) * (past[back] if back < at + 1 else 0.0)
+            rearmed += self.part * past[back - 1] if back - 1 < at + 1 else 0.0
+            armed, hit = self._advance(armed, np.array([rearmed]), self.photons[j % n : j % n + 1])
+            first[j] = hit[0]
+        return first, float(armed[0])
+
+
+class RecordRun:
+    """Records bin by bin through the exposure, in several rows at once that weigh them differently (12).
+
+    `start` (rows,) weighs the first records; `weigh` makes of the records (rows, bins) what the next ones follow from.
+    """
+
+    def __init__(self, grid: RecordGrid, start: Rows, weigh: Callable[[Rows], Rows]) -> None:
+        self.grid, self.start, self.weigh = grid, start, weigh
+        n, off, steps = grid.bins, grid.off, grid.steps
+        size = max(1, min(_BLOCK, off, n))  # the next record is t_e later at least: none within a block
+        self.blocks = [_Block(grid, at, min(at + size, n)) for at in range(0, n, size)]
+        self.reach = steps + 1
+        self.source = np.zeros((start.size, self.reach + n), start.dtype)  # the last `reach` bins, and the period
+        self.armed = np.zeros(start.size, start.dtype)  # armed and ready, nothing on the way
+        self.begun = 0  # bins of the exposure
+
+    def keep(self, rows: NDArray[np.bool_], weigh: Callable[[Rows], Rows]) -> None:
+        """Go on with some of the rows."""
+        self.start, self.source, self.armed, self.weigh = self.start[rows], self.source[rows], self.armed[rows], weigh
+
+    def period(self) -> Rows:
+        """Records (rows, bins) of the next period."""
+        grid, reach, begun = self.grid, self.reach, self.begun
+        source = self.source = np.concatenate(
+            [self.source[:, grid.bins :], np.zeros((self.start.size, grid.bins), self.start.dtype)], axis=1
+        )
+        records = np.zeros((self.start.size, grid.bins), self.start.dtype)
+        for block in self.blocks:
+            at, end = block.at, block.end
+            rearmed = source[:, at:end] * block.late
+            entry = grid.first.size - begun - at
+            if 0 <= entry < end - at:
+                rearmed[:, entry] += self.start * grid.first_armed
+            armed = self.armed[:, None] * block.lasting + product(rearmed, block.kept)
+            now = product(source[:, at + 1 : end + reach - grid.off], block.kernel) + armed * block.fired
+            if begun + at < grid.first.size:
+                first = grid.first[begun + at : begun + end]
+                now[:, : first.size] += self.start[:, None] * first
+            self.armed = armed[:, -1] * (1.0 - block.fired[-1])
+            records[:, at:end] = now
+            source[:, at + reach : end + reach] = self.weigh(now)
+        self.begun += grid.bins
+        return records
+
+
+class _Block:
+    """Some bins of the period: how records before them, and armed pixels, lead to records in them."""
+
+    def __init__(self, grid: RecordGrid, at: int, end: int) -> None:
+        self.at, self.end = at, end
+        n, off, steps = grid.bins, grid.off, grid.steps
+        before = np.concatenate([[0.0], np.cumsum(grid.photons[at:end])])
+        self.fired = -np.expm1(-grid.photons[at:end])
+        self.lasting = np.exp(-before[:-1])  # of what is armed at the start, up to each bin
+        self.kept = np.triu(np.exp(np.minimum(before[:-1, None] - before[None, :-1], 0.0)))  # from bin to bin
+        bins = np.arange(at, end)
+        self.late = grid.late[(bins - steps - 1) % n]
+        sources = np.arange(at - steps, end - off)
+        step = bins - sources[:, None]
+        inside = (step >= off) & (step <= steps)
+        kernel = grid.kernel[(sources % n)[:, None], np.clip(step - off, 0, steps - off)]
+        self.kernel = np.where(inside, kernel, 0.0)
+
+
+def product(x: Rows, matrix: FloatArray) -> Rows:
+    """A matrix times a real one; a complex one at the cost of two real products.
+
+    In pieces that BLAS libraries do on one thread: on a busy machine their threads wait for each other a hundred times
+    longer than they work on products of this size.
+    """
+    if np.iscomplexobj(x):
+        parts = product(np.concatenate([x.real, x.imag]), matrix)
+        return np.asarray(parts[: x.shape[0]] + 1j * parts[x.shape[0] :])
+    step = max(1, _ONE_THREAD // (x.shape[0] * matrix.shape[1]))
+    out = x[:, :step] @ matrix[:step]
+    for at in range(step, matrix.shape[0], step):
+        out += x[:, at : at + step] @ matrix[at : at + step]
+    return np.asarray(out)
+
+
+def bins_of(periods: float, bins: int) -> tuple[int, float]:
+    """A time as whole bins and a part of one."""
+    whole = math.floor(periods * bins + 1e-9)
+    return whole, max(periods * bins - whole, 0.0)
+
+
+# --- Moments and mean histogram ------------------------------------------------------------------------------------
 
 ELECTRONICS_MODES: tuple[Mode, ...] = ("nonparalyzable", "gated")
 _A_BLOCK = 2e4  # multiplications that take as long as what comes with a block
@@ -34,6 +238,7 @@ _SETTLED = 1e-11
 ElectronicsMoments = Moments
 
 
+@checked
 def electronics_moments(
     signal: ArrayLike | None,
     background: ArrayLike,
@@ -230,3 +435,207 @@ class _Run:
                 )
         self.mean = float(self.rate.sum())
         self.variance = 2.0 * pairs + self.mean - self.mean**2  # E N (N - 1) is twice the pairs
+
+
+# --- Stationary shape ----------------------------------------------------------------------------------------------
+
+_LEAST_TOLERANCE = 1e-3
+_DENSE = 2048  # bins up to which the chain is solved directly
+_TURNS = 2000
+_STANDS = 1e-9  # change of the law in a turn, total variation, relative to what turns still forget
+
+
+def stationary_records(cells: Cells, out: int, *, tolerance: float, threads: int | None) -> FloatArray:
+    """Shapes (cells, out) of the records of pixels that have been running for long; 0 where there is no flux.
+
+    The grid is refined until doubling it moves the shape by less than `tolerance`, at least 1e-3, in total variation.
+    """
+    tolerance = max(checks.real("tolerance", tolerance, low=1e-9, high=0.1), _LEAST_TOLERANCE)
+    bare, slower = without_electronics(cells)
+    if slower == 0.0:
+        return stationary_histogram(bare, out, tolerance=tolerance, threads=threads)
+    alone = replace(bare, system=bare.system.replace(start="armed"))  # no start is needed
+    return np.stack([_shape(alone.part(slice(k, k + 1)), slower, out, tolerance) for k in range(cells.size)])
+
+
+def _shape(cell: Cells, electronics_ns: float, out: int, tolerance: float) -> FloatArray:
+    if float(cell.total[0]) == 0.0:
+        return np.zeros(out)
+    electronics = electronics_ns / cell.system.period_ns
+    bins = coarsest_grid(cell)
+    coarse = _phases(RecordGrid(cell, bins, electronics, LAW_EFFORT))
+    while True:
+        bins *= 2
+        fine = _phases(RecordGrid(cell, bins, electronics, LAW_EFFORT))
+        if 0.5 * float(np.abs(fine.reshape(-1, 2).sum(-1) - coarse).sum()) <= tolerance:
+            return rebinned(cell, fine, coarse, out)
+        coarse = fine
+
+
+def _phases(grid: RecordGrid) -> FloatArray:
+    """Stationary law (bins,) of the phase of a record on one grid (20)."""
+    matrix = _transitions(grid)
+    n = grid.bins
+    if n <= _DENSE:
+        system = np.eye(n) - matrix.T
+        system[-1] = 1.0  # the equations add up to 0: one gives way to the sum
+        right = np.zeros(n)
+        right[-1] = 1.0
+        direct = np.maximum(np.linalg.solve(system, right), 0.0)
+        return np.asarray(direct / direct.sum())
+    law: FloatArray = np.full(n, 1.0 / n)
+    moved = math.inf
+    for _ in range(_TURNS):
+        following = np.asarray(law @ matrix, dtype=np.float64)
+        following /= following.sum()
+        before, moved = moved, 0.5 * float(np.abs(following - law).sum())
+        law = following
+        forgotten = 1.0 - min(moved / before, 1.0) if before > 0.0 else 1.0
+        if moved <= _STANDS * forgotten:
+            return law
+    raise ConvergenceError(
+        f"stationary shape of {grid.cell.name(0)} behind electronics with a dead time: {n} phases do not settle; use "
+        "method 'exposure', or simulate it with engine 'exact'"
+    )
+
+
+def _transitions(grid: RecordGrid) -> FloatArray:
+    """(bins, bins) probabilities that the next record after one in a bin is in another, whatever the period."""
+    n, kernel = grid.bins, grid.kernel
+    if kernel.shape[1] > n:  # bins whole periods apart are one
+        kernel = np.pad(kernel, ((0, 0), (0, -kernel.shape[1] % n))).reshape(n, -1, n).sum(1)
+    width = kernel.shape[1]
+    # those armed and ready, with nothing on the way, at the start of bin `begin`: the first photon from there on
+    before = np.concatenate([[0.0], np.cumsum(grid.photons)])
+    begin = (np.arange(n) + grid.steps + 1) % n
+    fires, ready = -np.expm1(-grid.photons), grid.late / -math.expm1(-before[-1])
+    matrix = np.empty((n, n))
+    for k, row in enumerate(matrix):  # a row at a time stays in the processor's own memory
+        passed = before[:-1] - before[begin[k]]
+        passed[: begin[k]] += before[-1]
+        np.multiply(ready[k] * np.exp(-np.maximum(passed, 0.0)), fires, out=row)
+        start = (k + grid.off) % n
+        fits = min(width, n - start)
+        row[start : start + fits] += kernel[k, :fits]
+        row[: width - fits] += kernel[k, fits:]
+    return matrix
+
+
+# --- Law of the count ----------------------------------------------------------------------------------------------
+
+ComplexArray = NDArray[np.complex128]
+
+_REACH, _MARGIN = 7.5, 6.0  # of a window: standard deviations, and counts beside them
+_EDGE = 1e-9  # probability at the ends of a window that holds all
+_POINTS = 64  # of the circle at a time
+_QUIET = 1e-17
+_LIKE_MOMENTS = 3.0  # times the tolerance by which the pmf's mean and variance may differ from those of the grid
+
+
+def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
+    """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
+    bare, slower = without_electronics(cells)
+    if slower == 0.0:
+        found = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
+        return exact_windows(bare, found.cumulants.reshape(-1, 4), found.bins.reshape(-1), threads)
+    return [_window(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
+
+
+def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
+    if float(cell.total[0]) == 0.0:
+        return Pmf(0, np.ones(1), 0.0)
+    mean, variance, _, bins = refined(cell, electronics_ns, tolerance, LAW_EFFORT)
+    electronics = electronics_ns / cell.system.period_ns
+    grids = [RecordGrid(cell, n, electronics, LAW_EFFORT) for n in (bins, bins // 2)]
+    most = math.floor(cell.system.cycles / electronics) + 1
+    spread = math.sqrt(variance)
+    half = math.ceil(_REACH * spread + _MARGIN)
+    left = [LAW_EFFORT.points]  # multiplications
+    while True:
+        first, last = max(math.floor(mean) - half, 0), min(math.ceil(mean) + half, most)
+        fine, coarse = (_folded(grid, first, last, left) for grid in grids)
+        pmf = fine + (fine - coarse) / 3.0  # the limit for fine grids
+        ends = max(pmf[0] if first > 0 else 0.0, pmf[-1] if last < most else 0.0)
+        if abs(ends) <= _EDGE:
+            break
+        half *= 2
+    offset = first + np.arange(pmf.size) - mean
+    error = max(
+        abs(float(pmf.sum()) - 1.0),
+        abs(float(pmf @ offset)) / max(spread, 1e-3),
+        abs(float(pmf @ offset**2) - variance) / max(variance, 1e-6),
+        -float(pmf.min()),
+    )
+    if not error <= _LIKE_MOMENTS * tolerance:
+        raise ConvergenceError(
+            f"count law of {cell.name(0)}, t_e = {electronics:g} periods: its pmf on {first} .. {last} disagrees with "
+            f"mean and variance by {error:.2g} (allowed {_LIKE_MOMENTS * tolerance:.2g}); electronics_moments has those"
+        )
+    pmf = np.maximum(pmf, 0.0)
+    outside = _EDGE * ((first > 0) + (last < most)) * pmf.size
+    return Pmf(first, pmf / pmf.sum(), outside)
+
+
+def _folded(grid: RecordGrid, first: int, last: int, left: list[float]) -> FloatArray:
+    """P(N = n) for n from `first` to `last`, by (23) of docs/theory_exposure.md; takes its cost off `left`."""
+    counts = last - first + 1
+    size = counts + counts % 2
+    angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
+    value = np.zeros(angle.size, np.complex128)
+    for start in range(0, angle.size, _POINTS):
+        some = np.exp(1j * angle[start : start + _POINTS])
+        value[start : start + _POINTS] = _values(grid, some, left)
+        if np.abs(value[start : start + _POINTS]).max() < _QUIET:  # a long exposure: nothing beyond
+            break
+    folded = np.fft.irfft(value.conj(), size)
+    return np.asarray(folded[np.arange(first, last + 1) % size], dtype=np.float64)
+
+
+def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArray:
+    """E z^N of the exposure at points z (points,) of the unit circle: records (12), each weighted with z (19)."""
+
+    def weigh(now: Rows) -> Rows:
+        return z[index, None] * now
+
+    index, result = np.arange(z.size), np.zeros_like(z)
+    run = RecordRun(grid, np.ones_like(z), weigh)
+    value, streak, ratio = np.ones_like(z), np.zeros(z.size, np.int64), np.zeros_like(z)
+    before: ComplexArray = np.zeros((z.size, grid.bins + 2), np.complex128)
+    a_period = 4.0 * grid.bins * (grid.shift + 64.0)  # multiplications of a point
+    for period in range(grid.cycles):
+        records, earlier = run.period(), value
+        left[0] -= a_period * index.size
+        value = value + (z[index] - 1.0) * records.sum(-1)
+        state = np.concatenate([records, run.armed[:, None], value[:, None]], axis=1)
+        # as in native/laws/exposure_characteristic.h: the state repeats but for a factor, by least squares
+        size, norm = np.abs(state).sum(-1), np.maximum((np.abs(before) ** 2).sum(-1), 1e-300)
+        best = (before.conj() * state).sum(-1) / norm
+        moved = np.abs(state - best[:, None] * before).sum(-1) + np.abs(best - ratio) * size
+        streak = np.where(moved <= _SETTLED * size, streak + 1, 0)
+        before, ratio = state, best
+        over = period == grid.cycles - 1
+        done = (streak > 3 * grid.periods) | (np.abs(value) < _QUIET) | over
+        if done.any():
+            ends = done & (np.abs(value) >= _QUIET)  # the others are 0
+            result[index[ends]] = _extrapolated(value[ends], earlier[ends], best[ends], grid.cycles - 1 - period)
+            rest = ~done
+            if not rest.any():
+                break
+            index, value, before, ratio, streak = index[rest], value[rest], before[rest], ratio[rest], streak[rest]
+            run.keep(rest, weigh)
+        if left[0] < 0.0:
+            raise ConvergenceError(
+                f"count law of {grid.cell.name(0)} behind electronics with a dead time: the state does not repeat "
+                f"within {period + 1} periods; electronics_moments has mean and variance, or simulate it with engine "
+                "'exact'"
+            )
+    return result
+
+
+def _extrapolated(now: ComplexArray, was: ComplexArray, ratio: ComplexArray, periods: int) -> ComplexArray:
+    """now * ratio^periods; near z = 1 the ratio from the values, (26) of docs/theory_exposure.md."""
+    near = np.abs(was) > 0.5
+    w = np.where(near, (now - was) / np.where(near, was, 1.0), 0.0)
+    log_near = 0.5 * np.log1p(2.0 * w.real + np.abs(w) ** 2) + 1j * np.arctan2(w.imag, 1.0 + w.real)
+    log_far = np.log(np.where(ratio == 0.0, 1e-300, ratio))
+    return np.asarray(now * np.exp(float(periods) * np.where(near, log_near, log_far)))

@@ -1,34 +1,308 @@
-"""Exact statistics of a finite exposure: cumulants of the count and mean histogram, by the delay recursion.
+"""Exact statistics of a finite exposure: cumulants of the count and the mean histogram, by the delay recursion.
 
-No stationarity, no Gaussian, no truncation: start-up, end and mixing of the exposure are in the result.
-Derivation and equation numbers: docs/theory_exposure.md.
+No stationarity, no Gaussian, no truncation: start-up, end and mixing of the exposure are in the result. Derivation and
+equation numbers: docs/theory_exposure.md; of paralyzable pixels: docs/detectors.md, equations (1) and (17). The result
+on one grid (`Exposure`) is compared with that on a finer grid (`refined_moments`).
+
+Without a dead time every photon is registered, and every bin is Poisson.
+
+A warmed-up exposure begins in the stationary state. Many background photons in a dead time make the pixel a clock that
+forgets its phase in thousands of periods, and the recursion takes as long to reach its fixed point (section 6). The
+fixed point is also the solution of one well-conditioned sparse equation (docs/joint_law.md, 4) on the same grid.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.brief import brief
+from mars_lidar._base.native import _core
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.detector import Mode
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure_result import Exposure as Exposure
-from mars_lidar.statistics.exposure_result import blank, darkness, movement, put, shaped, take
-from mars_lidar.statistics.narrow_pulse import meets_itself
-from mars_lidar.statistics.native_light import native_light
-from mars_lidar.statistics.no_dead_time import without_dead_time
-from mars_lidar.statistics.paralyzable_rate import RATES_STEPS
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.cells import Cells, fine_histograms, meets_itself
+from mars_lidar.statistics.gate import photons_before
+from mars_lidar.statistics.joint_grid import FoldedGrid
+from mars_lidar.statistics.phase_chain import ConvergenceError
 from mars_lidar.statistics.timing import Timing, is_timed
-from mars_lidar.statistics.warm import NOT_WARM, warm_history
+
+# --- Results on one grid and their comparison ----------------------------------------------------------------------
+
+_ORDERS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Statistics of the count N and of the histogram of one exposure, for cells of shape (...).
+
+    Attributes
+    ----------
+    cumulants
+        (..., 4) mean, variance, third and fourth cumulant of N.
+    histogram
+        (..., bins) mean registrations per bin; sums to the mean of N.
+    cumulant_rates, histogram_rate
+        (..., 4) and (..., bins): what one more cycle adds, once the state repeats from period to period, so
+        that an exposure of n cycles has ``cumulants + (n - cycles) * cumulant_rates``. NaN where the exposure
+        ended before that.
+    settled
+        (...) periods after which the state repeated and the rest was extrapolated; -1 where the exposure was
+        run to its end.
+    bins
+        (...) bins per period of the statistics grid that was needed, which is not the histogram's.
+    movement
+        (...) how far the result moved when that grid was last halved: the largest of the changes of the mean
+        in standard deviations (or relative, if that is larger), of the other cumulants relative to
+        themselves or to the power of the standard deviation, and of the shape in total variation. The error
+        of the result is smaller: the method is of fourth order for smooth pulses.
+    """
+
+    cumulants: FloatArray
+    histogram: FloatArray
+    cumulant_rates: FloatArray
+    histogram_rate: FloatArray
+    settled: IndexArray
+    bins: IndexArray
+    movement: FloatArray
+
+    __repr__ = brief
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of N (...)."""
+        return self.cumulants[..., 0]
+
+    @property
+    def variance(self) -> FloatArray:
+        """Variance of N (...), never negative."""
+        return self.cumulants[..., 1]
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Statistics of the number N of records and of the histogram of one exposure, for cells of shape (...).
+
+    Attributes
+    ----------
+    mean, variance
+        (...) of N.
+    histogram
+        (..., bins) mean records per bin; sums to the mean.
+    bins
+        (...) bins per period of the grid that was needed, which is not the histogram's.
+    """
+
+    mean: FloatArray
+    variance: FloatArray
+    histogram: FloatArray
+    bins: IndexArray
+
+    __repr__ = brief
+
+
+def darkness(result: Exposure, which: NDArray[np.bool_], bins: int) -> None:
+    """Nothing is registered where nothing arrives."""
+    for array in (result.cumulants, result.cumulant_rates, result.histogram, result.histogram_rate, result.settled):
+        array[which] = 0
+    result.bins[which] = bins
+
+
+def blank(cells: Cells, out_bins: int) -> Exposure:
+    """Room for the statistics of cells."""
+    n = cells.size
+    return Exposure(
+        cumulants=np.empty((n, _ORDERS)),
+        histogram=np.empty((n, out_bins)),
+        cumulant_rates=np.empty((n, _ORDERS)),
+        histogram_rate=np.empty((n, out_bins)),
+        settled=np.empty(n, np.int64),
+        bins=np.empty(n, np.int64),
+        movement=np.zeros(n),
+    )
+
+
+def movement(coarse: Exposure, fine: Exposure) -> FloatArray:
+    """`Exposure.movement` (21); infinite where the fine grid is still so coarse that a bin is negative."""
+    mean, spread = np.abs(fine.cumulants[:, 0]), np.sqrt(np.maximum(fine.cumulants[:, 1], 0.0))
+    floor = 1e-10 * mean + np.finfo(float).tiny  # rounding: the variance of a locked pixel may be 0
+    change = np.abs(fine.cumulants - coarse.cumulants)
+    worst = change[:, 0] / np.maximum(np.minimum(mean, spread), floor)
+    for k in range(1, _ORDERS):
+        scale = np.maximum(np.abs(fine.cumulants[:, k]), spread ** (k + 1))
+        worst = np.maximum(worst, change[:, k] / np.maximum(scale, floor))
+    joined = fine.histogram.reshape(*coarse.histogram.shape, -1).sum(-1)
+    shape = 0.5 * np.abs(joined - coarse.histogram).sum(-1) / np.maximum(mean, np.finfo(float).tiny)
+    below = fine.histogram.min(-1) < -1e-12 * mean
+    return np.asarray(np.where(below, np.inf, np.maximum(worst, shape)), dtype=np.float64)
+
+
+def take(some: Exposure, which: NDArray[np.bool_]) -> Exposure:
+    """Some of the cells."""
+    return Exposure(**{name: array[which] for name, array in vars(some).items()})
+
+
+def put(
+    result: Exposure, at: IndexArray, fine: Exposure, good: NDArray[np.bool_], bins: int, moved: FloatArray
+) -> None:
+    """Put the `good` ones of a grid of `bins` where they belong."""
+    for name, array in vars(fine).items():
+        vars(result)[name][at] = array[good]
+    result.histogram[at] = np.maximum(result.histogram[at], 0.0)
+    result.bins[at] = bins
+    result.movement[at] = moved[good]
+
+
+def shaped(flat: Exposure, shape: tuple[int, ...]) -> Exposure:
+    """As (...) instead of (cells,)."""
+    return Exposure(**{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(flat).items()})
+
+
+def normalised(histogram: FloatArray) -> FloatArray:
+    """Shapes (..., bins) of sum 1 of histograms; uniform where nothing registers."""
+    total = histogram.sum(-1, keepdims=True)
+    dark = total == 0.0
+    shape = np.where(dark, 1.0 / histogram.shape[-1], histogram / np.where(dark, 1.0, total))
+    return np.asarray(shape, dtype=np.float64)
+
+
+# --- Rates of a paralyzable pixel ----------------------------------------------------------------------------------
+
+_PARTS = 4  # of a bin, in each of which the rates of arrivals now and a dead time ago are taken as constant
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
+_RATE_MOMENTS = 4  # moments 0 to 3
+RATES_STEPS = 120.0  # of the native recursion, that the rates of a bin cost at most
+
+
+def registration_rates(cells: Cells, bins: int) -> FloatArray:
+    """Integrals of r(t) x^m over each bin, m = 0 .. 3, x from -1 to 1 in the bin, (cells, kinds * bins * 4).
+
+    Kinds: of the steady rate; for an armed start also of the first period, as it would be without a dead time's end,
+    and of the period in which the first dead time ends.
+    """
+    if cells.follow:  # each cell has bins of its own
+        rows = [cells.part(slice(k, k + 1)) for k in range(cells.size)]
+        return np.concatenate([_rates(row, row.edges(_PARTS * bins)) for row in rows])
+    return _rates(cells, np.arange(_PARTS * bins + 1) / (_PARTS * bins))
+
+
+def _rates(cells: Cells, edges: FloatArray) -> FloatArray:
+    """`registration_rates` on quarters of bins with these edges (4 bins + 1,)."""
+    dead = cells.system.dead_time_periods
+    whole = math.floor(dead)
+    before = photons_before(cells, edges)
+    total = before[:, -1:]
+    past = edges - (dead - whole)
+    wrapped = past < 0.0
+    # photons in the dead time before each edge, t_d = K + f (1)
+    within = before - photons_before(cells, np.where(wrapped, past + 1.0, past)) + total * (wrapped + float(whole))
+    kinds = [within]
+    if cells.system.start == "armed":
+        kinds += [before, np.where(wrapped, total * whole + before, within)]
+    return np.concatenate([_moments(before, each).reshape(cells.size, -1) for each in kinds], axis=1)
+
+
+def _moments(before: FloatArray, within: FloatArray) -> FloatArray:
+    """Moments (cells, bins, 4) on parts of a bin and on halves of it: their fourth-order limit, as (12) has it."""
+    fine, coarse = _on_parts(before, within, _PARTS), _on_parts(before[:, ::2], within[:, ::2], _PARTS // 2)
+    return np.asarray(fine + (fine - coarse) / 3.0, dtype=np.float64)
+
+
+def _on_parts(before: FloatArray, within: FloatArray, parts: int) -> FloatArray:
+    photons, rise = np.diff(before), np.diff(within)
+    out = np.zeros((before.shape[0], photons.shape[1] // parts, _RATE_MOMENTS))
+    for part in range(parts):
+        some, low, more = photons[:, part::parts], within[:, :-1][:, part::parts], rise[:, part::parts]
+        for node, weight in zip(0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS, strict=True):
+            rate = weight * some * np.exp(-(low + node * more))
+            place = 2.0 * (part + node) / parts - 1.0
+            for order in range(_RATE_MOMENTS):
+                out[:, :, order] += rate * place**order
+    return out
+
+
+# --- Light for the native recursion --------------------------------------------------------------------------------
+
+
+def native_light(cells: Cells, bins: int, history: FloatArray | None = None) -> _core.ExposureLight:
+    """Photons of the parts of bins, or of paralyzable pixels the rates of registrations.
+
+    `history` (cells, 2 bins + 2) is the warm state where it is known: `warm_history`.
+    """
+
+    if cells.system.detector.mode == "paralyzable":
+        return _core.ExposureLight.paralyzable(cells.grid(bins, 1), cells.total, registration_rates(cells, bins))
+    energy, row = cells.energies(bins)
+    signal, background = cells.native_flux
+    return _core.ExposureLight(signal=signal, background=background, shape=row, shapes=energy, history=history)
+
+
+# --- Pixels without a dead time ------------------------------------------------------------------------------------
+
+
+def recorded_light(cells: Cells, out_bins: int) -> FloatArray:
+    """Photons (cells, out_bins) of a period: all of them are registered where there is no dead time."""
+
+    parts, step = int(_core.EXPOSURE_PARTS), _poisson_bins(out_bins)
+    rate = np.empty((cells.size, out_bins))
+    for part in cells.chunks(step, out_bins):
+        some = cells.part(part)
+        energy, row = some.energies(step)
+        energy = energy.reshape(energy.shape[0], out_bins, step // out_bins * parts).sum(-1)
+        photons, flat = some.native_flux
+        rate[part] = photons[:, None] * energy[row] + flat[:, None] / out_bins
+    return rate
+
+
+def _poisson_bins(out_bins: int) -> int:
+    return out_bins * math.ceil(512 / out_bins)
+
+
+def without_dead_time(cells: Cells, out_bins: int) -> Exposure:
+    """No dead time: Poisson exactly, in every bin and in all."""
+    result = blank(cells, out_bins)
+    result.histogram_rate[:] = recorded_light(cells, out_bins)
+    result.cumulant_rates[:] = cells.total[:, None]
+    result.cumulants[:] = cells.system.cycles * result.cumulant_rates
+    result.histogram[:] = cells.system.cycles * result.histogram_rate
+    result.settled[:], result.bins[:] = 0, _poisson_bins(out_bins)
+    return shaped(result, cells.shape)
+
+
+# --- The stationary start by the feedback equation -----------------------------------------------------------------
+
+NOT_WARM = -3  # the native core's code: the warm state was not found
+
+
+def warm_history(cells: Cells, which: IndexArray, bins: int) -> FloatArray:
+    """Warm states (n, 2 bins + 2) of some cells as the native core takes them.
+
+    Mass and moment of the registrations of one period in each bin, the probability of being armed at its start, and the
+    registrations of the last d + f bins.
+    """
+
+    out = np.empty((which.size, 2 * bins + 2))
+    for row, k in zip(out, which, strict=True):
+        try:
+            grid = FoldedGrid.of(cells.part(np.array([k])), bins)
+            state = grid.state
+        except ConvergenceError as error:
+            raise ConvergenceError(f"stationary state of {cells.name(int(k))}: {error}; {cells.instead}") from None
+        tail = float(grid.blind(state)[0]) - grid.whole * float(state[0].sum())
+        row[:-2] = state.T.reshape(-1)
+        row[-2:] = max(1.0 - tail - grid.whole * float(state[0].sum()), 0.0), tail
+    return out
+
+
+# --- The recursion -------------------------------------------------------------------------------------------------
 
 _MODES: tuple[Mode, ...] = ("nonparalyzable", "paralyzable", "gated")
 MOST_BINS = 2**20  # of the statistics grid, unless the histogram itself has more
@@ -37,6 +311,7 @@ UNSETTLED = -2  # the native core's code: gave up
 _ENERGY_STEPS = 10.0  # of the native recursion, that the light of a bin and what follows from it costs
 
 
+@checked
 def exposure_moments(
     signal: ArrayLike | None,
     background: ArrayLike,
@@ -200,7 +475,6 @@ def _run(
     cells: Cells, bins: int, out_bins: int, threads: int, progress: Progress | None, steps: int | None = None
 ) -> Exposure:
     """One pass of the recursion over all cells on one grid."""
-    from mars_lidar._base.native import _core
 
     cells.check_history(bins)
     if steps is not None:
@@ -226,4 +500,64 @@ def _run(
         k = int(np.argmax(lost))
         raise ConvergenceError(f"exposure statistics of {cells.name(k)}: {_too_long(cells, steps)}")
     result.bins[:] = bins
+    return result
+
+
+# --- The shape of a pixel that has been running for long -----------------------------------------------------------
+
+
+def stationary_histogram(cells: Cells, out_bins: int, *, tolerance: float, threads: int | None) -> FloatArray:
+    """Registrations per period and bin (cells, out_bins) of a pixel that has been running for long (18)."""
+    tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
+    team = thread_count(threads)
+    if cells.system.dead_time_periods == 0.0:  # the light itself
+        return recorded_light(cells, out_bins)
+    return fine_histograms(
+        cells, out_bins, tolerance, lambda some, bins: _refined(some, bins, tolerance=tolerance, team=team)
+    )
+
+
+def _refined(cells: Cells, out_bins: int, *, tolerance: float, team: int) -> FloatArray:
+    """`stationary_histogram`, its grid a multiple of the bins."""
+    cells = cells.resolved(out_bins)
+    result = np.empty((cells.size, out_bins))
+    pending = np.arange(cells.size)
+    bins = cells.first_bins(out_bins)
+    most = max(MOST_BINS, out_bins)
+    shared = math.gcd(bins // 2, out_bins)
+    coarse = _stationary(cells, bins // 2, shared, team)
+    while pending.size:
+        fine = _stationary(cells.part(pending), bins, out_bins, team)
+        joined = fine.reshape(*coarse.shape, -1).sum(-1)
+        total = np.maximum(fine.sum(-1), np.finfo(float).tiny)
+        moved = np.abs(joined - coarse).sum(-1) / total
+        good = (moved <= tolerance) & (fine.min(-1) >= -1e-12 * total)
+        result[pending[good]] = np.maximum(fine[good], 0.0)
+        pending, coarse = pending[~good], fine[~good]
+        bins *= 2
+        if pending.size and bins > most:
+            raise ConvergenceError(
+                f"stationary histogram of {cells.name(int(pending[0]))}: with {bins // 2} bins per period it "
+                f"still moves by {moved[~good][0]:.2g} (tolerance {tolerance:g}); {cells.instead}"
+            )
+    return result
+
+
+def _stationary(cells: Cells, bins: int, out_bins: int, threads: int) -> FloatArray:
+
+    result = np.empty((cells.size, out_bins))
+    settled = np.empty(cells.size, np.int64)
+    for part in cells.chunks(bins, out_bins):
+        some = cells.part(part)
+        _core.exposure_stationary(
+            grid=some.grid(bins, out_bins),
+            light=native_light(some, bins),
+            histogram=result[part],
+            settled=settled[part],
+            threads=threads,
+        )
+    cold = np.flatnonzero(settled == UNSETTLED)
+    if cold.size:
+        known = warm_history(cells, cold, bins)[:, : 2 * bins : 2]
+        result[cold] = known.reshape(cold.size, out_bins, -1).sum(-1)
     return result

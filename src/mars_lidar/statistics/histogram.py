@@ -1,24 +1,32 @@
-"""The mean histogram of a finite exposure, for every mode of the detector."""
+"""Mean histograms of finite exposures in every mode of the detector, and the shape by any of the methods."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import LAW_STEPS, Cells
-from mars_lidar.statistics.electronics import ELECTRONICS_MODES, moments
-from mars_lidar.statistics.electronics_grid import LAW_EFFORT
-from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.statistics.fine_bins import fine_histograms
+from mars_lidar.statistics.cells import LAW_STEPS, Cells, fine_histograms
+from mars_lidar.statistics.chain import PhaseChain
+from mars_lidar.statistics.electronics import ELECTRONICS_MODES, LAW_EFFORT, moments, stationary_records
+from mars_lidar.statistics.exposure import normalised, refined_moments, stationary_histogram
+from mars_lidar.statistics.gate import PLAIN
 from mars_lidar.statistics.paralyzable import paralyzable_histograms
 from mars_lidar.statistics.synchronous import cumulants_of, first_arrivals, synchronous_windows
 from mars_lidar.statistics.timing import recorded
 
+# --- Mean histogram ------------------------------------------------------------------------------------------------
 
+
+@checked
 def mean_histogram(
     signal: ArrayLike | None,
     background: ArrayLike,
@@ -76,3 +84,119 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
         return exposure.histogram.reshape(some.size, bins)
 
     return fine_histograms(cells, bins, tolerance, compute)
+
+
+# --- Shape ---------------------------------------------------------------------------------------------------------
+
+_SHAPES = ("exposure", "stationary", "chain")
+
+
+@checked
+def registration_pdf(
+    signal: ArrayLike | None,
+    background: ArrayLike,
+    system: System,
+    method: Literal["exposure", "stationary", "chain"] = "exposure",
+    *,
+    delay_ns: ArrayLike | None = None,
+    waveform: ArrayLike | None = None,
+    rearm: Literal["centre", "edge"] | None = None,
+    tolerance: float = 1e-4,
+    threads: int | None = None,
+) -> FloatArray:
+    """Shape of the mean histogram: the distribution of registrations over the bins of the period.
+
+    Parameters
+    ----------
+    signal, background, delay_ns, waveform, tolerance, threads
+        As `count_law`; arrays broadcast to (...).
+    method
+        - ``"exposure"``: mean histogram of the finite exposure, which is what a measurement averages to,
+        - ``"stationary"``: that of a pixel which has been running for long,
+        - ``"chain"``: stationary distribution of the Markov chain of phases (arXiv 2509.20500), for detectors
+          of mode ``"nonparalyzable"``; the first two are for every mode (docs/detectors.md), and for dead time of the
+          electronics (to 1e-3 in total variation) with modes ``"nonparalyzable"`` and ``"gated"``.
+    rearm
+        ``"centre"`` (default) or ``"edge"`` of the bin, for ``"chain"`` only.
+
+    Returns
+    -------
+    NDArray
+        (..., bins), non-negative; sums to 1 over the last axis. A cell without any flux has the uniform
+        shape, the limit of little background.
+
+    See Also
+    --------
+    count_law, joint_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> pdf = ml.registration_pdf(1.0, 1.0, system, delay_ns=40.0)
+    >>> pdf.shape
+    (128,)
+    """
+    checks.choice("method", method, _SHAPES)
+    edge = rearm_of(rearm, method == "chain", f"method {method!r}")
+    cells = Cells.of(
+        signal,
+        background,
+        system,
+        delay_ns=delay_ns,
+        waveform=waveform,
+        what=f"registration_pdf of method {method!r}",
+        modes=PLAIN if method == "chain" else MODES,
+        effects=LIGHT_EFFECTS if method == "chain" else histogram_effects(system),
+    )
+    if method == "chain":
+        shape = _chain_shapes(cells, edge)
+    elif method == "exposure" or system.detector.mode == "synchronous":  # there the same at any time
+        shape = mean_histograms(cells, tolerance, threads)
+    elif system.detector.mode == "paralyzable":
+        warm = replace(cells, system=system.replace(start="stationary"))
+        shape = mean_histograms(warm, tolerance, threads)
+    else:
+        slow = "electronics_dead_time_ns" in system.detector.effects
+        compute = stationary_records if slow else stationary_histogram
+        shape = recorded(cells, lambda some, parts: compute(some, parts, tolerance=tolerance, threads=threads))
+    return normalised(shape).reshape(*cells.shape, system.bins)
+
+
+def rearm_of(rearm: str | None, used: bool, by: str) -> Literal["centre", "edge"]:
+    """Where the chain re-arms; a choice only where the chain is `used`."""
+    if rearm is None:
+        return "centre"
+    if not used:
+        raise ValueError(f"rearm must be None for {by}, which has no such choice, got {rearm!r}")
+    return "edge" if checks.choice("rearm", rearm, ("centre", "edge")) == "edge" else "centre"
+
+
+def pixel_of(cells: Cells, k: int) -> tuple[float | None, FloatArray | None, float | None]:
+    """Signal, waveform and delay of one cell as the chain takes them."""
+    if cells.waveform is not None:
+        return None, cells.signal[k] * cells.waveform[cells.row[k]], None
+    return float(cells.signal[k]), None, float(cells.delay[k]) * cells.system.period_ns
+
+
+def chain_of(cells: Cells, k: int, edge: Literal["centre", "edge"] = "centre") -> PhaseChain | None:
+    """The chain of one cell; None where there is no flux."""
+    background = float(cells.background[k])
+    if cells.signal[k] + background == 0.0:
+        return None
+    signal, waveform, delay = pixel_of(cells, k)
+    return PhaseChain.from_flux(signal, background, cells.system, rearm=edge, delay_ns=delay, waveform=waveform)
+
+
+def _chain_shapes(cells: Cells, edge: Literal["centre", "edge"]) -> FloatArray:
+    """Registrations per period (cells, bins), by the chain on its grid, summed into histogram bins."""
+    bins = cells.system.bins
+    out = np.zeros((cells.size, bins))
+    for k in range(cells.size):
+        chain = chain_of(cells, k, edge)
+        if chain is not None:
+            out[k] = chain.stationary().pdf.reshape(bins, -1).sum(-1)
+    return out

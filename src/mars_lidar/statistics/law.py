@@ -18,14 +18,13 @@ from mars_lidar.instrument.detector import MODES
 from mars_lidar.instrument.effects import LIGHT_EFFECTS, TIMING_EFFECTS
 from mars_lidar.instrument.system import System
 from mars_lidar.statistics.cells import LAW_STEPS, Cells
-from mars_lidar.statistics.count_window import Pmf, gaussian_window, poisson_window
-from mars_lidar.statistics.electronics_law import record_windows
+from mars_lidar.statistics.count_pmf import Pmf, exact_windows, gaussian_window, poisson_window
+from mars_lidar.statistics.electronics import record_windows
 from mars_lidar.statistics.exposure import Exposure, refined_moments
 from mars_lidar.statistics.gate import PLAIN
-from mars_lidar.statistics.histogram import histogram_effects
-from mars_lidar.statistics.pmf import exact_windows
-from mars_lidar.statistics.shape import chain_of, rearm_of
-from mars_lidar.statistics.shape import registration_pdf as registration_pdf
+from mars_lidar.statistics.histogram import chain_of, histogram_effects, rearm_of
+from mars_lidar.statistics.histogram import registration_pdf as registration_pdf
+from mars_lidar.statistics.renewal import holding_times
 from mars_lidar.statistics.synchronous import cumulants_of, synchronous_windows
 
 Method = Literal["exact", "mars", "renewal", "poisson"]
@@ -45,6 +44,23 @@ class CountLaw:
         The `Exposure` behind an exact law (its histogram has a single bin), else None.
 
     `support`, `pmf` and `cdf` are computed when first asked for, and kept.
+
+    See Also
+    --------
+    count_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> law = ml.count_law(1.0, 1.0, system, delay_ns=40.0)
+    >>> bool(abs(law.pmf.sum() - 1) < 1e-9)
+    True
+    >>> int(law.support[law.pmf.argmax()])
+    815
     """
 
     def __init__(
@@ -171,6 +187,23 @@ def count_law(
     -------
     CountLaw
         For cells of shape (...).
+
+    See Also
+    --------
+    joint_law, registration_pdf, simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> law = ml.count_law(1.0, 1.0, system, delay_ns=40.0)
+    >>> round(float(law.mean), 2), round(float(law.variance), 2)
+    (815.17, 127.32)
+    >>> round(float(ml.count_law(1.0, 1.0, system, method="poisson").variance), 2)
+    2000.0
     """
     checks.choice("method", method, _METHODS)
     edge = rearm_of(rearm, method == "mars", f"method {method!r}")
@@ -214,7 +247,6 @@ def _gaussian_moments(method: str, cells: Cells, edge: Literal["centre", "edge"]
         from mars_lidar.statistics.baselines import renewal_moments
 
         return renewal_moments(cells.signal, cells.background, cells.system)
-    from mars_lidar.statistics.renewal import holding_times
 
     mean, variance = np.zeros(cells.size), np.zeros(cells.size)
     for k in range(cells.size):

@@ -8,9 +8,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, IndexArray
-from mars_lidar.statistics.count_window import Pmf
+from mars_lidar.statistics.count_pmf import Pmf
 
 _MAX_COUNTS = 2**24
 _MAX_MEAN = 1e15
@@ -55,7 +56,6 @@ def matched_pmf(cumulants: ArrayLike, *, threads: int | None = None) -> list[Pmf
         )
     start = np.concatenate([[0], np.cumsum(size)])
     flat = np.empty(int(start[-1]))
-    from mars_lidar._base.native import _core
 
     _core.matched_pmf(cumulants=given, first=first, start=start, out=flat, threads=team)
     return [Pmf(int(first[k]), flat[start[k] : start[k + 1]].copy(), _OUTSIDE) for k in range(first.size)]
@@ -84,7 +84,6 @@ def matched_counts(cumulants: ArrayLike, uniform: ArrayLike, *, threads: int | N
         raise ValueError(f"uniform must be of shape ({given.shape[0]}, draws), got {u.shape}")
     if not ((u > 0.0) & (u < 1.0)).all():
         raise ValueError(f"uniform must be in (0, 1), got {u[~((u > 0.0) & (u < 1.0))][0]:g}")
-    from mars_lidar._base.native import _core
 
     out = np.empty(u.shape, np.int64)
     _core.matched_draw(cumulants=given, uniform=u, out=out, threads=team)
@@ -114,7 +113,6 @@ def _checked(cumulants: ArrayLike) -> FloatArray:
 
 
 def _support(given: FloatArray, team: int) -> tuple[IndexArray, IndexArray, NDArray[np.bool_]]:
-    from mars_lidar._base.native import _core
 
     cells = len(given)
     first, last, close = np.empty(cells, np.int64), np.empty(cells, np.int64), np.empty(cells, np.bool_)

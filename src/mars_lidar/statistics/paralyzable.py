@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure_result import Moments
+from mars_lidar.statistics.cells import Cells, knots
+from mars_lidar.statistics.exposure import Moments
 from mars_lidar.statistics.gate import photons_before
-from mars_lidar.statistics.narrow_pulse import knots
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.phase_chain import ConvergenceError
 
 _MAX_BINS = 2**20
 _LEAST_SPREAD = 1e-3  # standard deviation of a count, of a Poisson count's: that of the best locked pixels
@@ -31,6 +31,7 @@ _MAX_WHOLE = 20_000  # whole periods of a dead time: each is a step of the varia
 ParalyzableMoments = Moments
 
 
+@checked
 def paralyzable_moments(
     signal: ArrayLike | None,
     background: ArrayLike,

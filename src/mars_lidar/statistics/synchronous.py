@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.count_window import Pmf
+from mars_lidar.statistics.count_pmf import Pmf
 from mars_lidar.statistics.gate import photons_before
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
+from mars_lidar.statistics.phase_chain import ConvergenceError
 
 _TAIL = 1e-13  # probability left out at either end of the support
 _SPREAD = 9.0  # standard deviations of the number of late registrations that are summed over

@@ -1,22 +1,35 @@
-"""What a table holds for each (S, B): count cumulants, and the mean histogram in two parts.
+"""What a table holds for each (S, B), how that is evaluated, and how it is looked up for pixels (docs/table.md).
 
-An exposure of n periods whose state repeats has cumulants and mean histogram that are linear in n. So an entry
-made for N periods serves any n: cumulants by their rates, histograms as start-up part + n x rate (docs/table.md, 1).
+Of each entry: cumulants and shape of the count at the canonical delay t_r / 2 (`Entries`), the exact law of the count
+where four cumulants do not fix it (`NodeLaws`), and for an armed start the change of the cumulants with the delay
+(`StartPhases`). A `Recipe` evaluates entries, by the exact recursion or by the method of the MaRS paper.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from mars_lidar._base.native import _core
 from mars_lidar._base.progress import of_part
 from mars_lidar._base.types import FloatArray, IndexArray, Progress
 from mars_lidar.instrument.system import System
-from mars_lidar.statistics.cells import Cells
-from mars_lidar.statistics.exposure import refined_moments
-from mars_lidar.statistics.exposure_result import normalised
+from mars_lidar.statistics.cells import Cells, cell_name, default_bins, flat, reals, with_delays
+from mars_lidar.statistics.chain import PhaseChain, Rearm
+from mars_lidar.statistics.count_pmf import Pmf, guessed_windows
+from mars_lidar.statistics.exposure import _run, blank, native_light, normalised, refined_moments
+from mars_lidar.statistics.matched import trusted
+from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.statistics.renewal import holding_times
+from mars_lidar.table.axes import thinned
+
+# --- Entries by the exact recursion --------------------------------------------------------------------------------
 
 Shapes = NDArray[np.float32]
 
@@ -127,3 +140,481 @@ def exposure_entries(
             rest = part.histogram - system.cycles * part.histogram_rate
             entries.startup[some] = np.where(np.isnan(rest), 0.0, rest)
     return entries
+
+
+# --- Exact laws of some entries ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class NodeLaws:
+    """Probabilities of the count of some entries, at the canonical delay and for the cycles of the table.
+
+    Attributes
+    ----------
+    row
+        (m,) entries, ascending, as the rows of `Table.shapes`.
+    first
+        (m,) first count of each.
+    offsets
+        (m + 1,) where the probabilities of each begin in `pmf`.
+    pmf
+        (offsets[-1],) probabilities of the counts first, first + 1, ...
+    """
+
+    row: IndexArray
+    first: IndexArray
+    offsets: IndexArray
+    pmf: FloatArray
+
+    @classmethod
+    def of(cls, row: IndexArray, windows: Sequence[Pmf]) -> NodeLaws:
+        """From one window for each row."""
+        trimmed = [_trimmed(window) for window in windows]
+        return cls(
+            np.asarray(row, dtype=np.int64),
+            np.array([window.first for window in trimmed], np.int64),
+            np.concatenate([[0], np.cumsum([window.p.size for window in trimmed])]).astype(np.int64),
+            np.concatenate([np.empty(0), *(window.p for window in trimmed)]),
+        )
+
+    @classmethod
+    def none(cls) -> NodeLaws:
+        """Laws of no entry."""
+        return cls.of(np.empty(0, np.int64), [])
+
+    def window(self, row: int) -> Pmf | None:
+        """Law of an entry; None where its cumulants are enough."""
+        k = int(np.searchsorted(self.row, row))
+        if k == self.row.size or self.row[k] != row:
+            return None
+        return Pmf(int(self.first[k]), self.pmf[self.offsets[k] : self.offsets[k + 1]], _NEGLIGIBLE)
+
+
+_NEGLIGIBLE = 1e-12  # probability that is not kept at either end
+
+
+def _trimmed(window: Pmf) -> Pmf:
+    below = np.cumsum(window.p)
+    some = np.flatnonzero((below > _NEGLIGIBLE) & (below[-1] - below + window.p > _NEGLIGIBLE))
+    low, high = (int(some[0]), int(some[-1]) + 1) if some.size else (0, window.p.size)
+    return Pmf(window.first + low, window.p[low:high], _NEGLIGIBLE)
+
+
+def node_laws(
+    system: System,
+    signal: FloatArray,
+    background: FloatArray,
+    entries: Entries,
+    *,
+    threads: int,
+    progress: Progress | None = None,
+) -> NodeLaws:
+    """Laws of the entries of a table with axes `signal`, `background` for which `matched.trusted` does not vouch."""
+    if system.dead_time_periods == 0.0:
+        return NodeLaws.none()  # Poisson
+    row = np.flatnonzero(~trusted(entries.cumulants, threads=threads))
+    if not row.size:
+        return NodeLaws.none()
+    cells = Cells.of(signal[row // background.size], background[row % background.size], system)
+    waiting = None if progress is None else lambda done: progress(done, row.size)
+    return NodeLaws.of(row, guessed_windows(cells, entries.cumulants[row], entries.bins[row], threads, waiting))
+
+
+# --- Change with the delay -----------------------------------------------------------------------------------------
+
+_STEP = 0.2  # of log S and log B; bicubic between: errors below 1e-4 standard deviations (docs/table.md, 4)
+_PHASE_ERROR = 1e-3  # of linear interpolation between phases, in standard deviations
+_MAX_PHASES = 192
+_SAMPLE = 12  # cells of an axis by which the phases are chosen
+_MAX_EDGES = 2**14
+_BLOCK = 256
+_UNSETTLED = -2
+
+
+@dataclass(frozen=True, eq=False)
+class StartPhases:
+    """Corrections of the four cumulants over (S, B, phase).
+
+    Attributes
+    ----------
+    signal, background
+        (mS,), (mB,) photons per period: some of the table's axes.
+    phase
+        (p,) ascending from 0 to 1, in periods: where a canonical exposure begins; t_r / 2 - tau of a pixel.
+    correction
+        (mS * mB, p * 4) float32, added to the cumulants at the canonical delay; 0 at the phases 0 and 1.
+    settled
+        (mS * mB,) whether it holds for any long exposure; else for the table's own cycles only.
+    """
+
+    signal: FloatArray
+    background: FloatArray
+    phase: FloatArray
+    correction: NDArray[np.float32]
+    settled: NDArray[np.bool_]
+
+    @classmethod
+    def none(cls) -> StartPhases:
+        """No correction: nothing depends on the phase."""
+        nothing = np.empty(0)
+        return cls(nothing, nothing, nothing, np.empty((0, 0), np.float32), np.empty(0, dtype=bool))
+
+    def correction_at(self, own_cycles: bool) -> NDArray[np.float32]:
+        """The corrections for the table's own cycles, or for others: NaN where they do not hold then."""
+        if own_cycles or self.settled.all():
+            return self.correction
+        return np.where(self.settled[:, None], self.correction, np.float32(np.nan))
+
+
+def start_phases(
+    system: System,
+    signal: FloatArray,
+    background: FloatArray,
+    cumulants: FloatArray,
+    bins: IndexArray,
+    *,
+    threads: int,
+    progress: Progress | None = None,
+) -> StartPhases:
+    """Corrections for a table with axes `signal` (nS,), `background` (nB,).
+
+    Parameters
+    ----------
+    cumulants, bins
+        (nS * nB, 4) and (nS * nB,): of the entries, which say how large an error matters and which grid to use.
+    progress
+        Called as ``progress(done, total)``.
+    """
+    if system.dead_time_periods == 0.0:
+        return StartPhases.none()  # Poisson: no memory
+    row, column = thinned(signal, _STEP), thinned(background, _STEP)
+    index = (row[:, None] * background.size + column[None, :]).reshape(-1)
+    cells = Cells.of(np.repeat(signal[row], column.size), np.tile(background[column], row.size), system).resolved(1)
+    own = bins[index]
+    grids = np.maximum(own, _phase_grid(cells, int(own.min())))
+    spread = np.sqrt(np.maximum(cumulants[index, 1], 0.25))  # of small counts half a count is what matters
+    scale = spread[:, None] ** np.arange(1, 5)
+    some = np.zeros((row.size, column.size), dtype=bool)
+    some[np.ix_(_few(row.size), _few(column.size))] = True
+    phase, total = _choose(cells, grids, scale, np.flatnonzero(some), threads), cells.size
+    correction, settled = np.empty((cells.size, phase.size, 4)), np.empty(cells.size, np.int64)
+    for block, n in _blocks(grids):
+        correction[block], settled[block] = _corrections(cells.part(block), n, phase, threads)
+        if progress is not None:
+            progress(int(block[-1]), total)
+    unsettled = np.flatnonzero(settled < 0)
+    for place, k in enumerate(unsettled):
+        _replace_if_wrong(cells, int(k), int(own[k]), phase, scale[k], correction[k], threads)
+        if progress is not None:
+            progress(cells.size - unsettled.size + place, total)
+    return StartPhases(
+        signal[row],
+        background[column],
+        phase,
+        np.ascontiguousarray(correction.reshape(cells.size, -1), dtype=np.float32),
+        settled >= 0,
+    )
+
+
+def _few(size: int) -> IndexArray:
+    return np.unique(np.linspace(0, size - 1, _SAMPLE).round().astype(np.int64))
+
+
+def _phase_grid(cells: Cells, coarsest: int) -> int:
+    """Bins whose edges lie close enough for phases inside the pulse: an eighth of a sigma; a multiple of all grids."""
+    while coarsest < 4 * cells.first_bins(1):
+        coarsest *= 2
+    return coarsest
+
+
+def _blocks(grids: IndexArray) -> list[tuple[IndexArray, int]]:
+    """Cells in moderate numbers, of one statistics grid each."""
+    out = []
+    for n in np.unique(grids):
+        index = np.flatnonzero(grids == n)
+        out += [(index[k : k + _BLOCK], int(n)) for k in range(0, index.size, _BLOCK)]
+    return out
+
+
+def _corrections(cells: Cells, bins: int, phase: FloatArray, threads: int) -> tuple[FloatArray, IndexArray]:
+    """Corrections (cells, p, 4) at phases on the grid of `bins`, and when they settled (cells,) (P7)."""
+    cells.check_history(bins)
+    out = np.zeros((cells.size, phase.size * 4))
+    law = blank(cells, 1)
+    settled = law.settled
+    _core.exposure_moments(
+        grid=cells.grid(bins, 1),
+        light=native_light(cells, bins),
+        cumulants=law.cumulants,
+        cumulant_rates=law.cumulant_rates,
+        histogram=law.histogram,
+        histogram_rate=law.histogram_rate,
+        settled=settled,
+        threads=threads,
+        phase=np.rint(np.interp(phase, cells.edges(bins), np.arange(bins + 1))).astype(np.int32),
+        correction=out,
+    )
+    if (settled == _UNSETTLED).any():
+        k = int(np.argmax(settled == _UNSETTLED))
+        raise ConvergenceError(
+            f"start-phase correction of {cells.name(k)}: the state of the pixel does not repeat from period to "
+            "period for so long that the exposure cannot be run to its end"
+        )
+    values = out.reshape(cells.size, phase.size, 4)
+    values[:, phase == 1.0] = 0.0  # the whole period later: the same but for rounding
+    return values, settled
+
+
+def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArray, threads: int) -> FloatArray:
+    """Phases between which linear interpolation is good enough for a sample of cells, the worst one first."""
+    coarsest = int(grids.min())
+    stride = next(k for k in range(1, coarsest + 1) if coarsest % k == 0 and coarsest // k <= _MAX_EDGES)
+    edges = cells.edges(coarsest)[::stride]  # of every finer grid as well: those are multiples of it
+    coarsest //= stride
+    curves = []
+    for block, n in _blocks(grids[sample]):
+        index = sample[block]
+        values, _ = _corrections(cells.part(index), n, edges, threads)
+        curves.append((values / scale[index][:, None, :])[..., :2])  # the higher two follow: same places
+    curve = np.concatenate(curves).transpose(1, 0, 2).reshape(edges.size, -1)
+    error = np.zeros(edges.size)
+    nodes = [0, coarsest]
+
+    def settle(left: int, right: int) -> None:
+        inside = np.arange(left, right + 1)
+        t = ((inside - left) / (right - left))[:, None]
+        line = (1.0 - t) * curve[left] + t * curve[right]
+        error[inside] = np.abs(curve[inside] - line).max(1)
+        error[[left, right]] = 0.0
+
+    settle(0, coarsest)
+    for part in range(1, 32):  # at least every 32nd of the period: cells between those of the sample
+        at = part * coarsest // 32
+        if at not in nodes:
+            nodes.append(at)
+    nodes.sort()
+    for left, right in pairwise(nodes):
+        settle(left, right)
+    while error.max() > _PHASE_ERROR and len(nodes) < _MAX_PHASES:
+        worst = int(error.argmax())
+        place = int(np.searchsorted(nodes, worst))
+        left, right = nodes[place - 1], nodes[place]
+        nodes.insert(place, worst)
+        settle(left, worst)
+        settle(worst, right)
+    return edges[nodes]
+
+
+def _replace_if_wrong(
+    cells: Cells, cell: int, bins: int, phase: FloatArray, scale: FloatArray, correction: FloatArray, threads: int
+) -> None:
+    """Exact corrections (p, 4) of a cell whose exposure ended before start and end forgot each other.
+
+    Those of (P7) are checked at a few phases, where they are largest, and replaced where they are not right.
+    """
+    size = np.abs(correction / scale)
+    told = np.unique(np.concatenate([size.argmax(0), size[:, :2].argmin(0), [phase.size // 2]]))
+    exact = _directly(cells, cell, bins, phase[told], threads)
+    if not (np.abs(exact - correction[told])[:, :2] / scale[:2]).max() > _PHASE_ERROR:
+        return
+    correction[:] = _directly(cells, cell, bins, phase, threads)
+
+
+def _directly(cells: Cells, cell: int, bins: int, phase: FloatArray, threads: int) -> FloatArray:
+    """Corrections (p, 4) of one cell, an exposure for each phase."""
+    period = cells.system.period_ns
+    whole = Cells.of(
+        cells.signal[cell],
+        cells.background[cell],
+        cells.system,
+        delay_ns=(0.5 - np.concatenate([[0.0], phase])) * period,
+    ).resolved(1)
+    cumulants = _run(whole, bins, 1, threads, None).cumulants
+    return np.asarray(cumulants[1:] - cumulants[0], dtype=np.float64)
+
+
+# --- The two methods -----------------------------------------------------------------------------------------------
+
+Method = Literal["exposure", "mars"]
+_CELL_BLOCK = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """How entries are evaluated."""
+
+    method: Method
+    rearm: Rearm
+    tolerance: float
+    threads: int
+
+    def entries(
+        self, signal: FloatArray, background: FloatArray, system: System, progress: Progress | None = None
+    ) -> Entries:
+        """Entries of cells (n,)."""
+        if self.method == "mars":
+            return renewal_entries(
+                signal, background, system, rearm=self.rearm, threads=self.threads, progress=progress
+            )
+        return exposure_entries(
+            signal, background, system, tolerance=self.tolerance, threads=self.threads, progress=progress
+        )
+
+
+def renewal_entries(
+    signal: FloatArray,
+    background: FloatArray,
+    system: System,
+    *,
+    rearm: Rearm,
+    threads: int,
+    progress: Progress | None,
+) -> Entries:
+    """Entries (n,) of N ~ Normal(t / mu, t sigma^2 / mu^3) and of the chain's stationary shape (arXiv 2512.04924).
+
+    The sum of the covariances of the holding times is not truncated: it is what the paper's L lags and p
+    eigenpairs approximate (docs/theory.md, 3.10). Asymptotic in the exposure, so linear in it from 1 period on;
+    the start of the exposure, and with it the delay, is unknown to this law. Third and fourth cumulants are those
+    of a Gaussian, 0.
+    """
+    n, bins = signal.size, default_bins(system)
+    energy = np.maximum(system.pulse.bin_energy(0.5 * system.period_ns, system.period_ns, bins), 0.0)
+    rates = np.zeros((n, 4))
+    shape = np.full((n, system.bins), 1.0 / system.bins, dtype=np.float32)
+
+    def block(start: int) -> int:
+        stop = min(start + _CELL_BLOCK, n)
+        for k in range(start, stop):
+            photons = signal[k] * energy + background[k] / bins
+            if photons.any():
+                name = cell_name(float(signal[k]), float(background[k]), system)
+                times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, name))
+                rates[k, :2] = 1.0 / times.mu, times.sigma2 / times.mu**3
+                shape[k] = times.stationary.pdf.reshape(system.bins, -1).sum(-1)
+        return stop - start
+
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        waiting = {pool.submit(block, start) for start in range(0, n, _CELL_BLOCK)}
+        try:
+            while waiting:
+                done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_EXCEPTION)
+                for future in done:
+                    future.result()
+                if progress is not None:
+                    progress(n - min(n, _CELL_BLOCK * len(waiting)), n)
+        except BaseException:  # Ctrl-C as well: what has not begun never does
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return Entries(
+        cycles=system.cycles,
+        cumulants=system.cycles * rates,
+        rates=rates,
+        enough=np.ones(n, np.int64),
+        bins=np.full(n, bins, np.int64),
+        shape=shape,
+        startup=None,
+    )
+
+
+# --- Lookup --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Lookup:
+    """Entries of a table for P pixels; all arrays C-contiguous.
+
+    Attributes
+    ----------
+    rows, weights
+        (P, 4) rows of `Table.shapes` and their weights, >= 0 with sum 1: the pixel's shape at the canonical delay
+        is their mixture. A pixel `outside` has row 0 with weight 1.
+    cumulants
+        (P, 4) mean, variance, third and fourth cumulant of the pixel's count, at its own delay and the exposure
+        asked for; NaN for a pixel `outside`.
+    outside
+        (P,) pixels that the table does not reach, to be evaluated by the caller.
+    """
+
+    rows: IndexArray
+    weights: FloatArray
+    cumulants: FloatArray
+    outside: NDArray[np.bool_]
+
+    def trusted(self) -> NDArray[np.bool_]:
+        """Pixels (P,) whose four cumulants fix the law of the count to about 0.002 in total variation.
+
+        See `statistics.matched.trusted`; elsewhere (few photons, saturation, mode locking) an exact law may be worth
+        its cost. False `outside`.
+        """
+        good = np.zeros(self.outside.size, dtype=bool)
+        inside = ~self.outside
+        if inside.any():
+            good[inside] = trusted(self.cumulants[inside], threads=1)
+        return good
+
+
+def read_pixels(
+    period_ns: float,
+    axes: tuple[FloatArray, FloatArray],
+    signal: ArrayLike,
+    background: ArrayLike,
+    delay_ns: ArrayLike | None,
+    outside: str,
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """The arguments of `Table.lookup`, checked, (P,): signal, background, phase, and what lies beyond the axes.
+
+    The phase, in [0, 1) periods, is by how much the return comes before the canonical delay, half a period; 0 where
+    there is no return.
+    """
+    parts = with_delays(reals("signal", signal), reals("background", background), delay_ns, period_ns)
+    s, b, delay = (flat(part) for part in parts)
+    beyond = np.zeros(s.size, dtype=bool)
+    for name, values, axis in (("signal", s, axes[0]), ("background", b, axes[1])):
+        if not (values >= 0).all():
+            raise ValueError(f"{name} must be photons per period >= 0, got {values[~(values >= 0)][0]}")
+        out = (values < axis[0]) | (values > axis[-1])
+        if out.any() and outside == "error":
+            raise ValueError(
+                f"{name} must lie in the table's [{axis[0]:g}, {axis[-1]:g}] photons per period, got "
+                f"{values.min():g} to {values.max():g} ({int(out.sum())} of {values.size} pixels outside); build "
+                "the table over that range, or leave them to the exact engine with outside='exact'"
+            )
+        beyond |= out
+    canonical = 0.5 * period_ns
+    phase = (canonical - np.where(np.isnan(delay), canonical, delay)) / period_ns
+    phase -= np.floor(phase)
+    return s, b, phase, beyond
+
+
+def evaluate(
+    axes: tuple[FloatArray, FloatArray],
+    cumulants: FloatArray,
+    phases: StartPhases,
+    own_cycles: bool,
+    signal: FloatArray,
+    background: FloatArray,
+    phase: FloatArray,
+    nearest: bool,
+    threads: int,
+) -> tuple[IndexArray, FloatArray, FloatArray]:
+    """Rows, weights and cumulants (P, 4) each of pixels (P,) inside the axes; `phase` in [0, 1) periods."""
+    rows = np.empty((signal.size, 4), np.int64)
+    weights, out = np.empty((signal.size, 4)), np.empty((signal.size, 4))
+    _core.table_lookup(
+        signal_axis=axes[0],
+        background_axis=axes[1],
+        entries=cumulants,
+        sub_signal=phases.signal,
+        sub_background=phases.background,
+        phase=phases.phase,
+        correction=phases.correction_at(own_cycles),
+        signal=signal,
+        background=background,
+        at=phase,
+        nearest=nearest,
+        rows=rows,
+        weights=weights,
+        cumulants=out,
+        threads=threads,
+    )
+    return rows, weights, out

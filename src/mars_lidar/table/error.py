@@ -1,4 +1,4 @@
-"""How well a table answers between its nodes, and how close its count laws are: on random pixels, by exact laws."""
+"""Errors of a table on random pixels between its nodes: what is measured, and in which units."""
 
 from __future__ import annotations
 
@@ -10,15 +10,7 @@ from typing import Any
 import numpy as np
 
 from mars_lidar._base import checks
-from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.distance import Pmf, total_variation
-from mars_lidar.statistics.exposure import exposure_moments
-from mars_lidar.statistics.exposure_result import normalised
-from mars_lidar.statistics.law import count_law
-from mars_lidar.statistics.phase_chain_operator import ConvergenceError
-from mars_lidar.table.nodes import INTERPOLATIONS, Interpolation, Nodes
-from mars_lidar.table.recipe import Recipe
 
 # total variation between normal laws that differ a little: 0.399 per standard deviation of the mean, 0.242 per
 # relative change of the variance
@@ -93,75 +85,6 @@ class QuantisationError:
         return dataclasses.asdict(self)
 
 
-def long_error(table: Nodes, samples: int, threads: int | None) -> QuantisationError | None:
-    """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
-    if table.system.cycles != MOST_CYCLES and not table.entries.serves(MOST_CYCLES).all():
-        return None
-    try:
-        return quantisation_error(table, samples=samples, cycles=MOST_CYCLES, threads=threads)
-    except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
-        return None
-
-
-def quantisation_error(
-    table: Nodes,
-    *,
-    interpolation: Interpolation = "bilinear",
-    samples: int = 200,
-    seed: int = 0,
-    cycles: int | None = None,
-    threads: int | None = None,
-) -> QuantisationError:
-    """Errors on random pixels between the nodes, against the law of each evaluated directly.
-
-    Parameters
-    ----------
-    interpolation, cycles
-        As `lookup`.
-    samples, seed
-        Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
-        and the lowest value, where the axis has a 0.
-    """
-    checks.choice("interpolation", interpolation, INTERPOLATIONS)
-    samples = checks.integer("samples", samples, low=1, high=1_000_000)
-    rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
-    periods = table.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
-    system = table.system.replace(cycles=periods)
-    below = interpolation == "bilinear"  # the nearest entry knows nothing between 0 and the lowest value
-    signal, background = (random_pixels(rng, axis, samples, below) for axis in (table.signal, table.background))
-    recipe = Recipe(table.method, table.rearm, table.tolerance, thread_count(threads))
-    exact = recipe.entries(signal, background, system)
-    found = table.lookup(signal, background, cycles=periods, interpolation=interpolation)
-    shapes = table.shapes(periods)
-    mixed = np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
-    error = deviations(found.cumulants, exact.cumulants)
-    shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
-    delayed, delayed_shape = error, shape
-    if table.method == "exposure":
-        delayed, delayed_shape = _delayed(table, interpolation, rng, signal, background, mixed, periods, threads)
-    law = np.maximum(law_variation(error), law_variation(delayed))
-    worst = int(np.argmax(np.maximum(law, shape)))
-    return QuantisationError(
-        interpolation=interpolation,
-        samples=samples,
-        cycles=periods,
-        mean_rms=float(np.sqrt(np.mean(error[:, 0] ** 2))),
-        mean_max=float(error[:, 0].max()),
-        variance_rms=float(np.sqrt(np.mean(error[:, 1] ** 2))),
-        variance_max=float(error[:, 1].max()),
-        third_max=float(error[:, 2].max()),
-        fourth_max=float(error[:, 3].max()),
-        shape_mean=float(shape.mean()),
-        shape_max=float(shape.max()),
-        delayed_mean_max=float(delayed[:, 0].max()),
-        delayed_variance_max=float(delayed[:, 1].max()),
-        delayed_shape_max=float(delayed_shape.max()),
-        law_max=float(law.max()),
-        worst_signal=float(signal[worst]),
-        worst_background=float(background[worst]),
-    )
-
-
 def deviations(cumulants: FloatArray, exact: FloatArray) -> FloatArray:
     """Errors (P, 4) of cumulants in powers of the standard deviation, of at least half a count."""
     return np.abs(cumulants - exact) / np.maximum(np.sqrt(exact[:, 1:2]), _LEAST_SPREAD) ** np.arange(1, 5)
@@ -183,26 +106,6 @@ def random_pixels(rng: np.random.Generator, axis: FloatArray, samples: int, belo
         low = rng.random(samples) < 0.125
         values[low] = positive[0] * rng.random(int(low.sum()))
     return values
-
-
-def _delayed(
-    table: Nodes,
-    interpolation: Interpolation,
-    rng: np.random.Generator,
-    signal: FloatArray,
-    background: FloatArray,
-    mixed: FloatArray,
-    cycles: int,
-    threads: int | None,
-) -> tuple[FloatArray, FloatArray]:
-    """Errors (P, 4) and (P,) of cumulants and shape at random delays, whole bins from the canonical one."""
-    system = table.system.replace(cycles=cycles)
-    shift = rng.integers(0, system.bins, signal.size)
-    delay = 0.5 * system.period_ns + shift * system.bin_ns
-    exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads)
-    found = table.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
-    turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
-    return deviations(found.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
 
 
 @dataclass(frozen=True)
@@ -241,37 +144,3 @@ class LawError:
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""
         return dataclasses.asdict(self)
-
-
-def law_error(
-    table: Nodes, *, samples: int = 50, seed: int = 0, cycles: int | None = None, threads: int | None = None
-) -> LawError:
-    """Total variation, on random pixels, between the count law that the table leads to and the exact one.
-
-    Some 10 to 20 ms a pixel. Parameters as `quantisation_error`.
-    """
-    from mars_lidar.statistics.matched import matched_pmf
-
-    samples = checks.integer("samples", samples, low=1, high=100_000)
-    rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
-    system = table.system if cycles is None else table.system.replace(cycles=cycles)
-    signal, background = (random_pixels(rng, axis, samples, True) for axis in (table.signal, table.background))
-    delay = rng.uniform(0.0, system.period_ns, samples)
-    found = table.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
-    exact = count_law(signal, background, system, delay_ns=delay, tolerance=table.tolerance, threads=threads)
-    matched = matched_pmf(found.cumulants, threads=threads)
-    off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
-    good = found.trusted()
-    worst = int(off.argmax())
-    return LawError(
-        samples=samples,
-        cycles=system.cycles,
-        mean=float(off.mean()),
-        largest=float(off[worst]),
-        within=float(np.mean(off <= 0.002)),
-        trusted=float(good.mean()),
-        largest_trusted=float(off[good].max()) if good.any() else 0.0,
-        worst_signal=float(signal[worst]),
-        worst_background=float(background[worst]),
-        worst_delay_ns=float(delay[worst]),
-    )

@@ -4,30 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import fields
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.arguments import checked
-from mars_lidar._base.files import beside, check_target, reading, whole
+from mars_lidar._base.files import beside, check_target, whole
 from mars_lidar._base.hdf5 import ForgivingFile, open_hdf5, seal
 from mars_lidar._base.types import FloatArray
 from mars_lidar._version import __version__
 from mars_lidar.instrument.system import System
-from mars_lidar.table.entries import Entries
-from mars_lidar.table.node_laws import NodeLaws
-from mars_lidar.table.nodes import N, Nodes
-from mars_lidar.table.start_phase import StartPhases
 
 FORMAT = 2
 KEY_LENGTH = 24
 _KIND = "mars-lidar table"
 _SUFFIXES = (".h5", ".hdf5")
 _MAPPED = ("shape", "startup")
-_READABLE = (1, FORMAT)  # the first kept no laws of entries
 
 
 def request_key(
@@ -56,90 +49,20 @@ def request_key(
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
 
-class Stored(Nodes):
-    """Nodes in files."""
-
-    @checked
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
-        path = Path(path)
-        if path.suffix not in _SUFFIXES:
-            raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
-        check_target(path, folder=False, overwrite=overwrite)
-        with beside(path) as unfinished, ForgivingFile(unfinished).hdf5() as file:
-            for name, value in _header(self).items():
-                file.attrs[name] = value
-            for name, array in _arrays(self).items():
-                file.create_dataset(name, data=array)
-            seal(file)
-
-    @classmethod
-    @checked
-    def load(cls, path: str | Path, system: System | None = None) -> Self:
-        """The table of a file, for `system` (None: for the one it was made for); shapes stay in the file, mapped.
-
-        Raises
-        ------
-        ValueError
-            Where the table is of another system, naming the field that differs. Another number of cycles is no
-            difference where every entry holds for it.
-        """
-        if system is not None and not isinstance(system, System):
-            raise TypeError(f"system must be a System, got {type(system).__name__}")
-        with reading(path, "a table of mars-lidar") as source:
-            return _loaded(cls, source, system)
+def write(path: Path, header: dict[str, Any], arrays: dict[str, NDArray[Any]], overwrite: bool) -> None:
+    """Write attributes and arrays to a new HDF5 file, which appears under its name when it is complete."""
+    if path.suffix not in _SUFFIXES:
+        raise ValueError(f"path must end in .h5 or .hdf5, got {str(path)!r}")
+    check_target(path, folder=False, overwrite=overwrite)
+    with beside(path) as unfinished, ForgivingFile(unfinished).hdf5() as file:
+        for name, value in ({"kind": _KIND, "format": FORMAT} | header).items():
+            file.attrs[name] = value
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array)
+        seal(file)
 
 
-def _loaded(make: type[N], path: Path, system: System | None) -> N:
-    header, arrays = _read(path)
-    made_for = System.from_json(header["system"])
-    system = made_for if system is None else system.detected()
-    _compare(path, made_for, system)
-    own = {each.name: arrays[each.name] for each in fields(Entries) if each.name not in ("cycles", "startup")}
-    entries = Entries(cycles=made_for.cycles, **own, startup=arrays.get("startup"))
-    phases = StartPhases(**{each.name: arrays["phase_" + each.name] for each in fields(StartPhases)})
-    laws = NodeLaws(**{each.name: arrays["law_" + each.name] for each in fields(NodeLaws)})
-    table = make(
-        system,
-        header["method"],
-        arrays["signal"],
-        arrays["background"],
-        header["rearm"],
-        float(header["tolerance"]),
-        json.loads(header["provenance"]),
-        entries,
-        phases,
-        laws,
-    )
-    if not table.serves(system.cycles):
-        raise ValueError(
-            f"{path} is a table of another system: cycles is {made_for.cycles} there and {system.cycles} here, "
-            "and not every entry holds for other cycles"
-        )
-    return table
-
-
-def _header(table: Nodes) -> dict[str, Any]:
-    made_for = table.system.replace(cycles=table.entries.cycles)
-    return {
-        "kind": _KIND,
-        "format": FORMAT,
-        "system": made_for.to_json(),
-        "method": table.method,
-        "rearm": table.rearm,
-        "tolerance": table.tolerance,
-        "provenance": json.dumps(table.provenance),
-    }
-
-
-def _arrays(table: Nodes) -> dict[str, NDArray[Any]]:
-    arrays: dict[str, NDArray[Any]] = {"signal": table.signal, "background": table.background}
-    for prefix, part in (("", table.entries), ("phase_", table.start_phases), ("law_", table.laws)):
-        arrays |= {prefix + name: each for name, each in vars(part).items() if isinstance(each, np.ndarray)}
-    return arrays | {"phase_settled": arrays["phase_settled"].astype(np.uint8)}
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Attributes and arrays; the large ones are mapped, the others read."""
     if path.is_dir():
         raise ValueError(f"{path} is not a table of mars-lidar")
@@ -147,15 +70,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         header = dict(file.attrs.items())
         if header.get("kind") != _KIND:
             raise ValueError(f"{path} is not a table of mars-lidar")
-        if int(header["format"]) not in _READABLE:
-            raise ValueError(
-                f"{path} is a table of format {header['format']}; this version reads "
-                f"{' and '.join(map(str, _READABLE))}"
-            )
+        if int(header["format"]) != FORMAT:
+            raise ValueError(f"{path} is a table of format {header['format']}; this version reads format {FORMAT}")
         arrays = {name: _mapped(path, data) if name in _MAPPED else _own(whole(data)) for name, data in file.items()}
-    arrays["phase_settled"] = arrays["phase_settled"].astype(bool)
-    if "law_row" not in arrays:
-        arrays |= {f"law_{name}": each for name, each in vars(NodeLaws.none()).items()}
     return header, arrays
 
 
@@ -172,7 +89,7 @@ def _mapped(path: Path, data: Any) -> NDArray[Any]:
     return np.memmap(path, dtype=data.dtype, mode="r", offset=offset, shape=data.shape)
 
 
-def _compare(path: Path, made_for: System, system: System) -> None:
+def compare(path: Path, made_for: System, system: System) -> None:
     """Refuse another system, naming the field that differs."""
     theirs, ours = made_for.to_dict(), system.to_dict()
     for name in ours:

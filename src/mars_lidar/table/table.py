@@ -7,11 +7,65 @@ is stored, and the errors, are described in docs/table.md.
 
 from __future__ import annotations
 
-from mars_lidar.table.cache import Cached
-from mars_lidar.table.error import law_error, quantisation_error
+import contextlib
+import json
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
+from mars_lidar._base.brief import brief
+from mars_lidar._base.files import reading, reason
+from mars_lidar._base.memory import check_memory
+from mars_lidar._base.progress import of_part, shown
+from mars_lidar._base.threads import thread_count
+from mars_lidar._base.types import FloatArray, Progress
+from mars_lidar._version import __version__
+from mars_lidar.instrument.system import System
+from mars_lidar.statistics.chain import Rearm
+from mars_lidar.statistics.distance import Pmf, total_variation
+from mars_lidar.statistics.exposure import exposure_moments, normalised
+from mars_lidar.statistics.gate import require_mode
+from mars_lidar.statistics.law import count_law
+from mars_lidar.statistics.matched import matched_pmf
+from mars_lidar.statistics.phase_chain import ConvergenceError
+from mars_lidar.table import cache, storage
+from mars_lidar.table.axes import MAX_POINTS, PAPER_GRID, Grid, axis_values, describe, inserted, midpoints, thinned
+from mars_lidar.table.entries import (
+    Entries,
+    Lookup,
+    Method,
+    NodeLaws,
+    Recipe,
+    StartPhases,
+    evaluate,
+    node_laws,
+    read_pixels,
+    start_phases,
+)
+from mars_lidar.table.error import MOST_CYCLES, LawError, QuantisationError, deviations, law_variation, random_pixels
+
+Interpolation = Literal["bilinear", "nearest"]
+INTERPOLATIONS, OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
+_METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
+_ERROR_SAMPLES = 128  # pixels on which a table is checked when it is built
+_ATTEMPTS = 4  # of refining, each with half the error of the one before
+_LINES = 8  # values of the other axis at which one is looked at
+_ROUNDS = 12
+
+Axes = tuple[FloatArray, FloatArray]
+Evaluate = Callable[[FloatArray, FloatArray], Entries]
 
 
-class Table(Cached):
+@dataclass(frozen=True, eq=False)
+class Table:
     """Count law and histogram shape over a grid of (S, B); made by `build`, `load` or `cached`.
 
     Attributes
@@ -32,5 +86,555 @@ class Table(Cached):
         Exact laws of the count at those entries whose four cumulants do not fix it (`statistics.matched.trusted`).
     """
 
-    quantisation_error = quantisation_error
-    law_error = law_error
+    system: System
+    method: Method
+    signal: FloatArray
+    background: FloatArray
+    rearm: Rearm
+    tolerance: float
+    provenance: dict[str, Any]
+    entries: Entries = field(repr=False)
+    start_phases: StartPhases = field(repr=False)
+    laws: NodeLaws = field(repr=False)
+
+    __repr__ = brief
+
+    @classmethod
+    def build(
+        cls,
+        system: System,
+        signal: Grid = PAPER_GRID["signal"],
+        background: Grid = PAPER_GRID["background"],
+        *,
+        method: Method = "exposure",
+        rearm: Rearm = "centre",
+        refine: float | None = None,
+        tolerance: float = 1e-4,
+        check_law: bool = False,
+        threads: int | None = None,
+        progress: Progress | bool | None = None,
+    ) -> Table:
+        """Evaluate every entry.
+
+        Parameters
+        ----------
+        system
+            Laser, detector and histogram. Its detection efficiency and dark counts are left out (`System.detected`).
+        signal, background
+            Axes, detected photons per period (`Flux.detected`): ``(low, high, points)`` for 0 and `points` log-spaced
+            values, or an array of values taken as it is. Between 0 and the next value everything is interpolated
+            linearly.
+        method
+            ``"exposure"``: exact statistics of the finite exposure. ``"mars"``: the paper's, Markov chain and
+            Gaussian of the Markov-renewal law, asymptotic in the exposure.
+        rearm
+            ``"centre"`` or ``"edge"`` of the bin, for ``"mars"``.
+        refine
+            Error in total variation, in [1e-5, 0.1]: points are inserted until the table meets it between its
+            nodes (`QuantisationError.largest`). None: the axes as they are.
+        tolerance
+            Of each entry, for ``"exposure"``: see `exposure_moments`.
+        check_law
+            Compare the counts drawn from the table with exact laws as well (`law_error`), and keep the result.
+        threads
+            Threads to run on; default: all processors that this process may use.
+        progress
+            Called as ``progress(done, total)``; an exception from it stops the build.
+
+        Raises
+        ------
+        ValueError, TypeError
+            Naming the argument, before any work; or where `refine` cannot be met.
+        ConvergenceError
+            Naming the cell that could not be evaluated.
+        """
+        if not isinstance(system, System):
+            raise TypeError(f"system must be a System, got {type(system).__name__}")
+        require_mode("a table", system)
+        system = system.detected()  # its axes are detected photons
+        axes = axis_values("signal", signal), axis_values("background", background)
+        checks.choice("method", method, _METHODS)
+        checks.choice("rearm", rearm, _REARMS)
+        if rearm != "centre" and method != "mars":
+            raise ValueError(f"rearm must be 'centre' for method {method!r}, which has no such choice, got {rearm!r}")
+        goal = None if refine is None else checks.real("refine", refine, low=1e-5, high=0.1)
+        tolerance = checks.real("tolerance", tolerance, low=1e-9, high=0.1)
+        if not isinstance(check_law, bool):
+            raise TypeError(f"check_law must be True or False, got {check_law!r}")
+        progress = shown(progress, "building a table")
+        recipe = Recipe(method, rearm, tolerance, thread_count(threads))
+        began = time.perf_counter()
+        if goal is None:
+            table = _evaluated(system, axes, recipe, progress)
+            error = table.quantisation_error(samples=_ERROR_SAMPLES, threads=recipe.threads)
+        else:
+            table, error = _refined(system, axes, recipe, goal, progress)
+        longest = table._long_error(_ERROR_SAMPLES, recipe.threads)
+        law = table.law_error(threads=recipe.threads).to_dict() if check_law else None
+        table.provenance.update(
+            key=storage.request_key(system, axes, method=method, rearm=rearm, refine=goal, tolerance=tolerance),
+            refine=goal,
+            error=error.to_dict(),
+            error_longest=None if longest is None else longest.to_dict(),
+            law=law,
+            build_s=time.perf_counter() - began,
+        )
+        return table
+
+    @classmethod
+    def cached(
+        cls,
+        system: System,
+        signal: Grid = PAPER_GRID["signal"],
+        background: Grid = PAPER_GRID["background"],
+        **options: Any,
+    ) -> Table:
+        """`build`, or the same table from the user's cache (docs/table.md, 7), which keeps what is built.
+
+        Where nothing can be written there, the table is built, with a warning.
+        """
+        own, existing = cls._search(system, signal, background, options)
+        if existing is None:
+            table = cls.build(system.detected(), signal, background, **options)
+            try:
+                cache.keep(table.save, own)
+            except OSError as error:
+                warnings.warn(
+                    f"the table cannot be kept in {own.parent} ({reason(error)}) and will be built again the next "
+                    "time; MARS_LIDAR_CACHE names another folder",
+                    UserWarning,
+                    stacklevel=2,
+                )
+                return table
+        return cls.load(existing or own, system)
+
+    @classmethod
+    def cached_path(cls, system: System, signal: Grid, background: Grid, **options: Any) -> Path:
+        """File of the table in the cache; built and put there where it is not.
+
+        A table made for another number of cycles is taken where every entry of it holds for those of `system`.
+        """
+        own, existing = cls._search(system, signal, background, options)
+        if existing is None:
+            cache.keep(cls.build(system.detected(), signal, background, **options).save, own)
+        return existing or own
+
+    @classmethod
+    def _search(
+        cls, system: System, signal: Grid, background: Grid, options: dict[str, Any]
+    ) -> tuple[Path, Path | None]:
+        """Where the table belongs in the cache, and the file that serves, if there is one."""
+        if not isinstance(system, System):
+            raise TypeError(f"system must be a System, got {type(system).__name__}")
+        system = system.detected()
+        chosen = {"method": "exposure", "rearm": "centre", "refine": None, "tolerance": 1e-4} | options
+        unknown = set(chosen) - {"method", "rearm", "refine", "tolerance", "check_law", "threads", "progress"}
+        if unknown:
+            raise TypeError(f"the options are those of Table.build, got {sorted(unknown)[0]!r}")
+        axes = axis_values("signal", signal), axis_values("background", background)
+        request = {name: chosen[name] for name in ("method", "rearm", "refine", "tolerance")}
+        own, others = cache.candidates(storage.request_key(system, axes, **request), system.cycles)
+        for path in (own, *others):
+            with contextlib.suppress(OSError, ValueError):  # absent, out of reach, damaged, or of too few cycles
+                law = cls.load(path, system).provenance["law"]
+                if law is not None or not chosen.get("check_law", False):
+                    return own, path
+        return own, None
+
+    @checked
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write to an HDF5 file (.h5, .hdf5), which appears under its name when it is complete."""
+        made_for = self.system.replace(cycles=self.entries.cycles)
+        header = {
+            "system": made_for.to_json(),
+            "method": self.method,
+            "rearm": self.rearm,
+            "tolerance": self.tolerance,
+            "provenance": json.dumps(self.provenance),
+        }
+        arrays: dict[str, NDArray[Any]] = {"signal": self.signal, "background": self.background}
+        for prefix, part in (("", self.entries), ("phase_", self.start_phases), ("law_", self.laws)):
+            arrays |= {prefix + name: each for name, each in vars(part).items() if isinstance(each, np.ndarray)}
+        arrays["phase_settled"] = arrays["phase_settled"].astype(np.uint8)
+        storage.write(Path(path), header, arrays, overwrite)
+
+    @classmethod
+    @checked
+    def load(cls, path: str | Path, system: System | None = None) -> Table:
+        """The table of a file, for `system` (None: for the one it was made for); shapes stay in the file, mapped.
+
+        Raises
+        ------
+        ValueError
+            Where the table is of another system, naming the field that differs. Another number of cycles is no
+            difference where every entry holds for it.
+        """
+        if system is not None and not isinstance(system, System):
+            raise TypeError(f"system must be a System, got {type(system).__name__}")
+        with reading(path, "a table of mars-lidar") as source:
+            header, arrays = storage.read(source)
+            made_for = System.from_json(header["system"])
+            system = made_for if system is None else system.detected()
+            storage.compare(source, made_for, system)
+            arrays["phase_settled"] = arrays["phase_settled"].astype(bool)
+            own = {each.name: arrays[each.name] for each in fields(Entries) if each.name not in ("cycles", "startup")}
+            table = cls(
+                system,
+                header["method"],
+                arrays["signal"],
+                arrays["background"],
+                header["rearm"],
+                float(header["tolerance"]),
+                json.loads(header["provenance"]),
+                Entries(cycles=made_for.cycles, **own, startup=arrays.get("startup")),
+                StartPhases(**{each.name: arrays["phase_" + each.name] for each in fields(StartPhases)}),
+                NodeLaws(**{each.name: arrays["law_" + each.name] for each in fields(NodeLaws)}),
+            )
+            if not table.serves(system.cycles):
+                raise ValueError(
+                    f"{source} is a table of another system: cycles is {made_for.cycles} there and {system.cycles} "
+                    "here, and not every entry holds for other cycles"
+                )
+            return table
+
+    @checked
+    def lookup(
+        self,
+        signal: ArrayLike,
+        background: ArrayLike,
+        *,
+        delay_ns: ArrayLike | None = None,
+        cycles: int | None = None,
+        interpolation: Interpolation = "bilinear",
+        outside: Literal["error", "exact"] = "error",
+        threads: int | None = 1,
+    ) -> Lookup:
+        """Entries for pixels.
+
+        Parameters
+        ----------
+        signal, background, delay_ns
+            S and B, photons per period, and delay of the return, ns: scalars or arrays that broadcast; P is the
+            number of their elements in C order. The delay is of no account where S is 0, and may be NaN there;
+            None: the canonical t_r / 2 everywhere.
+        cycles
+            Laser periods of the exposure; None: the system's.
+        interpolation
+            ``"bilinear"``: the mean histogram is a mixture of four, linear in S and in B; cumulants are bicubic in
+            their logarithms. ``"nearest"``: the nearest entry, as in the paper.
+        outside
+            ``"error"``, or ``"exact"``: pixels beyond the axes are left to the caller, marked in `Lookup.outside`.
+        threads
+            Threads to run on; the result does not depend on it.
+
+        Raises
+        ------
+        ValueError
+            Naming the range that lies outside of the table; or the entry that does not hold for `cycles`.
+        """
+        checks.choice("interpolation", interpolation, INTERPOLATIONS)
+        checks.choice("outside", outside, OUTSIDE)
+        periods = self._cycles(cycles)
+        team = thread_count(threads)
+        s, b, phase, beyond = read_pixels(
+            self.system.period_ns, (self.signal, self.background), signal, background, delay_ns, outside
+        )
+        inside = np.flatnonzero(~beyond)
+        rows, weights = np.zeros((s.size, 4), np.int64), np.zeros((s.size, 4))
+        weights[:, 0] = 1.0
+        cumulants = np.full((s.size, 4), np.nan)
+        everything = inside.size == s.size
+        pick: NDArray[np.int64] | slice = slice(None) if everything else inside
+        rows[pick], weights[pick], cumulants[pick] = evaluate(
+            (self.signal, self.background),
+            self.entries.cumulants_at(periods),
+            self.start_phases,
+            periods == self.entries.cycles,
+            s[pick],
+            b[pick],
+            phase[pick],
+            interpolation == "nearest",
+            team,
+        )
+        if np.isnan(cumulants[inside]).any():
+            self._refuse(periods)
+        return Lookup(rows, weights, cumulants, beyond)
+
+    def shapes(self, cycles: int | None = None) -> NDArray[np.float32]:
+        """Normalised mean histograms at the canonical delay t_r / 2 (nS * nB, bins), float32, read-only.
+
+        Row iS * nB + iB belongs to ``signal[iS], background[iB]``. Mapped from the file where it holds what is
+        asked for; computed at each call for other cycles than those that the table was made for. Rows that do not
+        hold for `cycles` are NaN; `lookup` refuses to name them.
+        """
+        shapes = self.entries.shapes_at(self._cycles(cycles)).view()
+        shapes.flags.writeable = False
+        return shapes
+
+    def serves(self, cycles: int) -> bool:
+        """Whether every entry holds for exposures of `cycles` periods."""
+        periods = self._cycles(cycles)
+        own = periods == self.entries.cycles
+        return own or bool(self.entries.serves(periods).all() and self.start_phases.settled.all())
+
+    @property
+    def nbytes(self) -> int:
+        """Size of its arrays."""
+        parts = vars(self.entries) | vars(self.laws)
+        parts |= {name: getattr(self.start_phases, name) for name in ("correction", "settled")}
+        return sum(each.nbytes for each in parts.values() if isinstance(each, np.ndarray))
+
+    def _cycles(self, cycles: int | None) -> int:
+        return self.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
+
+    def _refuse(self, cycles: int) -> None:
+        """Raise, naming the entry that holds for the fewest numbers of cycles."""
+        enough = self.entries.enough
+        worst = int(np.argmin(enough)) if (enough < 0).any() else int(np.argmax(enough))
+        s, b = self.signal[worst // self.background.size], self.background[worst % self.background.size]
+        if enough[worst] < 0:
+            why = f"the state of a pixel at S = {s:g}, B = {b:g} does not repeat from period to period by then"
+        elif enough[worst] > cycles:
+            why = f"the state of a pixel at S = {s:g}, B = {b:g} repeats only after {enough[worst]} periods"
+        else:
+            why = "the effect of the delay has not settled by then"
+        raise ValueError(
+            f"cycles must be {self.entries.cycles} at some of these pixels, got {cycles}: the table was made for "
+            f"{self.entries.cycles} cycles, and {why}"
+        )
+
+    def quantisation_error(
+        self,
+        *,
+        interpolation: Interpolation = "bilinear",
+        samples: int = 200,
+        seed: int = 0,
+        cycles: int | None = None,
+        threads: int | None = None,
+    ) -> QuantisationError:
+        """Errors on random pixels between the nodes, against the law of each evaluated directly.
+
+        Parameters
+        ----------
+        interpolation, cycles
+            As `lookup`.
+        samples, seed
+            Pixels, log-uniform over the axes, with random delays; with ``"bilinear"`` one in eight lies between 0
+            and the lowest value, where the axis has a 0.
+        """
+        checks.choice("interpolation", interpolation, INTERPOLATIONS)
+        samples = checks.integer("samples", samples, low=1, high=1_000_000)
+        rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
+        periods = self.system.cycles if cycles is None else checks.integer("cycles", cycles, low=1, high=10**8)
+        system = self.system.replace(cycles=periods)
+        below = interpolation == "bilinear"  # the nearest entry knows nothing between 0 and the lowest value
+        signal, background = (random_pixels(rng, axis, samples, below) for axis in (self.signal, self.background))
+        recipe = Recipe(self.method, self.rearm, self.tolerance, thread_count(threads))
+        exact = recipe.entries(signal, background, system)
+        found = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        shapes = self.shapes(periods)
+        mixed = np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
+        error = deviations(found.cumulants, exact.cumulants)
+        shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
+        delayed, delayed_shape = error, shape
+        if self.method == "exposure":
+            delayed, delayed_shape = self._delayed(interpolation, rng, signal, background, mixed, periods, threads)
+        law = np.maximum(law_variation(error), law_variation(delayed))
+        worst = int(np.argmax(np.maximum(law, shape)))
+        return QuantisationError(
+            interpolation=interpolation,
+            samples=samples,
+            cycles=periods,
+            mean_rms=float(np.sqrt(np.mean(error[:, 0] ** 2))),
+            mean_max=float(error[:, 0].max()),
+            variance_rms=float(np.sqrt(np.mean(error[:, 1] ** 2))),
+            variance_max=float(error[:, 1].max()),
+            third_max=float(error[:, 2].max()),
+            fourth_max=float(error[:, 3].max()),
+            shape_mean=float(shape.mean()),
+            shape_max=float(shape.max()),
+            delayed_mean_max=float(delayed[:, 0].max()),
+            delayed_variance_max=float(delayed[:, 1].max()),
+            delayed_shape_max=float(delayed_shape.max()),
+            law_max=float(law.max()),
+            worst_signal=float(signal[worst]),
+            worst_background=float(background[worst]),
+        )
+
+    def law_error(
+        self, *, samples: int = 50, seed: int = 0, cycles: int | None = None, threads: int | None = None
+    ) -> LawError:
+        """Total variation, on random pixels, between the count law that the table leads to and the exact one.
+
+        Some 10 to 20 ms a pixel. Parameters as `quantisation_error`.
+        """
+        samples = checks.integer("samples", samples, low=1, high=100_000)
+        rng = np.random.default_rng(checks.integer("seed", seed, low=0, high=2**64 - 1))
+        system = self.system if cycles is None else self.system.replace(cycles=cycles)
+        signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
+        delay = rng.uniform(0.0, system.period_ns, samples)
+        found = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
+        exact = count_law(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
+        matched = matched_pmf(found.cumulants, threads=threads)
+        off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
+        good = found.trusted()
+        worst = int(off.argmax())
+        return LawError(
+            samples=samples,
+            cycles=system.cycles,
+            mean=float(off.mean()),
+            largest=float(off[worst]),
+            within=float(np.mean(off <= 0.002)),
+            trusted=float(good.mean()),
+            largest_trusted=float(off[good].max()) if good.any() else 0.0,
+            worst_signal=float(signal[worst]),
+            worst_background=float(background[worst]),
+            worst_delay_ns=float(delay[worst]),
+        )
+
+    def _long_error(self, samples: int, threads: int | None) -> QuantisationError | None:
+        """Errors at the longest exposure, 1e8 cycles; None where some entry does not serve it, or has no exact law."""
+        if self.system.cycles != MOST_CYCLES and not self.entries.serves(MOST_CYCLES).all():
+            return None
+        try:
+            return self.quantisation_error(samples=samples, cycles=MOST_CYCLES, threads=threads)
+        except ConvergenceError:  # the law of a random pixel between the entries, which is much of a locked one
+            return None
+
+    def _delayed(
+        self,
+        interpolation: Interpolation,
+        rng: np.random.Generator,
+        signal: FloatArray,
+        background: FloatArray,
+        mixed: FloatArray,
+        cycles: int,
+        threads: int | None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Errors (P, 4) and (P,) of cumulants and shape at random delays, whole bins from the canonical one."""
+        system = self.system.replace(cycles=cycles)
+        shift = rng.integers(0, system.bins, signal.size)
+        delay = 0.5 * system.period_ns + shift * system.bin_ns
+        exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
+        found = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
+        turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
+        return deviations(found.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
+
+
+def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:
+    signal, background = axes
+    check_memory(
+        2 * 4 * signal.size * background.size * system.bins,
+        f"tables of {signal.size} x {background.size} x {system.bins}",
+        "take fewer points or bins",
+    )
+    cells = signal.size * background.size
+    settled = cells + max(1, cells // 10)  # the start phases take about so much of the time
+    total = settled + max(1, cells // 20)  # and the laws of some entries so much
+    entries = recipe.entries(
+        np.repeat(signal, background.size),
+        np.tile(background, signal.size),
+        system,
+        of_part(progress, 0, cells, total),
+    )
+    phases, laws = StartPhases.none(), NodeLaws.none()
+    if recipe.method == "exposure":
+        phases = start_phases(
+            system,
+            signal,
+            background,
+            entries.cumulants,
+            entries.bins,
+            threads=recipe.threads,
+            progress=of_part(progress, cells, settled, total),
+        )
+        laws = node_laws(
+            system,
+            signal,
+            background,
+            entries,
+            threads=recipe.threads,
+            progress=of_part(progress, settled, total, total),
+        )
+    if progress is not None:
+        progress(total, total)
+    provenance = {"version": __version__, "signal": describe(signal), "background": describe(background)}
+    return Table(
+        system, recipe.method, signal, background, recipe.rearm, recipe.tolerance, provenance, entries, phases, laws
+    )
+
+
+def _refined(
+    system: System, axes: Axes, recipe: Recipe, goal: float, progress: Progress | None
+) -> tuple[Table, QuantisationError]:
+    inner = goal
+    for _ in range(_ATTEMPTS):
+        axes = _refined_axes(*axes, lambda s, b: recipe.entries(s, b, system), inner)
+        table = _evaluated(system, axes, recipe, progress)
+        error = table.quantisation_error(samples=4 * _ERROR_SAMPLES, threads=recipe.threads)
+        if error.largest <= goal:
+            return table, error
+        inner *= 0.5
+    raise ValueError(
+        f"refine must be an error that can be met, got {goal:g}: reached {error.largest:.2g} with "
+        f"{axes[0].size} x {axes[1].size} points at S = {error.worst_signal:g}, B = {error.worst_background:g}"
+    )
+
+
+def _refined_axes(
+    signal: FloatArray, background: FloatArray, evaluated: Evaluate, goal: float
+) -> tuple[FloatArray, FloatArray]:
+    """Axes with points inserted, where the error in the middle between two is above half of `goal`.
+
+    The error is in total variation, of the count law (two normal laws to first order) and of the shape; half of it
+    for each axis. Looked at along a few lines in the direction of each axis, in the canonical delay.
+    """
+    lines = _lines(background)
+    signal = _refined_axis(signal, lambda s: evaluated(np.repeat(s, lines.size), np.tile(lines, s.size)), lines, goal)
+    across = _lines(signal)
+    background = _refined_axis(
+        background, lambda b: evaluated(np.tile(across, b.size), np.repeat(b, across.size)), across, goal
+    )
+    return signal, background
+
+
+def _lines(axis: FloatArray) -> FloatArray:
+    positive = axis[axis > 0]
+    span = np.log(positive[-1] / positive[0]) if positive.size else 0.0
+    some = axis[thinned(axis, max(span / (_LINES - 1), 1e-9))]
+    return some[some > 0] if positive.size else some
+
+
+def _refined_axis(
+    axis: FloatArray, along: Callable[[FloatArray], Entries], lines: FloatArray, goal: float
+) -> FloatArray:
+    """One axis. `along` evaluates points x lines; lines are the exact nodes of a table's second axis here."""
+    for _ in range(_ROUNDS):
+        if axis.size < 2:
+            return axis
+        between = midpoints(axis)
+        nodes, exact = along(axis), along(between)
+        rows, weights, cumulants = evaluate(
+            (axis, lines),
+            nodes.cumulants,
+            StartPhases.none(),
+            True,
+            np.repeat(between, lines.size),
+            np.tile(lines, between.size),
+            np.zeros(between.size * lines.size),
+            False,
+            1,
+        )
+        law = law_variation(deviations(cumulants, exact.cumulants))
+        mixed = np.stack([w @ nodes.shape[r] for r, w in zip(rows, weights, strict=True)])
+        shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
+        bad = np.maximum(law, shape).reshape(between.size, lines.size).max(1) > 0.5 * goal
+        if not bad.any():
+            return axis
+        if axis.size + int(bad.sum()) > MAX_POINTS:
+            break
+        axis = inserted(axis, between[bad])
+    raise ValueError(
+        f"refine must be an error that {MAX_POINTS} points of an axis and {_ROUNDS} rounds can meet, got {goal:g}: "
+        f"{axis.size} points in [{axis[0]:g}, {axis[-1]:g}] do not meet it; choose a larger error or a smaller range"
+    )

@@ -4,6 +4,8 @@
 
 NB_MODULE(_core, module) {
     module.doc() = "Native core of mars_lidar.";
+    // At exit PyTorch and pytest still hold references to modules; nanobind would list every function of ours as leaked.
+    nanobind::set_leak_warnings(false);
     mars::bind_pulse(module);
     mars::bind_recording(module);
     mars::bind_job(module);
@@ -22,4 +24,5 @@ NB_MODULE(_core, module) {
     mars::bind_packing(module);
     mars::bind_corrected_rates(module);
     mars::bind_maximum_likelihood(module);
+    mars::bind_image(module);
 }

@@ -1,0 +1,6 @@
+"""`python -m mars_lidar` is the command `mars-lidar`."""
+
+from mars_lidar.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,206 @@
+"""What the pictures show: maps and rates computed from a cube, or from the light fitted to it, without matplotlib."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
+from mars_lidar.instrument.system import System
+from mars_lidar.io.cube import Cube
+from mars_lidar.io.layout import MEASURED
+from mars_lidar.io.recipe import Recipe
+from mars_lidar.light.flux import Flux
+from mars_lidar.reconstruct import METHODS, reconstruct
+from mars_lidar.reconstruct.quality import depth_lag_m
+
+_READ_BYTES = 64 * 2**20
+_PREDICTED_CYCLES = 20_000  # an exposure whose state never settles costs some 10 us a period
+
+
+@checked
+def count_maps(cube: Cube, realization: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Total counts (H, W), and the depth (H, W) in m at the largest bin: NaN where nothing was counted.
+
+    The depth is that of the bin's centre, with the distance between the pulse's peak and its origin taken
+    off; modulo the unambiguous range. The first of several equal bins is taken.
+    """
+    realizations, height, width, bins = cube.shape
+    realization = checks.integer("realization", realization, low=0, high=realizations - 1)
+    totals = np.empty((height, width), np.int64)
+    peaks = np.empty((height, width), np.int64)
+    band = max(1, _READ_BYTES // (width * bins * np.dtype(cube.histogram.dtype).itemsize))
+    for row in range(0, height, band):
+        rows = slice(row, min(row + band, height))
+        counts = np.asarray(cube.histogram[realization, rows])
+        totals[rows] = counts.sum(-1, dtype=np.int64)
+        peaks[rows] = counts.argmax(-1)
+    system = cube.system
+    delay = (system.time_ns[peaks] - _peak_offset_ns(system)) % system.period_ns
+    return totals, np.where(totals > 0, system.depth_m(delay), np.nan)
+
+
+@checked
+def example_pixels(flux: Flux, depth_m: NDArray[np.float64]) -> dict[str, tuple[int, int]]:
+    """A bright, a dim and an edge pixel: ``{"bright": (y, x), ...}``, as many as there are.
+
+    Bright and dim are the 98th and the 5th percentile of the signal among pixels with a return; the edge is
+    the steepest step in depth. The rim of the image is left out, where recorded images have their artefacts.
+    """
+    if np.shape(depth_m) != flux.shape:
+        raise ValueError(f"depth_m must be {flux.shape} as the flux, got shape {np.shape(depth_m)}")
+    inside, order = by_signal(flux)
+    if order.size == 0:
+        return {"first": (0, 0)}
+    flat = {"bright": order[int(0.98 * (order.size - 1))]}
+    dim = order[int(0.05 * (order.size - 1))]
+    if flux.signal.flat[dim] < flux.signal.flat[flat["bright"]]:
+        flat["dim"] = dim
+    if min(flux.shape) > 1:
+        slope = np.hypot(*np.gradient(depth_m))
+        slope[~np.isfinite(slope) | (flux.signal <= 0) | ~inside] = -1.0
+        if slope.max() > 0:
+            flat["edge"] = np.argmax(slope)
+    return with_pixels({}, flat, flux)
+
+
+def by_signal(flux: Flux) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """(H, W) pixels that do not belong to the rim of the image, and those with a return among them, flat, by signal."""
+    inside = np.zeros(flux.shape, bool)
+    rim = [n // 16 for n in flux.shape]
+    inside[rim[0] : flux.shape[0] - rim[0], rim[1] : flux.shape[1] - rim[1]] = True
+    lit = np.flatnonzero((flux.signal > 0) & inside)
+    return inside, lit[np.argsort(flux.signal.ravel()[lit], kind="stable")]
+
+
+def with_pixels(named: dict[str, tuple[int, int]], flat: dict[str, np.int64], flux: Flux) -> dict[str, tuple[int, int]]:
+    """Those `named` and those that `flat` names beside them, as (y, x)."""
+    for name, k in flat.items():
+        pixel = (int(k) // flux.shape[1], int(k) % flux.shape[1])
+        if pixel not in named.values():
+            named[name] = pixel
+    return named
+
+
+def instrument(system: System) -> str:
+    """A system in the words of a headline: bins, exposure, dead time, and what is not plain of the detector."""
+    detector, width = system.detector, system.bin_ns
+    bins = f"{system.bins:,} bin{'s' if system.bins > 1 else ''} of "
+    bins += f"{width:.4g} ns" if width >= 1.0 else f"{1e3 * width:.4g} ps"
+    periods = f"{system.cycles:,} laser period{'s' if system.cycles > 1 else ''} of {system.period_ns:.4g} ns"
+    mode = "" if detector.mode == "nonparalyzable" else f", {detector.mode}"
+    effects = [name.removesuffix("_ns").removesuffix("_hz").replace("_", " ") for name in detector.effects]
+    return f"{bins}; {periods}; dead time {detector.dead_time_ns:.4g} ns{mode}" + "".join(f", {one}" for one in effects)
+
+
+@checked
+def incident_rate(flux: Flux, system: System, y: int, x: int) -> NDArray[np.float64]:
+    """Photons per period in each bin (bins,) that reach pixel (y, x), before gate and dead time."""
+    y, x = (checks.integer(name, k, low=0, high=n - 1) for name, k, n in zip("yx", (y, x), flux.shape, strict=True))
+    background = np.full(system.bins, flux.background[y, x] / system.bins)
+    if flux.waveform is not None:
+        wave = flux.waveform[y, x]
+        cumulative = np.concatenate([[0.0], np.cumsum(wave)])
+        edges = np.linspace(0.0, wave.size, system.bins + 1)
+        background += np.diff(np.interp(edges, np.arange(wave.size + 1), cumulative))
+        return background
+    rate = background
+    for s, tau in zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True):
+        if s > 0:
+            rate = rate + s * system.pulse.bin_energy(tau, system.period_ns, system.bins)
+    return rate
+
+
+def predicted_counts(cube: Cube, y: int, x: int) -> NDArray[np.float64] | None:
+    """Mean histogram (bins,) of pixel (y, x) over many exposures, by the exact finite-exposure statistics.
+
+    None where that takes too long for a picture, does not converge, or is not known: behind a gate that moves, with
+    limits on events. The engine "poisson" has no dead time: its mean is the detected rate, inside of the gate.
+    """
+    from mars_lidar.statistics import ConvergenceError, mean_histogram
+    from mars_lidar.statistics.histogram import histogram_effects
+
+    system, flux = cube.system, cube.flux
+    effects = system.detector.effects
+    if system.detector.gate_moves or not set(effects) <= set(histogram_effects(system)):
+        return None
+    if cube.engine == "poisson" and system.detector.mode != "gated":
+        return incident_rate(flux[y, x].detected(system), system, 0, 0) * system.cycles
+    if system.cycles > _PREDICTED_CYCLES and system.detector.mode != "paralyzable":  # whose mean has a closed form
+        return None
+    if cube.engine == "poisson":
+        system = system.replace(detector=replace(system.detector, dead_time_ns=0.0))
+    tolerance = 1e-2 if "electronics_dead_time_ns" in effects else 1e-4  # seconds each beyond that
+    try:
+        return mean_histogram(system=system, tolerance=tolerance, **law_arguments(flux, system, y, x))
+    except ConvergenceError:
+        return None
+
+
+def law_arguments(flux: Flux, system: System, y: int, x: int) -> dict[str, Any]:
+    """Pixel (y, x) as `count_law` and `exposure_moments` take it; several returns become a fine waveform."""
+    background = float(flux.background[y, x])
+    waveform = None if flux.waveform is None else flux.waveform[y, x]
+    returns = zip(flux.returns_signal[:, y, x], flux.returns_delay_ns[:, y, x], strict=True)
+    lit = [(float(s), float(tau)) for s, tau in returns if s > 0]
+    if waveform is None and len(lit) > 1:
+        parts = system.bins * max(1, 8192 // system.bins)
+        waveform = np.sum([s * system.pulse.bin_energy(tau, system.period_ns, parts) for s, tau in lit], axis=0)
+    if waveform is not None:
+        return {"signal": None, "background": background, "waveform": np.maximum(waveform, 0.0)}
+    signal, delay = lit[0] if lit else (0.0, 0.0)
+    return {"signal": signal, "background": background, "delay_ns": delay}
+
+
+@checked
+def depth_error_m(cube: Cube, estimate_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Estimated minus true depth (H, W), m, modulo the unambiguous range; NaN where either is missing."""
+    if np.shape(estimate_m) != cube.shape[1:3]:
+        raise ValueError(f"estimate_m must be {cube.shape[1:3]} as the cube, got shape {np.shape(estimate_m)}")
+    return depth_lag_m(cube.system, np.asarray(estimate_m), cube.depth_m)
+
+
+def _peak_offset_ns(system: System) -> float:
+    """Time from the origin of a delay to the largest value of the pulse, at the width of a bin or finer."""
+    low, high = system.pulse.support_ns()
+    fine = max(64, min(2**16, int(np.ceil(4 * (high - low) / system.bin_ns))))
+    edges = np.linspace(low, high, fine + 1)
+    peak = int(np.argmax(np.diff(system.pulse.cumulative(edges))))
+    return float(0.5 * (edges[peak] + edges[peak + 1]))
+
+
+def fitted(cube: Cube, realization: int) -> Cube:
+    """One exposure of a measured cube with the flux that maximum likelihood finds in it; a simulated one as it is.
+
+    The flux is that of detectable photons, so the system is `System.detected`. Depth is NaN where no return is seen.
+    Detectors that maximum likelihood does not hold for are fitted by the first of the other methods that does.
+    """
+    if not cube.measured:
+        return cube
+    system = cube.system
+    counts = np.asarray(cube.histogram[realization])
+    names = ("maximum_likelihood", *(name for name in METHODS if name != "maximum_likelihood"))
+    for name in names:
+        with suppress(ValueError):
+            METHODS[name].check(system)
+            break
+    found = reconstruct(counts, system, name)
+    seen = found.seen & np.isfinite(found.signal)
+    flux = Flux(
+        np.where(seen, found.signal, 0.0),
+        np.where(np.isfinite(found.background), found.background, 0.0),
+        np.where(seen, found.delay_ns, 0.0),
+    )
+    recipe = Recipe(
+        system=system.detected(),
+        flux=flux,
+        engine=MEASURED,
+        depth_m=np.where(seen, found.depth_m, np.nan),
+        source=cube.recipe.source,
+    )
+    return Cube(histogram=counts[None], recipe=recipe, version=cube.version)

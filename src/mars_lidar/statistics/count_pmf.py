@@ -1,0 +1,400 @@
+"""Probabilities of the count of an exposure: closed forms, and the inversion of the generating function E z^N.
+
+The support comes first, from rigorous bounds of the tails (`Window`); then the generating function is evaluated at as
+many points of the unit circle as the support has counts, and an FFT turns it into probabilities. Equation numbers:
+docs/theory_exposure.md, section 8.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mars_lidar._base.native import _core
+from mars_lidar._base.types import FloatArray, IndexArray
+from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.exposure import NOT_WARM, native_light, refined_moments, warm_history
+from mars_lidar.statistics.phase_chain import ConvergenceError
+
+# --- Support of the count, and closed forms ------------------------------------------------------------------------
+
+TAIL = 1e-12  # probability that may lie outside the support, at either end
+
+
+@dataclass(frozen=True, eq=False)
+class Pmf:
+    """Probabilities `p` (w,) of the counts `first`, `first` + 1, ...; at most `outside` lies elsewhere.
+
+    Of simulated counts their frequencies.
+    """
+
+    first: int
+    p: FloatArray
+    outside: float = 0.0
+
+    @classmethod
+    def of_counts(cls, counts: NDArray[np.integer[Any]]) -> Pmf:
+        """Frequencies of simulated counts (n,)."""
+        first = int(counts.min())
+        return cls(first, np.bincount((counts - first).astype(np.int64)) / counts.size)
+
+    def on(self, low: int, high: int) -> FloatArray:
+        """Probabilities of the counts low .. high (inclusive)."""
+        out = np.zeros(high - low + 1)
+        begin, end = max(low, self.first), min(high, self.last)
+        if begin <= end:
+            out[begin - low : end - low + 1] = self.p[begin - self.first : end - self.first + 1]
+        return out
+
+    @property
+    def last(self) -> int:
+        """The largest count with an entry."""
+        return self.first + self.p.size - 1
+
+
+def poisson_window(mean: float) -> Pmf:
+    """Poisson law: exact without dead time. The support comes from Bernstein's bounds of the two tails."""
+    from scipy.special import gammaln, xlogy
+
+    reach = -math.log(TAIL)
+    low = max(0, math.ceil(mean - math.sqrt(2.0 * reach * mean)))
+    high = math.floor(mean + reach / 3.0 + math.sqrt(reach**2 / 9.0 + 2.0 * reach * mean))
+    counts = np.arange(low, high + 1)
+    return Pmf(low, np.exp(xlogy(counts, mean) - mean - gammaln(counts + 1.0)), TAIL * (1 + (low > 0)))
+
+
+def gaussian_window(mean: float, variance: float) -> Pmf:
+    """Normal law on the integers: P(n) = Phi((n + 1/2 - mean) / sd) - Phi((n - 1/2 - mean) / sd).
+
+    What lies below 0 is in P(0).
+    """
+    from scipy.special import ndtr
+
+    spread = math.sqrt(variance)
+    low = max(0, math.floor(mean - 8.5 * spread))
+    high = max(low, math.ceil(mean + 8.5 * spread))
+    counts = np.arange(low, high + 1)
+    if spread == 0.0:
+        return Pmf(low, (counts == round(mean)).astype(np.float64), 0.0)
+    edges = np.arange(low, high + 2) - 0.5 - mean
+    if low == 0:
+        edges[0] = -np.inf
+    # differences of the smaller of the two tails keep their digits at both ends
+    below, above = ndtr(edges / spread), ndtr(-edges / spread)
+    pmf = np.where(edges[:-1] > 0, above[:-1] - above[1:], below[1:] - below[:-1])
+    return Pmf(low, np.maximum(pmf, 0.0), float(below[0] + above[-1]))
+
+
+# --- The generating function and its cost --------------------------------------------------------------------------
+
+_UNSETTLED = -2
+_MAX_STEPS, _LANES = 80_000_000, 8  # bins x periods of a cell's points together, a second; points that run at once
+# A history of more bytes, or a dead time below a bin, makes a step cost as many; one beyond every cache six times that
+_NEAR_BYTES, _FAR_BYTES, _FAR = 1 << 20, 1 << 26, 4.0
+_PERIOD_BINS = 128.0  # bins that cost as much as what is done once a period
+
+
+class TooLongError(ConvergenceError):
+    """A transform whose state does not repeat for longer than a law is to take."""
+
+
+class Purse:
+    """Steps (bins x periods, `_LANES` points at once) that are left for the law of one cell."""
+
+    def __init__(self, share: float = 1.0) -> None:
+        self.left = share * _MAX_STEPS
+
+
+def characteristic(
+    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, purse: Purse | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
+
+    purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
+    dead = cells.system.dead_time_periods
+    reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
+    dear = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
+    dear *= 1.0 + _PERIOD_BINS / bins
+    # at real points the blind of every period of a dead time are summed
+    dear *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
+    steps = max(int(purse.left / dear) // batches, bins)
+    grid = cells.grid(bins, 1, steps)
+    re, im = np.empty(z_re.shape), np.empty(z_re.shape)
+    settled = np.empty(z_re.shape, np.int64)
+    points: dict[str, Any] = {
+        "tilted": z_im is None,
+        "z_re": np.ascontiguousarray(z_re),
+        "z_im": np.zeros(z_re.shape) if z_im is None else np.ascontiguousarray(z_im),
+        "re": re,
+        "im": im,
+        "settled": settled,
+    }
+    for part in cells.chunks(bins, 1):
+        mine: dict[str, Any] = points | {name: x[part] for name, x in points.items() if np.ndim(x)}
+        light = native_light(cells.part(part), bins)
+        _core.exposure_characteristic(grid=grid, light=light, **mine, threads=threads)
+    cold = np.flatnonzero((settled == NOT_WARM).any(-1))
+    if cold.size:
+        again: dict[str, Any] = points | {
+            name: np.ascontiguousarray(x[cold]) for name, x in points.items() if np.ndim(x)
+        }
+        light = native_light(cells.part(cold), bins, warm_history(cells, cold, bins))
+        _core.exposure_characteristic(grid=grid, light=light, **again, threads=threads)
+        for name, array in (("re", re), ("im", im), ("settled", settled)):
+            array[cold] = again[name]
+    lost = (settled == _UNSETTLED).any(-1)
+    if lost.any():
+        raise TooLongError(
+            f"count law of {cells.name(int(np.argmax(lost)))}: the state of the pixel does not repeat within "
+            f"{steps:.1g} bins x periods, too many to run the exposure to its end at {z_re.shape[1]} points; mean, "
+            f"variance and two more cumulants are known; for the law {cells.instead}"
+        )
+    taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
+    purse.left = max(purse.left - float(taken) * bins * batches * dear, 1.0)
+    return re, im
+
+
+# --- Probabilities -------------------------------------------------------------------------------------------------
+
+_TILTS = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 11.0, 15.0])  # standard deviations of reach
+_MAX_TILT = 25.0
+_MAX_LOG_GROWTH = 600.0  # of one period, below the largest double
+_CONSISTENT = 1e-5  # agreement demanded of the pmf with the cumulants, in standard deviations
+_CONSISTENT_PER_CYCLE = 1e-13  # and what extrapolation over so many cycles may add by rounding
+_MAX_COUNTS = 2**24
+_FOR_SUPPORT = 0.25  # of the steps of a law, to bound its support; a guess must do beyond
+_WIDE_REACH = 12.0  # standard deviations, and counts beside them, of that guess
+_REACH, _MARGIN = 7.5, 6.0  # of a guessed window: standard deviations, and counts beside them
+_WIDEST_GUESS = 1024
+_EDGE = 1e-10  # probability at the ends of a guessed window that holds all
+_LIKE_CUMULANTS = 0.02  # standard deviations by which the mean may differ from the one that was guessed by
+_BLOCK = 64  # cells at a time
+_ALL_POINTS = 256  # of the circle: narrower laws take all points
+_QUIET = 1e-15  # of the transform of a wide law, that counts as 0
+_SHORT_VARIANCE, _SHORTER = 4.0, 6  # the exposure in which other peaks are looked for: variance, and how much shorter
+
+
+def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int) -> list[Pmf]:
+    """Exact pmf of each cell, on the grid of `bins` (cells,) that its `cumulants` (cells, 4) needed."""
+    if cells.system.dead_time_periods == 0.0:
+        return [poisson_window(float(mean)) for mean in cumulants[:, 0]]
+    cells = cells.resolved(1)
+    dark = cells.total == 0.0
+    windows: list[Pmf | None] = [Pmf(0, np.ones(1), 0.0) if nothing else None for nothing in dark]
+    for n in np.unique(bins[~dark]):
+        index = np.flatnonzero((bins == n) & ~dark)
+        cells.check_history(int(n))
+        for block in np.array_split(index, math.ceil(index.size / 64)):
+            try:
+                lows, highs, outside = _supports(cells.part(block), cumulants[block], int(n), threads)
+            except TooLongError:
+                lows, highs, outside = _guessed_supports(cells, cumulants[block])
+            for k, cell in enumerate(block):
+                one = cells.part(block[k : k + 1])
+                spread = float(cumulants[cell, 1])
+                window = _window(one, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
+                _check(cells, int(cell), window, cumulants[cell])
+                windows[cell] = window
+    return [window for window in windows if window is not None]
+
+
+def guessed_windows(
+    cells: Cells, cumulants: FloatArray, bins: IndexArray, threads: int, waiting: Callable[[int], object] | None = None
+) -> list[Pmf]:
+    """Exact pmf of each cell where its cumulants (cells, 4) are known but roughly, as from a table.
+
+    The support is guessed by them and the result tells whether the guess was right; where not, `exact_windows` of the
+    cell's own cumulants. That is several times faster for narrow laws. `waiting` is called with the cells done.
+    """
+    cells = cells.resolved(1)
+    spread = np.sqrt(np.maximum(cumulants[:, 1], 0.0))
+    half = np.ceil(_REACH * spread + _MARGIN)
+    size = (8.0 * np.ceil((2.0 * half + 1.0) / 8.0)).astype(np.int64)
+    first = np.maximum(np.floor(cumulants[:, 0]) - half, 0.0).astype(np.int64)
+    windows: list[Pmf | None] = [None] * cells.size
+    done = 0
+    for n, width in np.unique(np.stack([bins, size], -1), axis=0):
+        index = np.flatnonzero((bins == n) & (size == width))
+        cells.check_history(int(n))
+        for block in np.array_split(index, math.ceil(index.size / _BLOCK)):
+            guessed = width <= _WIDEST_GUESS
+            pmf = _folded(cells.part(block), first[block], int(width), int(n), threads) if guessed else None
+            for k, cell in enumerate(block):
+                found = None if pmf is None else _if_whole(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
+                windows[cell] = found or _alone(cells.part(block[k : k + 1]), threads)
+            done += block.size
+            if waiting is not None:
+                waiting(done)
+    return [window for window in windows if window is not None]
+
+
+def _folded(cells: Cells, first: IndexArray, size: int, bins: int, threads: int) -> FloatArray:
+    """Probabilities (cells, size) of the counts from `first` (cells,) on, as (23) has them."""
+    angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
+    shape = (cells.size, 1)
+    re, im = characteristic(cells, np.tile(np.cos(angle), shape), np.tile(np.sin(angle), shape), bins, threads)
+    folded = np.fft.irfft(re - 1j * im, size, axis=-1)
+    return np.take_along_axis(folded, (first[:, None] + np.arange(size)) % size, axis=-1)
+
+
+def _if_whole(pmf: FloatArray, first: int, mean: float, spread: float) -> Pmf | None:
+    """The window if it holds all of the law: nothing at its ends, no negative probability, the mean where it was."""
+    away = float(pmf @ (first + np.arange(pmf.size))) - mean
+    ends = _ends(pmf, first)
+    if not (ends <= _EDGE and abs(away) <= _LIKE_CUMULANTS * max(spread, 0.5) and float(pmf.min()) >= -_CONSISTENT):
+        return None
+    if not abs(float(pmf.sum()) - 1.0) <= _CONSISTENT:
+        return None
+    return Pmf(first, np.maximum(pmf, 0.0), pmf.size * _EDGE)
+
+
+def _ends(pmf: FloatArray, first: int, most: float = math.inf) -> float:
+    """The larger probability of a window's first and last count, of those that others may lie beyond."""
+    low = abs(float(pmf[0])) if first > 0 else 0.0
+    return max(low, abs(float(pmf[-1])) if first + pmf.size - 1 < most else 0.0)
+
+
+def _alone(cell: Cells, threads: int) -> Pmf:
+
+    own = refined_moments(cell, 1, tolerance=1e-4, threads=threads)
+    return exact_windows(cell, own.cumulants.reshape(-1, 4), own.bins.reshape(-1), threads)[0]
+
+
+def _supports(
+    cells: Cells, cumulants: FloatArray, bins: int, threads: int
+) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """First and last count of the support of each cell, and a bound on the probability outside (24)."""
+    mean, spread = cumulants[:, 0], np.sqrt(cumulants[:, 1])
+    # a period multiplies E e^(theta N) at most by e^(theta (1 + t_r/t_d)) and by exp(Lambda (e^theta - 1))
+    dead = cells.system.dead_time_periods
+    growth = np.maximum(
+        _MAX_LOG_GROWTH / (1.0 + 1.0 / dead),
+        np.log1p(_MAX_LOG_GROWTH / np.maximum(cells.total, 1e-300)),
+    )
+    # as many deviations as fit below the limit: where counts beyond the usual one are rare, small tilts bound best
+    unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, _MAX_TILT) / _TILTS[-1])
+    tilt = _TILTS * unit[:, None]
+    tilt = np.concatenate([tilt, -tilt], axis=1)
+    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, Purse(_FOR_SUPPORT))[0]
+    with np.errstate(invalid="ignore"):
+        # P(N >= edge) <= tail for a positive tilt, P(N <= edge) <= tail for a negative one
+        edge = (log_value - math.log(TAIL)) / tilt
+    up, down = np.split(np.where(np.isfinite(edge), edge, np.nan), 2, axis=1)
+    most = _most(cells)
+    high = np.fmin.reduce(up, axis=1, initial=most + 1.0)
+    low = np.fmax.reduce(down, axis=1, initial=-1.0)
+    last = np.minimum(np.ceil(high) - 1.0, most)
+    first = np.clip(np.floor(low) + 1.0, 0.0, np.floor(mean))
+    last = np.maximum(last, np.ceil(mean))
+    if (last - first >= _MAX_COUNTS).any():
+        k = int(np.argmax(last - first))
+        raise ConvergenceError(
+            f"count law of {cells.name(k)}: its support of {last[k] - first[k]:.3g} counts exceeds "
+            f"{_MAX_COUNTS}; mean, variance and cumulants are known; use method 'mars' or 'renewal' for a Gaussian"
+        )
+    # where the support ends at the least or the largest possible count nothing lies beyond
+    outside = TAIL * ((first > 0).astype(np.float64) + (last < most))
+    return first.astype(np.int64), last.astype(np.int64), outside
+
+
+def _most(cells: Cells) -> float:
+    """The largest count that is possible."""
+    return min(math.floor(cells.system.cycles / cells.system.dead_time_periods) + 1.0, 9e15)
+
+
+def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, IndexArray, FloatArray]:
+    """Supports by mean and variance alone; `_check` then tells whether they hold all of the law."""
+    spread, mean = np.sqrt(cumulants[:, 1]), cumulants[:, 0]
+    half = np.ceil(_WIDE_REACH * (spread + 1.0))
+    most = _most(cells)
+    first, last = np.maximum(np.floor(mean) - half, 0.0), np.minimum(np.ceil(mean) + half, most)
+    return first.astype(np.int64), last.astype(np.int64), (last - first) * _EDGE
+
+
+def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
+    from scipy.fft import irfft  # of lengths with a large prime factor twice as fast as NumPy's
+
+    counts, purse = last - first + 1, Purse()
+    size = counts + counts % 2
+    value = _narrow(cell, size, bins, threads, variance, purse) if size > _ALL_POINTS else None
+    if value is None:
+        angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
+        re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, purse)
+        value = re[0] - 1j * im[0]
+    # the transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
+    folded = np.asarray(irfft(value, size))
+    return Pmf(first, np.roll(folded, -(first % size))[:counts], outside)
+
+
+def _narrow(
+    cell: Cells, size: int, bins: int, threads: int, variance: float, purse: Purse
+) -> NDArray[np.complex128] | None:
+    """Conjugate of E z^N on the points (size // 2 + 1,) of the circle where it is not 0; None where that is not sure.
+
+    A wide law has a narrow transform, about 1 at z = 1 and nothing beyond some 9 standard deviations of its own width,
+    unless counts keep to a lattice (all even, say): then it has other peaks, as narrow. Those are looked for in a much
+    shorter exposure, whose transform has them too, and wide enough to be seen on few points (27).
+    """
+    cycles = cell.system.cycles
+    shorter = max(1, math.ceil(_SHORT_VARIANCE * cycles / max(variance, 1e-300)))
+    if shorter * _SHORTER > cycles:
+        return None
+    angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
+    value = np.zeros(angle.size, np.complex128)
+    step = max(8, math.ceil(2.0 * size / (2.0 * np.pi * math.sqrt(variance))))  # some two standard deviations
+    end = 0
+    while end < angle.size:
+        some = slice(end, min(end + step, angle.size))
+        re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, purse)
+        value[some] = re[0] - 1j * im[0]
+        end = some.stop
+        if np.abs(value[some]).max() <= _QUIET:
+            break
+    spread = math.sqrt(variance * shorter / cycles)
+    begin = min(4.0 / spread, np.pi)
+    between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
+    re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, purse)
+    beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
+    brief = replace(cell, system=cell.system.replace(cycles=shorter))
+    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, purse)
+    highest = float(np.hypot(short_re, short_im).max())
+    faint = float(np.hypot(re, im).max()) <= 10.0 * _QUIET
+    return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None
+
+
+def _check(cells: Cells, cell: int, window: Pmf, cumulants: FloatArray) -> None:
+    """The pmf must be one, and have the mean and variance that came another way; then rounding is removed."""
+    pmf: NDArray[np.float64] = window.p
+    offset = window.first + np.arange(pmf.size) - cumulants[0]
+    spread = max(math.sqrt(cumulants[1]), 1e-3)
+    edge = _EDGE + _CONSISTENT_PER_CYCLE * cells.system.cycles
+    if window.outside > TAIL * 4.0 and _ends(pmf, window.first, _most(cells)) > edge:  # a guessed support
+        raise ConvergenceError(
+            f"count law of {cells.name(cell)}: it reaches beyond {window.first} .. {window.first + pmf.size - 1}, "
+            f"where mean and variance let expect its end; mean, variance and cumulants are known; for the law "
+            f"{cells.instead}"
+        )
+    total, mean = float(pmf.sum()), float((pmf * offset).sum())
+    variance, least = float((pmf * offset**2).sum()), float(pmf.min())
+    # rounding and extrapolation err in probabilities, whatever the width: for a locked count, more than its variance
+    rounding, unit = _CONSISTENT_PER_CYCLE * cells.system.cycles, max(spread, 1.0)
+    error = max(
+        abs(total - 1.0) / (_CONSISTENT + rounding),
+        abs(mean) / (_CONSISTENT * spread + rounding * unit),
+        abs(variance - cumulants[1]) / (_CONSISTENT * spread**2 + rounding * unit**2),
+        -least / (_CONSISTENT + rounding),
+    )
+    if not error <= 1.0:
+        raise ConvergenceError(
+            f"count law of {cells.name(cell)}: its pmf on {window.first} .. {window.first + pmf.size - 1} "
+            f"disagrees with the cumulants {error:.2g} times as much as is allowed: sum - 1 = "
+            f"{total - 1.0:.2g}, mean off by {mean:.2g}, variance {variance:.6g} for {cumulants[1]:.6g}, "
+            f"least {least:.2g}; mean, variance and cumulants are known; for the law {cells.instead}"
+        )
+    np.maximum(pmf, 0.0, out=pmf)
+    pmf /= pmf.sum()

@@ -1,0 +1,172 @@
+"""Tables of a comparison for a terminal of 100 columns, and the same numbers as plain data."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mars_lidar.cli.console import grid, screen
+from mars_lidar.instrument.system import System
+from studies.compare.sample import SIGNIFICANT, Distance, Estimate, Moments
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
+    from studies.compare.comparison import Comparison
+
+_MARK = "!"
+_SMALL = 4  # numbers in an array that is written as such
+
+
+def show(found: Comparison) -> None:
+    """Print all tables on standard output; what is significantly wrong is red and marked."""
+    console = screen()
+    _scene_table(console, found)
+    for pixel in found.pixels:
+        _pixel_table(console, found, pixel)
+    for line in (
+        "",
+        f"{_MARK} deviates by more than {SIGNIFICANT:g} standard errors from what is predicted, or else from "
+        f"{found.against}.",
+        "In brackets: standard error in the last digits. Window: +-3 sigma around the return.",
+        "lag-1: covariance of neighbouring bins over the mean count, in 1/1000.",
+        "TV: total variation of the mean histogram's shape and of the law of the count, in 1/1000;",
+        "in brackets what chance makes of it.",
+    ):
+        console.print(line, style="dim")
+
+
+def as_data(found: Any) -> Any:
+    """A comparison as JSON can hold it, its attributes by their names.
+
+    NaN is None, infinity 1e308; maps, laws and histograms are left out.
+    """
+    if isinstance(found, System):
+        return found.to_dict()
+    if isinstance(found, float):
+        return found if math.isfinite(found) else None if math.isnan(found) else math.copysign(1e308, found)
+    if isinstance(found, np.ndarray | np.generic):
+        return as_data(found.tolist())
+    if dataclasses.is_dataclass(found):
+        found = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+    if isinstance(found, dict):
+        small = {name: one for name, one in found.items() if not (isinstance(one, np.ndarray) and one.size > _SMALL)}
+        return {name: as_data(one) for name, one in small.items()}
+    return [as_data(one) for one in found] if isinstance(found, tuple | list) else found
+
+
+def _scene_table(console: Console, found: Comparison) -> None:
+    known = int(found.expected.known.sum())
+    height, width = found.flux.shape
+    goal = f"against the exact mean of {known:,} pixels" if known > 1 else f"against {found.against}"
+    shown = grid(
+        f"Whole image, {width} × {height} pixels, {found.threads} threads; bias {goal}",
+        (
+            "engine",
+            "ms",
+            "cubes",
+            "ns/count",
+            "registrations",
+            "bias/sd",
+            "bias %",
+            "dispersion",
+        ),
+    )
+    for name, s in found.scenes.items():
+        percent = Estimate(100 * s.relative_bias.value, 100 * s.relative_bias.error, s.relative_bias.z)
+        shown.add_row(
+            name,
+            _number(1e3 * s.median_s),
+            str(len(s.seconds)),
+            _number(s.ns_per_registration),
+            f"{s.registrations:,.0f}",
+            cell(s.bias),
+            cell(percent),
+            cell(s.dispersion),
+        )
+    console.print()
+    console.print(shown)
+    for name, why in found.skipped.items():
+        console.print(f"{name} was not run: {why}")
+
+
+def _pixel_table(console: Console, found: Comparison, pixel: str) -> None:
+    y, x = found.pixels[pixel]
+    statistics, law = found.statistics[pixel], found.laws[pixel]
+    drawn = {name: s.realizations for name, s in statistics.items()}
+    most = max(drawn.values())
+    fewer = "".join(f", {name} {n:,}" for name, n in drawn.items() if n < most)
+    shown = grid(
+        f"{pixel} pixel (y {y}, x {x}): S = {found.flux.signal[y, x]:.3g}, "
+        f"B = {found.flux.background[y, x]:.3g}; {most:,} exposures{fewer}",
+        ("engine", "mean", "variance", "Fano", "window var", f"/ {found.against}", "lag-1", "TV shape", "TV count"),
+    )
+    if law is not None:
+        known: Moments = law.counts
+        exact = [f"{e.value:.6g}" for e in (known.mean, known.variance)] + [_number(known.fano.value)]
+        window = "" if law.window is None else _number(float(law.window[1]))
+        lag = "" if math.isnan(law.lag1) else f"{1e3 * law.lag1:.3g}"
+        shown.add_row("predicted", *(f"{words} " for words in (*exact, window, "", lag)), "", "", style="bold")
+    for name, s in statistics.items():
+        relative = cell(s.window_ratio)
+        if name == found.against and math.isfinite(s.window_ratio.value):
+            relative = cell(Estimate(1.0))
+        lag1 = Estimate(1e3 * s.lag1.value, 1e3 * s.lag1.error, s.lag1_error.z)
+        shown.add_row(
+            name,
+            cell(s.counts.mean),
+            cell(s.counts.variance),
+            cell(s.counts.fano),
+            cell(s.window.variance),
+            relative,
+            cell(lag1),
+            cell(s.shape),
+            cell(s.law),
+        )
+    console.print()
+    console.print(shown)
+    if pixel in found.unpredicted:
+        console.print(f"{pixel} pixel has no prediction: {found.unpredicted[pixel]}")
+
+
+def cell(found: Estimate | Distance) -> Text:
+    """A value with its error, or a distance (in 1/1000) with its floor; red with a mark where it is wrong."""
+    from rich.text import Text
+
+    if isinstance(found, Distance):
+        words = "–" if math.isnan(found.value) else f"{_short(1e3 * found.value)} ({_short(1e3 * found.floor)})"
+    else:
+        words = with_error(found.value, found.error)
+    return Text(words + _MARK, style="bold red") if found.wrong else Text(words + " ")
+
+
+def with_error(value: float, error: float) -> str:
+    """The value with its standard error in brackets, in units of the last digit: 858.44(12), 858.4(3).
+
+    One digit of the error, two where it begins with 1, so that rounding changes it by no more than a third.
+    """
+    if math.isnan(value):
+        return "–"
+    if not (math.isfinite(error) and error > 0.0) or abs(value) >= 1e7:
+        return _number(value)
+    lead = math.floor(math.log10(error))
+    digits = (1 if error < 1.95 * 10.0**lead else 0) - lead
+    if digits > 8:
+        return f"{value:.3g}"
+    if digits <= 0:
+        return f"{value:.0f}({error:.0f})"
+    return f"{value:.{digits}f}({round(error * 10**digits)})"
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}"
+
+
+def _number(value: float) -> str:
+    if math.isnan(value):
+        return "–"
+    return f"{value:,.0f}" if 999.5 <= abs(value) < 1e7 else f"{value:.3g}"

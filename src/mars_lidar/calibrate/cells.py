@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate.model import Model
@@ -86,7 +85,7 @@ class Cells:
         """Counts (size,) of one stretch of recorded times (n,)."""
         x = t * (1.0 / self.period) + _SHIFT / _PHASES
         x -= np.floor(x)
-        at: NDArray[np.int32] = (x * _PHASES).astype(np.int32)
+        at = np.asarray(x * _PHASES).astype(np.int32)
         gap = np.searchsorted(self.gap_edges, np.diff(t))
         phases = np.bincount(self.phase_of[at], minlength=self.phases)
         gaps = np.bincount(gap, minlength=self.gap_edges.size + 1)

@@ -15,6 +15,7 @@ from mars_lidar.calibrate.start import first_spread, with_edge
 
 _STREAMS = 4 * LIGHTS  # that tell the direction of an effect
 NAMED = 4.0  # standard deviations of a score beyond which an effect is refitted: 3e-5 by chance
+_CLEAR = 2.5  # errors of the size of an effect that has no score of its own
 _FINISHED = 2  # refits that fresh streams judge
 _MISFIT = 1e-3  # probability of the misfit below which effects without a clear score are refitted too
 _FACTOR = 100.0  # of the probability of the misfit, for a refit that gains less in its square
@@ -127,6 +128,8 @@ def _best(fit: Fit, fitted: Fitted, tried: list[Score], listed: list[Score]) -> 
         final = fit.finish(model, theta, root, free, settled)
         named = Named(score.effect, score.z, fitted.misfit_z - final.misfit_z)
         gains = named.gain > _GAIN or final.p_value > max(_FACTOR * fitted.p_value, _MISFIT)
+        if score.z <= NAMED and not score.effect.onoff:  # without a score of its own: its size must be clear
+            gains = gains and final.theta[-1] > _CLEAR * final.covariance[-1, -1] ** 0.5
         if gains and final.converged:
             finals.append((final, named))
             if best is None or final.misfit_z < best[0].misfit_z:

@@ -157,7 +157,7 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
     size = effect.start[0] if effect.onoff else float(np.clip(score.size, 0.3 * effect.start[0], effect.most[0]))
     moved = fitted.theta.copy()
     moved[fitted.free] -= score.shift * min(size, effect.start[0])
-    if fitted.model.light + 2 in fitted.free and effect.names[0] in ("twilight_ns", "recovery_ns"):
+    if fitted.model.light + 2 in fitted.free and effect.names[0] == "recovery_ns":
         moved, size = fitted.theta.copy(), effect.start[0]  # the dead time has taken up what it could of them
     theta = model.bounded(np.r_[moved, size, effect.start[1:]])
     spread = first_spread(model, theta)
@@ -167,7 +167,7 @@ def _stepped(fit: Fit, fitted: Fitted, score: Score) -> _Stepped | None:
     free = np.r_[fitted.free, np.array(more, np.intp)].astype(np.intp)
     photons = float(fit.recording.photons)
     try:
-        if effect.names[0] in ("twilight_ns", "recovery_ns") and fitted.model.light + 2 in fitted.free:
+        if effect.names[0] == "recovery_ns" and fitted.model.light + 2 in fitted.free:
             gaps = np.diff(fit.recording.pieces[0][: 12 * fit.effort.first])
             theta = with_edge(fit, model, theta, np.sort(gaps))
         theta, root, misfit, settled = fit.steps(model, theta, np.diag(spread[free]), free, photons, 5, photons / 6.0)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mars_lidar._base import checks
+from mars_lidar._base.arguments import checked
 from mars_lidar._base.brief import brief
 from mars_lidar._base.types import FloatArray
 from mars_lidar.calibrate import start, suspects
@@ -198,6 +199,7 @@ class Calibration:
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}; estimates: {', '.join(estimates)}")
 
 
+@checked
 def calibrate(
     times: Timestamps | Sequence[Timestamps] | ArrayLike,
     given: System | Detector | Mapping[str, Any] | None = None,

@@ -114,6 +114,15 @@ def two_integers(option: str, text: str, form: str = "Y,X (row, column)") -> tup
     return first, second
 
 
+def two_numbers(option: str, text: str, form: str) -> tuple[float, float]:
+    """What an option of this form gives, such as START,STOP."""
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"{option} must be two numbers {form}, got {text!r}") from None
+    return first, second
+
+
 def save_picture(figure: Figure, out: Path) -> None:
     """Write a figure beside its name and rename it when it is whole."""
     options: dict[str, Any] = {"pil_kwargs": {"compress_level": 4}} if out.suffix == ".png" else {}

@@ -1,7 +1,8 @@
 """Files of reconstructed maps: .zarr, .h5 or .npz with named dimensions, units and what they were made of.
 
 Variables (method, realization, y, x): ``depth``, ``reflectivity``, ``signal``, ``background``, ``delay``, errors of the
-methods that give them (NaN for the others), ``significance`` and ``flags``. Where several returns were looked for:
+methods that give them (NaN for the others), ``significance`` and ``flags``; of the methods for images half widths of
+90 % intervals and ``outlier``. Where several returns were looked for:
 ``returns`` (their number), and of each (method, realization, y, x, return) ``return_depth``, ``return_signal``,
 ``return_delay``, their errors, and ``return_false_alarm``, nearest first, NaN beyond the last. Attributes: ``format`` =
 "mars-lidar maps", ``format_version``, ``system`` (JSON), ``level``, ``source`` (the cube), ``version``.
@@ -11,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -49,9 +49,11 @@ _VARIABLES = {  # name in the file: attribute, unit, in words
     "background_error": ("background_error", _PHOTONS, "standard error of the background"),
     "significance": ("significance", "1", "significance of the signal, standard deviations"),
     "p_value": ("p_value", "1", "probability of a histogram as far from the law of its estimate"),
-    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns, 32 misfit"),
+    "flags": ("flags", "1", "1 empty, 2 no signal, 4 saturated, 8 unconverged, 16 more returns, 32 filled, 64 misfit"),
+    "depth_half_width": ("depth_half_width_m", "m", "half width of the 90 % interval of the depth"),
+    "delay_half_width": ("delay_half_width_ns", "ns", "half width of the 90 % interval of the delay"),
+    "outlier": ("outlier", "1", "probability that the depth is that of another surface"),
     "returns": ("returns.count", "1", "number of returns"),
-    "radius": ("radius", "pixel", "radius of the window whose photons were taken together"),
 }
 _OF_EACH = ("depth", "signal", "delay", "depth_error", "signal_error", "delay_error")
 _OF_RETURNS = {f"return_{name}": (*_VARIABLES[name][:2], f"{_VARIABLES[name][2]} of each return") for name in _OF_EACH}
@@ -71,20 +73,16 @@ def save_maps(path: str | Path, results: Mapping[str, Any], *, source: str = "",
     target = Path(path)
     check_maps_output(target, overwrite=overwrite)
     variables, attrs = _contents(results, source)
-    with beside(target) as unfinished:
+    with beside(target, folder=target.suffix == ".zarr") as unfinished:
         if target.suffix == ".zarr":
             import zarr
 
-            shutil.rmtree(unfinished, ignore_errors=True)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "The data type")  # of the methods' names: fixed-length text
                 group = zarr.create_group(unfinished, zarr_format=3)
                 zarr_store.add(group, variables)
                 zarr_store.consolidated(group)
                 manifest.seal(unfinished, attrs)
-            if target.exists():
-                (target / "zarr.json").unlink(missing_ok=True)
-                shutil.rmtree(target)
         elif target.suffix == ".npz":
             with npz.archive(unfinished) as archive:
                 npz.add_attributes(archive, {**attrs, "variables": npz.add(archive, variables)})
@@ -121,6 +119,8 @@ def _check_suffix(name: str, path: Path) -> None:
 def _check_format(path: Path, attrs: Mapping[str, Any]) -> None:
     if attrs.get("format") != FORMAT:
         raise ValueError(f"{path} is not a file of maps of mars-lidar (no attribute format = {FORMAT!r})")
+    if attrs.get("complete", True) is not True:  # maps are written whole: nothing of ours says otherwise
+        raise ValueError(f"{path} is damaged: its attribute complete is {attrs['complete']!r}")
 
 
 def _check(found: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any]) -> None:

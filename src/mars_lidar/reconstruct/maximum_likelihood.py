@@ -8,7 +8,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mars_lidar._base import checks
+from mars_lidar._base import arguments, checks
 from mars_lidar._base.types import FloatArray
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.fit_quality import FALSE_ALARM, fit_quality, holds_for
@@ -127,6 +127,7 @@ class MaximumLikelihood(Method):
         return returns.reshape(pixels, self.returns, len(RETURN_COLUMNS))
 
 
+@arguments.checked
 def log_likelihood(
     histogram: ArrayLike, system: System, signal: ArrayLike, background: ArrayLike, delay_ns: ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -148,9 +149,9 @@ def log_likelihood(
     """
     from mars_lidar._base.native import _core
 
-    given, shape = checked(histogram, system, 1)
-    if shape:
-        raise ValueError(f"histogram must be ({system.bins},), of one pixel, got leading axes {shape}")
+    if np.shape(histogram) != (system.bins,):
+        raise ValueError(f"histogram must be ({system.bins},), of one pixel, got shape {np.shape(histogram)}")
+    given, _ = checked(histogram, system, 1)
     MaximumLikelihood().check(system)
     s, b, tau = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (signal, background, delay_ns)))
     if not ((s >= 0) & (b > 0) & np.isfinite(s + b + tau)).all():

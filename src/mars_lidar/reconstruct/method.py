@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields
 from enum import IntFlag
 from typing import Any, ClassVar, Literal
 
@@ -40,7 +40,9 @@ class Flags(IntFlag):
     """The iteration did not come to rest."""
     MORE_RETURNS = 16
     """There is light of further returns than the most that were asked for."""
-    MISFIT = 32
+    FILLED = 32
+    """An outlier is likelier than not, or nothing came: the delay is that of the pixels around."""
+    MISFIT = 64
     """The histogram is not one of the estimate's (p below 1e-3): a wrong dead time or pulse, another return."""
 
 
@@ -59,12 +61,19 @@ class Estimates:
     background_error: FloatArray | None = None
     delay_error: FloatArray | None = None
     significance: FloatArray | None = field(default=None)
+    half_width: FloatArray | None = None  # of the 90 % interval of the delay
+    outlier: FloatArray | None = None  # probability that the delay is another surface's
     p_value: FloatArray | None = None  # of the fit; NaN where too few photons tell
     longer: FloatArray | None = None  # scores, standard deviations: where a longer dead time, ...
     shorter: FloatArray | None = None  # ... a shorter one, ...
     wider: FloatArray | None = None  # ... a wider pulse would fit better
-    radius: NDArray[np.uint8] | None = None  # of the window whose photons were taken together, pixels
     returns: FloatArray | None = None  # (pixels, most, len(RETURN_COLUMNS)), NaN beyond those of a pixel
+
+    @staticmethod
+    def joined(parts: Sequence[Estimates]) -> Estimates:
+        """Those of several sets of pixels, one after the other."""
+        values = {each.name: [getattr(part, each.name) for part in parts] for each in fields(Estimates)}
+        return Estimates(**{name: np.concatenate(v) for name, v in values.items() if v[0] is not None})
 
 
 class Method(ABC):
@@ -74,6 +83,7 @@ class Method(ABC):
     modes: ClassVar[tuple[Mode, ...]]  # of the detector, that the method holds for
     assumes: ClassVar[str]  # in words, for tables
     windows: ClassVar[bool] = True  # signal and background come from inside and outside of a window
+    of_images: ClassVar[bool] = False  # each pixel's estimate depends on those around it: cubes (..., H, W, bins)
 
     def check(self, system: System) -> None:
         """Raise ValueError, naming mode and method, for a system that this method does not hold for."""
@@ -149,7 +159,10 @@ class RateMethod(Method):
         self.check(system)
         flat = None
         if total is not None:
-            flat = np.ascontiguousarray(np.broadcast_to(np.asarray(total, np.float64), shape).reshape(-1))
+            known = np.asarray(total, np.float64)
+            if known.shape not in ((), tuple(shape)):
+                raise ValueError(f"total must be a number or {tuple(shape)} as the pixels, got shape {known.shape}")
+            flat = np.ascontiguousarray(np.broadcast_to(known, shape).reshape(-1))
             if not ((flat > 0) & np.isfinite(flat)).all():
                 raise ValueError("total must be finite and positive, photons per period")
         out, flags = np.empty(given.counts.shape), np.empty(len(given.counts), np.uint8)

@@ -2,9 +2,9 @@
 One photon a pixel
 ==================
 
-A room of which each pixel registers one photon of the laser on average, and one of the background, in the whole exposure.
-Alone, half of the pixels have no depth, or that of a background photon. Method ``image`` takes the pixels around into
-account, and says how sure it is: pixels whose depth may be that of another surface have no interval.
+A room of which each pixel registers one photon of the laser on average, and one of the background, in the whole
+exposure. Alone, half of the pixels have no depth, or that of a background photon. Method ``image`` takes the pixels
+around into account, and says how sure it is: pixels whose depth may be that of another surface have no interval.
 """
 
 import matplotlib.pyplot as plt

@@ -49,7 +49,7 @@ class Settings:
 
 
 FULL = Settings(64, (1.0, 2.0, 5.0, 10.0), (0.03, 0.3, 1.0, 3.0), len(FROZEN))
-QUICK = Settings(24, (2.0,), (1.0,), 1)
+QUICK = Settings(24, (2.0,), (1.0,), 0)  # no frozen scene: a quick look is a look
 
 
 def systems() -> dict[str, System]:

@@ -1,6 +1,6 @@
 """``kill -9`` at random moments of everything that writes: ``python -m tests.fuzz.kills --kills 40``.
 
-Afterwards nothing under the final name may be half written, what was there before must be there still or be replaced as a
+Afterwards nothing under the final name may be half written, what was there before must be there or be replaced as a
 whole, and the same command must succeed when it is repeated.
 """
 

@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # a script's own folder, also wh
 from page_files import FILES, make
 
 ROOT = Path(__file__).resolve().parents[1]
-GENERATED = ("docs/api", "docs/copied", "docs/gallery")
+GENERATED = ("docs/api", "docs/copied", "docs/gallery", "docs/katex", "docs/lessons")
 SHOWN = ("text", "console")  # what a program prints, drawings
 _FENCE = re.compile(
     r"^(?:<!-- (?P<mark>run|not run|command): (?P<words>.*?) -->[ \t]*\n+)?"

@@ -1,13 +1,21 @@
-"""The documentation's site: ``python -m sphinx -W -b html docs build/site`` builds it and runs the gallery."""
+"""The documentation's site: ``python -m sphinx -W -b html docs build/site`` builds it and runs the gallery.
+
+Equations become HTML while the site is built (KaTeX, run by Node): pages need neither scripts nor a network for them.
+"""
 
 from __future__ import annotations
 
+import inspect
+import json
 import os
 import re
 import shutil
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import matplotlib.style
+from docutils import nodes
 from sphinx.application import Sphinx
 
 import mars_lidar
@@ -24,18 +32,24 @@ extensions = [
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["gallery/**/*.ipynb", "gallery/**/*.py", "gallery/**/*.json", "gallery/**/*.md5"]
+exclude_patterns = [
+    "katex",
+    *(f"{folder}/**/*.{kind}" for folder in ("gallery", "lessons") for kind in ("ipynb", "py", "json", "md5")),
+]
 templates_path = ["_templates"]
 default_role = "py:obj"
+smartquotes_action = "qe"  # quotes and ellipses: two hyphens are those of an option, not a dash
 suppress_warnings = ["config.cache"]  # the gallery's settings hold a function
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 4
+html_math_renderer = "katex"  # of this file
+
 
 autosummary_generate = True
 autodoc_typehints = "none"  # in the signature they are longer than the text; numpydoc shows each parameter's own
@@ -50,8 +64,8 @@ def _style(gallery: dict[str, object], name: str) -> None:
 
 
 sphinx_gallery_conf = {
-    "examples_dirs": ["../examples/gallery"],
-    "gallery_dirs": ["gallery"],
+    "examples_dirs": ["../examples/lessons", "../examples/gallery"],
+    "gallery_dirs": ["lessons", "gallery"],
     "filename_pattern": r"\.py$",
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
@@ -62,23 +76,28 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "reset_modules": ("matplotlib", _style),
     "image_srcset": [],
+    "write_computation_times": False,
 }
 
 html_theme = "pydata_sphinx_theme"
+html_context = {"default_mode": "auto"}
 html_title = f"mars-lidar {version}"
-html_static_path = ["_static"]
-html_css_files = ["site.css"]
+html_favicon = "_static/favicon.svg"
+html_static_path = ["_static", "copied/static"]
+html_css_files = ["katex/katex.min.css", "site.css"]
 html_theme_options = {
     "show_prev_next": False,
     "secondary_sidebar_items": ["page-toc"],
     "navbar_align": "left",
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 8,
     "footer_start": ["copyright"],
     "footer_end": [],
     "show_toc_level": 2,
 }
 html_show_sourcelink = False
-html_sidebars = {page: [] for page in ("start", "explorer", "coming_from")}  # pages without pages below them
+html_sidebars = {
+    page: [] for page in ("start", "seven_pictures", "explorer", "coming_from")
+}  # pages without pages below them
 
 # Pages that stand elsewhere, where the programs or the hosts of repositories look for them, and what a program says.
 COPIED = ROOT / "docs" / "copied"
@@ -97,6 +116,62 @@ def _copy(source: Path, target: Path) -> None:
     target.write_text(text, encoding="utf-8")
 
 
+def _katex_style() -> None:
+    """KaTeX from npm, and a copy of its style sheet and fonts for the pages."""
+    package = ROOT / "docs" / "katex"
+    if not (package / "node_modules" / "katex").is_dir():
+        npm = shutil.which("npm")
+        if npm is None:
+            raise RuntimeError("building the site needs Node and npm, which render its equations: https://nodejs.org")
+        subprocess.run([npm, "ci", "--silent", "--no-audit", "--no-fund"], cwd=package, check=True)
+    dist, target = package / "node_modules" / "katex" / "dist", COPIED / "static" / "katex"
+    shutil.rmtree(target, ignore_errors=True)
+    (target / "fonts").mkdir(parents=True)
+    shutil.copy(dist / "katex.min.css", target)
+    for font in dist.glob("fonts/*.woff2"):
+        shutil.copy(font, target / "fonts")
+
+
+class Formulas:
+    """Formulas as HTML, by a process of Node with KaTeX that begins with the first one."""
+
+    process: subprocess.Popen[str] | None = None
+
+    def html(self, tex: str, display: bool) -> str:
+        """ValueError for a formula that KaTeX cannot read."""
+        if self.process is None:
+            command = ["node", ROOT / "docs" / "katex" / "render.js"]
+            self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps({"tex": tex, "display": display}) + "\n")
+        self.process.stdin.flush()
+        answer = json.loads(self.process.stdout.readline())
+        if "error" in answer:
+            raise ValueError(f"{answer['error']}: {tex}")
+        return str(answer["html"])
+
+    def close(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.communicate()
+            self.process = None
+
+
+FORMULAS = Formulas()
+
+
+def _inline_math(writer: Any, node: nodes.math) -> None:
+    writer.body.append(f'<span class="math">{FORMULAS.html(node.astext(), display=False)}</span>')
+    raise nodes.SkipNode
+
+
+def _display_math(writer: Any, node: nodes.math_block) -> None:
+    writer.body.append(writer.starttag(node, "div", "", CLASS="math"))
+    writer.body.append(FORMULAS.html(node.astext(), display=True) + "</div>\n")
+    raise nodes.SkipNode
+
+
 def _commands() -> str:
     """The command line, as it describes itself."""
     import typer
@@ -109,13 +184,77 @@ def _commands() -> str:
     return re.sub(r"\[/?(?:bold|dim)\]", "", text)
 
 
+_katex_style()
 for copied in COPIES.items():
     _copy(*copied)
 COPIED.joinpath("commands.md").write_text(_commands(), encoding="utf-8")
 
 
+_HEADING = re.compile(r"^(Parameters|Attributes)$")
+
+
+def _annotations(thing: Any, section: str) -> dict[str, str]:
+    """Types of a callable's parameters, or of a class's attributes, as the source spells them."""
+    if section == "Parameters":
+        try:
+            parameters = inspect.signature(thing).parameters.values()
+        except (TypeError, ValueError):
+            return {}
+        return {p.name: str(p.annotation) for p in parameters if p.annotation is not p.empty}
+    types: dict[str, str] = {}
+    for base in reversed(getattr(thing, "__mro__", ())):
+        types |= {name: str(text) for name, text in inspect.get_annotations(base).items()}
+        for name, member in vars(base).items():
+            getter = getattr(member, "fget", None) or getattr(member, "func", None)  # a property, also a cached one
+            text = getattr(getter, "__annotations__", {}).get("return")
+            if text is not None:
+                types[name] = str(text)
+    return types
+
+
+def _document_types(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Puts the types of the annotations beside the names of the sections Parameters and Attributes."""
+    types: dict[str, str] = {}
+    for number, line in enumerate(lines):
+        following = lines[number + 1] if number + 1 < len(lines) else ""
+        if following.startswith("---"):
+            heading = _HEADING.match(line)
+            types = _annotations(thing, heading[1]) if heading else {}
+        elif types and re.fullmatch(r"\*{0,2}\w+(, \w+)*", line):
+            of_names = [types.get(each.strip("* ")) for each in line.split(",")]
+            if of_names[0] is not None and len(set(of_names)) == 1:
+                lines[number] = f"{line} : " + re.sub(r"_(?!\w)", r"\_", of_names[0])  # not a link of reStructuredText
+
+
+# Reports that one program made more than once, each with a title of its own.
+TITLES = {
+    "results/count_law_sequential/count_law": "Count laws against simulation photon by photon (T1)",
+    "results/sanitize_address": "The native core under the address sanitizer",
+    "results/sanitize_thread": "The native core under the thread sanitizer",
+    "copied/benchmarks/default": "Benchmarks: Intel Xeon",
+    "copied/benchmarks/epyc": "Benchmarks: AMD EPYC",
+    "copied/benchmarks/full": "Benchmarks: AMD EPYC, more cases",
+}
+
+
+def _title(app: Sphinx, page: str, source: list[str]) -> None:
+    if page in TITLES:
+        source[0] = re.sub(r"^# .*$", f"# {TITLES[page]}", source[0], count=1, flags=re.MULTILINE)
+
+
 def _link_copies(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = source[0].replace("](../benchmarks/results/", "](copied/benchmarks/")
+
+
+def _describe_pictures(app: Sphinx, doctree: nodes.document) -> None:
+    """Alternative texts for the pictures of the programs: else sphinx-gallery writes the name of a file."""
+    if not app.env.docname.startswith(("gallery/", "lessons/")):
+        return
+    title = next(iter(doctree.findall(nodes.title)), nodes.title()).astext()
+    for number, image in enumerate(doctree.findall(nodes.image), 1):
+        description = image.get("alt", "")
+        if not description or re.match(r"(plot|lesson) \d", description):
+            image["alt"] = f"{title}: picture {number}, described in the text beside it"
 
 
 def _take_explorer(app: Sphinx, error: Exception | None) -> None:
@@ -128,4 +267,9 @@ def _take_explorer(app: Sphinx, error: Exception | None) -> None:
 def setup(app: Sphinx) -> None:
     """Hooks of Sphinx."""
     app.connect("source-read", _link_copies)
+    app.connect("source-read", _title)
+    app.connect("autodoc-process-docstring", _document_types, priority=400)  # before numpydoc, 500
+    app.connect("doctree-read", _describe_pictures)
+    app.connect("build-finished", lambda app, error: FORMULAS.close())
+    app.add_html_math_renderer("katex", inline_renderers=(_inline_math, None), block_renderers=(_display_math, None))
     app.connect("build-finished", _take_explorer)

@@ -59,11 +59,6 @@ def table() -> ml.Table:
 
 
 @functools.cache
-def calibration() -> ml.Calibration:
-    return ml.calibrate(times())
-
-
-@functools.cache
 def chain() -> statistics.PhaseChain:
     return statistics.PhaseChain(np.full(8, 0.1), 0.3)
 
@@ -163,10 +158,6 @@ CALLS: dict[str, Callable[[Path], tuple[Callable[..., Any], dict[str, Any]]]] = 
     "Table.save": lambda at: (table().save, {"path": at / "b.h5", "overwrite": True}),
     "Table.load": lambda at: (ml.Table.load, {"path": at / "table.h5"}),
     "calibrate": lambda _: (ml.calibrate, {"times": times()}),
-    "validate": lambda _: (
-        ml.validate,
-        {"times": times(), "calibration": calibration(), "cycles": 100, "simulated": 200},
-    ),
     "Timestamps.save": lambda at: (times().save, {"path": at / "b.npz", "overwrite": True}),
     "Timestamps.load": lambda at: (ml.Timestamps.load, {"path": at / "photons.npz"}),
     "Timestamps.pixel": lambda _: (times().pixel, {"y": 0, "x": 0}),
@@ -383,7 +374,7 @@ SAYS = {
 # Public names that hold results or are raised: people get them, and do not call them.
 RESULTS = {
     *("Calibration", "CountLaw", "Generated", "JointLaw", "Lookup", "Pulse", "QuantisationError", "Reconstruction"),
-    *("Table", "Timestamps", "UnitWarning", "Validation", "__version__", "to_xarray"),  # the last is io's too
+    *("Table", "Timestamps", "UnitWarning", "__version__", "to_xarray"),  # the last is io's too
     *("io.Converted", "io.Cube", "io.IncompleteFileError", "io.Interrupted", "io.MissingLibraryError", "io.Problem"),
     *("io.SUFFIXES", "io.SceneFile", "io.SpadMat", "io.WriteError", "io.Written"),
 }
@@ -461,9 +452,7 @@ COMMANDS: dict[str, Callable[[Path], list[Any]]] = {
     "view": lambda at: [at / "cube.zarr", "-o", at / f"cli{next(NUMBERS)}.png"],
     "convert": lambda at: [at / "cube.zarr", at / f"cli{next(NUMBERS)}.npz"],
     "timestamps": lambda at: [at / "cube.zarr", "-o", at / f"cli{next(NUMBERS)}.npz"],
-    "inspect": lambda at: [at / "photons.npz"],
     "calibrate": lambda at: [at / "photons.npz"],
-    "validate": lambda at: [at / "photons.npz", "--cycles", 100],
     "reconstruct": lambda at: [at / "cube.zarr", "-o", at / f"cli{next(NUMBERS)}.npz"],
     "init": lambda at: [at / f"cli{next(NUMBERS)}.yaml"],
     "schema": lambda _: [],

@@ -3,8 +3,9 @@ Pile-up against the Poisson model
 =================================
 
 A bright surface at 40 ns, behind a pixel that is blind for 75 ns after each photon that it registers. A model without
-dead time (Poisson) predicts the grey rate; the pixel registers far fewer photons, too many of them early, and a shadow
-follows the pulse. The exact mean needs no simulation, and the simulation agrees with it.
+dead time (Poisson) predicts the grey rate; the pixel registers far fewer photons, too many of them early, and a
+shadow follows the pulse. The exact mean needs no simulation, and the simulation agrees with it. The program prints
+``45% of the photons are registered.``
 """
 
 import matplotlib.pyplot as plt
@@ -22,6 +23,7 @@ fig, ax = plt.subplots()
 ax.fill_between(system.time_ns, poisson, step="mid", color="0.85", label=f"Poisson model, {poisson.sum():,} counts")
 ax.plot(system.time_ns, counts, ".", ms=3, label=f"simulated with dead time, {counts.sum():,} counts")
 ax.plot(system.time_ns, mean, label="exact mean histogram")
-ax.set(xlabel="time in the laser period (ns)", ylabel="counts per bin", yscale="log", ylim=(200, None))
+ax.set(xlabel="time in the laser period (ns)", ylabel="counts per bin", yscale="log")
 ax.legend()
 plt.show()
+print(f"{counts.sum() / poisson.sum():.0%} of the photons are registered.")

@@ -2,9 +2,9 @@
 An RGB-D image to a cube and a point cloud
 ==========================================
 
-Depth and colour, as an RGB-D camera gives them (here written from a built-in scene: put your own files in their place),
-become photon rates, photon rates become a cube of histograms, and the cube a depth map and a cloud of points that any
-viewer opens.
+Depth and colour, as an RGB-D camera gives them (here written from a built-in scene: put your own files in their
+place), become photon rates, photon rates become a cube of histograms, and the cube a depth map and a cloud of points
+that any viewer opens. The program prints ``6,669,611 counts; median depth error 4.4 mm.``
 """
 
 import imageio.v3 as imageio
@@ -26,8 +26,12 @@ ml.io.save_cloud("room.ply", found.depth_m, focal_px=110.0, intensity=found.sign
 
 x, y, z = np.moveaxis(ml.io.points(found.depth_m, focal_px=110.0), -1, 0)
 fig = plt.figure(figsize=(8.2, 3.3))
-fig.add_subplot(121, title=f"{cube.sum():,} counts in {cube.shape[1:]}").imshow(cube[0].sum(-1), cmap="gray")
+counts = fig.add_subplot(121, title="Counts", xlabel="column", ylabel="row")
+counts.imshow(cube[0].sum(-1), cmap="gray")
 cloud = fig.add_subplot(122, projection="3d", xlim=(-3, 3), ylim=(1, 8), zlim=(-2, 2), elev=15, azim=-75)
+cloud.set(title="Points", xlabel="x (m)", ylabel="depth (m)", zlabel="height (m)")
 cloud.scatter(x, z, -y, c=found.signal, s=1.5, vmax=1.5, axlim_clip=True)
-cloud.set_box_aspect((6, 7, 4), zoom=1.3)
+cloud.set_box_aspect((6, 7, 4), zoom=1.1)
 plt.show()
+error_mm = 1e3 * np.nanmedian(np.abs(found.depth_m - scene.depth_m))
+print(f"{cube.sum():,} counts; median depth error {error_mm:.1f} mm.")

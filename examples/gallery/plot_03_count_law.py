@@ -3,8 +3,9 @@ The law of the count against 10,000 draws
 =========================================
 
 How many photons does a pixel register in an exposure? `mars_lidar.count_law` answers exactly, start and end of the
-exposure included, and ten thousand simulated exposures follow it. The Gaussian of the MaRS paper is close where counts
-are many; that of a renewal process at a constant rate of equal energy is too wide: a pulse comes when it comes.
+exposure included, and ten thousand simulated exposures follow it. The Gaussian of the MaRS paper is close where
+counts are many; that of a renewal process at a constant rate of equal energy is too wide: a pulse comes when it
+comes. The program prints ``Variance 7.13 drawn, 7.11 by the exact law.``
 """
 
 import matplotlib.pyplot as plt
@@ -27,3 +28,5 @@ for method, label in {"exact": "exact law", "mars": "MaRS, Gaussian", "renewal":
 ax.set(xlabel="registrations in 200 laser periods", ylabel="probability", xlim=(k[0], k[-1]))
 ax.legend()
 plt.show()
+exact = ml.count_law(**light, system=system)
+print(f"Variance {drawn.var():.2f} drawn, {exact.variance:.2f} by the exact law.")

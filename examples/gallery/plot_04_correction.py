@@ -2,9 +2,10 @@
 A piled-up histogram corrected
 ==============================
 
-Two thirds of the light are background, and a free-running pixel with 75 ns of dead time bends it: bins behind a bright
-one are seldom armed. Coates' correction is for a detector that is armed at the start of each period, and fails here.
-The generalised one counts in how many periods each bin was armed; maximum likelihood knows the pulse as well.
+Two thirds of the light are background, and a free-running pixel with 75 ns of dead time bends it: bins behind a
+bright one are seldom armed. Coates' correction is for a detector that is armed at the start of each period, and fails
+here. The generalised one counts in how many periods each bin was armed; maximum likelihood knows the pulse as well.
+The program prints ``Registered 0.92 photons per period; fitted 3.00, true 3.00.``
 """
 
 import matplotlib.pyplot as plt
@@ -28,3 +29,5 @@ ax.plot(system.time_ns, fitted, label=f"maximum likelihood: S = {found.signal:.3
 ax.set(xlabel="time in the laser period (ns)", ylabel="photons per bin and period", yscale="log", ylim=(None, 3))
 ax.legend(ncols=2, loc="upper left")
 plt.show()
+rate, fit = counts.sum() / system.cycles, found.signal + found.background
+print(f"Registered {rate:.2f} photons per period; fitted {fit:.2f}, true 3.00.")

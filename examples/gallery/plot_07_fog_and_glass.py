@@ -3,7 +3,8 @@ Fog and glass
 =============
 
 The same wall in clear air, behind a pane of glass, and in fog. A pane is a second return in every pixel; fog is light
-from everywhere before the wall, and less of it from the wall. In a pixel with dead time the early light hides the late.
+from everywhere before the wall, and less of it from the wall. In a pixel with dead time the early light hides the
+late. The program prints ``Counts of the wall: 76,806 in clear air, 7,553 in fog.``
 """
 
 import matplotlib.pyplot as plt
@@ -23,9 +24,13 @@ fog = clear.in_fog(system, extinction_per_m=0.12, backscatter=1.0)
 
 fig, ax = plt.subplots()
 metres = 0.1499 * system.bin_ns * (np.arange(system.bins) + 0.5)
+wall_counts = {}
 for name, flux in {"clear air": clear, "behind glass": pane, "in fog": fog}.items():
     counts = ml.simulate(flux, system, seed=0)[0, 0, 0]
-    ax.step(metres, counts + 1, where="mid", lw=0.9, label=f"{name}: {counts.sum():,} counts")
-ax.set(xlabel="depth (m)", ylabel="counts per bin", yscale="log", ylim=(5, None))
+    wall_counts[name] = counts[np.abs(metres - 7) < 0.3].sum()
+    ax.step(metres, counts, where="mid", lw=0.9, label=f"{name}: {counts.sum():,} counts")
+ax.set(xlabel="depth (m)", ylabel="counts per bin", ylim=(-0.5, None))
+ax.set_yscale("symlog", linthresh=1.0)  # zeros have a place
 ax.legend()
 plt.show()
+print(f"Counts of the wall: {wall_counts['clear air']:,} in clear air, {wall_counts['in fog']:,} in fog.")

@@ -5,10 +5,11 @@ A network on an endless stream
 `mars_lidar.learn.CubeStream` simulates cubes as PyTorch asks for them: scenes and light that never come again. Three
 convolutions learn in seconds, on a processor, to place the return of a dim scene in its bin; beside them the matched
 filter, which sees one pixel at a time. From the left: the true depth, the matched filter's, the network's.
+The program prints ``The network's median error is below the matched filter's: True.``
 """
 
 import matplotlib.pyplot as plt
-from torch import from_numpy, hstack, nn, optim
+from torch import from_numpy, nn, optim
 
 import mars_lidar as ml
 from mars_lidar.learn import CubeStream, LogUniform
@@ -25,8 +26,19 @@ for batch in CubeStream(system, size=32, batch_size=8, epoch_size=8 * 60, signal
     optimizer.step()
 
 (test,) = CubeStream(system, size=64, batch_size=1, epoch_size=1, signal=0.05, seed=2)
+truth = test["depth"][0]
 matched = ml.reconstruct(test["cube"][0].movedim(0, -1).numpy(), system, "matched_filter").depth_m
 learned = 0.1499 * system.bin_ns * (net(test["cube"].log1p()).argmax(1)[0] + 0.5)
-plt.imshow(hstack((test["depth"][0], from_numpy(matched), learned)), vmin=0, vmax=6)
-plt.colorbar(label="depth (m)", shrink=0.7)
+fig, axes = plt.subplots(1, 3, figsize=(8.2, 2.9))
+for ax, name, depth in zip(
+    axes, ("true depth", "matched filter", "network"), (truth, from_numpy(matched), learned), strict=True
+):
+    image = ax.imshow(depth, vmin=0, vmax=6)
+    ax.set(title=name, xticks=[], yticks=[])
+fig.colorbar(image, ax=axes, label="depth (m)", shrink=0.8)
 plt.show()
+error_m = {
+    name: float((depth - truth).abs().nanmedian())
+    for name, depth in (("filter", from_numpy(matched)), ("network", learned))
+}
+print(f"The network's median error is below the matched filter's: {error_m['network'] < error_m['filter']}.")

@@ -2,9 +2,10 @@
 The joint law, and why count times shape is not enough
 ======================================================
 
-Dead time ties the bins of a histogram together. Simulators that draw a count and then distribute it over the mean shape
-(MaRS, and every multinomial) have the right mean of each bin and the right count, but not the covariance: two bins less
-than a dead time apart exclude each other. `mars_lidar.joint_law` gives the covariance exactly.
+Dead time ties the bins of a histogram together. Simulators that draw a count and then distribute it over the mean
+shape (MaRS, and every multinomial) have the right mean of each bin and the right count, but not the covariance: two
+bins less than a dead time apart exclude each other. `mars_lidar.joint_law` gives the covariance exactly. The program
+prints ``Variance of the counts at the pulse: 157 by the exact law, 109 by count times shape.``
 """
 
 import matplotlib.pyplot as plt
@@ -20,11 +21,14 @@ for engine in ("exact", "mars"):
     cube = ml.simulate(ml.Flux(**light), system, engine=engine, realizations=20_000, seed=0)
     covariances[f"engine {engine!r}, 20,000 draws"] = np.cov(cube.reshape(-1, system.bins).T)
 
+windows = {}
 fig, axes = plt.subplots(1, 3, figsize=(8.4, 3.0), sharey=True)
 for ax, (name, covariance) in zip(axes, covariances.items(), strict=True):
     image = ax.imshow(covariance, cmap="RdBu_r", vmin=-2, vmax=2, extent=(0, 100, 100, 0))
-    window = covariance[17:24, 17:24].sum()
+    window = windows[name] = covariance[17:24, 17:24].sum()
     ax.set(title=f"{name}\nvariance at the pulse: {window:.0f}", xlabel="time (ns)")
 axes[0].set(ylabel="time (ns)")
 fig.colorbar(image, ax=axes, label="covariance (counts²)", shrink=0.8)
 plt.show()
+exact, _, mars = windows.values()
+print(f"Variance of the counts at the pulse: {exact:.0f} by the exact law, {mars:.0f} by count times shape.")

@@ -93,14 +93,16 @@ struct Folded {
 
 extern "C" {
 
-// Draws histograms `out` (pixels, bins), uint32. `told`: cycles, bins, dead time, stationary, mode, gate start, gate
-// width, mean of the afterpulses, their mean delay, twilight, electronics dead time, sigma of the jitter.
-EMSCRIPTEN_KEEPALIVE void simulate(double sigma, const double* told, int32_t pixels, const double* signal,
-                                   const double* delay, const double* background, const uint32_t* pixel_index,
-                                   uint32_t seed_low, uint32_t seed_high, int32_t realizations, uint32_t* out) {
+// Draws histograms `out` (pixels, bins), uint32. `signal` and `delay`: (returns, pixels). `told`: cycles, bins, dead
+// time, stationary, mode, gate start, gate width, mean of the afterpulses, their mean delay, twilight, electronics dead
+// time, sigma of the jitter.
+EMSCRIPTEN_KEEPALIVE void simulate(double sigma, const double* told, int32_t pixels, int32_t returns,
+                                   const double* signal, const double* delay, const double* background,
+                                   const uint32_t* pixel_index, uint32_t seed_low, uint32_t seed_high,
+                                   int32_t realizations, uint32_t* out) {
     Job job;
     job.pixels = pixels;
-    job.returns = 1;
+    job.returns = returns;
     job.realizations = realizations;
     job.seed = static_cast<uint64_t>(seed_high) << 32 | seed_low;
     job.cycles = static_cast<int32_t>(told[0]);
@@ -119,7 +121,8 @@ EMSCRIPTEN_KEEPALIVE void simulate(double sigma, const double* told, int32_t pix
     Recording recording;
     recording.electronics_dead_time = told[10];
     if (told[11] > 0.0) recording.jitter = &pulse_of(told[11]);
-    if (told[10] > 0.0 || told[11] > 0.0) job.recording = &recording;
+    // the kernel of avalanches records through a Recorder even where it changes nothing, and address 0 is legal here
+    if (told[10] > 0.0 || told[11] > 0.0 || job.avalanches_matter()) job.recording = &recording;
     Output output{};
     output.sink = Sink::kHistogram32;
     output.out = out;

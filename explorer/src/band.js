@@ -8,7 +8,7 @@ const FORGOTTEN = 1e-6, MOST_STEPS = 6e7, SETTLING_STEPS = 4e6, TOGETHER = 64;
 
 /** Variances (bins); `law` is that of exposure(), in as many bins or, with jitter, in its parts. */
 export function binVariances(native, system, pixel, law, jitter) {
-  if (system.dead === 0 || !(pixel.signal + pixel.background > 0)) return null;
+  if (!(pixel.signal + (pixel.second ?? 0) + pixel.background > 0)) return new Float64Array(system.bins);
   const out = jitter ? jitter.parts : system.bins, photons = photonsIn(native, system, pixel, PARTS * law.bins);
   const grid = gridOf(system, law.bins, out, SETTLING_STEPS);
   const settled = native.settlingPeriods(grid, photons, FORGOTTEN, SETTLING_STEPS);

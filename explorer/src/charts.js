@@ -25,11 +25,12 @@ class Chart {
   }
 
   get size() {
-    return { width: Math.max(240, this.element.clientWidth), height: this.height() };
+    return { width: Math.max(200, this.element.clientWidth), height: this.height() };
   }
 
   resize() {
-    if (this.plot && this.plot.width !== this.size.width) this.plot.setSize(this.size);
+    const { width, height } = this.size;
+    if (this.plot && (this.plot.width !== width || this.plot.height !== height)) this.plot.setSize({ width, height });
   }
 
   /** Anew: for other colours, or another scale. */
@@ -45,28 +46,31 @@ class Chart {
   }
 }
 
+const LOWEST = 0.2, ZERO = 0.25; // of a logarithmic axis of counts: its lower end, and where counts of 0 are drawn, as rings
+
 export class HistogramChart extends Chart {
   logarithmic = false;
 
   options() {
-    const positive = (u, low, high) => [0, Math.max(high, 1e-9) * 1.05];
-    const logRange = (u, low, high) => [0.5, Math.max(high, 10) * 1.5];
+    const positive = (u, low, high) => [0, Math.max(high, 1) * 1.05];
+    const logRange = (u, low, high) => [LOWEST, Math.max(high, 10) * 1.5];
+    const tick = (_, values) => values.map((value) => (value === null || value < 0.99 ? "" : short(value)));
     return {
       cursor: { drag: { x: true, y: false }, points: { show: false } },
       scales: {
-        x: { time: false }, counts: this.logarithmic ? { distr: 3, range: logRange } : { range: positive }, light: { range: positive },
+        x: { time: false }, counts: this.logarithmic ? { distr: 3, range: logRange } : { range: positive },
       },
       axes: [
-        axis("time in the period (ns)", { space: 40 }), axis("counts per bin", { scale: "counts", values: shortAll, size: 56 }),
-        axis("photons per bin and period", { scale: "light", side: 1, grid: { show: false }, values: shortAll, size: 60 }),
+        axis("time in the period (ns)", { space: 40 }), axis("photons or counts per bin", { scale: "counts", values: this.logarithmic ? tick : shortAll, size: 56 }),
       ],
       series: [
         {},
-        { scale: "light", stroke: css("--light-line"), fill: css("--light"), width: 1, points: { show: false } },
+        { scale: "counts", stroke: css("--light-line"), fill: css("--light"), fillTo: this.logarithmic ? LOWEST : 0, width: 1, points: { show: false } },
         { scale: "counts", stroke: css("--band-line"), width: 1, points: { show: false } },
         { scale: "counts", stroke: css("--band-line"), width: 1, points: { show: false } },
         { scale: "counts", stroke: css("--mean"), width: 2, points: { show: false } },
         { scale: "counts", stroke: css("--dots"), paths: () => null, points: { show: true, size: 4, width: 0, fill: css("--dots") } },
+        { scale: "counts", stroke: css("--dots"), paths: () => null, points: { show: true, size: 5, width: 1, fill: css("--card") } },
       ],
       bands: [{ series: [3, 2], fill: css("--band") }],
     };
@@ -74,10 +78,11 @@ export class HistogramChart extends Chart {
 
   /** Arrays of the bins, or null where there is nothing yet; `spread`: one standard deviation. */
   show({ time, incident, mean, spread, counts }, logarithmic) {
-    const none = new Array(time.length).fill(null), least = logarithmic ? 0.5 : 0;
+    const none = new Array(time.length).fill(null), least = logarithmic ? LOWEST : 0;
     const band = (sign) => (mean && spread ? mean.map((m, j) => Math.max(m + sign * 2 * spread[j], least)) : none);
-    const positive = (a) => (logarithmic ? a.map((x) => (x > 0 ? x : null)) : a);
-    this.data = [time, incident, band(-1), band(1), mean ? positive(Array.from(mean)) : none, positive(Array.from(counts))];
+    const line = (a) => (logarithmic ? a.map((x) => Math.max(x, LOWEST)) : a), dots = Array.from(counts);
+    const zeros = logarithmic ? dots.map((x) => (x > 0 ? null : ZERO)) : none; // where a logarithmic axis has no place for them
+    this.data = [time, line(incident), band(-1), band(1), mean ? line(Array.from(mean)) : none, logarithmic ? dots.map((x) => (x > 0 ? x : null)) : dots, zeros];
     if (logarithmic !== this.logarithmic) {
       this.logarithmic = logarithmic;
       this.reset();

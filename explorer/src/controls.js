@@ -1,5 +1,5 @@
 // The form: a slider and a box for each number, and choices.
-import { GROUPS, INITIAL, MODES, NUMBERS, rounded } from "./model.js";
+import { GROUPS, INITIAL, MODES, NUMBERS, entered, rounded } from "./model.js";
 
 const PLACES = 400; // of a slider
 
@@ -27,7 +27,7 @@ const element = (name, attributes = {}, ...children) => {
 };
 
 export class Controls {
-  /** `change(changes)` is called with what the reader sets. */
+  /** `change(changes, warning)` is called with what the reader sets, and what of it could not be taken as it was. */
   constructor(form, change) {
     this.form = form;
     this.rows = {};
@@ -55,7 +55,11 @@ export class Controls {
     const slider = element("input", { type: "range", id: `${key}-slider`, min: 0, max: PLACES, step: 1, ariaLabel: `${label}${unit ? `, ${unit}` : ""}` });
     const box = element("input", { type: "number", id: key, step: "any", min: number.zero ? 0 : number.low, max: number.high });
     slider.addEventListener("input", () => change({ [key]: valueAt(number, Number(slider.value), this.most(number)) }));
-    box.addEventListener("change", () => change({ [key]: rounded(number, Number(box.value)) }));
+    box.addEventListener("change", () => {
+      const { value, changed } = entered(number, box.value, this.state[key]);
+      if (changed) box.value = value;
+      change({ [key]: value }, changed);
+    });
     const name = element("label", { htmlFor: key, textContent: label });
     if (unit) name.append(" ", element("span", { className: "unit", textContent: unit }));
     const row = element("div", { className: "number" }, name, box, slider);
@@ -72,7 +76,7 @@ export class Controls {
     this.state = state;
     for (const number of NUMBERS) {
       const { row, slider, box } = this.rows[number.key], value = state[number.key];
-      row.hidden = number.mode !== undefined && number.mode !== state.mode;
+      row.hidden = (number.mode !== undefined && number.mode !== state.mode) || (number.with !== undefined && state[number.with] === 0);
       slider.disabled = box.disabled = fixed.includes(number.key);
       const place = placeOf(number, value, this.most(number));
       if (Number(slider.value) !== place && document.activeElement !== slider) slider.value = place;
@@ -87,6 +91,5 @@ export class Controls {
     const effects = this.form.querySelector("details summary");
     const on = GROUPS.find((group) => group.folded).numbers.filter(({ key }) => key !== "trapDelay" && state[key] !== INITIAL[key]).length;
     effects.textContent = on ? `Effects (${on} on)` : "Effects";
-    this.rows.trapDelay.row.hidden = state.afterpulses === 0;
   }
 }

@@ -14,12 +14,20 @@ function openParts(system) {
   return end <= 1 ? [[system.gateStart, end]] : [[0, end - 1], [system.gateStart, 1]];
 }
 
-function ungated(native, system, pixel, edges) {
+/** Energy of the train of pulses of a return between the start of the period and `edges`. */
+function energyOf(native, system, delay, edges) {
   const at = new Float64Array(edges.length + 1);
-  at[0] = -pixel.delay;
-  edges.forEach((edge, k) => { at[k + 1] = edge - pixel.delay; });
+  at[0] = -delay;
+  edges.forEach((edge, k) => { at[k + 1] = edge - delay; });
   const energy = native.energyBefore(system.sigma, at);
-  return edges.map((edge, k) => Math.max(pixel.signal * (energy[k + 1] - energy[0]) + pixel.background * edge, 0));
+  return edges.map((_, k) => energy[k + 1] - energy[0]);
+}
+
+function ungated(native, system, pixel, edges) {
+  const energy = energyOf(native, system, pixel.delay, edges);
+  const second = pixel.second ? energyOf(native, system, pixel.secondDelay, edges) : null;
+  return edges.map((edge, k) =>
+    Math.max(pixel.signal * energy[k] + (second ? pixel.second * second[k] : 0) + pixel.background * edge, 0));
 }
 
 /** Photons between the start of the period and `edges` in [0, 1], inside of the gate. */

@@ -1,34 +1,59 @@
 // The page: state, link, controls, figure and pictures together.
 import { Controls } from "./controls.js";
 import { Engine, Refusal, unpacked } from "./engine.js";
+import { picture, savePicture, saveTable, table } from "./export.js";
 import { Figure } from "./figure.js";
-import { INITIAL, SPEED_OF_LIGHT, fromHash, problem, toHash } from "./model.js";
+import { INITIAL, SPEED_OF_LIGHT, detected, fromHash, inPeriods, problem, toHash } from "./model.js";
 import { Picture } from "./pictures.js";
+import { PRESETS } from "./presets.js";
 import { snippet } from "./snippet.js";
 import { CubeSource, SceneSource } from "./sources.js";
+import { length } from "./units.js";
 import colours from "./colours.json";
 
 const at = (id) => document.getElementById(id);
-const PICTURE_KEYS = ["signal", "background", "dead", "sigma", "mode", "start", "cycles", "bins", "period", "gateStart", "gateWidth", "efficiency",
+const PICTURE_KEYS = ["signal", "background", "second", "gap", "dead", "sigma", "mode", "start", "cycles", "bins", "period", "gateStart", "gateWidth", "efficiency",
   "dark", "jitter", "afterpulses", "trapDelay", "twilight", "electronics", "seed", "method"];
 const PAUSE_MS = 250; // after the last change, before all pixels are drawn again
+const LINK_MS = 400; // after the last change, before the address has it: Safari throws at 100 changes in 30 s
 
 async function begin() {
   const told = JSON.parse(at("cube").textContent);
   const source = told ? new CubeSource(told) : new SceneSource();
   const module = await unpacked(at("native").textContent), worker = at("worker").textContent;
-  const page = { histogram: at("histogram"), law: at("law"), facts: at("facts"), notes: at("notes") };
+  const page = { histogram: at("histogram"), law: at("law"), facts: at("facts"), notes: at("notes"), computing: at("computing") };
+  const figureAlone = new URLSearchParams(location.search).has("figure"); // embedded in a page of its own prose
+  document.body.classList.toggle("figure-alone", figureAlone);
   const figure = new Figure(page, new Engine(module, worker)), painter = new Engine(module, worker);
   const pixels = source.height * source.width;
-  let state = told ? { ...INITIAL, ...source.settings } : fromHash(location.hash, pixels);
-  let painted = "", timer = 0, lastPicture = {};
+  const base = told ? { ...INITIAL, ...source.settings } : INITIAL;
+  const first = fromHash(location.hash, pixels, base, source.images);
+  let state = first.state, painted = "", timer = 0, linkTimer = 0, lastPicture = {};
+  at("changed").textContent = first.changed;
 
-  const set = (changes) => {
+  const set = (changes, warning = "") => {
     const next = { ...state, ...changes };
-    if (next.delay > next.period) next.delay = next.period;
+    for (const key of ["delay", "gap"]) if (next[key] > next.period) next[key] = next.period;
     state = next;
+    at("changed").textContent = warning;
     return refresh();
   };
+  const address = () => {
+    const hash = toHash(state, base);
+    return hash ? `#${hash}` : location.pathname + location.search;
+  };
+  const linked = () => {
+    clearTimeout(linkTimer);
+    linkTimer = setTimeout(() => {
+      try {
+        history.replaceState(null, "", address());
+      } catch { // a browser that counts: the next change tries again
+      }
+    }, LINK_MS);
+  };
+  // The state of a preset, with a place in the picture kept out: its sentence is about one pixel's figure.
+  const presetState = ({ changes }) => ({ ...INITIAL, ...changes });
+  const story = () => PRESETS.find((preset) => toHash(presetState(preset)) === toHash({ ...state, seed: INITIAL.seed }));
 
   const pick = async (row, column) => {
     const pixel = row * source.width + column;
@@ -44,9 +69,10 @@ async function begin() {
   const controls = new Controls(at("controls"), set);
 
   function refresh() {
-    const hash = toHash(state);
-    if (!told) history.replaceState(null, "", hash ? `#${hash}` : location.pathname + location.search);
-    const wrong = problem(state), pixel = source.pixel(state);
+    linked();
+    const wrong = problem(state), pixel = source.pixel(state), active = told ? null : story();
+    at("story").textContent = active?.sentence ?? "";
+    for (const link of at("presets").querySelectorAll("a")) link.ariaCurrent = link.textContent === active?.name ? "true" : null;
     controls.show(state, [...source.fixed, ...(state.pixel >= 0 && !told ? ["delay"] : [])]);
     at("method").value = state.method;
     at("log").checked = state.log === 1;
@@ -57,8 +83,8 @@ async function begin() {
     for (const picture of pictures) picture.select(state.pixel < 0 ? null : [Math.floor(state.pixel / source.width), state.pixel % source.width]);
     at("problem").textContent = wrong;
     if (wrong) return Promise.resolve();
-    const key = told ? state.method + source.image : PICTURE_KEYS.map((name) => state[name]).join();
-    if (key !== painted) {
+    const key = told ? state.method + state.image : PICTURE_KEYS.map((name) => state[name]).join();
+    if (key !== painted && !figureAlone) {
       painted = key;
       clearTimeout(timer);
       painter.stop();
@@ -105,8 +131,8 @@ async function begin() {
     if (!source.truth) return;
     const off = depth.map((z, p) => Math.abs(z - (source.truth[p] % range))).filter((x) => !Number.isNaN(x)).sort();
     const lost = depth.length - off.length;
-    at("error").textContent = current.method === "truth" ? "" :
-      `Median error of the depth ${Number((100 * off[Math.floor(off.length / 2)]).toPrecision(3))} cm${lost ? `, ${lost} pixels without` : ""}.`;
+    at("error").textContent = current.method === "truth" ? "" : off.length === 0 ? "No pixel has a depth." :
+      `Median error of the depth ${length(off[Math.floor(off.length / 2)], 3)}${lost ? `, ${lost} pixels without` : ""}.`;
   }
 
   at("method").onchange = (event) => set({ method: event.target.value });
@@ -114,7 +140,12 @@ async function begin() {
   at("again").onclick = () => set({ seed: (state.seed + 1) % 2 ** 32 });
   at("again").hidden = Boolean(told);
   at("free").onclick = () => set({ pixel: -1 });
-  at("reset").onclick = () => { state = told ? { ...INITIAL, ...source.settings } : { ...INITIAL }; refresh(); };
+  at("reset").onclick = () => set({ ...base, ...(told ? { pixel: state.pixel, image: state.image } : {}) });
+  const settings = () => `${toHash(state) || "as at first"}; Registered ${figure.results.draw.registered}`;
+  const canvases = () => [...document.querySelectorAll(".chart canvas")];
+  at("csv").onclick = () => saveTable(figure.results, settings());
+  at("png").onclick = () => savePicture(canvases(), `mars-lidar explorer: ${settings()}`);
+  at("presets").append(...(told ? [] : PRESETS.map((preset) => Object.assign(document.createElement("a"), { href: `#${toHash(presetState(preset))}`, textContent: preset.name }))));
   const copied = (button, text) => async () => {
     await navigator.clipboard.writeText(text());
     const label = button.textContent;
@@ -122,14 +153,17 @@ async function begin() {
     setTimeout(() => { button.textContent = label; }, 1200);
   };
   at("copy").onclick = copied(at("copy"), () => at("python").textContent);
-  at("link").onclick = copied(at("link"), () => location.href);
+  at("link").onclick = copied(at("link"), () => new URL(address(), location.href).href);
   at("link").hidden = Boolean(told);
   at("image-number").hidden = source.images < 2;
   at("image").max = source.images - 1;
+  at("image").value = source.image = state.image;
   at("image").onchange = async (event) => {
-    source.image = Math.min(Math.max(Math.round(Number(event.target.value)), 0), source.images - 1);
+    const wanted = event.target.value === "" ? NaN : Number(event.target.value);
+    const image = Number.isFinite(wanted) ? Math.min(Math.max(Math.round(wanted), 0), source.images - 1) : state.image;
+    event.target.value = source.image = image;
     if (state.pixel >= 0) await source.read(state.pixel);
-    refresh();
+    set({ image }, image === wanted ? "" : `Images are numbered from 0 to ${source.images - 1}: it is ${image}.`);
   };
   at("check").onclick = async () => {
     const { cubes } = await figure.engine.ask("golden"), same = cubes.filter(({ found, expected }) => found === expected);
@@ -138,20 +172,31 @@ async function begin() {
       : `${cubes.length - same.length} of ${cubes.length} golden cubes differ: please report this with your browser's name.`;
     return cubes;
   };
-  addEventListener("hashchange", () => { state = fromHash(location.hash, pixels); refresh(); });
+  addEventListener("hashchange", () => {
+    if (told) return; // its address is written, and read when the page loads
+    const answer = fromHash(location.hash, pixels);
+    set(answer.state, answer.changed);
+  });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => figure.restyle());
   at("title-cube").textContent = told ? `${told.path}: ${told.height} x ${told.width} pixels` : "";
 
   // For tests, and for those who look behind the page.
   window.explorer = {
-    set, pick, figure, painter, source, initial: INITIAL, get state() { return state; }, get picture() { return lastPicture; },
+    set, pick, figure, painter, source, initial: INITIAL, presets: PRESETS, address, table: () => table(figure.results, settings()),
+    png: () => picture(canvases(), settings()),
+    counts: async (changes) => { // of the page's own pixel in some state, not shown
+      const some = { ...INITIAL, ...changes }, light = detected(some, [some.signal], [some.delay], [0], some.second > 0 ? [some.second] : null);
+      return (await painter.ask("draw", { system: inPeriods(some), light, seed: some.seed })).counts;
+    }, get state() { return state; }, get picture() { return lastPicture; },
     golden: async () => (await figure.engine.ask("golden")).cubes, pictureCube: async () => (await painter.ask("cube")).cube,
   };
   at("loading").hidden = true;
   if (!told) return refresh();
   at("dots-name").textContent = "the stored exposure";
   if (!source.known) at("method").querySelector("[value=truth]").remove();
-  await pick(source.height >> 1, source.width >> 1);
+  if (state.pixel < 0) return pick(source.height >> 1, source.width >> 1);
+  await source.read(state.pixel); // the light of the link is kept
+  await refresh();
 }
 
 begin().catch((error) => {

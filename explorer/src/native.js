@@ -39,7 +39,8 @@ export class Native {
     }
   }
 
-  /** Histograms (realizations * pixels * bins) of `light`, arrays signal, delay, background and index of the pixels. */
+  /** Histograms (realizations * pixels * bins) of `light`: arrays signal, delay, background and index of the pixels, and of
+   *  pixels with a second return `second` and `secondDelay`. */
   simulate(system, light, seed, realizations = 1) {
     const pixels = light.signal.length;
     const told = new Float64Array([
@@ -47,9 +48,10 @@ export class Native {
       system.afterpulses, system.trapDelay, system.twilight, system.electronics, system.jitter,
     ]);
     const [low, high] = seedWords(seed);
-    const inputs = [told, light.signal, light.delay, light.background, light.index];
+    const returns = light.second ? 2 : 1, both = (first, second) => (second ? Float64Array.from([...first, ...second]) : first);
+    const inputs = [told, both(light.signal, light.second), both(light.delay, light.secondDelay), light.background, light.index];
     return this.with(inputs, [[Uint32Array, pixels * realizations * system.bins]], (t, s, d, b, i, out) =>
-      this.calls.simulate(system.sigma, t, pixels, s, d, b, i, low, high, realizations, out)).copies[0];
+      this.calls.simulate(system.sigma, t, pixels, returns, s, d, b, i, low, high, realizations, out)).copies[0];
   }
 
   /** Energy of the train of pulses up to times `t` after the delay. */

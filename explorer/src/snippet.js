@@ -16,11 +16,14 @@ function detector(state) {
   return told.join(",\n        ");
 }
 
+const parts = (bins) => bins * Math.max(4, Math.ceil(8192 / bins)); // of the period, in which two returns are put together
+
 /** Python for a state and its pixel (signal, background, delayNs, index), with the dots of a stored cube if `stored`. */
 export function snippet(state, pixel, stored) {
-  const exact = lawless(state).length === 0, joint = exact && state.mode === "nonparalyzable";
+  const exact = lawless(state).length === 0, two = pixel.second > 0, poisson = state.dead === 0 && state.mode !== "synchronous";
+  const joint = exact && state.mode === "nonparalyzable" && !poisson;
   const names = ["photons_per_bin", ...(exact ? ["count_law", "mean_histogram"] : []), ...(joint ? ["joint_law"] : [])].sort();
-  const light = "signal, background, system, delay_ns=delay_ns";
+  const light = two ? "None, 0.0, system, waveform=waveform" : "signal, background, system, delay_ns=delay_ns";
   const lines = [
     "import matplotlib.pyplot as plt", "import numpy as np", "", "import mars_lidar as ml",
     `from mars_lidar.statistics import ${names.join(", ")}`, "",
@@ -28,26 +31,31 @@ export function snippet(state, pixel, stored) {
     `    pulse=ml.GaussianPulse(sigma_ns=${num(state.sigma)}),`, `    detector=ml.Detector(\n        ${detector(state)}\n    ),`,
     ...(state.start === "armed" ? [] : [`    start="${state.start}",`]), ")",
     `signal, background, delay_ns = ${num(pixel.signal)}, ${num(pixel.background)}, ${num(pixel.delayNs)}`,
+    ...(two ? [`second, second_ns = ${num(pixel.second)}, delay_ns + ${num(state.gap)}`] : []),
   ];
   if (stored) {
     lines.push(`drawn = np.asarray(ml.io.load(${JSON.stringify(stored.path)}).histogram[${stored.image}, ${stored.row}, ${stored.column}])`);
   } else {
-    lines.push("flux = ml.Flux([[signal]], [[background]], [[delay_ns]])",
+    lines.push(two ? "flux = ml.Flux([[[signal]], [[second]]], [[background]], [[[delay_ns]], [[second_ns]]])" : "flux = ml.Flux([[signal]], [[background]], [[delay_ns]])",
       `drawn = ml.simulate(flux, system, seed=${state.seed}, pixel_index=[[${pixel.index}]])[0, 0, 0]`);
   }
-  lines.push("incident = photons_per_bin(signal, background, system, bins=system.bins, delay_ns=delay_ns)");
+  lines.push(`incident = photons_per_bin(signal, background, system, bins=${two ? parts(state.bins) : "system.bins"}, delay_ns=delay_ns)`);
+  if (two) {
+    lines.push(`waveform = incident + photons_per_bin(second, 0.0, system, bins=${parts(state.bins)}, delay_ns=second_ns)  # both returns`,
+      "incident = waveform.reshape(system.bins, -1).sum(1)");
+  }
   if (exact) lines.push(`mean = mean_histogram(${light})`, `law = count_law(${light})`);
   if (joint) lines.push(`spread = np.sqrt(joint_law(${light}).variance)`);
-  else if (exact) lines.push("spread = np.sqrt(mean)  # Poisson: for this mode there is no exact variance of a bin");
+  else if (exact && poisson) lines.push("spread = np.sqrt(mean)  # no dead time: counts are Poisson's");
   lines.push("", 'figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4), layout="constrained", width_ratios=(2, 1))',
-    "behind = left.twinx()", 'behind.fill_between(system.time_ns, incident, step="mid", color="0.85")',
-    'behind.set_ylabel("photons per bin and period")', "behind.set_zorder(-1)", "left.patch.set_visible(False)",
+    'left.fill_between(system.time_ns, system.cycles * incident, step="mid", color="0.85", label="photons that arrive")',
     'left.plot(system.time_ns, drawn, ".", label="one exposure")');
   if (exact) {
-    lines.push('left.plot(system.time_ns, mean, label="exact mean")',
-      'left.fill_between(system.time_ns, mean - 2 * spread, mean + 2 * spread, alpha=0.3, label="two standard deviations")',
-      "right.bar(law.support, law.pmf, width=1.0)");
+    lines.push('left.plot(system.time_ns, mean, label="exact mean")');
+    if (joint || poisson) lines.push('left.fill_between(system.time_ns, mean - 2 * spread, mean + 2 * spread, alpha=0.3, label="two standard deviations")');
+    lines.push("right.bar(law.support, law.pmf, width=1.0)");
   }
+  if (state.log === 1) lines.push('left.set_yscale("symlog", linthresh=1.0)  # linear below 1, so that zeros are there');
   lines.push('left.set(xlabel="time (ns)", ylabel="counts")', "left.legend()",
     'right.axvline(drawn.sum(), color="k")', 'right.set(xlabel="registrations N", ylabel="probability")', "plt.show()");
   return lines.join("\n") + "\n";

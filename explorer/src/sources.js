@@ -24,14 +24,16 @@ export class SceneSource {
   /** Light of a pixel, or of the page's own where `state.pixel` is -1. */
   pixel(state) {
     const { pixel } = state;
-    if (pixel < 0) return { signal: state.signal, background: state.background, delayNs: state.delay, index: 0 };
-    return { signal: state.signal * this.light[pixel], background: state.background, delayNs: NS_PER_M * this.depth[pixel], index: pixel };
+    if (pixel < 0) return { signal: state.signal, second: state.second, background: state.background, delayNs: state.delay, index: 0 };
+    const share = this.light[pixel];
+    return { signal: state.signal * share, second: state.second * share, background: state.background, delayNs: NS_PER_M * this.depth[pixel], index: pixel };
   }
 
   /** Counts and delays (periods) of all pixels, by parts to `show`. */
   async picture(state, engine, tell, show) {
     const delays = this.depth.map((depth) => NS_PER_M * depth), pixels = Array.from(delays, (_, p) => p);
-    const light = detected(state, this.light.map((x) => state.signal * x), delays, pixels);
+    const second = state.second > 0 ? this.light.map((x) => state.second * x) : null;
+    const light = detected(state, this.light.map((x) => state.signal * x), delays, pixels, second);
     const found = await engine.ask("picture", { system: inPeriods(state), light, seed: state.seed }, tell);
     show({ totals: found.totals, delay: found.delay });
     if (state.method === "likelihood") show(await engine.ask("likelihood", {}, tell));
@@ -70,7 +72,7 @@ export class CubeSource {
 
   pixel(state) {
     const stored = this.shown && { path: this.path, image: this.image, row: Math.floor(this.shown.pixel / this.width), column: this.shown.pixel % this.width };
-    return { signal: state.signal, background: state.background, delayNs: state.delay, index: 0, stored, counts: this.shown?.counts };
+    return { signal: state.signal, second: state.second, background: state.background, delayNs: state.delay, index: 0, stored, counts: this.shown?.counts };
   }
 
   async picture(state, engine, tell, show) {

@@ -13,10 +13,12 @@ import { Jitter } from "./timing.js";
 const SYNCHRONOUS = 2, SLICE = 256; // pixels at a time, between which the page is told how far it is
 let native = null, kept = {}; // what later stages of the same request need
 
+const poissonVariances = ({ histogram }, jitter) => (jitter ? jitter.forward(histogram) : histogram);
+
 const stages = {
   /** The dots and the light: counts (bins), their number, and photons that arrive in a bin and period, gate or not. */
   draw({ system, light, seed, counts }) {
-    const pixel = { signal: light.signal[0], background: light.background[0], delay: light.delay[0] };
+    const pixel = { signal: light.signal[0], background: light.background[0], delay: light.delay[0], second: light.second?.[0], secondDelay: light.secondDelay?.[0] };
     const drawn = counts ?? native.simulate(system, light, seed);
     kept = { system, pixel, drawn };
     return { counts: drawn, registered: sum(drawn), incident: photonsIn(native, { ...system, mode: 0 }, pixel, system.bins) };
@@ -47,10 +49,11 @@ const stages = {
     return { peak, likelihood: { signal: signal[0], background: background[0], delay: delay[0], delayError: delayError[0], flags: flags[0] } };
   },
 
-  /** Exact variances of the bins, or null where there is no dead time. */
+  /** Exact variances of the bins. */
   band() {
     const { system, pixel, law, jitter } = kept;
-    if (system.mode !== 0) throw new Refused("for this mode there is no exact variance of a bin");
+    if (system.dead === 0 && system.mode !== SYNCHRONOUS) return { variances: poissonVariances(law, jitter) };
+    if (system.mode !== 0) throw new Refused("for this mode the page has no exact variance of a bin");
     return { variances: binVariances(native, system, pixel, law, jitter) };
   },
 

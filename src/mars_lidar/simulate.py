@@ -15,12 +15,12 @@ from mars_lidar._base.progress import shown
 from mars_lidar._base.threads import thread_count
 from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.engines import Engine, EngineOptions, check_detector, find_engine
-from mars_lidar.engines.engine import IN_PARTS, Records, Task
+from mars_lidar.engines.engine import IN_PARTS, PhaseRecords, Records, Task
 from mars_lidar.instrument.system import System
 from mars_lidar.instrument.units import check_delays
 from mars_lidar.light.flux import MAX_RETURNS, Flux
 from mars_lidar.light.stored_flux import StoredFlux
-from mars_lidar.light.timestamps import Timestamps
+from mars_lidar.light.timestamps import DrawnTimestamps, Timestamps
 
 if TYPE_CHECKING:
     pass
@@ -93,6 +93,23 @@ def simulate(
     NDArray
         (realizations, H, W, bins), uint16, or uint32 where a bin could exceed 65535 (`out` if given); of CuPy
         with ``device="cuda"``.
+
+    See Also
+    --------
+    simulate_timestamps, count_law, reconstruct, System
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> cube = ml.simulate(ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system, realizations=3, seed=0)
+    >>> cube.shape  # (realizations, H, W, bins)
+    (3, 1, 2, 128)
+    >>> bool(cube.sum(-1).max() <= system.cycles * 100 / 75 + 1)  # at most one count a dead time
+    True
     """
     if not isinstance(report, dict | None):
         raise TypeError(f"report must be a dictionary, got {type(report).__name__}")
@@ -137,7 +154,23 @@ def simulate_timestamps(
     Returns
     -------
     Timestamps
-        Packed times (ns), cycles and bins of all pixels.
+        Packed times (ns), cycles and bins of all pixels: of `exact` 8 bytes a registration, times and bins when asked
+        for.
+
+    See Also
+    --------
+    simulate, Timestamps
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> times = ml.simulate_timestamps(ml.Flux(0.5, 0.5, 40.0), system, seed=0)
+    >>> times.histogram().shape
+    (1, 1, 128)
     """
     drawn_by = find_engine(engine)
     task = _task(flux, system, drawn_by, 1, realization, pixel_index, seed, threads, progress, first_name="realization")
@@ -145,26 +178,17 @@ def simulate_timestamps(
         from mars_lidar import cuda
 
         cuda.check(drawn_by, task.flux, task.system)
-        records = cuda.records(drawn_by, task)
+        records: Records | PhaseRecords = cuda.records(drawn_by, task)
     else:
         detected = flux.detected(system)
         expected = float((_share_registered(detected, system) * _expected_arrivals(detected, system)).sum())
-        _check_memory((math.ceil(0.5 * expected),), Records.BYTES, "timestamps")  # before any work
+        _check_memory((math.ceil(0.5 * expected),), PhaseRecords.BYTES, "timestamps")  # before any work
         records = drawn_by.records(task, expected)
-    times_ns = records.times
-    times_ns *= system.period_ns
-    return Timestamps(
-        times_ns,
-        records.cycle,
-        records.bin,
-        records.offsets,
-        flux.shape,
-        system.bins,
-        system.histogram_dtype,
-        system.period_ns,
-        system.cycles,
-        {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)},
-    )
+    info = {"system": system.to_dict(), "engine": drawn_by.name, "seed": int(seed), "realization": int(realization)}
+    what = (flux.shape, system.bins, system.histogram_dtype, system.period_ns, system.cycles, info)
+    if isinstance(records, PhaseRecords):
+        return DrawnTimestamps.of(records.cycle, records.phase, records.offsets, *what)
+    return Timestamps(records.times * system.period_ns, records.cycle, records.bin, records.offsets, *what)
 
 
 def _on_cuda(engine: Engine, task: Task, shape: tuple[int, ...], out: Any) -> Any:

@@ -58,7 +58,7 @@ def test_unbiased_and_at_the_bound(name):
     pixels = 2000
     cube = ml.simulate(ml.Flux(np.full((1, pixels), signal), background, delay), system, seed=7)[0, 0]
     found = ml.reconstruct(cube, system)
-    assert not found.flags.any()
+    assert not (found.flags & ~np.uint8(Flags.MISFIT)).any()
     bound = ml.cramer_rao(signal, background, system, delay_ns=delay)
     lag = (found.delay_ns - delay + 0.5 * PERIOD) % PERIOD - 0.5 * PERIOD
     outcomes = {}
@@ -226,7 +226,7 @@ def test_threads_and_types_do_not_matter():
     flux = ml.Flux(np.geomspace(0.01, 10, 300)[None], 1.0, 50.0)
     cube = ml.simulate(flux, PLAIN, seed=1)[0]
     for method in METHODS.values():
-        if PLAIN.detector.mode not in method.modes:
+        if PLAIN.detector.mode not in method.modes or method.of_images:
             continue
         one = ml.reconstruct(cube, PLAIN, method, threads=1)
         for other in (

@@ -52,11 +52,12 @@ def loader() -> Any:
 
     for name, (pattern, first) in _SCALARS.items():
         Loader.add_implicit_resolver(f"tag:yaml.org,2002:{name}", pattern, first)
-    Loader.add_constructor("tag:yaml.org,2002:int", lambda reader, node: _integer(reader.construct_scalar(node)))
+    Loader.add_constructor("tag:yaml.org,2002:int", _integer)
     return Loader
 
 
-def _integer(text: str) -> int:
+def _integer(reader: Any, node: Any) -> int:
+    text = reader.construct_scalar(node)
     base = {"0o": 8, "0x": 16}.get(text[:2], 10)
     return int(text if base == 10 else text[2:], base)
 

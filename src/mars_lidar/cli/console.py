@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+FAILED, BAD_INPUT, MISFIT, INTERRUPTED = 1, 2, 3, 130
 _PIPE = 250  # columns where nobody is watching
 _FIELDS = {  # of the package, where an option has another name
     "sigma_ns": "pulse_sigma_ns",

@@ -182,7 +182,7 @@ def _recorder_rows(path: Path) -> list[tuple[str, str]]:
         scan = recorded(path)
     else:
         found = photons_of(path)
-        streams = [("a channel's stream", "mars-lidar inspect, calibrate, validate --pixel 0,C")]
+        streams = [("a channel's stream", "mars-lidar calibrate --pixel 0,C")]
         clock = f"{1e3 * found.clock_ns:.7g} ps"
         if found.fine is None:
             rows.append(("clock", f"absolute times in units of {clock} (T2)"))

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 RECONSTRUCT_EPILOG = examples(
     "mars-lidar reconstruct room.zarr -o maps.zarr",
     "mars-lidar reconstruct room.zarr --method all -o maps.h5",
+    "mars-lidar reconstruct dim.zarr --method image -o maps.zarr",
     "mars-lidar reconstruct room.zarr -o maps.npz --cloud room.ply --focal-px 110",
     "mars-lidar reconstruct face.npy --bin-ps 80 --cycles 20000 --dead-time-ns 50 --pulse-fwhm-ns 0.3 -o face.zarr",
     "mars-lidar reconstruct glass.zarr --returns 3 -o maps.zarr --cloud glass.ply --focal-px 110",
@@ -53,7 +54,7 @@ def reconstruct(
     foreign: ForeignOptions,
     out: Path = out_option("The maps: .zarr, .h5, .hdf5 or .npz.", panel=None),
     method: str = option(
-        "One or more methods, separated by commas, or all that suit the detector.",
+        "One or more methods, separated by commas, or all that suit the detector; image for 1 to 10 photons a pixel.",
         default="maximum_likelihood",
     ),
     level: float | None = option(
@@ -75,12 +76,6 @@ def reconstruct(
     ),
     false_alarm: float | None = option(
         "Share of the pixels without signal in which noise passes for it, at most; of maximum_likelihood.", "0.01"
-    ),
-    neighbourhood: int | None = option(
-        "For dim cubes: take neighbours within up to so many pixels together, on a plane; such as 4.",
-        "each pixel alone",
-        min=1,
-        max=12,
     ),
     threads: int | None = option("Threads.", "all cores", min=1),
     cloud: Path | None = option(
@@ -123,7 +118,6 @@ def reconstruct(
                     level=level,
                     attenuation=attenuation,
                     returns=several,
-                    neighbourhood=neighbourhood,
                     threads=threads,
                     progress=progress,
                 )
@@ -210,7 +204,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     from mars_lidar.reconstruct.quality import errors_against, ssim_available
 
     realizations, height, width, _ = cube.shape
-    head = ["method", "seconds", "seen %", "saturated %"]
+    head = ["method", "seconds", "seen %", "saturated %", "misfit %"]
     lines: list[list[str]] = []
     errors = {name: errors_against(cube, each.found) for name, each in found.items()}
     several = any(each.found.returns is not None for each in found.values())
@@ -230,6 +224,7 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
             f"{each.seconds:.3g}",
             f"{100.0 * each.found.seen.mean():.4g}",
             f"{100.0 * ((flags & Flags.SATURATED) > 0).mean():.3g}",
+            "-" if math.isnan(each.found.misfits) else f"{100.0 * each.found.misfits:.3g}",
         ]
         if several:
             count = np.zeros(1) if each.found.returns is None else each.found.returns.count
@@ -245,6 +240,10 @@ def _show(cube: Cube, found: dict[str, Timed]) -> None:
     for line in lines:
         shown.add_row(*line)
     screen().print(shown)
+    for name, each in found.items():
+        if advice := each.found.advice:
+            share = f"{100.0 * each.found.misfits:.3g} % of the pixels do not fit (0.1 % do so by chance)"
+            say(f"warning: {name}: {share}; would fit better: {advice}; mars-lidar calibrate CUBE finds the value")
 
 
 def _save_cloud(path: Path, results: dict[str, Reconstruction], focal_px: float, overwrite: bool) -> int:

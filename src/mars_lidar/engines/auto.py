@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from mars_lidar.engines.engine import Engine, Task
 from mars_lidar.engines.exact import ExactEngine
 from mars_lidar.engines.feedback import FeedbackEngine
-from mars_lidar.engines.feedback_rule import Plan, draw_rest
+from mars_lidar.engines.feedback_rule import Plan, draw_rest, expected_registrations
 from mars_lidar.engines.parts import stage
-from mars_lidar.instrument.system import System
-from mars_lidar.light.flux import Flux
 
 BREAK_EVEN = 4.0
 """Registrations per internal cell above which feedback is the faster engine.
@@ -52,19 +50,18 @@ class AutoEngine(Engine):
 
     def histogram(self, task: Task, out: NDArray[Any]) -> None:
         """Feedback where it pays, exact for the rest."""
-        plan = Plan.of(task.flux, task.system)
         registrations = expected_registrations(task.flux, task.system).reshape(-1)
-        many = registrations > BREAK_EVEN * plan.cells
+        many = registrations > BREAK_EVEN * task.system.bins
+        pixels = np.flatnonzero(many)
+        plan = Plan.of(task, pixels)
+        worth = registrations[pixels] > BREAK_EVEN * plan.grids.cells()
+        many[pixels[~worth]] = False
+        plan = plan.part(worth)
         share = float(many.mean())
         first, second = (replace(task, progress=stage(task.progress, *part)) for part in ((0.0, share), (share, 1.0)))
-        worth = registrations[many] / BREAK_EVEN_LAPS
-        refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many), plan, worth)
+        lap_cells = registrations[many] / BREAK_EVEN_LAPS
+        refused = FeedbackEngine(self.level).sample(first, out, np.flatnonzero(many), plan, lap_cells)
         rest = replace(refused, pixels=np.sort(np.concatenate([np.flatnonzero(~many), refused.pixels])))
         draw_rest(ExactEngine(self.level), second, out, rest)
         task.report["pixels drawn by exact"] = float(rest.pixels.size)
         task.report["pixels drawn by feedback"] = float(many.size - rest.pixels.size)
-
-
-def expected_registrations(flux: Flux, system: System) -> NDArray[np.float64]:
-    """Registrations of an exposure (H, W) under a constant rate of the same energy: N_r Lambda / (1 + Lambda t_d)."""
-    return np.asarray(system.cycles * flux.total / (1.0 + flux.total * system.dead_time_periods))

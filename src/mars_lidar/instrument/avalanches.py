@@ -44,6 +44,17 @@ class Afterpulsing:
     generations
         Avalanches of photons (and of crosstalk) are generation 0, those of their carriers generation 1, and so on. Only
         generations below this number leave carriers: 1 is a single afterpulse generation. Default: no limit.
+
+    See Also
+    --------
+    Crosstalk, Detector
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> afterpulsing = ml.Afterpulsing(probability=0.02, delay_ns=40.0)
+    >>> ml.Detector(dead_time_ns=30.0, afterpulsing=afterpulsing).afterpulsing.delay_ns
+    40.0
     """
 
     probability: float
@@ -160,6 +171,16 @@ class Crosstalk:
     kernel
         ``"4"`` (the pixels above, below, left and right), ``"8"`` (the diagonal ones too), all alike; or relative
         weights (3, 3) of the neighbours, that of the pixel itself in the middle 0.
+
+    See Also
+    --------
+    Afterpulsing, Detector
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> ml.Detector(dead_time_ns=30.0, crosstalk=ml.Crosstalk(probability=0.01)).crosstalk.probability
+    0.01
     """
 
     probability: float

@@ -37,6 +37,17 @@ def dark_count_map(
         Median of the hot pixels over that of the others; their logarithms spread alike.
     seed
         Integer in [0, 2**64).
+
+    See Also
+    --------
+    Detector, Flux
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> rates = ml.dark_count_map((4, 6), median_hz=50.0)
+    >>> rates.shape
+    (4, 6)
     """
     if not isinstance(shape, tuple | list) or len(shape) != 2:
         raise ValueError(f"shape must be (H, W), got {shape!r}")

@@ -93,6 +93,18 @@ class Detector:
         Non-linearity of the time-to-digital converter: relative widths (n,) of n neighbouring codes, as a code-density
         test finds them. n divides the number of bins, and the pattern repeats (the taps of a delay line in each cycle
         of the clock); n = bins gives every bin its own.
+
+    See Also
+    --------
+    System, Afterpulsing, Crosstalk, Jitter
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> ml.Detector(dead_time_ns=75.0, detection_efficiency=0.3).dead_time_ns
+    75.0
+    >>> ml.Detector(dead_time_ns=10.0, mode="synchronous").mode
+    'synchronous'
     """
 
     dead_time_ns: float

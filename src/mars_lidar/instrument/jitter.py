@@ -29,6 +29,16 @@ class Jitter:
         Mean of the exponential delay of carriers that diffuse into the multiplication region, ns.
     tail_fraction
         Share of the avalanches that have it, in [0, 1].
+
+    See Also
+    --------
+    SampledJitter, Detector
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> ml.Detector(dead_time_ns=75.0, jitter=ml.Jitter(sigma_ns=0.1)).jitter.sigma_ns
+    0.1
     """
 
     sigma_ns: float
@@ -126,6 +136,17 @@ class SampledJitter:
         Sample width, ns; n x bin_ns must fit in the laser period.
     origin
         Where the jitter is 0: ``"peak"``, ``"centroid"`` or ``"first"``, see `SampledPulse`.
+
+    See Also
+    --------
+    Jitter, Detector
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> jitter = ml.SampledJitter([1.0, 4.0, 2.0, 1.0], bin_ns=0.05)
+    >>> ml.Detector(dead_time_ns=75.0, jitter=jitter).dead_time_ns
+    75.0
     """
 
     values: tuple[float, ...]

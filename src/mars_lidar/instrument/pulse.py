@@ -105,6 +105,17 @@ class GaussianPulse(Pulse):
     """Gaussian pulse of standard deviation `sigma_ns` (ns), centred on the delay.
 
     FWHM = 2.355 sigma; `GaussianPulse.from_fwhm(fwhm_ns=...)` takes that instead.
+
+    See Also
+    --------
+    SampledPulse, System
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> pulse = ml.GaussianPulse(sigma_ns=0.5)
+    >>> round(pulse.sigma_ns, 2)
+    0.5
     """
 
     sigma_ns: float
@@ -180,6 +191,17 @@ class SampledPulse(Pulse):
         For ``"peak"`` and ``"centroid"`` the record is cyclic and is cut opposite the origin, so a response
         whose rising edge was stored at the end of the array is put together again. For ``"first"`` it is
         taken as it stands.
+
+    See Also
+    --------
+    GaussianPulse, System
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> pulse = ml.SampledPulse([0.0, 1.0, 3.0, 1.0, 0.0], bin_ns=0.1)
+    >>> round(pulse.bin_ns, 2)
+    0.1
     """
 
     __slots__ = ("_bytes", "_cumulative", "_start_ns", "bin_ns", "origin", "values")

@@ -59,6 +59,22 @@ class System:
     -----
     UnitWarning
         A time that is possible, and likely meant in ps or s: a dead time of 75,000 ns, a pulse of 100 ns.
+
+    See Also
+    --------
+    Detector, GaussianPulse, simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> system.bin_ns
+    0.78125
+    >>> system.replace(cycles=50).cycles
+    50
     """
 
     period_ns: float

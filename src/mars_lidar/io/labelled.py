@@ -49,6 +49,20 @@ def to_xarray(
     -------
     xarray.Dataset
         ``histogram`` (realization, y, x, time), and what is known of the light.
+
+    See Also
+    --------
+    simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> ml.to_xarray(ml.simulate(ml.Flux([[0.5, 2.0]], 1.0, [[20.0, 60.0]]), system), system).dims
+    FrozenMappingWarningOnValuesAccess({'realization': 1, 'y': 1, 'x': 2, 'time': 128})
     """
     import xarray
 

@@ -132,6 +132,19 @@ class Flux:
         (H, W, T) or None.
     info
         What made this flux, for the record (scene radiometry puts its achieved means here).
+
+    See Also
+    --------
+    Scene, simulate, System
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> flux = ml.Flux(signal=[[0.5, 2.0]], background=1.0, delay_ns=[[20.0, 60.0]])
+    >>> flux.shape
+    (1, 2)
+    >>> flux.signal
+    array([[0.5, 2. ]])
     """
 
     signal: FloatArray

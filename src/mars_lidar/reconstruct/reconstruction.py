@@ -15,12 +15,13 @@ from mars_lidar._base.types import FloatArray, Progress
 from mars_lidar.instrument.system import System
 from mars_lidar.reconstruct.centroid import Centroid
 from mars_lidar.reconstruct.coates import Coates, GeneralisedCoates
+from mars_lidar.reconstruct.fit_quality import FALSE_ALARM
 from mars_lidar.reconstruct.histograms import checked
+from mars_lidar.reconstruct.image import Image, UntrainedImage
 from mars_lidar.reconstruct.matched_filter import MatchedFilter, Peak
 from mars_lidar.reconstruct.maximum_likelihood import MaximumLikelihood
 from mars_lidar.reconstruct.mchc import ChainCorrection
 from mars_lidar.reconstruct.method import Estimates, Flags, Method, tell_effects
-from mars_lidar.reconstruct.neighbourhood import Neighbourhood
 from mars_lidar.reconstruct.returns import MOST_RETURNS, Returns, returns_of
 
 ATTENUATIONS = ("none", "inverse_square")
@@ -35,6 +36,8 @@ METHODS: dict[str, Method] = {
         MatchedFilter(),
         Centroid(),
         Peak(),
+        Image(),
+        UntrainedImage(),
     )
 }
 
@@ -64,10 +67,35 @@ class Reconstruction:
         Root of twice the gain in log likelihood by the signal, in standard deviations about; or None.
     flags
         (...) uint8, `Flags`.
+    p_value
+        Probability of a histogram as far from the estimate's law; NaN for too few photons, None where the method has
+        no law.
+    longer, shorter, wider
+        Scores of a longer and of a shorter dead time and of a wider pulse, standard deviations; see `advice`.
     returns
         Every return of each pixel, where several were asked for; then the maps above are those of the strongest.
-    radius
-        (...) pixels to each side whose photons were taken together, where a neighbourhood was asked for.
+    delay_half_width_ns, depth_half_width_m
+        Half width of the 90 % interval of delay and depth, of methods ``"image"`` and ``"image_untrained"``; NaN where
+        an outlier is too likely for one.
+    outlier
+        (...) probability that the depth is that of another surface, of the same methods.
+
+    See Also
+    --------
+    reconstruct
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> maps = ml.reconstruct(ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0], system)
+    >>> maps.depth_m.shape
+    (1, 1)
+    >>> maps.method
+    'maximum_likelihood'
     """
 
     method: str
@@ -84,8 +112,14 @@ class Reconstruction:
     background_error: FloatArray | None
     significance: FloatArray | None
     flags: NDArray[np.uint8]
+    p_value: FloatArray | None = None
+    longer: FloatArray | None = None
+    shorter: FloatArray | None = None
+    wider: FloatArray | None = None
     returns: Returns | None = None
-    radius: NDArray[np.uint8] | None = None
+    delay_half_width_ns: FloatArray | None = None
+    depth_half_width_m: FloatArray | None = None
+    outlier: FloatArray | None = None
 
     __repr__ = brief
 
@@ -98,6 +132,31 @@ class Reconstruction:
     def seen(self) -> NDArray[np.bool_]:
         """(...) whether a return was seen: a depth, and a signal above the background."""
         return _seen(self.depth_m, self.flags)
+
+    @property
+    def misfits(self) -> float:
+        """Share of the pixels with a p-value that the estimate does not fit; NaN without p-values."""
+        if self.p_value is None or not np.isfinite(self.p_value).any():
+            return float("nan")
+        return float((self.p_value[np.isfinite(self.p_value)] < FALSE_ALARM).mean())
+
+    @property
+    def advice(self) -> str:
+        """What would fit more of the pixels, in words; empty where the share of misfits is that of false alarms."""
+        tested = 0 if self.p_value is None else int(np.isfinite(self.p_value).sum())
+        if tested == 0 or self.misfits * tested <= FALSE_ALARM * tested + 4.0 * (FALSE_ALARM * tested) ** 0.5 + 1.0:
+            return ""
+        means = {}
+        for name, values in (("longer", self.longer), ("shorter", self.shorter), ("wider", self.wider)):
+            if values is not None and np.isfinite(values).any():
+                some = values[np.isfinite(values)]
+                means[name] = float(some.mean() * some.size**0.5)
+        words = {"longer": "a longer dead time", "shorter": "a shorter dead time", "wider": "a wider pulse"}
+        best = max(means, key=lambda name: abs(means[name]) if name == "wider" else means[name], default="")
+        if not best or abs(means[best]) < 5.0:
+            return "none of dead time and pulse alone: another return, a drift, or an effect of the detector"
+        text = "a narrower pulse" if best == "wider" and means[best] < 0.0 else words[best]
+        return f"{text} ({abs(means[best]):.0f} standard deviations over all pixels)"
 
     def maps(self) -> dict[str, NDArray[Any]]:
         """The maps that this method gives, by name."""
@@ -126,7 +185,6 @@ def reconstruct(
     level: float | None = None,
     attenuation: Literal["none", "inverse_square"] = "none",
     returns: int = 1,
-    neighbourhood: int | None = None,
     threads: int | None = None,
     progress: Progress | bool | None = None,
 ) -> Reconstruction:
@@ -142,6 +200,7 @@ def reconstruct(
     method
         A name in `mars_lidar.reconstruct.METHODS` (default ``"maximum_likelihood"``; docs/reconstruction.md says what
         each assumes), or a `Method` of your own settings. Each refuses detectors that it does not hold for.
+        ``"image"``, for images (..., H, W, bins) of 1 to 20 photons a pixel, takes the pixels around into account.
     level
         Detectable signal photons per period of a surface of reflectivity 1 (at 1 m, with
         ``attenuation="inverse_square"``).
@@ -151,10 +210,6 @@ def reconstruct(
     returns
         Returns to look for in each pixel, 1 to 8: panes of glass, foliage. Each is tested, and all of them are in
         `Reconstruction.returns`. Of ``"maximum_likelihood"`` alone.
-    neighbourhood
-        For dim cubes (..., H, W, bins): take the photons of the pixels around together, up to so many pixels to each
-        side, on a plane, and over the window that predicts left-out photons best (docs/reconstruction.md, section 10).
-        Of ``"maximum_likelihood"`` alone, for one return a pixel. None: each pixel alone.
     threads
         Threads to run on; default: all processors this process may use. The result does not depend on it.
     progress
@@ -164,12 +219,28 @@ def reconstruct(
     -------
     Reconstruction
         Maps of shape (...).
+
+    See Also
+    --------
+    Reconstruction, cramer_rao, simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> counts = ml.simulate(ml.Flux(1.0, 1.0, 40.0), system, seed=0)[0]
+    >>> maps = ml.reconstruct(counts, system)
+    >>> bool((abs(maps.delay_ns - 40.0) < 5 * maps.delay_error_ns).all())
+    True
     """
     if isinstance(cube, Recorded):
         system, cube = cube.system if system is None else system, np.asarray(cube.histogram)
     if system is None:
         raise TypeError("system must be given for an array of counts (a cube of mars_lidar.io.load carries its own)")
-    used = with_options(find_method(method), returns, neighbourhood)
+    used = with_returns(find_method(method), returns)
     checks.choice("attenuation", attenuation, ATTENUATIONS)
     if level is not None:
         level = checks.real("level", level, low=0.0, strict_low=True)
@@ -191,21 +262,15 @@ def find_method(method: str | Method) -> Method:
     return METHODS[checks.choice("method", method, tuple(METHODS))]
 
 
-def with_options(method: Method, returns: int, neighbourhood: int | None) -> Method:
-    """The method, looking for so many returns of each pixel, or over a neighbourhood."""
-    several = checks.integer("returns", returns, low=1, high=MOST_RETURNS) > 1
-    if not several and neighbourhood is None:
+def with_returns(method: Method, returns: int) -> Method:
+    """The method, looking for so many returns of each pixel."""
+    if checks.integer("returns", returns, low=1, high=MOST_RETURNS) == 1:
         return method
-    asked = f"returns={returns}" if several else f"neighbourhood={neighbourhood}"
     if not isinstance(method, MaximumLikelihood):
         raise ValueError(
-            f"{asked} needs the likelihood, which method {method.name!r} has not; use 'maximum_likelihood'"
+            f"returns={returns} needs the likelihood, which method {method.name!r} has not; use 'maximum_likelihood'"
         )
-    if neighbourhood is None:
-        return replace(method, returns=int(returns))
-    if several:
-        raise ValueError(f"neighbourhood={neighbourhood} is for one return a pixel, got {asked}")
-    return Neighbourhood(neighbourhood, false_alarm=method.false_alarm)
+    return replace(method, returns=int(returns))
 
 
 def assembled(
@@ -239,12 +304,18 @@ def assembled(
         signal_error=mapped(found.signal_error),
         background_error=mapped(found.background_error),
         significance=mapped(found.significance),
+        p_value=mapped(found.p_value),
+        longer=mapped(found.longer),
+        shorter=mapped(found.shorter),
+        wider=mapped(found.wider),
         flags=flags,
         returns=returns_of(found.returns, system, shape),
-        radius=None if found.radius is None else found.radius.reshape(shape),
+        delay_half_width_ns=mapped(found.half_width, period),
+        depth_half_width_m=mapped(found.half_width, float(system.depth_m(period))),
+        outlier=mapped(found.outlier),
     )
 
 
 def _seen(depth: FloatArray, flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    lacking = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL)
+    lacking = np.uint8(Flags.EMPTY | Flags.NO_SIGNAL | Flags.FILLED)
     return np.asarray(np.isfinite(depth) & ((flags & lacking) == 0), dtype=np.bool_)

@@ -48,6 +48,23 @@ class Scene:
         Read-only float64 (H, W); `background` may be None.
     valid
         Pixels with a return (H, W), bool.
+
+    See Also
+    --------
+    Flux, simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> scene = ml.Scene.example("room", size=(48, 64))
+    >>> scene.depth_m.shape
+    (48, 64)
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> scene.flux(system, signal=0.5, sbr=1.0).signal.mean().round(3)
+    np.float64(0.5)
     """
 
     depth_m: FloatArray

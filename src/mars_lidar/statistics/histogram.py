@@ -124,6 +124,21 @@ def registration_pdf(
     NDArray
         (..., bins), non-negative; sums to 1 over the last axis. A cell without any flux has the uniform
         shape, the limit of little background.
+
+    See Also
+    --------
+    count_law, joint_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> pdf = ml.registration_pdf(1.0, 1.0, system, delay_ns=40.0)
+    >>> pdf.shape
+    (128,)
     """
     checks.choice("method", method, _SHAPES)
     edge = rearm_of(rearm, method == "chain", f"method {method!r}")

@@ -430,6 +430,23 @@ def joint_law(
     Nothing is assumed stationary: the terms of the start and of the end of the exposure are in the result. Where
     the exposure is too short to forget its start (`settled` is -1) every window is carried through all periods,
     which is exact too but costs O(bins x cycles) a window instead of O(bins).
+
+    See Also
+    --------
+    count_law, simulate
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> law = ml.joint_law(1.0, 1.0, system, delay_ns=40.0)
+    >>> law.covariance().shape
+    (128, 128)
+    >>> bool(law.covariance().sum() < law.variance.sum())  # bins exclude each other
+    True
     """
     tolerance = checks.real("tolerance", tolerance, low=1e-7, high=0.1)
     for name, value in (("signal", signal), ("background", background), ("delay_ns", delay_ns)):
@@ -525,6 +542,21 @@ class JointLaw:
     settled
         Periods after which the start is forgotten; -1 where the exposure is shorter than that, and is run through
         for every window.
+
+    See Also
+    --------
+    joint_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> law = ml.joint_law(1.0, 1.0, system, delay_ns=40.0)
+    >>> law.mean.shape, law.variance.shape
+    ((128,), (128,))
     """
 
     system: System

@@ -190,6 +190,21 @@ def holding_time_covariance(
         For arguments out of range, and for a flux of 0: without registrations there are no holding times.
     ConvergenceError
         Where a solution did not converge; the message names the cell.
+
+    See Also
+    --------
+    count_law, joint_law
+
+    Examples
+    --------
+    >>> import mars_lidar as ml
+    >>> system = ml.System(
+    ...     period_ns=100.0, cycles=1000, bins=128,
+    ...     pulse=ml.GaussianPulse(sigma_ns=1.0), detector=ml.Detector(dead_time_ns=75.0),
+    ... )
+    >>> covariance = ml.holding_time_covariance(1.0, 1.0, system)
+    >>> round(covariance.mu, 1)  # mean time between registrations, ns
+    122.7
     """
     require_mode("holding_time_covariance", system)
     lags = checks.integer("lags", lags, low=0, high=_MAX_LAGS)

@@ -1,0 +1,101 @@
+r"""
+3 What dead time does to counts, shapes and correlations
+========================================================
+
+A free-running detector is armed again as soon as its dead time :math:`t_d` is over, wherever in the laser period that
+is. Three things then differ from counting without dead time.
+
+Counts: fewer, and more regular
+-------------------------------
+
+Under constant light of rate :math:`\lambda` a registration costs a dead time and a wait of mean :math:`1/\lambda`.
+Renewal theory gives for a long exposure :math:`t`
+
+.. math:: \mathsf E N = \frac{\lambda t}{1 + \lambda t_d},
+   \qquad \frac{\operatorname{Var} N}{\mathsf E N} = \frac{1}{(1 + \lambda t_d)^2}. \tag{1}
+
+A Poisson count has the ratio 1. Under pulsed light it can fall by orders of magnitude: the detector *locks* to the
+laser. The exact law of the count, ``ml.count_law``, for the same mean light as a bright pulse and as constant light:
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mars_lidar as ml
+from mars_lidar.statistics import mean_histogram, photons_per_bin
+
+pulse, detector = ml.GaussianPulse(sigma_ns=1.0), ml.Detector(dead_time_ns=75.0)
+system = ml.System(period_ns=100.0, cycles=1000, bins=100, pulse=pulse, detector=detector)
+
+fig, ax = plt.subplots()
+for signal, background, name in ((0.0, 3.0, "constant light"), (2.9, 0.1, "pulses")):
+    law = ml.count_law(signal, background, system, delay_ns=40.0)
+    ax.plot(law.support, law.pmf, label=f"{name}: variance / mean {law.variance / law.mean:.3f}")
+mean = float(ml.count_law(0.0, 3.0, system).mean)
+n = np.arange(820, 1040)
+ax.plot(
+    n,
+    np.exp(-((n - mean) ** 2) / (2 * mean)) / np.sqrt(2 * np.pi * mean),
+    "k--",
+    lw=1,
+    label="Poisson of the same mean",
+)
+ax.set(xlabel="counts in 1000 periods, 3 photons per period", ylabel="probability", xlim=(820, 1040))
+ax.legend()
+plt.show()
+
+# %%
+# Shapes: shadows and echoes
+# --------------------------
+#
+# After a bright return nearly all detectors are blind at the same time, and armed again at the same time. So a strong
+# return casts a *shadow* of length :math:`t_d`, and at its end counts jump above what the background alone gives: an
+# echo where nothing is. Shown is the chance of being armed, counts over light: the histogram divided by what arrives.
+
+fig, ax = plt.subplots()
+short = system.replace(detector=ml.Detector(dead_time_ns=40.0))
+for signal in (0.1, 1.0, 8.0):
+    shape = mean_histogram(signal, 3.0, short, delay_ns=30.0)
+    ax.plot(
+        short.time_ns,
+        shape / (short.cycles * photons_per_bin(signal, 3.0, short, bins=100, delay_ns=30.0)),
+        label=f"S = {signal:g}",
+    )
+ax.axvline(30, color="0.7", lw=0.8)
+ax.axvline(70, color="0.7", lw=0.8, ls="--")
+ax.set(xlabel="time (ns): return at 30, dead time of 40 ends at 70", ylabel="counts over light")
+ax.legend()
+plt.show()
+
+# %%
+# Correlations: bins are not independent
+# --------------------------------------
+#
+# One registration forbids others for a dead time, so neighbouring bins compete: their counts are negatively
+# correlated, and bins a dead time apart positively. ``ml.joint_law`` has the exact covariance of all bins of a finite
+# exposure:
+
+joint = ml.joint_law(5.0, 0.5, system, delay_ns=40.0)
+covariance = joint.covariance()
+spread = np.sqrt(np.diag(covariance))
+correlation = covariance / np.outer(spread, spread)
+np.fill_diagonal(correlation, np.nan)
+limit = np.nanmax(np.abs(correlation))
+
+fig, ax = plt.subplots(figsize=(4.6, 3.8))
+image = ax.imshow(correlation, cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower", extent=(0, 100, 0, 100))
+fig.colorbar(image, label="correlation of two bins")
+ax.set(xlabel="time of one bin (ns)", ylabel="time of the other (ns)")
+ax.set_title("S = 5, B = 0.5, return at 40 ns")
+plt.show()
+near = slice(35, 45)
+window = covariance[near, near].sum() / np.trace(covariance[near, near])
+print(f"Counts of the ten bins around the return: their sum has {window:.2f} of the variance of independent bins.")
+
+# %%
+# The last line printed is
+# ``Counts of the ten bins around the return: their sum has 0.19 of the variance of independent bins.``
+# An error bar that adds the variances of bins is wrong by the root of that.
+#
+# Next: :doc:`lesson_4_depth`. Theory: :doc:`/theory_exposure` (counts and shapes), :doc:`/joint_law` (correlations),
+# :doc:`/theory` (the Markov-renewal view of the MaRS paper).

@@ -1,0 +1,31 @@
+"""The programs of the gallery and of the lessons run, and print what their texts state."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LESSONS = sorted(ROOT.glob("examples/lessons/lesson_*.py"))
+GALLERY = sorted(path for path in ROOT.glob("examples/gallery/plot_*.py") if "measured_stream" not in path.name)
+_NEEDS = {"plot_10_endless_stream": "torch"}
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("program", [*LESSONS, *GALLERY], ids=lambda path: path.stem)
+def test_the_program_prints_what_its_text_states(program: Path, tmp_path: Path):
+    if program.stem in _NEEDS:
+        pytest.importorskip(_NEEDS[program.stem])
+    run = subprocess.run(
+        [sys.executable, program], cwd=tmp_path, capture_output=True, text=True, env={"MPLBACKEND": "Agg"}, check=False
+    )
+    assert run.returncode == 0, run.stderr[-2000:]
+    last = run.stdout.rstrip().splitlines()[-1]
+    source = program.read_text(encoding="utf-8")
+    prose = re.sub(r"\s*\n(?:# ?)?\s*", " ", source)
+    assert f"``{last}``" in prose
+    assert re.search(r"\d|True", last)

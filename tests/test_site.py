@@ -1,0 +1,181 @@
+"""The built site in a browser: what a visitor must not meet, on every page, on a telephone and on a desk."""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "explore"))
+from explorer_page import chromium  # noqa: E402
+
+pytestmark = pytest.mark.full
+SITE = Path(os.environ.get("SITE_UNDER_TEST", ROOT / "build" / "site"))
+SOURCES = (
+    "docs/*.md",
+    "docs/*.py",
+    "docs/*.mplstyle",
+    "docs/_*/*",
+    "docs/*/*.md",
+    "examples/*/*.py",
+    "examples/*/*.rst",
+)
+GENERATED = ("docs/api/", "docs/copied/", "docs/gallery/", "docs/lessons/")
+WEIGHT = 1_000_000  # bytes of a page with all it loads, pictures aside, which have a limit of their own
+PICTURES = 1_000_000
+
+CONTRAST = """() => {
+  const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
+  const linear = (x) => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
+  const light = ([r, g, b]) => 0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+  const behind = (element) => {
+    for (let e = element; e; e = e.parentElement) {
+      const c = rgb(getComputedStyle(e).backgroundColor);
+      if (c.length < 4 || c[3] > 0.5) return c;
+    }
+    return [255, 255, 255];
+  };
+  const low = [];
+  const walker = document.createTreeWalker(document.querySelector("main"), NodeFilter.SHOW_TEXT);
+  while (walker.nextNode()) {
+    const text = walker.currentNode.textContent.trim(), element = walker.currentNode.parentElement;
+    const skipped = "script, style, noscript, .headerlink, .katex-mathml";
+    if (!text || element.closest(skipped) || !element.checkVisibility()) continue;
+    const style = getComputedStyle(element), box = element.getBoundingClientRect();
+    const colour = rgb(style.color);
+    if (box.width < 2 || style.visibility === "hidden" || colour[3] === 0) continue;
+    const [a, b] = [light(colour), light(behind(element))].sort((x, y) => y - x);
+    const size = parseFloat(style.fontSize), large = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
+    if ((a + 0.05) / (b + 0.05) < (large ? 3 : 4.5))
+      low.push(`${text.slice(0, 30)}: ${style.color} on ${behind(element)}`);
+  }
+  return [...new Set(low)];
+}"""
+
+
+def pages_of(site: Path) -> list[str]:
+    names = sorted(str(path.relative_to(site)) for path in site.rglob("*.html"))
+    return [
+        name
+        for name in names
+        if not name.startswith(("_static", "_modules", "explorer/")) and name not in ("search.html", "genindex.html")
+    ]
+
+
+@pytest.fixture(scope="module")
+def site() -> Path:
+    """The site of these sources: built here unless it is newer than all of them."""
+    sources = [path for pattern in SOURCES for path in ROOT.glob(pattern)]
+    newest = max(path.stat().st_mtime for path in sources if not str(path.relative_to(ROOT)).startswith(GENERATED))
+    index = SITE / "index.html"
+    if not index.is_file() or index.stat().st_mtime < newest:
+        command = [sys.executable, "-m", "sphinx", "-W", "-q", "-E", "-b", "html", "docs", str(SITE)]
+        subprocess.run(command, cwd=ROOT, check=True, env=os.environ | {"MPLBACKEND": "Agg"})
+    return SITE
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as started:
+        yield started
+
+
+FACTS = """() => ({
+  scroll: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+  levels: [...document.querySelectorAll("main h1, main h2, main h3, main h4")].map((h) => Number(h.tagName[1])),
+  undescribed: [...document.images].filter((i) => !i.alt || /(^|[ /_])(plot|sphx|_images)[ _/]|\\.png$/i.test(i.alt))
+    .map((i) => i.alt || i.src.split("/").pop()),
+})"""
+
+
+def weight(file: Path) -> int:
+    """Bytes that a server sends: text compressed, as all of them do."""
+    content = file.read_bytes()
+    return len(gzip.compress(content)) if file.suffix in (".html", ".css", ".js", ".svg") else len(content)
+
+
+def test_every_page_on_a_telephone(site: Path, browser: Any):
+    """390 px wide: no sideways scroll, one first heading and no level left out, pictures described, nothing to complain
+    about, below 1 MB but for pictures and the explorer, and nothing from another host."""
+    tab = browser.new_page(viewport={"width": 390, "height": 844})
+    said: list[str] = []
+    asked: list[str] = []
+    tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: said.append(str(error)))
+    tab.on("request", lambda request: asked.append(request.url))
+    weights: dict[Path, int] = {}
+    wrong: dict[str, Any] = {}
+    for name in pages_of(site):
+        said.clear()
+        asked.clear()
+        tab.goto((site / name).as_uri(), wait_until="load")
+        facts = tab.evaluate(FACTS)
+        levels = facts["levels"]
+        names = {
+            unquote(url.removeprefix("file://").split("?")[0].split("#")[0]) for url in asked if url.startswith("file:")
+        }
+        files = [Path(each) for each in names if Path(each).is_file() and Path(each).parent.name != "explorer"]
+        for file in files:
+            weights.setdefault(file, weight(file))
+        pictures = sum(weights[file] for file in files if file.suffix in (".png", ".gif", ".webp"))
+        rest = sum(weights[file] for file in files) - pictures
+        problems = {
+            "scroll": max(facts["scroll"], 0),
+            "headings": levels
+            if levels.count(1) != 1 or any(b > a + 1 for a, b in itertools.pairwise(levels))
+            else None,
+            "alt": facts["undescribed"],
+            "console": list(said),
+            "bytes": rest if rest >= WEIGHT else 0,
+            "bytes of pictures": pictures if pictures >= PICTURES else 0,
+            "elsewhere": [url for url in asked if not url.startswith(("file:", "data:", "blob:"))],
+        }
+        if any(problems.values()):
+            wrong[name] = {key: value for key, value in problems.items() if value}
+    tab.close()
+    assert not wrong, "\n".join(f"{name}: {problems}" for name, problems in wrong.items())
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_can_be_read(site: Path, browser: Any, scheme: str):
+    """The contrast of all text of the pages without their API is that of WCAG AA."""
+    tab = browser.new_page(viewport={"width": 1400, "height": 900}, color_scheme=scheme, offline=True)
+    wrong = {}
+    for name in pages_of(site):
+        if not name.startswith(("api/", "copied/benchmarks")):
+            tab.goto((site / name).as_uri(), wait_until="load")
+            low = tab.evaluate(CONTRAST)
+            if low:
+                wrong[name] = low[:5]
+    tab.close()
+    assert not wrong, "\n".join(f"{name}: {low}" for name, low in wrong.items())
+
+
+def test_commands_can_be_copied(site: Path):
+    """Two hyphens of an option are two hyphens."""
+    text = re.sub(r"<title>.*?</title>", "", (site / "copied" / "commands.html").read_text())
+    assert "–" not in text
+    assert text.count("--") > 200
+
+
+def test_equations_are_in_the_pages(site: Path):
+    """Equations are HTML already, all could be read, and they have the numbers that the code cites."""
+    for name, number in {"theory_exposure": 27, "detectors": 23, "feedback": 5, "theory_exact": 5, "theory": 4}.items():
+        text = (site / f"{name}.html").read_text()
+        assert f">{number}<" in text or f">({number})<" in text or f"\\tag{{{number}" in text, name
+    for name in pages_of(site):
+        text = (site / name).read_text()
+        assert "katex-error" not in text, name
+        assert not re.search(r"\\\\[(\\[]", re.sub(r"<(pre|code|annotation)\b.*?</\1>", "", text, flags=re.DOTALL)), (
+            name
+        )

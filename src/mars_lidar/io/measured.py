@@ -135,8 +135,8 @@ def from_photon_times(
     if start != 0.0 and raw.size and since_ns.max() >= system.period_ns:
         warnings.warn(
             f"start_ns={start:g} is added to the times, which then reach {since_ns.max():.6g} ns and are folded into "
-            f"the period of {system.period_ns:g} ns: right for a gate that crosses its end; for times that count from the "
-            "laser pulse leave out start_ns (--start-ns) and give window_ns, (start, stop) (--window-ns)",
+            f"the period of {system.period_ns:g} ns: right for a gate that crosses its end; for times that count from "
+            "the laser pulse leave out start_ns (--start-ns) and give window_ns, (start, stop) (--window-ns)",
             stacklevel=3,  # of the caller, through what checks the arguments
         )
     if window_ns is not None:

@@ -65,8 +65,7 @@ def test_absolute_photon_times_in_a_window(tmp_path):
     """It gave 61.3 m: the start was added to times that have it, and folded."""
     truth = tower(tmp_path / "tower.mat")
     given = [tmp_path / "tower.mat", "--unit-ns", "0.001", "--bin-ps", "1000", "--period-ns", "10000", *KNOWN]
-    told = refused("reconstruct", *given, "--start-ns", "5180", "-o", tmp_path / "a.npz")
-    assert "give --window-ns" in told or "give window_ns" in told
+    assert "--window-ns" in run("reconstruct", *given, "--start-ns", "5180", "-o", tmp_path / "a.npz")
     run("reconstruct", *given, "--window-ns", "5180,5300", "-o", tmp_path / "maps.npz")
     found = depth(tmp_path / "maps.npz")
     assert found.shape == (4, 5)

@@ -71,7 +71,7 @@ def test_a_deleted_store_is_not_zeros(store):
     opened = open_dataset(store)
     shutil.rmtree(store)
     for array in (opened.histogram, opened.maps["depth"]):
-        with pytest.raises((FileError, FileNotFoundError), match=r"set\.zarr.* (is missing|does not exist)"):
+        with pytest.raises(FileError, match=r"set\.zarr.* removed after it was opened.* is missing"):
             np.asarray(array)
 
 
@@ -83,7 +83,7 @@ def test_a_deleted_cube_is_not_saved_as_zeros(tmp_path):
         io.simulate_to(path, flux, system)
         cube = io.load(path)
         shutil.rmtree(path) if suffix == ".zarr" else path.unlink()
-        with pytest.raises((FileError, FileNotFoundError), match=f"cube{suffix}"):
+        with pytest.raises(FileError, match=f"cube{suffix}.* removed after it was opened"):
             io.save(tmp_path / "copy.h5", cube)
         assert not (tmp_path / "copy.h5").exists()
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -145,6 +148,53 @@ def test_it_is_for_this_machine_and_this_page_only(server: CubeServer):
     assert b"room \\u003c1>.zarr" in content
     assert "Access-Control-Allow-Origin" not in headers
     assert "default-src 'none'" in headers["Content-Security-Policy"]
+
+
+def test_what_is_no_request_gets_the_policy_too(server: CubeServer):
+    port = urlsplit(server.url).port
+    for request, status in (
+        (b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n\r\n", b" 414 "),
+        (b"BREW / HTTP/1.1\r\nHost: x\r\n\r\n", b" 501 "),
+    ):
+        with socket.create_connection(("127.0.0.1", port), timeout=30) as line:
+            line.sendall(request)
+            answer = b"".join(iter(lambda: line.recv(65536), b""))
+        head = answer.partition(b"\r\n\r\n")[0]
+        assert status in head.splitlines()[0]
+        for directive in (b"default-src 'none'", b"base-uri 'none'", b"form-action 'none'", b"frame-ancestors 'none'"):
+            assert directive in head
+
+
+def test_silent_connections_hold_few_threads_and_end(monkeypatch):
+    monkeypatch.setattr("mars_lidar.explore.server._SILENT_S", 0.5)
+    running = CubeServer()
+    thread = threading.Thread(target=running.serve)
+    thread.start()
+    before = threading.active_count()
+    lines = [socket.create_connection(("127.0.0.1", urlsplit(running.url).port), timeout=30) for _ in range(100)]
+    try:
+        held = threading.active_count() - before
+        assert held <= 32
+        for line in lines:
+            with contextlib.suppress(ConnectionResetError):
+                assert line.recv(10) == b""  # closed: beyond the limit at once, else after half a second
+        for _ in range(100):
+            if threading.active_count() <= before:
+                break
+            time.sleep(0.05)
+        assert got(running, "/")[0] == 200
+    finally:
+        for line in lines:
+            line.close()
+        running.stop()
+        thread.join()
+        running.close()
+
+
+def test_a_port_in_use_is_named(server: CubeServer):
+    port = urlsplit(server.url).port
+    with pytest.raises(OSError, match=rf"port {port} of 127\.0\.0\.1: .*in use; give another \(--port\)"):
+        CubeServer(port=port)
 
 
 def test_what_the_sliders_cannot_tell():

@@ -167,6 +167,8 @@ def _hdf5(path: Path, edit: dict[str, Any]) -> None:
     with h5py.File(path, "r+") as file:
         found: list[str] = []
         file.visit(found.append)
+        if not found:  # a link to another file alone
+            return
         name = sorted(found)[int(where[0] * len(found))]
         attrs = file.attrs if where[5] < 0.3 else file[name].attrs
         keys = sorted(key for key in attrs if key not in ("CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST"))

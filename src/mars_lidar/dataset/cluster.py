@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import logging
 import math
 import os
 import platform
@@ -77,11 +78,17 @@ def team(dataset: Dataset, workers: int | None, threads: int, scheduler: str | N
     """`workers` processes of this machine, or the workers of the `scheduler` at that address."""
     distributed = needed(*_LIBRARY)
     with contextlib.ExitStack() as after:
+        after.enter_context(_silent())  # what goes wrong is told once, by us
         if scheduler is not None:
             client = after.enter_context(_client(distributed, scheduler))
         else:  # one part at a time in a worker: its memory is that of a chunk
             cluster = distributed.LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
             )
             client = distributed.Client(after.enter_context(cluster), set_as_default=False)
             after.enter_context(client)
@@ -126,6 +133,18 @@ class Run:
     threads: int
     version: str
     fingerprint: str
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Keep the tracebacks that dask logs of parts that failed off the terminal."""
+    logger = logging.getLogger("distributed")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def fingerprint() -> str:

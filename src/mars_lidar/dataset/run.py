@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import json
 import math
@@ -171,6 +172,11 @@ def generate(
                 dataset = open_dataset(target)
         except KeyboardInterrupt:
             raise Interrupted(f"interrupted; {_left(store, target)}") from None
+        except RuntimeError as error:
+            if "thread" not in str(error):
+                raise
+            told = f"{error}: give fewer threads, or more memory; {_left(store, target)}"
+            raise WriteError(errno.EAGAIN, told) from error
         except OSError as error:
             if isinstance(error, FileNotFoundError | FileExistsError) and not store.exists():
                 raise

@@ -88,6 +88,8 @@ def read_scene(key: Key, entry: Any) -> dict[str, Any]:
     if len(kinds) != 1:
         got = " and ".join(kinds) or "none of them"
         raise RecipeError(key, f"{name} must give one of example, depth (or path) and transient, got {got}")
+    if entry[kinds[0]] is None:
+        raise RecipeError((*key, kinds[0]), f"{kinds[0]} must have a value, got nothing behind it")
     kind = _STANDS_FOR.get(kinds[0], kinds[0])
     told = values.read_mapping(key, entry, {**SINGLE[kind], **KINDS[kind]}, name=name)
     for one, many in _STANDS_FOR.items():

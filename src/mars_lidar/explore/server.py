@@ -27,8 +27,11 @@ _MOST_PIXELS = 2**16  # of one answer, or one row
 _METHODS = {"peak": "peak", "likelihood": "maximum_likelihood"}
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
-    "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self'"
+    "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
 )
+_SILENT_S = 10.0  # a connection that says nothing for so long is closed
+_MOST_CONNECTIONS = 32  # at a time, each a thread: a browser opens six to a host
 
 
 def page_text() -> str:
@@ -61,8 +64,11 @@ class CubeServer:
             told = json.dumps(self._told(cube, name), allow_nan=False).replace("<", "\\u003c")
             text = text.replace(_PLACE, _PLACE.replace("null", told, 1))
         self._page = text.encode()
-        self._server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
-        self._server.daemon_threads = True
+        try:
+            self._server = _Server(("127.0.0.1", port), _handler(self))
+        except OSError as error:
+            told = f"port {port} of 127.0.0.1: {error.strerror}; give another (--port)"
+            raise OSError(error.errno, told) from None
         self.hosts = tuple(f"{name}:{self._server.server_port}" for name in ("127.0.0.1", "localhost"))  # that may ask
         self.url = f"http://{self.hosts[0]}{self._word}/"
 
@@ -133,6 +139,34 @@ class CubeServer:
         return "application/octet-stream", np.stack([totals, delay]).astype("<f8").tobytes()
 
 
+class _Server(ThreadingHTTPServer):
+    """A thread for each of a limited number of connections; those beyond are closed at once."""
+
+    daemon_threads = True
+
+    def __init__(self, *args: Any) -> None:
+        self._free = threading.Semaphore(_MOST_CONNECTIONS)
+        super().__init__(*args)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread of its own."""
+        if not self._free.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._free.release()
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer, and make room for another."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+
 def _whole(name: str, given: dict[str, str], size: int) -> int:
     """A whole number in [0, size)."""
     value = int(given[name])
@@ -145,6 +179,7 @@ def _handler(server: CubeServer) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         server_version = "mars-lidar"
         sys_version = ""
+        timeout = _SILENT_S
 
         def do_GET(self) -> None:
             if self.headers.get("Host", "") not in server.hosts:
@@ -175,6 +210,14 @@ def _handler(server: CubeServer) -> type[BaseHTTPRequestHandler]:
                 self.wfile.write(content)
             except (BrokenPipeError, ConnectionResetError):  # the reader has gone to another page
                 pass
+
+        def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+            """What is no request that is answered here: with the headers of every answer."""
+            status = HTTPStatus(code)
+            self.close_connection = True
+            if not hasattr(self, "request_version") or self.request_version == "HTTP/0.9":
+                self.request_version = "HTTP/1.0"  # or no header is sent
+            self._send(status, "text/plain", status.phrase.encode())
 
         def log_message(self, format: str, *args: Any) -> None:
             """Nothing: a line for each click would be noise."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import warnings
 from numbers import Real
 from typing import Any
 
@@ -107,7 +108,7 @@ def from_photon_times(
     unit_ns
         Unit of the times, ns. Times that are all whole numbers are units of a clock and become the middle of theirs.
     start_ns
-        Time from the laser pulse to time 0, ns: of a gate that the times count from. They must end within the period.
+        Time from the laser pulse to time 0, ns: of a gate that the times count from.
     window_ns
         (start, stop): photons within this time of the laser pulse alone, whole numbers of bins; the cube is a window.
         For times that count from the pulse, of a recording with a gate, or to leave out an internal reflection.
@@ -132,10 +133,11 @@ def from_photon_times(
     middle = 0.5 if raw.size and bool((raw == np.floor(raw)).all()) else 0.0
     since_ns = (raw + middle) * unit + start
     if start != 0.0 and raw.size and since_ns.max() >= system.period_ns:
-        raise ValueError(
-            f"start_ns must be the start of a gate that the times count from, got {start:g}: with it times reach "
-            f"{since_ns.max():.6g} ns, beyond the period of {system.period_ns:g} ns; for times that count from the "
-            "laser pulse give window_ns, (start, stop), instead"
+        warnings.warn(
+            f"start_ns={start:g} is added to the times, which then reach {since_ns.max():.6g} ns and are folded into "
+            f"the period of {system.period_ns:g} ns: right for a gate that crosses its end; for times that count from "
+            "the laser pulse leave out start_ns (--start-ns) and give window_ns, (start, stop) (--window-ns)",
+            stacklevel=3,  # of the caller, through what checks the arguments
         )
     if window_ns is not None:
         return _in_window(since_ns, [cell.size for cell in times], image.shape, system, window_ns, source)

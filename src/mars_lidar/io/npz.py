@@ -90,6 +90,8 @@ def _counts(path: Path) -> LazyCounts:
     def read() -> NDArray[Any]:
         size = math.prod(shape) * dtype.itemsize
         check_memory(size, f"the counts of {path}", "a .zarr or .h5 is read in parts")
+        if not path.exists():
+            raise FileError(f"{path} was removed after it was opened")
         with zipfile.ZipFile(path) as archive:
             if opened != archive.getinfo(name).CRC:
                 raise FileError(f"{path} was replaced after it was opened: open it again")

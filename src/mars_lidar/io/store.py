@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mars_lidar._base.files import reading, whole
+from mars_lidar._base.files import FileError, reading, whole
 from mars_lidar._base.memory import check_memory
 from mars_lidar.light.transient import RateArray
 
@@ -77,7 +77,7 @@ class OnDisk:
     def _read(self, read: Callable[[], Any]) -> Any:
         try:
             return read()
-        except (IndexError, TypeError):  # of the key
+        except (IndexError, TypeError, FileError):  # of the key; one that names the file
             raise
         except Exception as error:
             with self._naming():

@@ -166,11 +166,20 @@ def _read_npz(path: Path, attrs: dict[str, Any]) -> Timestamps:
     if attrs["format"] != FORMAT:
         raise ValueError(f"{path} is not a file of timestamps written by mars-lidar (no format = {FORMAT!r})")
     with open_npz(path) as archive:
-        counts = np.diff(archive["offsets"])
-        times = from_attributes(attrs, archive["times_ns"], archive["cycle"], archive["bin"], counts)
-    apart = np.abs(times.times_ns / times.period_ns - times.cycle - 0.5)
+        content = {name: archive[name] for name in ("offsets", "times_ns", "cycle", "bin")}
+    for name, values in content.items():
+        if values.ndim != 1 or values.dtype.kind not in ("f" if name == "times_ns" else "iu"):
+            raise ValueError(f"{name} must be {'times' if name == 'times_ns' else 'integers'} (n,), got {values.dtype}")
+    counts = np.diff(content["offsets"])
+    times = from_attributes(attrs, content["times_ns"], content["cycle"], content["bin"], counts)
+    since = times.times_ns / times.period_ns - times.cycle
+    apart = np.abs(since - 0.5)
     if apart.max(initial=0.0) > 0.5 + 1e-6:
         raise ValueError(
             f"times_ns must lie in the laser periods that cycle tells, got {apart.max() - 0.5:.3g} periods off"
         )
+    if times.bin.size and "code_density" not in json.dumps(attrs.get("info", {}), default=str):  # of uneven bins
+        beyond = float(np.abs(since * times.bins - times.bin - 0.5).max()) - 0.5
+        if beyond > 1e-6 + 4.0 * np.finfo(float).eps * times.bins * max(1, times.cycles):
+            raise ValueError(f"bin must be that of times_ns, got one {beyond:.3g} bins off")
     return times

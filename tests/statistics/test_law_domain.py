@@ -201,7 +201,7 @@ def test_laws_on_a_lattice_take_all_points(monkeypatch: pytest.MonkeyPatch, latt
     monkeypatch.setattr(pmf_module, "characteristic", transform)
     variance = 0.3 * 10_000 * lattice**2
     size = 2 * math.ceil(8 * math.sqrt(variance))
-    found = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.Purse())
+    found = pmf_module._narrow(Cells.of(1.0, 1.0, system), size, 128, 1, variance, pmf_module.StepBudget())
     assert (found is not None) == seen
 
 

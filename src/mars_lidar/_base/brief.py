@@ -13,12 +13,12 @@ _MOST_TEXT = 240  # characters of anything else, such as a system inside of a re
 
 def brief(self: Any) -> str:
     """The ``__repr__`` of a dataclass: fields that differ from their defaults, large arrays by type and shape only."""
-    told = []
+    fields = []
     for field in dataclasses.fields(self):
         value = getattr(self, field.name)
         if field.repr and not _is_default(field, value):
-            told.append(f"{field.name}={_shown(value)}")
-    return f"{type(self).__name__}({', '.join(told)})"
+            fields.append(f"{field.name}={_value_text(value)}")
+    return f"{type(self).__name__}({', '.join(fields)})"
 
 
 def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
@@ -28,7 +28,7 @@ def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
     return default is value or (type(default) is type(value) and not isinstance(value, np.ndarray) and default == value)
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     if isinstance(value, np.ndarray) and value.size > _MOST_VALUES:
         return f"<{value.dtype} {value.shape}>"
     if isinstance(value, np.ndarray):

@@ -14,9 +14,9 @@ _LARGEST = 160  # pixels of a map on its longer side: more cannot be seen
 _INCHES, _DPI = 1.7, 75
 
 
-def as_html(shown: object, panels: Mapping[str, Any]) -> str:
+def as_html(thing: object, panels: Mapping[str, Any]) -> str:
     """The ``repr`` of `shown` above `panels`: maps (H, W) by their title and unit, or curves (x, y)."""
-    text = f"<code>{html.escape(repr(shown))}</code>"
+    text = f"<code>{html.escape(repr(thing))}</code>"
     drawn = {name: values for name, values in panels.items() if _has_values(values)}
     if not drawn:
         return text

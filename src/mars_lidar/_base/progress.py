@@ -22,8 +22,8 @@ def shown(progress: Any, label: str) -> Progress | None:
         return Bar(label)
     if not callable(progress):
         raise TypeError(f"progress must be callable as progress(done, total), or True, got {progress!r}")
-    told: Progress = progress
-    return told
+    callback: Progress = progress
+    return callback
 
 
 def of_part(progress: Progress | None, first: int, last: int, total: int) -> Progress | None:

@@ -42,8 +42,8 @@ def calibrate(
     The likelihood is that of the point process itself, sum log lambda(x_k) - integral of lambda over the armed time:
     no assumption on the exposure, the start, or the stationarity, and no correction of pile-up is needed.
 
-    That is exact for a detector with one dead time, with Gaussian jitter (`estimate.jittered`) or with a slow recovery
-    (`armed_time.Sensitivity`). For one with other effects (of `system`) the bias is taken off by simulation: the light
+    That is exact for a detector with one dead time, with Gaussian jitter or with a slow recovery
+    (`calibrate.armed_time.Sensitivity`). For one with other effects (of `system`) the bias is taken off by simulation: the light
     is sought whose streams by the exact engine give the same estimate.
 
     Parameters

@@ -243,13 +243,13 @@ class Detector:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which `Detector.from_dict` makes an equal detector; gate and effects only where used."""
-        told = {}
+        data = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             off = effects.FIELDS[field.name].off if field.name in effects.FIELDS else None
             if value != off:
-                told[field.name] = effects.plain(value)
-        return told
+                data[field.name] = effects.plain(value)
+        return data
 
     @classmethod
     def from_dict(cls, data: Any) -> Detector:
@@ -269,5 +269,5 @@ def require_effects(what: str, detector: Detector, able: tuple[str, ...], instea
     for name in detector.effects:
         if name not in able:
             value = repr(getattr(detector, name))
-            told = value if len(value) <= 100 else f"{value[:97]}..."
-            raise ValueError(f"{what} does not do {name} of the detector, got {told}{instead(name)}")
+            given = value if len(value) <= 100 else f"{value[:97]}..."
+            raise ValueError(f"{what} does not do {name} of the detector, got {given}{instead(name)}")

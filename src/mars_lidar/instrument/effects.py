@@ -104,12 +104,12 @@ def _code_density(value: Any) -> tuple[float, ...]:
 
 
 def _native_traps(traps: Afterpulsing, period_ns: float) -> dict[str, Any]:
-    told: dict[str, Any] = {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period_ns}
+    fields: dict[str, Any] = {"traps": traps.probability, "trap_delay": traps.mean_delay_ns / period_ns}
     if traps.delays is not None:
-        told |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period_ns}
+        fields |= {"trap_delays": traps.edges_below, "trap_sample": (traps.bin_ns or 0.0) / period_ns}
     if traps.generations is not None:
-        told["generations"] = traps.generations
-    return told
+        fields["generations"] = traps.generations
+    return fields
 
 
 def _native_jitter(jitter: Jitter | SampledJitter, period_ns: float) -> dict[str, Any]:
@@ -242,12 +242,12 @@ EFFECTS = tuple(FIELDS)
 
 def native_fields(values: Mapping[str, Any], period_ns: float) -> dict[str, Any]:
     """The native fields of effects, by their names and values, that are on."""
-    told: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for name, value in values.items():
         effect = FIELDS[name]
         if effect.native is not None and value != effect.off:
-            told |= effect.native(value, period_ns)
-    return told
+            fields |= effect.native(value, period_ns)
+    return fields
 
 
 def plain(value: Any) -> Any:

@@ -204,10 +204,10 @@ class System:
         Where each value is from, or that it is an assumption, stands in docs/detectors.md and in the file that
         ``mars-lidar init --preset NAME`` writes. ValueError for one that is a detector alone (`Detector.preset`).
         """
-        told = sourced(name)
-        if "period_ns" not in told:
+        fields = sourced(name)
+        if "period_ns" not in fields:
             raise ValueError(f"{name} is a detector, without a laser: use Detector.preset({name!r})")
-        period, cycles, bins, fwhm = (told[key][0] for key in ("period_ns", "cycles", "bins", "pulse_fwhm_ns"))
+        period, cycles, bins, fwhm = (fields[key][0] for key in ("period_ns", "cycles", "bins", "pulse_fwhm_ns"))
         pulse = pulse_from_dict({"kind": "gaussian", "fwhm_ns": fwhm})
         return cls(period_ns=period, cycles=cycles, bins=bins, pulse=pulse, detector=Detector.preset(name))
 

@@ -31,16 +31,16 @@ def check_units(period: float, pulse: Pulse, detector: Detector) -> None:
     """Warn of times that are 1000 or 1e9 times what is usual."""
     if hint := period_hint(period):
         _warn(hint)
-    told = [
+    times = [
         ("dead_time_ns", detector.dead_time_ns, _DEAD),
         ("electronics_dead_time_ns", detector.electronics_dead_time_ns, _DEAD),
     ]
     if isinstance(pulse, GaussianPulse):
-        told.append(("sigma_ns", pulse.sigma_ns, _PULSE))
-    told += [(name, abs(getattr(detector, name) or 0.0), _GATE) for name in ("gate_start_ns", "gate_step_ns")]
-    if any(value >= meant for _, value, (_, _, meant) in told):
+        times.append(("sigma_ns", pulse.sigma_ns, _PULSE))
+    times += [(name, abs(getattr(detector, name) or 0.0), _GATE) for name in ("gate_start_ns", "gate_step_ns")]
+    if any(value >= meant for _, value, (_, _, meant) in times):
         return  # nobody's laboratory: the far end of the domain, in units of its own
-    for name, value, (odd_ns, odd_periods, _) in told:
+    for name, value, (odd_ns, odd_periods, _) in times:
         if 0.0 < value < _LONGEST_NS and value < 1e-6 * period and not math.log10(value).is_integer():  # a limit, then
             likely, unit = 1e9 * value, "seconds"
         elif odd_ns <= value and odd_periods * period <= value != period and _typed(name, value):
@@ -61,7 +61,7 @@ def check_delays(median_ns: float, period_ns: float) -> None:
 def _typed(name: str, value: float) -> bool:
     """Whether somebody may have typed it, perhaps as the width at half maximum."""
     values = [value, FWHM_PER_SIGMA * value] if name == "sigma_ns" else [value]
-    return any(abs(float(f"{one:.{_DIGITS}g}") - one) < 1e-9 * one for one in values)
+    return any(abs(float(f"{candidate:.{_DIGITS}g}") - candidate) < 1e-9 * candidate for candidate in values)
 
 
 def _warn(text: str) -> None:

@@ -322,8 +322,8 @@ class Transient:
             place = (edges + n * period_ns - self.start_ns) / self.bin_ns
             whole = np.round(place)  # edges that meet must meet exactly, or light leaks into a neighbour
             place = np.clip(np.where(np.abs(place - whole) < 1e-9 * bins, whole, place), 0.0, bins)
-            left = np.minimum(place.astype(np.int64), bins - 1)
-            at = before[..., left] + (place - left) * light[..., left]
+            below = np.minimum(place.astype(np.int64), bins - 1)
+            at = before[..., below] + (place - below) * light[..., below]
             out += np.diff(at, axis=-1)
         return np.maximum(out, 0.0)
 

@@ -100,15 +100,17 @@ def _survival(counts: FloatArray, rate: FloatArray, system: System) -> FloatArra
 
     exposure, dead = float(system.cycles), system.dead_time_periods
     if system.start == "armed":
-        left = np.maximum(exposure - (counts - 1.0) * dead, 0.0)
-        found = gammainc(np.maximum(counts, 1.0), rate * left)
-        return np.asarray(np.where(counts == 0.0, 1.0, found), dtype=np.float64)
+        armed_time = np.maximum(exposure - (counts - 1.0) * dead, 0.0)
+        probability = gammainc(np.maximum(counts, 1.0), rate * armed_time)
+        return np.asarray(np.where(counts == 0.0, 1.0, probability), dtype=np.float64)
 
     def integral(k: FloatArray) -> FloatArray:
         # of P(k t_d + Gamma(k, 1/rate) <= y) over y in [0, exposure]; for no wait at all, the exposure
-        left, shape = np.maximum(exposure - k * dead, 0.0), np.maximum(k, 1.0)
+        armed_time, shape = np.maximum(exposure - k * dead, 0.0), np.maximum(k, 1.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            area = left * gammainc(shape, rate * left) - shape / rate * gammainc(shape + 1.0, rate * left)
+            area = armed_time * gammainc(shape, rate * armed_time) - shape / rate * gammainc(
+                shape + 1.0, rate * armed_time
+            )
         return np.where(k == 0.0, exposure, np.where(rate > 0, area, 0.0))
 
     # the first wait of a warmed-up pixel has the density (1 - F) / mean, F the law of the others (6.5)

@@ -62,8 +62,8 @@ def broadcast(names: tuple[str, ...], *arrays: NDArray[Any]) -> list[NDArray[Any
     try:
         return list(np.broadcast_arrays(*arrays))
     except ValueError:
-        told = ", ".join(f"{n} {a.shape}" for n, a in zip(names, arrays, strict=False))
-        raise ValueError(f"shapes must broadcast, got {told}") from None
+        shapes = ", ".join(f"{n} {a.shape}" for n, a in zip(names, arrays, strict=False))
+        raise ValueError(f"shapes must broadcast, got {shapes}") from None
 
 
 def with_delays(
@@ -265,14 +265,14 @@ def followed_edges(cells: CellLight, parts: int, out_bins: int) -> FloatArray:
     low, high = (x / cells.system.period_ns for x in cells.system.pulse.support_ns())
     for row, delay in zip(out, cells.delay, strict=True):
         for block in range(math.floor((delay + low) * blocks), math.ceil((delay + high) * blocks)):
-            left, right = block / blocks, (block + 1) / blocks
-            begin, end = max(delay + low, left), min(delay + high, right)
-            if begin > left and end < right:
-                knots = [0.0, 0.25, 0.75, 1.0], [left, begin, end, right]
-            elif begin > left:
-                knots = [0.0, 0.5, 1.0], [left, begin, right]
-            elif end < right:
-                knots = [0.0, 0.5, 1.0], [left, end, right]
+            low_edge, high_edge = block / blocks, (block + 1) / blocks
+            begin, end = max(delay + low, low_edge), min(delay + high, high_edge)
+            if begin > low_edge and end < high_edge:
+                knots = [0.0, 0.25, 0.75, 1.0], [low_edge, begin, end, high_edge]
+            elif begin > low_edge:
+                knots = [0.0, 0.5, 1.0], [low_edge, begin, high_edge]
+            elif end < high_edge:
+                knots = [0.0, 0.5, 1.0], [low_edge, end, high_edge]
             else:
                 continue
             at = np.interp(np.arange(1, each) / each, *knots)
@@ -591,10 +591,10 @@ def _fine(cell: Cells, bins: int, tolerance: float, compute: Callable[[Cells, in
         if before[-1] == 0.0 or misplaced(before, edges, light) > 2.0 * tolerance:
             continue
         counts = compute(cell, few)[0]
-        found = np.diff(registered_before(before, counts, light))
+        fine = np.diff(registered_before(before, counts, light))
         coarse = np.diff(registered_before(before[::2], counts.reshape(-1, 2).sum(-1), light))
-        if float(np.abs(found - coarse).sum()) <= 2.0 * tolerance * float(counts.sum()):
-            return found[None]
+        if float(np.abs(fine - coarse).sum()) <= 2.0 * tolerance * float(counts.sum()):
+            return fine[None]
     return compute(cell, bins)
 
 

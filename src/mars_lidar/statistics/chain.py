@@ -239,8 +239,8 @@ class PhaseChain:
 
     def describe(self) -> str:
         """The cell in words, for warnings and errors."""
-        told = f"{self.total:g} photons per period in {self.bins} bins, t_d = {self.dead_time:g} periods"
-        return self.cell or told
+        description = f"{self.total:g} photons per period in {self.bins} bins, t_d = {self.dead_time:g} periods"
+        return self.cell or description
 
 
 def stationary_from(chain: PhaseChain, solution: Solution) -> Stationary:

@@ -86,17 +86,17 @@ def _exponential(rate: float, dead: float, twilight: float, p: float, delay: flo
     scale = min(delay, 1.0 / rate)  # of the integrands
     level, interval = p, math.inf
     for _ in range(_ROUNDS):
-        seen = level * math.exp(-dead / delay)
-        again = -math.expm1(-rate * twilight - seen * math.expm1(twilight / delay))
+        released = level * math.exp(-dead / delay)
+        again = -math.expm1(-rate * twilight - released * math.expm1(twilight / delay))
 
-        def armed(s: float, seen: float = seen) -> float:  # P(no avalanche up to s after the recovery)
-            return math.exp(-rate * s + seen * math.expm1(-s / delay))
+        def armed(s: float, released: float = released) -> float:  # P(no avalanche up to s after the recovery)
+            return math.exp(-rate * s + released * math.expm1(-s / delay))
 
-        def soon(x: float, seen: float = seen) -> float:  # its part that depends on the releases
-            return scale * math.exp(-rate * x * scale - seen) * math.expm1(seen * math.exp(-x * scale / delay))
+        def soon(x: float, released: float = released) -> float:  # its part that depends on the releases
+            return scale * math.exp(-rate * x * scale - released) * math.expm1(released * math.exp(-x * scale / delay))
 
         # E e^(-s / delay) of the next avalanche, by parts
-        mean = math.exp(-seen) / rate + quad(soon, 0.0, 60.0, epsabs=0.0, limit=400)[0]
+        mean = math.exp(-released) / rate + quad(soon, 0.0, 60.0, epsabs=0.0, limit=400)[0]
         part = quad(lambda x: armed(x * scale) * math.exp(-x * scale / delay) * scale, 0.0, 60.0, limit=400)[0]
         decay = again + (1.0 - again) * (1.0 - part / delay)
         level, last, interval = p / (1.0 - math.exp(-dead / delay) * decay), interval, dead + (1.0 - again) * mean
@@ -127,8 +127,8 @@ def _sampled(rate: float, dead: float, twilight: float, density: NDArray[np.floa
         mean = float(np.sum(fires / hazard) * cell + armed[-1] / rate)
         # what an avalanche `s` after the recovery finds at u: the carriers at dead + s + u; s in the middle of a cell
         later = between(edges + (dead + 0.5 * cell))
-        found = fftconvolve(later, fires[::-1])[n - 1 :]
-        carriers = density + (1.0 - again) * np.maximum(found, 0.0) + again * free
+        trapped = fftconvolve(later, fires[::-1])[n - 1 :]
+        carriers = density + (1.0 - again) * np.maximum(trapped, 0.0) + again * free
         last, interval = interval, dead + (1.0 - again) * mean
         if abs(interval - last) <= _TOLERANCE * interval:
             return interval

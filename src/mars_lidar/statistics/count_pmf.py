@@ -103,26 +103,26 @@ class TooLongError(ConvergenceError):
     """A transform whose state does not repeat for longer than a law is to take."""
 
 
-class Purse:
+class StepBudget:
     """Steps (bins x periods, `_LANES` points at once) that are left for the law of one cell."""
 
     def __init__(self, share: float = 1.0) -> None:
-        self.left = share * _MAX_STEPS
+        self.steps = share * _MAX_STEPS
 
 
 def characteristic(
-    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, purse: Purse | None = None
+    cells: Cells, z_re: FloatArray, z_im: FloatArray | None, bins: int, threads: int, budget: StepBudget | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """E z^N (re, im) of each cell at its points (cells, points); without `z_im` its logarithm at real z."""
 
-    purse, batches = purse or Purse(), math.ceil(z_re.shape[1] / _LANES)
+    budget, batches = budget or StepBudget(), math.ceil(z_re.shape[1] / _LANES)
     dead = cells.system.dead_time_periods
     reach = 256.0 * bins * (min(dead, float(cells.system.cycles)) + 1.0)
-    dear = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
-    dear *= 1.0 + _PERIOD_BINS / bins
+    cost = 6.0 * _FAR if reach > _FAR_BYTES else _FAR if reach > _NEAR_BYTES or dead * bins < 1.0 else 1.0
+    cost *= 1.0 + _PERIOD_BINS / bins
     # at real points the blind of every period of a dead time are summed
-    dear *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
-    steps = max(int(purse.left / dear) // batches, bins)
+    cost *= 1.0 + (min(dead, float(cells.system.cycles)) / bins if z_im is None else 0.0)
+    steps = max(int(budget.steps / cost) // batches, bins)
     grid = cells.grid(bins, 1, steps)
     re, im = np.empty(z_re.shape), np.empty(z_re.shape)
     settled = np.empty(z_re.shape, np.int64)
@@ -155,7 +155,7 @@ def characteristic(
             f"variance and two more cumulants are known; for the law {cells.instead}"
         )
     taken = np.where(settled >= 0, settled, cells.system.cycles).mean(-1).max()
-    purse.left = max(purse.left - float(taken) * bins * batches * dear, 1.0)
+    budget.steps = max(budget.steps - float(taken) * bins * batches * cost, 1.0)
     return re, im
 
 
@@ -195,9 +195,9 @@ def exact_windows(cells: Cells, cumulants: FloatArray, bins: IndexArray, threads
             except TooLongError:
                 lows, highs, outside = _guessed_supports(cells, cumulants[block])
             for k, cell in enumerate(block):
-                one = cells.part(block[k : k + 1])
+                single = cells.part(block[k : k + 1])
                 spread = float(cumulants[cell, 1])
-                window = _window(one, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
+                window = _window(single, int(lows[k]), int(highs[k]), float(outside[k]), int(n), threads, spread)
                 _check(cells, int(cell), window, cumulants[cell])
                 windows[cell] = window
     return [window for window in windows if window is not None]
@@ -225,8 +225,10 @@ def guessed_windows(
             guessed = width <= _WIDEST_GUESS
             pmf = _folded(cells.part(block), first[block], int(width), int(n), threads) if guessed else None
             for k, cell in enumerate(block):
-                found = None if pmf is None else _if_whole(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
-                windows[cell] = found or _alone(cells.part(block[k : k + 1]), threads)
+                candidate = (
+                    None if pmf is None else _if_whole(pmf[k], int(first[cell]), cumulants[cell, 0], spread[cell])
+                )
+                windows[cell] = candidate or _alone(cells.part(block[k : k + 1]), threads)
             done += block.size
             if waiting is not None:
                 waiting(done)
@@ -280,7 +282,7 @@ def _supports(
     unit = np.minimum(1.0 / np.maximum(spread, 1e-300), np.minimum(growth, _MAX_TILT) / _TILTS[-1])
     tilt = _TILTS * unit[:, None]
     tilt = np.concatenate([tilt, -tilt], axis=1)
-    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, Purse(_FOR_SUPPORT))[0]
+    log_value = characteristic(cells, np.exp(tilt), None, bins, threads, StepBudget(_FOR_SUPPORT))[0]
     with np.errstate(invalid="ignore"):
         # P(N >= edge) <= tail for a positive tilt, P(N <= edge) <= tail for a negative one
         edge = (log_value - math.log(TAIL)) / tilt
@@ -319,12 +321,12 @@ def _guessed_supports(cells: Cells, cumulants: FloatArray) -> tuple[IndexArray, 
 def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threads: int, variance: float) -> Pmf:
     from scipy.fft import irfft  # of lengths with a large prime factor twice as fast as NumPy's
 
-    counts, purse = last - first + 1, Purse()
+    counts, budget = last - first + 1, StepBudget()
     size = counts + counts % 2
-    value = _narrow(cell, size, bins, threads, variance, purse) if size > _ALL_POINTS else None
+    value = _narrow(cell, size, bins, threads, variance, budget) if size > _ALL_POINTS else None
     if value is None:
         angle = 2.0 * np.pi * np.arange(size // 2 + 1) / size
-        re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, purse)
+        re, im = characteristic(cell, np.cos(angle)[None], np.sin(angle)[None], bins, threads, budget)
         value = re[0] - 1j * im[0]
     # the transform has e^(-i angle n): the conjugate; index n mod size holds count n (23)
     folded = np.asarray(irfft(value, size))
@@ -332,7 +334,7 @@ def _window(cell: Cells, first: int, last: int, outside: float, bins: int, threa
 
 
 def _narrow(
-    cell: Cells, size: int, bins: int, threads: int, variance: float, purse: Purse
+    cell: Cells, size: int, bins: int, threads: int, variance: float, budget: StepBudget
 ) -> NDArray[np.complex128] | None:
     """Conjugate of E z^N on the points (size // 2 + 1,) of the circle where it is not 0; None where that is not sure.
 
@@ -350,7 +352,7 @@ def _narrow(
     end = 0
     while end < angle.size:
         some = slice(end, min(end + step, angle.size))
-        re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, purse)
+        re, im = characteristic(cell, np.cos(angle[some])[None], np.sin(angle[some])[None], bins, threads, budget)
         value[some] = re[0] - 1j * im[0]
         end = some.stop
         if np.abs(value[some]).max() <= _QUIET:
@@ -358,10 +360,10 @@ def _narrow(
     spread = math.sqrt(variance * shorter / cycles)
     begin = min(4.0 / spread, np.pi)
     between = np.geomspace(angle[min(end, angle.size - 1)], max(begin, angle[min(end, angle.size - 1)]), 16)
-    re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, purse)
+    re, im = characteristic(cell, np.cos(between)[None], np.sin(between)[None], bins, threads, budget)
     beyond = np.linspace(begin, np.pi, 2 + math.ceil((np.pi - begin) * spread / 0.3))
     brief = replace(cell, system=cell.system.replace(cycles=shorter))
-    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, purse)
+    short_re, short_im = characteristic(brief, np.cos(beyond)[None], np.sin(beyond)[None], bins, threads, budget)
     highest = float(np.hypot(short_re, short_im).max())
     faint = float(np.hypot(re, im).max()) <= 10.0 * _QUIET
     return value if faint and highest ** (cycles / shorter) <= 1e-3 * _QUIET else None

@@ -25,15 +25,15 @@ def total_variation(a: Pmf, b: Pmf) -> float:
 
 def sampling_floor(law: Pmf, size: int, draws: int, random: np.random.Generator) -> FloatArray:
     """Total variation (draws,) to `law` of samples of `size` counts drawn from it (parametric bootstrap)."""
-    kept = law.p > _NEGLIGIBLE / size
-    p = np.append(law.p[kept], max(1.0 - float(law.p[kept].sum()), 0.0))
+    listed = law.p > _NEGLIGIBLE / size
+    p = np.append(law.p[listed], max(1.0 - float(law.p[listed].sum()), 0.0))
     p /= p.sum()
-    found = np.empty(draws)
+    distances = np.empty(draws)
     step = max(1, 2**22 // p.size)
     for start in range(0, draws, step):
         drawn = random.multinomial(size, p, size=min(step, draws - start))
-        found[start : start + step] = 0.5 * np.abs(drawn / size - p).sum(-1)
-    return found
+        distances[start : start + step] = 0.5 * np.abs(drawn / size - p).sum(-1)
+    return distances
 
 
 def g_test(law: Pmf, sample: Pmf, size: int, *, any_mean: bool = False) -> float:
@@ -87,8 +87,8 @@ def two_sample_g_test(first: Pmf, first_size: int, second: Pmf, second_size: int
     table = table[:, table.sum(0) > 0]
     if table.shape[1] < 2:
         return 1.0
-    found = chi2_contingency(table, correction=False, lambda_="log-likelihood")
-    square, freedom = float(found.statistic), int(found.dof)
+    test = chi2_contingency(table, correction=False, lambda_="log-likelihood")
+    square, freedom = float(test.statistic), int(test.dof)
     if any_mean and freedom > 1:
         both = (first_size * first.on(low, high) + second_size * second.on(low, high)) / (first_size + second_size)
         counts = low + np.arange(both.size)

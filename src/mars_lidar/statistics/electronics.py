@@ -99,21 +99,21 @@ class RecordGrid:
         n, steps = self.bins, self.steps
         photons = np.concatenate([self.photons, self.photons])
         armed = np.zeros(n)
-        unseen = np.zeros((steps + 1, n))  # the record itself, then avalanches that are not recorded
-        unseen[0] = 1.0
-        seen = np.zeros((steps - self.off + 1, n))
+        unrecorded = np.zeros((steps + 1, n))  # the record itself, then avalanches that are not recorded
+        unrecorded[0] = 1.0
+        recorded = np.zeros((steps - self.off + 1, n))
         for j in range(1, steps + 1):
             rearmed = np.zeros(n)
             if j >= self.shift:
-                rearmed += (1.0 - self.part) * unseen[j - self.shift]
+                rearmed += (1.0 - self.part) * unrecorded[j - self.shift]
             if j > self.shift:
-                rearmed += self.part * unseen[j - self.shift - 1]
+                rearmed += self.part * unrecorded[j - self.shift - 1]
             armed, hit = self._advance(armed, rearmed, photons[j % n : j % n + n])
             ready = self._ready(j)
-            unseen[j] = (1.0 - ready) * hit
+            unrecorded[j] = (1.0 - ready) * hit
             if j >= self.off:
-                seen[j - self.off] = ready * hit
-        return np.ascontiguousarray(seen.T), armed
+                recorded[j - self.off] = ready * hit
+        return np.ascontiguousarray(recorded.T), armed
 
     def _ready(self, step: int) -> float:
         """Share of the bin `step` after a record, both evenly in their bins, that lies beyond t_e."""
@@ -297,10 +297,10 @@ def moments(cells: Cells, tolerance: float, effort: Effort = MOST_EFFORT) -> Ele
     histogram = np.empty((cells.size, bins))
     bare, slower = without_electronics(cells)
     if slower == 0.0:
-        found = refined_moments(bare, bins, tolerance=min(tolerance, 1e-4), threads=None)
-        flat = found.cumulants.reshape(-1, found.cumulants.shape[-1])
-        mean, variance, histogram = flat[:, 0], flat[:, 1], found.histogram.reshape(-1, bins)
-        grid = found.bins.reshape(-1)
+        exposure = refined_moments(bare, bins, tolerance=min(tolerance, 1e-4), threads=None)
+        flat = exposure.cumulants.reshape(-1, exposure.cumulants.shape[-1])
+        mean, variance, histogram = flat[:, 0], flat[:, 1], exposure.histogram.reshape(-1, bins)
+        grid = exposure.bins.reshape(-1)
     else:
         for k in range(cells.size):
             mean[k], variance[k], histogram[k], grid[k] = refined(bare.part(slice(k, k + 1)), slower, tolerance, effort)
@@ -342,16 +342,16 @@ def refined(
     out, electronics = system.bins, electronics_ns / system.period_ns
     bins = coarsest_grid(cell)
     coarse, before = _Run(cell, bins, electronics, effort), None
-    left = effort.moments - coarse.spent
+    remaining = effort.moments - coarse.spent
     while True:
         bins *= 2
-        if 4.0 * coarse.spent > left:  # as many periods, on twice the bins with kernels twice as long
+        if 4.0 * coarse.spent > remaining:  # as many periods, on twice the bins with kernels twice as long
             raise ConvergenceError(
                 f"electronics_moments of {cell.name(0)}: {bins} bins per period take too long, and fewer are not "
                 f"enough; {effort.instead}"
             )
-        fine = _Run(cell, bins, electronics, replace(effort, moments=left))
-        left -= fine.spent
+        fine = _Run(cell, bins, electronics, replace(effort, moments=remaining))
+        remaining -= fine.spent
         # the grid errs by the square of its step: what doubling it moved tells the limit
         limit = np.array([fine.mean, fine.variance])
         limit += (limit - [coarse.mean, coarse.variance]) / 3.0
@@ -422,9 +422,9 @@ class _Run:
             steady = steady + 1 if moved <= _SETTLED * scale else 0
             last = now
             if steady > 3 * grid.periods:
-                left = self.cycles - period - 1
-                self.rate += left * records
-                pairs += left * float(weighted.sum()) + 0.5 * left * (left + 1.0) * growth
+                remaining = self.cycles - period - 1
+                self.rate += remaining * records
+                pairs += remaining * float(weighted.sum()) + 0.5 * remaining * (remaining + 1.0) * growth
                 break
             if period >= budget:
                 raise ConvergenceError(
@@ -534,8 +534,8 @@ def record_windows(cells: Cells, tolerance: float, threads: int) -> list[Pmf]:
     """Pmf of the number of records of each cell; the tolerance is that of `electronics_moments`."""
     bare, slower = without_electronics(cells)
     if slower == 0.0:
-        found = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
-        return exact_windows(bare, found.cumulants.reshape(-1, 4), found.bins.reshape(-1), threads)
+        exposure = refined_moments(bare, 1, tolerance=min(tolerance, 1e-4), threads=threads)
+        return exact_windows(bare, exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1), threads)
     return [_window(bare.part(slice(k, k + 1)), slower, tolerance) for k in range(cells.size)]
 
 
@@ -548,10 +548,10 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     most = math.floor(cell.system.cycles / electronics) + 1
     spread = math.sqrt(variance)
     half = math.ceil(_REACH * spread + _MARGIN)
-    left = [LAW_EFFORT.points]  # multiplications
+    budget = [LAW_EFFORT.points]  # multiplications
     while True:
         first, last = max(math.floor(mean) - half, 0), min(math.ceil(mean) + half, most)
-        fine, coarse = (_folded(grid, first, last, left) for grid in grids)
+        fine, coarse = (_folded(grid, first, last, budget) for grid in grids)
         pmf = fine + (fine - coarse) / 3.0  # the limit for fine grids
         ends = max(pmf[0] if first > 0 else 0.0, pmf[-1] if last < most else 0.0)
         if abs(ends) <= _EDGE:
@@ -574,7 +574,7 @@ def _window(cell: Cells, electronics_ns: float, tolerance: float) -> Pmf:
     return Pmf(first, pmf / pmf.sum(), outside)
 
 
-def _folded(grid: RecordGrid, first: int, last: int, left: list[float]) -> FloatArray:
+def _folded(grid: RecordGrid, first: int, last: int, budget: list[float]) -> FloatArray:
     """P(N = n) for n from `first` to `last`, by (23) of docs/theory_exposure.md; takes its cost off `left`."""
     counts = last - first + 1
     size = counts + counts % 2
@@ -582,14 +582,14 @@ def _folded(grid: RecordGrid, first: int, last: int, left: list[float]) -> Float
     value = np.zeros(angle.size, np.complex128)
     for start in range(0, angle.size, _POINTS):
         some = np.exp(1j * angle[start : start + _POINTS])
-        value[start : start + _POINTS] = _values(grid, some, left)
+        value[start : start + _POINTS] = _values(grid, some, budget)
         if np.abs(value[start : start + _POINTS]).max() < _QUIET:  # a long exposure: nothing beyond
             break
     folded = np.fft.irfft(value.conj(), size)
     return np.asarray(folded[np.arange(first, last + 1) % size], dtype=np.float64)
 
 
-def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArray:
+def _values(grid: RecordGrid, z: ComplexArray, budget: list[float]) -> ComplexArray:
     """E z^N of the exposure at points z (points,) of the unit circle: records (12), each weighted with z (19)."""
 
     def weigh(now: Rows) -> Rows:
@@ -602,7 +602,7 @@ def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArra
     a_period = 4.0 * grid.bins * (grid.shift + 64.0)  # multiplications of a point
     for period in range(grid.cycles):
         records, earlier = run.period(), value
-        left[0] -= a_period * index.size
+        budget[0] -= a_period * index.size
         value = value + (z[index] - 1.0) * records.sum(-1)
         state = np.concatenate([records, run.armed[:, None], value[:, None]], axis=1)
         # as in native/laws/exposure_characteristic.h: the state repeats but for a factor, by least squares
@@ -621,7 +621,7 @@ def _values(grid: RecordGrid, z: ComplexArray, left: list[float]) -> ComplexArra
                 break
             index, value, before, ratio, streak = index[rest], value[rest], before[rest], ratio[rest], streak[rest]
             run.keep(rest, weigh)
-        if left[0] < 0.0:
+        if budget[0] < 0.0:
             raise ConvergenceError(
                 f"count law of {grid.cell.name(0)} behind electronics with a dead time: the state does not repeat "
                 f"within {period + 1} periods; electronics_moments has mean and variance, or simulate it with engine "

@@ -373,9 +373,9 @@ def recorded_moments(
         return refined_moments(cells, cells.system.bins, tolerance=tolerance, threads=threads, progress=progress)
     timing = Timing(cells.system, cells.finest)
     untimed = replace(cells, system=timing.untimed)
-    found = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
+    exposure = refined_moments(untimed, timing.parts, tolerance=tolerance, threads=threads, progress=progress)
     return replace(
-        found, histogram=timing.forward(found.histogram), histogram_rate=timing.forward(found.histogram_rate)
+        exposure, histogram=timing.forward(exposure.histogram), histogram_rate=timing.forward(exposure.histogram_rate)
     )
 
 

@@ -31,9 +31,9 @@ def require_mode(
     require_effects(what, system.detector, effects, _simulated)
     mode = system.detector.mode
     if mode not in modes:
-        told = " and ".join(map(repr, modes))
+        allowed = " and ".join(map(repr, modes))
         raise ValueError(
-            f"{what} is for detectors of mode {told}, got {mode!r}{_INSTEAD[mode]}; any mode can be simulated"
+            f"{what} is for detectors of mode {allowed}, got {mode!r}{_INSTEAD[mode]}; any mode can be simulated"
         )
     if system.detector.gate_moves:
         raise ValueError(

@@ -72,9 +72,9 @@ def _registrations(cells: Cells, bins: int, tolerance: float, threads: int | Non
         return moments(cells, max(tolerance, 1e-3), LAW_EFFORT).histogram.reshape(cells.size, bins)
     if mode == "synchronous":
         armed = first_arrivals(cells)
-        seen = np.maximum(armed.sum(-1), np.finfo(float).tiny)
+        registered = np.maximum(armed.sum(-1), np.finfo(float).tiny)
         mean = np.array([cumulants_of(window)[0] for window in synchronous_windows(cells)])
-        return np.asarray(armed * (mean / seen)[:, None], dtype=np.float64)
+        return np.asarray(armed * (mean / registered)[:, None], dtype=np.float64)
     if mode == "paralyzable":
         return paralyzable_histograms(cells, tolerance)
 

@@ -52,13 +52,13 @@ class Windows:
     """What m windows need for their covariances; arrays (m, ...), made by `SettledLaw.windows`.
 
     `y` is the transposed solution, `noise` half of its noise plus that of its change at the end (both (m, 2 n)),
-    `left` and `spread` the worth of the registrations that end or begin the exposure, without and with their
+    `after_end` and `spread` the worth of the registrations that end or begin the exposure, without and with their
     covariance; `step`, `first`, `edge`, `expected` what whole periods, and the oldest bin, add to them.
     """
 
     y: FloatArray
     noise: FloatArray
-    left: FloatArray
+    after_end: FloatArray
     spread: FloatArray
     step: FloatArray
     first: FloatArray
@@ -107,20 +107,20 @@ class SettledLaw:
         below = np.cumsum(armed, -1)
         step = below[:, -1]
         # What a registration before the end is still worth after it (5.6), whole periods apart
-        left = np.stack([weights - y[:, 0] + below - (grid.whole + 1) * step[:, None], -y[:, 1]], 1)
+        worth = np.stack([weights - y[:, 0] + below - (grid.whole + 1) * step[:, None], -y[:, 1]], 1)
         edge = self._edge(y, armed)
-        source = self._often * left
+        source = self._often * worth
         source[:, 0] += self._sum1 * step[:, None]
         source[:, :, self._old] += edge
         change = grid.adjoint(source[:, 0], source[:, 1], tolerance=1e-7)  # a term that does not grow with N_r
         x = grid.state
-        first = (left * x).sum((1, 2))
-        expected = (self._often * left * x).sum((1, 2)) + self._sum1 * step * x[0].sum() + edge @ x[:, self._old]
+        first = (worth * x).sum((1, 2))
+        expected = (self._often * worth * x).sum((1, 2)) + self._sum1 * step * x[0].sum() + edge @ x[:, self._old]
         return Windows(
             y=y.reshape(-1, 2 * n),
             noise=(_product(0.5 * self._total, y) + _product(self._noise, change)).reshape(-1, 2 * n),
-            left=left.reshape(-1, 2 * n),
-            spread=(self._often * _product(_spread(x), left)).reshape(-1, 2 * n),
+            after_end=worth.reshape(-1, 2 * n),
+            spread=(self._often * _product(_spread(x), worth)).reshape(-1, 2 * n),
             step=step,
             first=first,
             edge=edge,
@@ -131,7 +131,7 @@ class SettledLaw:
         """(m,) covariances of windows a[k] and b[k]; or (m,) with one b for all: (5.5)."""
         rows = "ki,ki->k" if len(a.y) == len(b.y) else "ki,li->k"
         inside = np.einsum(rows, a.y, b.noise) + np.einsum(rows, a.noise, b.y)
-        ends = np.einsum(rows, a.left, b.spread) + np.einsum(rows, a.edge @ self._old_spread, b.edge)
+        ends = np.einsum(rows, a.after_end, b.spread) + np.einsum(rows, a.edge @ self._old_spread, b.edge)
         ends += self._sum1 * (a.step * b.first + a.first * b.step)
         ends += self._sum2 * a.step * b.step * self.grid.state[0].sum() - a.expected * b.expected
         return np.asarray(inside + (2.0 if self.grid.warm else 1.0) * ends)
@@ -139,7 +139,7 @@ class SettledLaw:
     def matrix(self, a: Windows) -> FloatArray:
         """(m, m) covariances of all windows with each other."""
         ends = 2.0 if self.grid.warm else 1.0
-        half = a.y @ a.noise.T + (0.5 * ends) * (a.left @ a.spread.T)
+        half = a.y @ a.noise.T + (0.5 * ends) * (a.after_end @ a.spread.T)
         half += (0.5 * ends) * (a.edge @ self._old_spread @ a.edge.T)
         half += (ends * self._sum1) * np.outer(a.step, a.first)
         half += (0.5 * ends * self._sum2 * self.grid.state[0].sum()) * np.outer(a.step, a.step)
@@ -236,8 +236,8 @@ class Pixel:
         """Covariance (bins, bins) of the histogram."""
         eye = np.eye(self.out)
         if self.law is None:
-            found = self._columns(eye)
-            return np.asarray(0.5 * (found + found.T))
+            columns = self._columns(eye)
+            return np.asarray(0.5 * (columns + columns.T))
         return self.law.matrix(self._windows(eye))
 
     def _windows(self, weights: FloatArray) -> Windows:
@@ -304,7 +304,7 @@ def _monitors(mean: FloatArray, dead: float, few: bool) -> FloatArray:
 # --- Bins that show registrations of other cells -------------------------------------------------------------------
 
 
-class SeenPixel(Pixel):
+class RecordedPixel(Pixel):
     """A `Pixel` whose registrations, of mean `mass` (cells,) on its own bins, are seen in others."""
 
     def __init__(self, pixel: Pixel, mass: FloatArray) -> None:
@@ -312,23 +312,23 @@ class SeenPixel(Pixel):
         self.cells, self.grid, self.law = pixel.cells, pixel.grid, pixel.law
 
     @abstractmethod
-    def _seen(self, weights: FloatArray) -> FloatArray:
+    def _mean_weight(self, weights: FloatArray) -> FloatArray:
         """Mean (windows, cells) of the weight (windows, bins) of a registration of each cell."""
 
     def variances(self, weights: FloatArray) -> FloatArray:
         """Variances (windows,) of the counts in windows `weights` (windows, bins)."""
-        v = self._seen(weights)
-        return np.asarray(self.pixel.variances(v) + (self._seen(weights * weights) - v * v) @ self._mass)
+        v = self._mean_weight(weights)
+        return np.asarray(self.pixel.variances(v) + (self._mean_weight(weights * weights) - v * v) @ self._mass)
 
     monitored = variances
 
     def covariances(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Covariances (windows,) of the counts in pairs of windows (windows, bins)."""
-        v, w = self._seen(first), self._seen(second)
-        return np.asarray(self.pixel.covariances(v, w) + (self._seen(first * second) - v * w) @ self._mass)
+        v, w = self._mean_weight(first), self._mean_weight(second)
+        return np.asarray(self.pixel.covariances(v, w) + (self._mean_weight(first * second) - v * w) @ self._mass)
 
 
-class FinePixel(SeenPixel):
+class FinePixel(RecordedPixel):
     """A `Pixel` on cells of the period, seen in `out` finer bins that need not divide them.
 
     Given the cells of all registrations, their places within them are taken for independent, with the mean histogram's
@@ -361,11 +361,11 @@ class FinePixel(SeenPixel):
         """None: MemoryError."""
         raise MemoryError(f"covariances of {self.out} bins with each other; use window() or covariance_of()")
 
-    def _seen(self, weights: FloatArray) -> FloatArray:
+    def _mean_weight(self, weights: FloatArray) -> FloatArray:
         return np.stack([np.asarray(self._parts @ row) / self._mass for row in weights])
 
 
-class TimedPixel(SeenPixel):
+class TimedPixel(RecordedPixel):
     """A pixel on fine parts of the period, with mean (parts,), seen through `timing`: jitter and code widths."""
 
     def __init__(self, pixel: Pixel, mean: FloatArray, timing: Timing) -> None:
@@ -376,11 +376,11 @@ class TimedPixel(SeenPixel):
         """(bins, bins) covariances."""
         parts = self._mass.size
         check_memory(24 * parts**2, f"covariances of {parts} parts of the period", "use window() or lag()")
-        v = self._seen(np.eye(self._timing.system.bins))
-        seen = v @ self.pixel.matrix() @ v.T
-        return np.asarray(seen + np.diag(v @ self._mass) - (v * self._mass) @ v.T)
+        v = self._mean_weight(np.eye(self._timing.system.bins))
+        covariance = v @ self.pixel.matrix() @ v.T
+        return np.asarray(covariance + np.diag(v @ self._mass) - (v * self._mass) @ v.T)
 
-    def _seen(self, weights: FloatArray) -> FloatArray:
+    def _mean_weight(self, weights: FloatArray) -> FloatArray:
         return self._timing.backward(weights)
 
 
@@ -609,15 +609,15 @@ class JointLaw:
             j = np.arange(n)
             return np.asarray(self._covariance[j, (j + lag) % n])
         check_memory(8 * n * n, f"lags of {n} bins", "use window() or covariance_of() for the bins of interest")
-        found = np.empty(n)
+        covariances = np.empty(n)
         eye = np.eye(n)
         for start in range(0, n, _BLOCK):
             j = np.arange(start, min(start + _BLOCK, n))
             if lag % n == 0:
-                found[j] = self._pixel.variances(eye[j])
+                covariances[j] = self._pixel.variances(eye[j])
             else:
-                found[j] = self._pixel.covariances(eye[j], eye[(j + lag) % n])
-        return np.maximum(found, 0.0) if lag % n == 0 else found
+                covariances[j] = self._pixel.covariances(eye[j], eye[(j + lag) % n])
+        return np.maximum(covariances, 0.0) if lag % n == 0 else covariances
 
     def covariance(self) -> FloatArray:
         """(bins, bins) covariance matrix, in O(bins^3) simple steps: a fraction of a second for 1024 bins.
@@ -630,12 +630,12 @@ class JointLaw:
         n = self.mean.size
         if self._pixel is None:
             return np.diag(self.mean)
-        found = self._covariance
-        if found is None:
+        matrix = self._covariance
+        if matrix is None:
             check_memory(8 * n * (10 * self.grid_bins + 3 * n), f"covariances of {n} bins", "use window() or lag()")
-            found = self._pixel.matrix()
-            object.__setattr__(self, "_covariance", found)
-        return found.copy()
+            matrix = self._pixel.matrix()
+            object.__setattr__(self, "_covariance", matrix)
+        return matrix.copy()
 
     _covariance: FloatArray | None = field(default=None, init=False, repr=False)
 

@@ -89,18 +89,18 @@ def factorised(grid: FeedbackEquation) -> Callable[..., FloatArray]:
     lit = grid.response[0]
     peak = int(np.argmax(lit))
     dim = np.roll(lit, -peak) <= lit.min() + 1e-3 * (lit.max() - lit.min())
-    behind = (peak + int(np.argmax(dim))) % grid.bins
+    after_peak = (peak + int(np.argmax(dim))) % grid.bins
     best, least = None, np.inf
-    for place in dict.fromkeys((behind, 0, peak, (peak + grid.bins // 2) % grid.bins)):
+    for place in dict.fromkeys((after_peak, 0, peak, (peak + grid.bins // 2) % grid.bins)):
         solve = _factors_at(grid, place)
         source = grid.response[[0, 3]]
         x = np.zeros_like(source)
         for _ in range(2):
             rest = np.concatenate([(source - grid.apply(x)).reshape(-1), np.zeros(grid.bins)])
             x = x + solve(rest, trans="T")[: 2 * grid.bins].reshape(2, -1)
-        left = left_over(source - grid.apply(x), x)
-        if best is None or left < least:
-            best, least = solve, left
+        error = left_over(source - grid.apply(x), x)
+        if best is None or error < least:
+            best, least = solve, error
         if least <= 0.1 * GOOD:
             break
     assert best is not None
@@ -127,9 +127,9 @@ def _factors_at(grid: FeedbackEquation, place: int) -> Callable[..., FloatArray]
         out[order] = factors.solve(ordered, trans=trans)
         return out
 
-    one = np.zeros(3 * n)
-    one[2 * n] = 1.0
-    change = {"N": (bare(one, "N"), row), "T": (bare(row, "T"), one)}
+    held = np.zeros(3 * n)
+    held[2 * n] = 1.0
+    change = {"N": (bare(held, "N"), row), "T": (bare(row, "T"), held)}
 
     def whole(right: FloatArray, trans: str = "N") -> FloatArray:
         three = right.reshape(3, n, -1)
@@ -178,8 +178,8 @@ def _matrix(grid: FeedbackEquation) -> csc_matrix:
 
 def left_over(rest: FloatArray, x: FloatArray) -> float:
     """Largest residual `rest` of a solution `x`, relative to its largest value; infinite of none where there is one."""
-    size, left = float(np.abs(x).max()), float(np.abs(rest).max())
-    return left / size if size > 0.0 else math.inf if left != 0.0 else 0.0
+    size, largest = float(np.abs(x).max()), float(np.abs(rest).max())
+    return largest / size if size > 0.0 else math.inf if largest != 0.0 else 0.0
 
 
 # --- The folded exposure -------------------------------------------------------------------------------------------
@@ -339,10 +339,10 @@ class FoldedGrid(FeedbackEquation):
         return y
 
     def _judge(self, rest: FloatArray, x: FloatArray) -> None:
-        left = left_over(rest, x)
-        self.residual = max(self.residual, left)
-        if not left <= GOOD:
-            raise ConvergenceError(f"the feedback equation is left with a relative residual of {left:.1e}")
+        error = left_over(rest, x)
+        self.residual = max(self.residual, error)
+        if not error <= GOOD:
+            raise ConvergenceError(f"the feedback equation is left with a relative residual of {error:.1e}")
 
     def _apply_transposed(self, y: FloatArray) -> FloatArray:
         """The left side of (5.4) for `y` (m, 2, n), without whole periods of dead time."""

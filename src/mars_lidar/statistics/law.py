@@ -187,8 +187,8 @@ def count_law(
     slow = "electronics_dead_time_ns" in cells.system.detector.effects
     if method == "exact" and (slow or system.detector.mode == "synchronous"):
         windows = record_windows(cells, max(tolerance, 1e-3), team) if slow else synchronous_windows(cells)
-        found = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
-        return CountLaw(method, found, lambda: windows)
+        recorded_cumulants = np.array([cumulants_of(window) for window in windows]).reshape(*cells.shape, 4)
+        return CountLaw(method, recorded_cumulants, lambda: windows)
     if method == "exact":
         exposure = refined_moments(cells, 1, tolerance=tolerance, threads=team, steps=LAW_STEPS)
         flat, bins = exposure.cumulants.reshape(-1, 4), exposure.bins.reshape(-1)

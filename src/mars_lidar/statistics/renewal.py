@@ -234,11 +234,11 @@ def mars_moments(
     if bins is None and waveform is None:
         bins = default_bins(system)
     for index in np.ndindex(s.shape):
-        one, other = None if signal is None else float(s[index]), float(b[index])
-        photons = photons_per_bin(one, other, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
+        s_pixel, b_pixel = None if signal is None else float(s[index]), float(b[index])
+        photons = photons_per_bin(s_pixel, b_pixel, system, bins=bins, delay_ns=delay_ns, waveform=waveform)
         if not photons.any():
             continue
-        cell = cell_name(one, other, system)
+        cell = cell_name(s_pixel, b_pixel, system)
         times = holding_times(PhaseChain(photons, system.dead_time_periods, rearm, cell))
         mean[index] = system.cycles / times.mu
         variance[index] = system.cycles * times.sigma2 / times.mu**3

@@ -91,8 +91,8 @@ class HoldingTimeCovariance:
         modes = checks.integer("modes", modes, low=1, high=self._chain.bins)
         values, weights = self._modes
         count = self._whole_pairs(modes)
-        kept, weight = values[1:count], weights[1:count]
-        tail = np.sum(weight * kept**lags / (1.0 - kept))
+        leading, weight = values[1:count], weights[1:count]
+        tail = np.sum(weight * leading**lags / (1.0 - leading))
         return self.cutoff_sum(lags) + float(tail.real)
 
     def automatic_rule(self, tolerance: float = 1e-3) -> tuple[int, int]:
@@ -147,15 +147,15 @@ class HoldingTimeCovariance:
                 f"exact_sum and cutoff_sum need none"
             )
         # Left eigenvectors from inv(V) have given negative variances: P is strongly non-normal (4.4)
-        found: Any = eig(self._chain.dense(), left=True, right=True)
-        values, left, right = found
+        decomposition: Any = eig(self._chain.dense(), left=True, right=True)
+        values, left_vectors, right_vectors = decomposition
         order = np.argsort(-np.round(np.abs(values), 12), kind="stable")  # keeps conjugates side by side
-        values, left, right = values[order], left[:, order], right[:, order]
+        values, left_vectors, right_vectors = values[order], left_vectors[:, order], right_vectors[:, order]
         pdf, times = self._times.stationary.pdf, self._times
         row = weighted_waits(self._chain, pdf) - times.mu * pdf
         with np.errstate(divide="ignore", invalid="ignore"):  # the many modes of lambda = 0 are defective
-            overlap = np.sum(left.conj() * right, axis=0)
-            weights = (row @ right) * (left.conj().T @ (times.mean - times.mu)) / overlap
+            overlap = np.sum(left_vectors.conj() * right_vectors, axis=0)
+            weights = (row @ right_vectors) * (left_vectors.conj().T @ (times.mean - times.mu)) / overlap
         return values, weights * self._unit
 
 

@@ -67,20 +67,20 @@ class _Count:
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
-        self.seen = -math.expm1(-total)  # q
+        self.armed_register = -math.expm1(-total)  # q
         after = math.exp(-early) * -math.expm1(-max(total - early, 0.0))
-        self.late = min(after / self.seen, 1.0) if self.seen > 0.0 else 0.0
+        self.late = min(after / self.armed_register, 1.0) if self.armed_register > 0.0 else 0.0
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:
         """P(first armed period = r) (r,): after a renewal process that has been running for long, (7)."""
         if not stationary:
             return np.ones(1)
-        longer = np.full(min(self.whole, self.cycles) + 2, self.seen)  # P(M > r)
+        longer = np.full(min(self.whole, self.cycles) + 2, self.armed_register)  # P(M > r)
         longer[0] = 1.0
         if self.whole < self.cycles:
-            longer[-1] = self.seen * self.late
-        return np.asarray(longer / (1.0 + self.seen * (self.whole + self.late)), dtype=np.float64)
+            longer[-1] = self.armed_register * self.late
+        return np.asarray(longer / (1.0 + self.armed_register * (self.whole + self.late)), dtype=np.float64)
 
     def at_least(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) (6)."""
@@ -107,28 +107,30 @@ class _Count:
         empty = self.cycles - 1.0 - (k[:, None] - 1.0) * (self.whole + 1.0) - late  # periods that may be empty
         wanted = k[:, None]
 
-        def waited(left: FloatArray, more: float = 0.0) -> FloatArray:
+        def waited(empty_periods: FloatArray, more: float = 0.0) -> FloatArray:
             """P(no more than `left` empty periods before registration k + `more`)."""
-            chance = betainc(wanted + more, np.maximum(left, 0.0) + 1.0, self.seen)
-            return np.asarray(np.where(left >= 0.0, chance, 0.0), dtype=np.float64)
+            chance = betainc(wanted + more, np.maximum(empty_periods, 0.0) + 1.0, self.armed_register)
+            return np.asarray(np.where(empty_periods >= 0.0, chance, 0.0), dtype=np.float64)
 
-        def summed(left: FloatArray) -> FloatArray:
+        def summed(empty_periods: FloatArray) -> FloatArray:
             """Sum of `waited` from 0 up to `left`."""
-            mean = wanted * (1.0 - self.seen) / self.seen
-            return np.asarray(np.maximum((left + 1.0) * waited(left) - mean * waited(left - 1.0, 1.0), 0.0))
+            mean = wanted * (1.0 - self.armed_register) / self.armed_register
+            return np.asarray(
+                np.maximum((empty_periods + 1.0) * waited(empty_periods) - mean * waited(empty_periods - 1.0, 1.0), 0.0)
+            )
 
         n = self.first.size
-        found = self.first[0] * waited(empty)
+        probability = self.first[0] * waited(empty)
         if n > 1:  # probabilities of the wait for the first armed period: all the same but for the first and the last
-            found += self.first[-1] * waited(empty - (n - 1.0))
+            probability += self.first[-1] * waited(empty - (n - 1.0))
         if n > 2:
-            found += self.first[1] * np.maximum(summed(empty - 1.0) - summed(empty - (n - 1.0)), 0.0)
-        total = (found * weight).sum(-1)
+            probability += self.first[1] * np.maximum(summed(empty - 1.0) - summed(empty - (n - 1.0)), 0.0)
+        total = (probability * weight).sum(-1)
         return np.asarray(np.where(counts <= 0.0, 1.0, np.minimum(total, 1.0)), dtype=np.float64)
 
     def window(self) -> Pmf:
         most = math.ceil(self.cycles / (self.whole + 1))
-        if self.seen == 0.0:
+        if self.armed_register == 0.0:
             return Pmf(0, np.ones(1), 0.0)
         low, high = self._reach(most)
         if low >= _MANY_COUNTS and (high - low) * _SUMS * self._spread(float(most)) > _MANY_TERMS:
@@ -149,22 +151,27 @@ class _Count:
 
     def _reach(self, most: int) -> tuple[int, int]:
         """Counts between which the law is, from mean and variance of the time of a registration."""
-        lost = (1.0 - self.seen) / self.seen + self.late  # periods a registration loses beyond its dead time
+        lost = (
+            1.0 - self.armed_register
+        ) / self.armed_register + self.late  # periods a registration loses beyond its dead time
         each = self.whole + 1.0 + lost
         mean = self.cycles / each
-        spread = math.sqrt(mean * ((1.0 - self.seen) / self.seen**2 + self.late * (1.0 - self.late))) / each
+        spread = (
+            math.sqrt(mean * ((1.0 - self.armed_register) / self.armed_register**2 + self.late * (1.0 - self.late)))
+            / each
+        )
         reach = _REACH * spread + 10.0 + self.first.size / each
         return max(0, math.floor(mean - reach)), min(most, math.ceil(mean + reach))
 
     def _transformed(self, counts: FloatArray) -> FloatArray:
         """P(N >= counts) (n,) by the transform of the periods that k registrations lose, (21)."""
-        k, q, late, n = counts, self.seen, self.late, self.first.size
+        k, q, late, n = counts, self.armed_register, self.late, self.first.size
         room = self.cycles - 1.0 - (k - 1.0) * (self.whole + 1.0)  # periods that may be lost
         spread = math.sqrt(float(k.max()) * ((1.0 - q) / q**2 + late * (1.0 - late)))
         away = float(np.abs(room - k * (1.0 - q) / q - (k - 1.0) * late).max())
         half = math.ceil(away + _REACH * spread + n + 64.0 / q)
         size, least = 2 * half + 2, float(k.min())
-        found = np.full(k.size, (half + 1.0) / size * float(self.first.sum()))
+        survival = np.full(k.size, (half + 1.0) / size * float(self.first.sum()))
         for start in range(1, half + 1, _POINTS):
             angle = 2.0 * np.pi * np.arange(start, min(start + _POINTS, half + 1)) / size
             away_from_one = 2.0 * np.sin(0.5 * angle) ** 2 - 1j * np.sin(angle)  # 1 - w
@@ -179,9 +186,9 @@ class _Count:
             weight = 2.0 / size * first * window
             keep = np.abs(weight) * np.exp(least * empty.real + (least - 1.0) * delayed.real) > _FAINT
             for c, a, b, t in zip(weight[keep], empty[keep], delayed[keep], angle[keep], strict=True):
-                found += (c * np.exp(k * a + (k - 1.0) * b - 1j * np.remainder(room * t, 2.0 * np.pi))).real
+                survival += (c * np.exp(k * a + (k - 1.0) * b - 1j * np.remainder(room * t, 2.0 * np.pi))).real
             if not keep.any():  # the moduli of both factors fall all the way round the circle
-                return np.asarray(np.clip(found, 0.0, 1.0), dtype=np.float64)
+                return np.asarray(np.clip(survival, 0.0, 1.0), dtype=np.float64)
             if (start + _POINTS) * k.size > _MAX_TRANSFORM:
                 break
         raise ConvergenceError(

@@ -209,7 +209,7 @@ def node_laws(
     threads: int,
     progress: Progress | None = None,
 ) -> NodeLaws:
-    """Laws of the entries of a table with axes `signal`, `background` for which `matched.trusted` does not vouch."""
+    """Laws of the entries of a table with axes `signal`, `background` for which `statistics.matched.trusted` does not vouch."""
     if system.dead_time_periods == 0.0:
         return NodeLaws.none()  # Poisson
     row = np.flatnonzero(~trusted(entries.cumulants, threads=threads))
@@ -380,12 +380,12 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
     error = np.zeros(edges.size)
     nodes = [0, coarsest]
 
-    def settle(left: int, right: int) -> None:
-        inside = np.arange(left, right + 1)
-        t = ((inside - left) / (right - left))[:, None]
-        line = (1.0 - t) * curve[left] + t * curve[right]
+    def settle(begin: int, end: int) -> None:
+        inside = np.arange(begin, end + 1)
+        t = ((inside - begin) / (end - begin))[:, None]
+        line = (1.0 - t) * curve[begin] + t * curve[end]
         error[inside] = np.abs(curve[inside] - line).max(1)
-        error[[left, right]] = 0.0
+        error[[begin, end]] = 0.0
 
     settle(0, coarsest)
     for part in range(1, 32):  # at least every 32nd of the period: cells between those of the sample
@@ -393,15 +393,15 @@ def _choose(cells: Cells, grids: IndexArray, scale: FloatArray, sample: IndexArr
         if at not in nodes:
             nodes.append(at)
     nodes.sort()
-    for left, right in pairwise(nodes):
-        settle(left, right)
+    for begin, end in pairwise(nodes):
+        settle(begin, end)
     while error.max() > _PHASE_ERROR and len(nodes) < _MAX_PHASES:
         worst = int(error.argmax())
         place = int(np.searchsorted(nodes, worst))
-        left, right = nodes[place - 1], nodes[place]
+        begin, end = nodes[place - 1], nodes[place]
         nodes.insert(place, worst)
-        settle(left, worst)
-        settle(worst, right)
+        settle(begin, worst)
+        settle(worst, end)
     return edges[nodes]
 
 
@@ -413,9 +413,9 @@ def _replace_if_wrong(
     Those of (P7) are checked at a few phases, where they are largest, and replaced where they are not right.
     """
     size = np.abs(correction / scale)
-    told = np.unique(np.concatenate([size.argmax(0), size[:, :2].argmin(0), [phase.size // 2]]))
-    exact = _directly(cells, cell, bins, phase[told], threads)
-    if not (np.abs(exact - correction[told])[:, :2] / scale[:2]).max() > _PHASE_ERROR:
+    checked = np.unique(np.concatenate([size.argmax(0), size[:, :2].argmin(0), [phase.size // 2]]))
+    exact = _directly(cells, cell, bins, phase[checked], threads)
+    if not (np.abs(exact - correction[checked])[:, :2] / scale[:2]).max() > _PHASE_ERROR:
         return
     correction[:] = _directly(cells, cell, bins, phase, threads)
 

@@ -430,10 +430,10 @@ class Table:
         signal, background = (random_pixels(rng, axis, samples, below) for axis in (self.signal, self.background))
         recipe = Recipe(self.method, self.rearm, self.tolerance, thread_count(threads))
         exact = recipe.entries(signal, background, system)
-        found = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
+        looked_up = self.lookup(signal, background, cycles=periods, interpolation=interpolation)
         shapes = self.shapes(periods)
-        mixed = np.stack([w @ shapes[r] for r, w in zip(found.rows, found.weights, strict=True)])
-        error = deviations(found.cumulants, exact.cumulants)
+        mixed = np.stack([w @ shapes[r] for r, w in zip(looked_up.rows, looked_up.weights, strict=True)])
+        error = deviations(looked_up.cumulants, exact.cumulants)
         shape = 0.5 * np.abs(mixed - exact.shape).sum(-1)
         delayed, delayed_shape = error, shape
         if self.method == "exposure":
@@ -472,11 +472,11 @@ class Table:
         system = self.system if cycles is None else self.system.replace(cycles=cycles)
         signal, background = (random_pixels(rng, axis, samples, True) for axis in (self.signal, self.background))
         delay = rng.uniform(0.0, system.period_ns, samples)
-        found = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
+        law = self.lookup(signal, background, delay_ns=delay, cycles=system.cycles)
         exact = count_law(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
-        matched = matched_pmf(found.cumulants, threads=threads)
+        matched = matched_pmf(law.cumulants, threads=threads)
         off = np.array([total_variation(w, Pmf(int(exact.support[k, 0]), exact.pmf[k])) for k, w in enumerate(matched)])
-        good = found.trusted()
+        good = law.trusted()
         worst = int(off.argmax())
         return LawError(
             samples=samples,
@@ -515,9 +515,9 @@ class Table:
         shift = rng.integers(0, system.bins, signal.size)
         delay = 0.5 * system.period_ns + shift * system.bin_ns
         exact = exposure_moments(signal, background, system, delay_ns=delay, tolerance=self.tolerance, threads=threads)
-        found = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
+        law = self.lookup(signal, background, delay_ns=delay, cycles=cycles, interpolation=interpolation)
         turned = np.stack([np.roll(row, k) for row, k in zip(mixed, shift, strict=True)])
-        return deviations(found.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
+        return deviations(law.cumulants, exact.cumulants), 0.5 * np.abs(turned - normalised(exact.histogram)).sum(-1)
 
 
 def _evaluated(system: System, axes: Axes, recipe: Recipe, progress: Progress | None) -> Table:

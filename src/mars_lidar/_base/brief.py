@@ -1,4 +1,4 @@
-"""One short line for every public object: what a notebook or a debugger shows must not fill the screen."""
+"""Short ``repr`` of public objects, which fits on a screen."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-_MOST_VALUES = 4  # of an array or a sequence that is written out; larger ones by type and shape
-_MOST_TEXT = 240  # characters of anything else, such as a system inside of a result
+_MOST_VALUES = 4  # values of an array or sequence that is written out; larger ones by type and shape
+_MOST_TEXT = 240  # characters of other values, such as a system inside a result
 
 
 def brief(self: Any) -> str:

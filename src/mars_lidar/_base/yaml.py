@@ -1,6 +1,6 @@
-"""YAML as people write it, with the line of every key, so that an error can point at it.
+"""YAML with the line of every key, which errors state.
 
-1e-3 is a number, as in YAML 1.2 and in Python, which PyYAML (1.1) takes for text.
+1e-3 is a number, as in YAML 1.2 and in Python; PyYAML (1.1) reads it as text.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _MOST_BYTES, _MOST_NODES = 2**20, 2**17  # PyYAML reads a megabyte in 10 s
 
 
 class RecipeError(ValueError):
-    """A value of a description that cannot be; `key` is where it stands."""
+    """An invalid value of a description; `key` is its place."""
 
     def __init__(self, key: Key, message: str) -> None:
         super().__init__(message)
@@ -63,7 +63,7 @@ def opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _expanded(node: Any, known: dict[int, int]) -> int:
-    """Nodes below this one, those behind aliases counted as often as they stand there."""
+    """Number of nodes below this one; those of an alias count each time it is used."""
     if id(node) not in known:
         known[id(node)] = _MOST_NODES + 1  # of a node that contains itself
         inner = getattr(node, "value", None)
@@ -87,7 +87,7 @@ def read_yaml(path: Path) -> tuple[Any, Lines]:
 
 @contextlib.contextmanager
 def located(path: Path, lines: Lines, overridden: Callable[[Key], bool] = lambda key: False) -> Iterator[None]:
-    """Turn what is wrong with the data of a file into ``FILE:LINE: what``; no line for keys that stand `overridden`."""
+    """Turn what is wrong with the data of a file into ``FILE:LINE: what``; no line for keys that are `overridden`."""
     try:
         yield
     except (ValueError, TypeError) as error:

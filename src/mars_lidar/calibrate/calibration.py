@@ -43,8 +43,8 @@ def calibrate(
     no assumption on the exposure, the start, or the stationarity, and no correction of pile-up is needed.
 
     That is exact for a detector with one dead time, with Gaussian jitter or with a slow recovery
-    (`calibrate.armed_time.Sensitivity`). For one with other effects (of `system`) the bias is taken off by simulation: the light
-    is sought whose streams by the exact engine give the same estimate.
+    (`calibrate.armed_time.Sensitivity`). For one with other effects (of `system`) the bias is taken off by simulation:
+    the light is sought whose streams by the exact engine give the same estimate.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What an avalanche leaves behind: afterpulses in its own pixel, and crosstalk in the neighbours."""
+"""Avalanches triggered by avalanches: afterpulses in the same pixel and crosstalk in its neighbours."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Afterpulsing:
     def after_dead_time(
         cls, *, probability: float, delay_ns: float, dead_time_ns: float, generations: int | None = None
     ) -> Afterpulsing:
-        """Exponential delays of which `probability` per avalanche are left after its dead time."""
+        """Exponential delays with `probability` afterpulses per avalanche after its dead time."""
         after_dead = checks.real("probability", probability, low=0.0, high=1.0, strict_low=True)
         delay = checks.real("delay_ns", delay_ns, low=0.0, strict_low=True)
         dead = checks.real("dead_time_ns", dead_time_ns, low=0.0)

@@ -26,7 +26,7 @@ _MAX_RECOVERY_PERIODS = 1e6  # beyond it a pixel that has rested would not be to
 _GATE = ("gate_start_ns", "gate_width_ns", "gate_step_ns", "gate_cycles")
 _MAX_GATE_CYCLES = 100_000_000
 _MIN_GATE_PERIODS = 1e-5  # phases have 24 bits: at 1e-6 periods the counts behind a gate were 4 % off
-_NOTEBOOK_POINTS = 301  # of the curve in a notebook: more than its pixels
+_NOTEBOOK_POINTS = 301  # points of the curve in a notebook, more than its pixels
 _MAX_GATE_NS = 1e12  # a start or a step is taken modulo the period: far beyond it no digits are left
 
 

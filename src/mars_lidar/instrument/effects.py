@@ -1,4 +1,4 @@
-"""What a real pixel and its electronics do beside dead time and mode: the optional fields of `Detector`.
+"""Effects of a pixel and its electronics beside dead time and mode: the optional fields of `Detector`.
 
 Every effect is declared here once: its check, its form in files, its option, its native fields. All are off by default,
 and then the bits are those of the ideal pixel. The order in which they act, and what each of them is taken to be, is in
@@ -35,9 +35,9 @@ def native_pulse(pulse: Pulse, period_ns: float) -> _core.PulseTable:
 
 # --- Effects -------------------------------------------------------------------------------------------------------
 
-_MAX_RATE_HZ = 1e12
-_MAX_EVENTS = 2**31 - 1
-_MAX_CODES = 2**16
+MAX_RATE_HZ = 1e12  # dark counts or photons per second, the most that are accepted
+_MAX_EVENTS = 2**31 - 1  # records of an exposure: 32-bit counters
+_MAX_CODES = 2**16  # codes of a TDC
 
 
 Kind = Literal["light", "avalanche", "recording", "timing"]
@@ -134,7 +134,7 @@ FIELDS: dict[str, Effect] = {
     "dark_count_hz": Effect(
         "light",
         0.0,
-        lambda v: checks.real("dark_count_hz", v, low=0.0, high=_MAX_RATE_HZ),
+        lambda v: checks.real("dark_count_hz", v, low=0.0, high=MAX_RATE_HZ),
         "dark_count_hz: 100.0             # counts/s of every pixel",
         help="Dark counts of every pixel, counts/s, which no efficiency reduces.",
         default="0",

@@ -29,7 +29,7 @@ SPEED_OF_LIGHT_M_PER_NS = 0.299792458
 _STARTS = ("armed", "stationary")
 MAX_CYCLES = 100_000_000  # the sampler counts periods in 32 bits: ten seconds at 10 MHz
 _MAX_BINS = 2**20
-_LINED_BYTES = 2**16  # of JSON that is read as YAML, a hundred times slower, so that errors name the line
+_LINED_BYTES = 2**16  # bytes up to which JSON is read as YAML, a hundred times slower, so that errors state the line
 _MAX_DEAD_PERIODS = 2**20
 
 

@@ -1,4 +1,4 @@
-"""A look at the units of a system: times in ps or s where ns are meant, which no other check can know."""
+"""Warnings for times that are likely given in ps or s instead of ns."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from mars_lidar.instrument.pulse import FWHM_PER_SIGMA, GaussianPulse, Pulse
 
 
 class UnitWarning(UserWarning):
-    """A value that is possible, and likely meant in another unit."""
+    """A possible value that is likely meant in another unit."""
 
 
-# from what on a time is odd in ns, and in laser periods, and from what on nobody types it: such values are meant
+# time from which a value is unusual, in ns and in laser periods; and from which it is meant as it is, in ns
 _PULSE, _DEAD, _GATE = (41.0, 0.31, 2e4), (25_000.0, 25.0, 1e6), (0.0, 25.0, 1e6)
 _LONGEST_NS = 1e-6  # of a time in seconds that was taken for ns: a second is the longest anybody has
-_ODD_DELAY = 100.0  # periods
-_DIGITS = 3  # what people type; a computed value has more
+_ODD_DELAY = 100.0  # periods from which a median delay is unusual
+_DIGITS = 3  # significant digits of typed values; computed values have more
 
 
 def period_hint(period_ns: float) -> str:
-    """What a period was likely meant to be, or nothing."""
+    """Hint at the period that was likely meant, or an empty text."""
     if period_ns < 1e-3:  # 1 ps
         return f"period_ns={period_ns:g} is {period_ns:g} ns: {1e9 * period_ns:.4g} ns, if it was given in seconds"
     return ""

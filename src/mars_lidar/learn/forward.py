@@ -91,20 +91,20 @@ def _cumulative(pulse: Pulse, time: torch.Tensor) -> torch.Tensor:
 
 
 def inputs(*given: torch.Tensor) -> list[torch.Tensor]:
-    """Checked, and of one shape."""
+    """Tensors of one shape, checked for type, shape and values."""
     light = alike(*given)
     check_values(*light)
     return light
 
 
 def check_values(signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> None:
-    """Raise where they are no light and no time."""
+    """Raise ValueError for negative photons or a delay that is not finite."""
     if not (bool((signal >= 0).all()) and bool((background >= 0).all()) and bool(torch.isfinite(delay_ns).all())):
         raise ValueError("signal and background must be >= 0 and delay_ns finite")
 
 
 def alike(*given: torch.Tensor) -> list[torch.Tensor]:
-    """Checked for type and shape, and of one shape."""
+    """Tensors broadcast to one shape, checked for type and shape."""
     for name, tensor in zip(("signal", "background", "delay_ns"), given, strict=True):
         if not isinstance(tensor, torch.Tensor) or not tensor.is_floating_point():
             raise TypeError(f"{name} must be a tensor of floating point numbers, got {tensor!r}")
@@ -118,7 +118,7 @@ def alike(*given: torch.Tensor) -> list[torch.Tensor]:
 def detected(
     signal: torch.Tensor, background: torch.Tensor, system: System
 ) -> tuple[torch.Tensor, torch.Tensor, System]:
-    """What the pixel detects of them, and the system for that: as `Flux.detected`, efficiency and dark counts."""
+    """Detected photons, with efficiency and dark counts as `Flux.detected`, and the system that detects all of them."""
     detector = system.detector
     dark = 1e-9 * detector.dark_count_hz * system.period_ns
     if detector.detection_efficiency == 1.0 and dark == 0.0:
@@ -145,10 +145,10 @@ def check_detector(system: System, *, light: bool = False) -> None:
 
 Rows = torch.Tensor  # (pixels, bins), double
 
-_KRYLOV, _RESTARTS = 40, 25
-TOLERANCE = 1e-13  # of the residual, relative to the source
-_GOOD = 1e-9  # that is still accepted where rounding ends the descent
-_ROWS = 2**15  # pixels x bins solved at a time on a CPU: what is used again and again stays in the cache
+_KRYLOV, _RESTARTS = 40, 25  # dimension of the Krylov space; restarts of GMRES
+TOLERANCE = 1e-13  # residual relative to the source at which GMRES stops
+_GOOD = 1e-9  # relative residual that is accepted where rounding prevents further progress
+_ROWS = 2**15  # pixels x bins solved together on a CPU, so that the working arrays stay in the cache
 _HELD = 24  # arrays (pixels, bins) beside the Krylov space, the powers of two of the recursion among them
 
 
@@ -197,10 +197,10 @@ class Delay:
         return window + self.whole * h.sum(-1, keepdim=True)
 
     def at_end(self, h: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """What dead time at the end of the exposure leaves of settled registrations h a period: e and its falls.
+        """Dead time beyond the end of the exposure, for settled registrations h per period: e and its decrements.
 
         With (4.6) of docs/joint_law.md, e: expected periods, of those that follow the exposure, in which the pixel is
-        still blind at the start of a bin; its falls: re-armings that come after the end.
+        still blind at the start of a bin; its decrements: re-armings after the end.
         """
         k, j = self.whole, torch.arange(self.bins, device=h.device)
         falls = self.rearmed(h, k + (j < self.shift).to(h.dtype), k + (j <= self.shift).to(h.dtype))
@@ -290,13 +290,13 @@ def gmres(apply: Callable[[Rows], Rows], wanted: Rows, tolerance: float = TOLERA
         rest = wanted - apply(x)
     if not last <= _GOOD:
         raise ConvergenceError(
-            f"the feedback equation is left with a relative residual of {last:.1e} after {_KRYLOV * _RESTARTS} steps"
+            f"the feedback equation has a relative residual of {last:.1e} after {_KRYLOV * _RESTARTS} steps"
         )
     return x
 
 
 def _krylov(apply: Callable[[Rows], Rows], rest: Rows, enough: torch.Tensor) -> Rows:
-    """What to add to x: the least residual in the space that `apply` makes of `rest`."""
+    """Correction of x that minimises the residual in the Krylov space of `apply` and `rest`."""
     least = torch.finfo(rest.dtype).tiny
     size = torch.linalg.vector_norm(rest, dim=-1)
     basis = rest.new_empty((len(rest), _KRYLOV + 1, rest.shape[-1]))
@@ -378,7 +378,7 @@ class _Solution(torch.autograd.Function):
 
 
 def by_rows(function: Any, info: Any, in_dims: tuple[int | None, ...], given: tuple[Any, ...]) -> Any:
-    """The rule of `torch.vmap` for a function of rows that are independent of each other: more of them."""
+    """Rule of `torch.vmap` for a function of independent rows: the batch becomes further rows."""
     number, flat = info.batch_size, []
     for argument, dim in zip(given, in_dims, strict=True):
         if isinstance(argument, torch.Tensor):
@@ -402,7 +402,7 @@ def registered(
 
 
 def blocks(most: int, bins: int, *rows: torch.Tensor) -> Any:
-    """Some rows of each at a time, of at most so many rows x bins."""
+    """Blocks of rows of all tensors, of at most `most` rows x bins."""
     return zip(*(torch.split(tensor, max(1, most // bins)) for tensor in rows), strict=True)
 
 
@@ -416,8 +416,8 @@ def _block(device: torch.device) -> int:
 
 # --- The expected histogram ----------------------------------------------------------------------------------------
 
-_FINE = 4.0  # parts of a sigma of the pulse
-_BLOCK = 2**22  # pixels x bins of photons that are held at a time
+_FINE = 4.0  # parts per sigma of the pulse
+_BLOCK = 2**22  # pixels x bins of photons in memory together
 
 
 def expected_histogram(
@@ -569,7 +569,7 @@ def _summed(fine: torch.Tensor, parts: int) -> torch.Tensor:
 
 
 def armed_periods(histogram: torch.Tensor, system: System) -> torch.Tensor:
-    """Periods D (..., bins) in which the pixel was armed in each bin, as its own histogram (..., bins) tells.
+    """Periods D (..., bins) in which the pixel was armed in each bin, estimated from its histogram (..., bins).
 
     ``N_r`` less the registrations whose dead time covers the bin (Gupta et al., ICCV 2019); a registration in the bin
     and a re-arming count half. What the dead time covers after the end of the exposure is taken for its beginning,

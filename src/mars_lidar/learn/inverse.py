@@ -100,7 +100,7 @@ class LidarPhysics(Physics):  # type: ignore[misc]  # deepinv is not typed
 
     @staticmethod
     def custom_init(y: torch.Tensor, physics: LidarPhysics) -> dict[str, Any]:
-        """Where an algorithm of deepinv starts: ``physics.A_dagger(y)``, for it and its auxiliary variable."""
+        """Initial estimate of an algorithm of deepinv: ``physics.A_dagger(y)``, also for its auxiliary variable."""
         start = physics.A_dagger(y)
         return {"est": (start, start.clone())}
 

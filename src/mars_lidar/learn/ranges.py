@@ -57,7 +57,7 @@ class LogUniform(Uniform):
 
 @dataclass(frozen=True)
 class Choice:
-    """One of some numbers, all equally likely."""
+    """Uniform distribution over a list of numbers."""
 
     values: tuple[float, ...]
 
@@ -161,7 +161,7 @@ class SystemRange:
 
 
 class SystemList:
-    """One of some instruments, all equally likely."""
+    """Uniform distribution over a list of instruments."""
 
     def __init__(self, systems: Sequence[System]) -> None:
         self._systems = list(systems)
@@ -184,7 +184,7 @@ class SystemList:
 
 
 def as_systems(value: System | Sequence[System] | SystemRange) -> SystemRange | SystemList:
-    """What instruments are drawn from."""
+    """Distribution from which instruments are drawn."""
     if isinstance(value, SystemRange):
         return value
     if isinstance(value, System):

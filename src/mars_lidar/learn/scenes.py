@@ -99,9 +99,9 @@ def _checksum(number: int, maps: NDArray[np.float64]) -> int:
 
 # --- Where scenes come from ----------------------------------------------------------------------------------------
 
-POOL = 16  # ray-cast scenes that are in use at a time
-_MARGIN = 1.5  # they are cast larger than what is cropped from them
-_KEPT = 32  # scenes in memory, of each worker
+POOL = 16  # ray-cast scenes in use together
+_MARGIN = 1.5  # side of a ray-cast scene relative to the crop taken from it
+_CACHED = 32  # scenes in memory, per worker
 
 
 def generator(purpose: int, seed: int, *numbers: int) -> np.random.Generator:
@@ -129,7 +129,7 @@ class SceneSource(ABC):
         number = self.number(seed, epoch, sample)
         if number not in self._kept:
             self._kept[number] = self.load(number)
-            if len(self._kept) > _KEPT:
+            if len(self._kept) > _CACHED:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(number)
         return self._kept[number]
@@ -158,7 +158,7 @@ class RayCast(SceneSource):
         return _pooled(seed, epoch, sample // (POOL * self._reuse), which)
 
     def load(self, number: int) -> Scene:
-        """Cast it, or take it from another worker."""
+        """Ray-cast the scene, or copy it from another worker."""
         shared = None if torch.utils.data.get_worker_info() is None else self._shared
         scene = None if shared is None else shared.get(number)
         if scene is None:
@@ -252,7 +252,7 @@ class Arrays(Given):
 
 
 def as_source(scenes: Any, size: tuple[int, int] | None, reuse: int) -> SceneSource:
-    """What `CubeStream` takes as scenes."""
+    """Source of scenes for the argument `scenes` of `CubeStream`."""
     reuse = checks.integer("reuse", reuse, low=1, high=2**31)
     if isinstance(scenes, str) and scenes in Scene.example_names():
         return RayCast(scenes, size or (64, 64), reuse)
@@ -306,7 +306,7 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What samples are drawn from."""
+    """Distribution from which samples are drawn."""
 
     source: SceneSource
     systems: SystemRange | SystemList
@@ -374,7 +374,7 @@ def _run(first: int, number: int, step: int) -> slice:
 
 
 def example_of(samples: Sequence[Sample], cube: torch.Tensor) -> dict[str, Any]:
-    """What a loader gives of some samples: cubes, and maps and settings as float32, each with a leading axis."""
+    """Example of a loader: cubes, and maps and settings as float32, each with a leading axis of samples."""
 
     def maps(get: Callable[[Sample], FloatArray]) -> torch.Tensor:
         return torch.from_numpy(np.stack([get(sample) for sample in samples]).astype(np.float32)).to(cube.device)

@@ -64,8 +64,8 @@ def worker_of() -> tuple[int, int, bool]:
 
 # --- Passes --------------------------------------------------------------------------------------------------------
 
-_WORKERS = 1024  # most of one loader
-_SEED_BITS = 24
+_WORKERS = 1024  # largest number of workers of one loader
+_SEED_BITS = 24  # low bits of a mark, which identify the pass
 _SEEDS = (1 << _SEED_BITS) - 1
 _BY_WORKER = 1 << (_SEED_BITS - 1)  # set in the seed part of a worker's mark; those of the main process have 0 there
 
@@ -130,7 +130,7 @@ class Passes:
 
 
 def _mark() -> int:
-    """Of the seed that all workers of a pass share; 0 outside of workers."""
+    """Mark of the seed that all workers of a pass share; 0 outside of workers."""
     info = torch.utils.data.get_worker_info()
     return 0 if info is None else ((info.seed - info.id) & _SEEDS) | _BY_WORKER
 
@@ -331,7 +331,7 @@ class Buffers:
 
 
 def _alone() -> int:
-    """What `sys.getrefcount` tells of an object that only a list holds; it differs between versions of Python."""
+    """Result of `sys.getrefcount` for an object that only a list holds; it differs between versions of Python."""
     held = [object()]
     return sys.getrefcount(held[0])
 
@@ -505,7 +505,7 @@ class CubeStream(torch.utils.data.IterableDataset[dict[str, Any]]):
         return first if self._repeat else first + max(self._passes.begun - 1, 0)
 
     def state_dict(self, batches: int | None = None) -> dict[str, int]:
-        """Where the pass stands, for `load_state_dict`.
+        """Position in the pass, for `load_state_dict`.
 
         torchdata's ``StatefulDataLoader`` asks for it in each of its workers, and resumes exactly with any number of
         them. The parent of a plain loader's workers does not know how far the pass has gone: they run ahead.

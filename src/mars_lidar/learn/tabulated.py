@@ -10,7 +10,7 @@ from mars_lidar.learn.forward import Delay, blocks, check_detector, inputs, wrap
 from mars_lidar.learn.needed import torch
 from mars_lidar.table import Table
 
-_BLOCK = 2**18  # pixels x bins evaluated at a time
+_BLOCK = 2**18  # pixels x bins evaluated together
 
 
 class HistogramTable(torch.nn.Module):
@@ -87,7 +87,7 @@ class HistogramTable(torch.nn.Module):
         return expected.reshape(*given[0].shape, self.system.bins).to(given[0].dtype)
 
     def extra_repr(self) -> str:
-        """Told by ``print``."""
+        """Size of the table, for ``print``."""
         return f"{len(self.signal)} x {len(self.background)} x {self.system.bins}, {self.system.cycles} cycles"
 
     def _expected(self, signal: torch.Tensor, background: torch.Tensor, delay_ns: torch.Tensor) -> torch.Tensor:
@@ -113,7 +113,7 @@ class HistogramTable(torch.nn.Module):
         n, delay = self.system.bins, Delay(self.system.dead_time_periods, self.system.bins)
         photons = signal * self._energy(torch.ones_like(part)) + background / n
         share = (signal * self._energy(part) + background * part / n) / photons.clamp_min(1e-30)
-        share = torch.where(photons > 1e-30, share, part)  # of nothing
+        share = torch.where(photons > 1e-30, share, part)  # an empty bin is uniform
         # blind at a bin's start: registrations of the bins within the last dead time, and a part of one
         cut = 1.0 - delay.part
         until = (signal * self._energy(part.new_tensor([[cut]])) + background * cut / n) / photons.clamp_min(1e-30)

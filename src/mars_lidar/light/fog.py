@@ -17,8 +17,8 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.light.stored_flux import StoredFlux
 from mars_lidar.light.transient import through_pulse
 
-PARTS_PER_BIN = 4  # of the waveform, by default
-_BAND_BYTES = 8 * 2**20  # of waveforms that are made together, some six times over
+PARTS_PER_BIN = 4  # default parts of the waveform per histogram bin
+_BAND_BYTES = 8 * 2**20  # waveforms computed together; the work takes about six times as much
 _DARK = 40.0  # optical depths of the way there and back beyond which nothing comes: e^-40
 _FOLDS = 256  # periods from which light of fog is told apart
 
@@ -110,7 +110,7 @@ def _depths(flux: Flux) -> tuple[NDArray[np.bool_], FloatArray]:
 
 
 def _farthest(lit: NDArray[np.bool_], depth: FloatArray) -> FloatArray:
-    """Where the beam of each pixel ends (H, W), m."""
+    """Range at which the beam of each pixel ends (H, W), m."""
     return np.asarray(np.where(lit.any(0), depth.max(0, initial=0.0), math.inf), np.float64)
 
 

@@ -12,7 +12,7 @@ from mars_lidar._base.memory import check_memory
 from mars_lidar._base.types import FloatArray
 from mars_lidar.light.flux import Flux, check_photons
 
-BAND_BYTES = 64 * 2**20  # of waveforms that are made together
+BAND_BYTES = 64 * 2**20  # waveforms computed together
 
 
 class StoredFlux(Flux):

@@ -1,4 +1,4 @@
-"""What the pictures show: maps and rates computed from a cube, or from the light fitted to it, without matplotlib."""
+"""Maps and rates for the figures, computed from a cube or from the light fitted to it, without matplotlib."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from mars_lidar.light.flux import Flux
 from mars_lidar.scene.radiometry import scene_flux
 from mars_lidar.scene.scene import Scene
 
-MOST = 16  # returns of a pixel
+MOST = 16  # layers, and returns of a pixel
 
 
 class LayeredScene:
@@ -47,7 +47,7 @@ class LayeredScene:
     def behind_pane(
         cls, scene: Scene | LayeredScene, depth_m: float, reflectivity: float, transmission: float = 1.0
     ) -> LayeredScene:
-        """What is seen through a pane at one range.
+        """A scene seen through a pane at one range.
 
         Parameters
         ----------
@@ -106,8 +106,8 @@ class LayeredScene:
             S_k = signal * w_k / mean_V(sum_k w_k)
 
         so that all returns of a pixel together have the mean `signal`. Ambient ``"reflectivity"`` is the sum of the
-        reflectivities of the surfaces that a pixel sees, and where it sees none the largest reflectivity of all
-        layers, in whatever order they come.
+        reflectivities of the surfaces in a pixel; in a pixel without any it is the largest reflectivity of all
+        layers.
         """
         depth, share = (
             np.stack([getattr(layer, name) for layer in self.layers]) for name in ("depth_m", "reflectivity")

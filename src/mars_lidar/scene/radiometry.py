@@ -94,7 +94,7 @@ def scene_flux(
 def _scaled(
     light: FloatArray, mean: float, with_return: Callable[[FloatArray], FloatArray], what: str, asked: str
 ) -> FloatArray:
-    """Relative maps (K, H, W) scaled together, so that their sum has a mean over the pixels that are `seen`."""
+    """Relative maps (K, H, W) with a common factor that gives their sum the `mean` over the pixels `with_return`."""
     total = light.sum(0)
     top = float(with_return(total).max())
     if top == 0.0:
@@ -105,7 +105,7 @@ def _scaled(
 
 
 def _means(s: FloatArray, ambient: FloatArray, dark: float) -> dict[str, float | None]:
-    """What was achieved over the valid pixels, photons per laser period."""
+    """Means over the valid pixels, photons per laser period, and the resulting SBR."""
     mean_s, mean_a = float(s.mean()), float(ambient.mean())
     mean_b = float((ambient + dark).mean())
     return {

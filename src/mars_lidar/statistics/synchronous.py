@@ -1,8 +1,8 @@
 """Exact statistics of a synchronous pixel: armed at the start of each period, first photon only (Coates 1968).
 
 Every armed period registers with probability q = 1 - e^-Lambda, at a phase with the law of the first arrival,
-independently of all others. A registration costs 1 + K or 2 + K periods, t_d = K + f: the latter where it comes after
-1 - f. So the count is a renewal process of whole periods: docs/detectors.md, equations (4) to (7).
+independently of all others. A registration occupies 1 + K periods, or 2 + K where it comes after 1 - f, with t_d =
+K + f. The count is thus a renewal process of whole periods: docs/detectors.md, equations (4) to (7).
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mars_lidar._base.types import FloatArray
-from mars_lidar.statistics.cells import Cells
+from mars_lidar.statistics.cells import Cells, photons_before
 from mars_lidar.statistics.count_pmf import Pmf
-from mars_lidar.statistics.gate import photons_before
 from mars_lidar.statistics.phase_chain import ConvergenceError
 
-_TAIL = 1e-13  # probability left out at either end of the support
-_SPREAD = 9.0  # standard deviations of the number of late registrations that are summed over
-_CHUNK = 1 << 20  # terms of (6) at a time
+_TAIL = 1e-13  # probability outside the support, at either end
+_SPREAD = 9.0  # half width of the sum over late registrations, in standard deviations of their number
+_CHUNK = 1 << 20  # terms of (6) computed together
 _SUMS = 6  # incomplete beta functions in a term of (6)
-_MAX_TERMS = 1 << 23  # of one cell: a second
-_MANY_TERMS, _MANY_COUNTS = 1 << 18, 20  # from which on the transform (21) is faster, and good
-_REACH = 11.0  # standard deviations, in each of which the law and its transform are taken to end
-_POINTS, _FAINT, _MAX_TRANSFORM = 32, 1e-15, 30_000_000
-_LOOSE_TAIL = 1e-10  # of a law by its transform
+_MAX_TERMS = 1 << 23  # terms of (6) of one cell: a second
+_MANY_TERMS, _MANY_COUNTS = 1 << 18, 20  # terms, and counts at the lower end, from which the transform (21) is used
+_REACH = 11.0  # half width of the law, and of its transform, in standard deviations
+_POINTS = 32  # points of the circle evaluated together
+_FAINT = 1e-15  # modulus of the transform below which it counts as 0
+_MAX_TRANSFORM = 30_000_000  # points x counts of one cell
+_LOOSE_TAIL = 1e-10  # probability outside the support of a law by its transform
 _INSTEAD = "use fewer cycles, or simulate it with engine 'exact'"
 
 
@@ -63,7 +64,7 @@ def _log1p(u: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 class _Count:
-    """The count of one pixel: `early` of its `total` photons a period come before 1 - f."""
+    """The count of one pixel, of whose `total` photons a period `early` arrive before 1 - f."""
 
     def __init__(self, cells: Cells, name: str, whole: int, early: float, total: float) -> None:
         self.name, self.cycles, self.whole = name, cells.system.cycles, whole
@@ -73,7 +74,7 @@ class _Count:
         self.first = self._first(cells.system.start == "stationary")
 
     def _first(self, stationary: bool) -> FloatArray:
-        """P(first armed period = r) (r,): after a renewal process that has been running for long, (7)."""
+        """P(first armed period = r) (r,): 1 for r = 0, or of a stationary renewal process, (7)."""
         if not stationary:
             return np.ones(1)
         longer = np.full(min(self.whole, self.cycles) + 2, self.armed_register)  # P(M > r)
@@ -90,7 +91,7 @@ class _Count:
         return np.concatenate(parts)
 
     def _spread(self, most: float) -> float:
-        """Numbers of late registrations that matter."""
+        """Width of the sum over the number of late registrations, for `most` registrations."""
         return 1.0 if self.late == 0.0 else 2.0 * (_SPREAD * math.sqrt(most * self.late * (1.0 - self.late)) + 20.0)
 
     def _at_least(self, counts: FloatArray, spread: float) -> FloatArray:
@@ -108,12 +109,12 @@ class _Count:
         wanted = k[:, None]
 
         def waited(empty_periods: FloatArray, more: float = 0.0) -> FloatArray:
-            """P(no more than `left` empty periods before registration k + `more`)."""
+            """P(at most `empty_periods` empty periods before registration k + `more`)."""
             chance = betainc(wanted + more, np.maximum(empty_periods, 0.0) + 1.0, self.armed_register)
             return np.asarray(np.where(empty_periods >= 0.0, chance, 0.0), dtype=np.float64)
 
         def summed(empty_periods: FloatArray) -> FloatArray:
-            """Sum of `waited` from 0 up to `left`."""
+            """Sum of `waited` from 0 to `empty_periods`."""
             mean = wanted * (1.0 - self.armed_register) / self.armed_register
             return np.asarray(
                 np.maximum((empty_periods + 1.0) * waited(empty_periods) - mean * waited(empty_periods - 1.0, 1.0), 0.0)
@@ -121,7 +122,7 @@ class _Count:
 
         n = self.first.size
         probability = self.first[0] * waited(empty)
-        if n > 1:  # probabilities of the wait for the first armed period: all the same but for the first and the last
+        if n > 1:  # the waits for the first armed period are equally likely except the first and the last
             probability += self.first[-1] * waited(empty - (n - 1.0))
         if n > 2:
             probability += self.first[1] * np.maximum(summed(empty - 1.0) - summed(empty - (n - 1.0)), 0.0)
@@ -137,10 +138,10 @@ class _Count:
             survival = self._transformed(np.arange(low, high + 2, dtype=np.float64))
             tail = _LOOSE_TAIL
             if not (survival[0] >= 1.0 - tail and survival[-1] <= tail):
-                raise ConvergenceError(f"count law of {self.name}: it does not end within {low} .. {high}; {_INSTEAD}")
+                raise ConvergenceError(f"count law of {self.name}: it extends beyond {low} .. {high}; {_INSTEAD}")
         else:
             self._check((math.log2(most + 1.0) + 1.0) * 2.0, most)
-            # what the sums over the wait for the first armed period may lose to rounding
+            # rounding error of the sums over the wait for the first armed period
             tail = _TAIL + (4.0 * np.finfo(float).eps * self.cycles / self.first.size if self.first.size > 2 else 0.0)
             low, high = self._last(1.0 - tail, most), self._last(_TAIL, most)
             self._check(high + 2.0 - low, high)
@@ -150,10 +151,10 @@ class _Count:
         return Pmf(low, pmf, tail * ((low > 0) + (high < most)))
 
     def _reach(self, most: int) -> tuple[int, int]:
-        """Counts between which the law is, from mean and variance of the time of a registration."""
+        """First and last count of the support, from mean and variance of the time of a registration."""
         lost = (
             1.0 - self.armed_register
-        ) / self.armed_register + self.late  # periods a registration loses beyond its dead time
+        ) / self.armed_register + self.late  # periods per registration beyond its dead time
         each = self.whole + 1.0 + lost
         mean = self.cycles / each
         spread = (
@@ -187,13 +188,13 @@ class _Count:
             keep = np.abs(weight) * np.exp(least * empty.real + (least - 1.0) * delayed.real) > _FAINT
             for c, a, b, t in zip(weight[keep], empty[keep], delayed[keep], angle[keep], strict=True):
                 survival += (c * np.exp(k * a + (k - 1.0) * b - 1j * np.remainder(room * t, 2.0 * np.pi))).real
-            if not keep.any():  # the moduli of both factors fall all the way round the circle
+            if not keep.any():  # the moduli of both factors decrease monotonically with the angle up to pi
                 return np.asarray(np.clip(survival, 0.0, 1.0), dtype=np.float64)
             if (start + _POINTS) * k.size > _MAX_TRANSFORM:
                 break
         raise ConvergenceError(
-            f"count law of {self.name}: a dead time that reaches over period starts all but locks the count, whose "
-            f"transform does not end; {_INSTEAD}"
+            f"count law of {self.name}: the count is nearly constant because the dead time spans period starts, and "
+            f"its transform is too wide; {_INSTEAD}"
         )
 
     def _check(self, counts: float, most: int) -> None:
@@ -201,11 +202,11 @@ class _Count:
         if terms > _MAX_TERMS:
             raise ConvergenceError(
                 f"count law of {self.name}: {terms:.2g} terms are too many for mode 'synchronous' with a dead time "
-                f"that reaches over period starts (at most {_MAX_TERMS:.2g}); {_INSTEAD}"
+                f"that spans period starts (at most {_MAX_TERMS:.2g}); {_INSTEAD}"
             )
 
     def _last(self, chance: float, most: int) -> int:
-        """The largest count that is reached with at least this probability."""
+        """Largest count n with P(N >= n) >= `chance`."""
         low, high = 0, most + 1
         while high - low > 1:
             middle = (low + high) // 2

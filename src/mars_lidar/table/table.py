@@ -55,9 +55,9 @@ from mars_lidar.table.error import MOST_CYCLES, LawError, QuantisationError, dev
 Interpolation = Literal["bilinear", "nearest"]
 INTERPOLATIONS, OUTSIDE = ("bilinear", "nearest"), ("error", "exact")
 _METHODS, _REARMS = ("exposure", "mars"), ("centre", "edge")
-_ERROR_SAMPLES = 128  # pixels on which a table is checked when it is built
-_ATTEMPTS = 4  # of refining, each with half the error of the one before
-_LINES = 8  # values of the other axis at which one is looked at
+_ERROR_SAMPLES = 128  # random pixels on which a new table is checked
+_ATTEMPTS = 4  # refinements, each with half the error of the previous one
+_LINES = 8  # values of the other axis at which an axis is examined
 _ROUNDS = 12
 
 Axes = tuple[FloatArray, FloatArray]
@@ -223,7 +223,7 @@ class Table:
     def _search(
         cls, system: System, signal: Grid, background: Grid, options: dict[str, Any]
     ) -> tuple[Path, Path | None]:
-        """Where the table belongs in the cache, and the file that serves, if there is one."""
+        """Path of the table in the cache, and the existing file that can be used instead, or None."""
         if not isinstance(system, System):
             raise TypeError(f"system must be a System, got {type(system).__name__}")
         system = system.detected()
